@@ -17,6 +17,7 @@ __all__ = [
     "TAIL",
     "WRONG",
     "Finding",
+    "FindingWarning",
     "Judgement",
     "by_severity",
     "judge",
@@ -61,11 +62,15 @@ def judge(findings: Iterable[Finding], tests: Iterable[tuple[str, str]] = ()) ->
     return Judgement(STATUS[ordered[0].severity] if ordered else "use", ordered, tuple(tests))
 
 
+class FindingWarning(UserWarning):
+    """A finding that a result has among its findings as well."""
+
+
 def warn(findings: Iterable[Finding], stacklevel: int = 2) -> None:
     """Warn of the findings that are more than a note; `stacklevel` as seen from the caller."""
     for each in findings:
         if each.severity != NOTE:
-            warnings.warn(each.message, stacklevel=stacklevel + 1)
+            warnings.warn(each.message, FindingWarning, stacklevel=stacklevel + 1)
 
 
 def labelled(findings: Iterable[Finding]) -> list[str]:

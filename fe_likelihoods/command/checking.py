@@ -42,8 +42,9 @@ def check_job(file: Path, picture: Path, say: Callable[[str], None], progress: b
     _say_data(problem, say)
     checked = _say_simulation(problem, events, say, progress)
     parts = [part for part, _ in problem.posterior.likelihood.parts()]
-    repairs = [line for part in parts for line in repair_lines(screen(part.measurements), job.measurements)]
-    if repairs and job.measurements:
+    given = {} if job.measurements is None else job.measurements.given()
+    repairs = [line for part in parts for line in repair_lines(screen(part.measurements), given)]
+    if repairs and given:
         say("Lines of [measurements] that deal with the sensors, instead of lines with the same keys:")
         for line in repairs:
             say(f"  {line}")
@@ -51,12 +52,11 @@ def check_job(file: Path, picture: Path, say: Callable[[str], None], progress: b
         steps = f"{event.record.n_steps} samples at {event.record.dt:g} s"
         compared = "without measurements" if event.measured is None else "compared with measurements"
         say(f"Event {event.name}: {event.record.name}, {steps}, {compared}")
-    guided = job.sampler.get("guide", False)
     if is_emcee(job):
-        simulations = sampler.nwalkers * (job.sampler["steps"] + 1)
+        simulations = sampler.nwalkers * (job.sampler.steps + 1)
         say(f"emcee makes {simulations} simulations: {sampler.nwalkers} walkers, {job.sampler['steps']} steps")
     else:
-        _say_cost(make_problem(job).posterior, sampler, guided, job.budget, checked, say)
+        _say_cost(make_problem(job).posterior, job, sampler, checked, say)
     pictures = _draw(problem, checked.seconds, picture)
     names = ", ".join(map(str, pictures))
     say(f"{names}: the measurements should lie within the band of the simulations at draws of the prior")
@@ -107,7 +107,7 @@ def _say_data(problem: Problem, say: Callable[[str], None]) -> None:
 
 def _cache_of_the_run(job: Job, folder: Path) -> SimulationCache | None:
     """The cache that a run in this folder will use; None if it uses none, or cannot use the folder."""
-    if not job.budget.get("cache", True) or not is_free(folder):
+    if not job.budget.cache or not is_free(folder):
         return None
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -150,12 +150,11 @@ def _say_simulation(
     return checked
 
 
-def _say_cost(
-    posterior: Posterior, sampler: Any, guided: bool, budget: dict, checked: ModelCheck, say: Callable[[str], None]
-) -> None:
+def _say_cost(posterior: Posterior, job: Job, sampler: Any, checked: ModelCheck, say: Callable[[str], None]) -> None:
     """Estimate the cost with a posterior whose simulations are not cached."""
     from samplers import estimate_cost
 
+    guided, most = job.sampler.guide, job.budget.max_simulations
     estimate = estimate_cost(posterior, sampler.nwalkers, type(sampler), seed=1)
     if guided and np.isfinite(checked.searched):
         # later starts often join earlier ones; rough responses take several rounds of draws
@@ -173,9 +172,9 @@ def _say_cost(
         )
     else:
         say(f"Estimated cost until beta = 1:\n{estimate}")
-    if "max_simulations" in budget:
-        say(f"The run stops at {budget['max_simulations']} simulations (max_simulations)")
-        if not guided and budget["max_simulations"] < estimate.fewest:
+    if most is not None:
+        say(f"The run stops at {most} simulations (max_simulations)")
+        if not guided and most < estimate.fewest:
             say(
                 f"CAUTION: it needs about {estimate.fewest:.3g} or more, and will probably end before "
                 "beta = 1; a larger max_simulations continues it"

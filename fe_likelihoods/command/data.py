@@ -12,56 +12,48 @@ from ..signals.datasets import Dataset, read_dataset
 from ..signals.read import read_columns, read_record
 from ..signals.records import Record
 from .job import Job
-from .schema import did_you_mean, read_quantity
+from .keys import did_you_mean, read_quantity
+from .sections import Measured
 
 __all__ = [
-    "BUNDLED",
     "FEWEST_SAMPLES",
     "is_dataset",
     "read_base_motion",
     "read_bundled",
     "read_measured",
     "read_supports",
+    "reduce_data",
     "within",
 ]
 
-BUNDLED = {
-    "column-short": ("bridge_column_data", ("short",)),
-    "column-eq1": ("bridge_column_data", ("eq1",)),
-    "column-eq1-eq2": ("bridge_column_data", ("eq1-eq2",)),
-    "bridge-twin": ("isolated_bridge_data", ("twin",)),
-    "bridge-means": ("isolated_bridge_data", ("means",)),
-}
-"""Bundled synthetic data sets: function in `fe_likelihoods.problems`, and its arguments."""
-
-_TABLE_KEYS = ("dt", "time", "time_unit", "skip")
 _HDF5 = (".h5", ".hdf5")
 
 
 def read_bundled(job: Job, section: str) -> Dataset:
-    """The bundled data set that a section names; ValueError for an unknown name."""
+    """The bundled data set that a section names: ``column-eq1`` is the column's with the motion ``eq1``."""
     from .. import problems
 
-    name = getattr(job, section)["bundled"]
-    if name not in BUNDLED:
-        raise ValueError(
-            f"{job.where(section)} bundled: unknown synthetic data {name!r}; {did_you_mean(name, tuple(BUNDLED))}"
-        )
-    function, arguments = BUNDLED[name]
-    return vars(problems)[function](*arguments)
+    structure, _, name = getattr(job, section).bundled.partition("-")
+    return {"column": problems.bridge_column_data, "bridge": problems.isolated_bridge_data}[structure](name)
 
 
 def is_dataset(job: Job, section: str) -> bool:
     """Whether the file of a section is a data set in HDF5, which has record and measurements."""
     given = getattr(job, section)
-    return "bundled" in given or Path(given.get("file", "")).suffix.lower() in _HDF5
+    return given is not None and (given.bundled is not None or Path(given.file or "").suffix.lower() in _HDF5)
 
 
-def _one_source(job: Job, section: str) -> None:
+def _dataset(job: Job, section: str) -> Dataset | None:
+    """The data set that a section names, bundled or a file; None for other files."""
     given = getattr(job, section)
-    if ("file" in given) == ("bundled" in given):
-        found = "both" if "file" in given else "none"
+    if (given.file is None) == (given.bundled is None):
+        found = "both" if given.file else "none"
         raise ValueError(f"{job.where(section)} file: expected file = ... or bundled = ...; got {found} of them")
+    if not is_dataset(job, section):
+        return None
+    if given.bundled is not None:
+        return read_bundled(job, section)
+    return job.located(section, lambda: read_dataset(job.path(section, "file", given.file)))
 
 
 def read_base_motion(job: Job) -> Record | None:
@@ -70,44 +62,56 @@ def read_base_motion(job: Job) -> Record | None:
     ValueError, which names the key, if the file does not exist or cannot be read.
     """
     given = job.record
-    if (job.kind == "bridge deck") != ("supports" in given):
+    if (job.kind == "bridge deck") != (given is not None and given.supports is not None):
         raise ValueError(
             f'{job.where("record")} supports: a bridge deck needs three, supports = ["base.csv", "first.csv", '
             '"second.csv"], and other structures have one motion, file'
         )
-    if "supports" in given:
-        return read_supports(job)[0]
-    if not given:
+    if given is None:
         if job.kind in ("column", "bridge", "oscillator", "frame", "grouped frame"):
             raise ValueError(f"{job.where('record')} file: this key is missing; the {job.kind} needs a base motion")
         return None
-    _one_source(job, "record")
-    if "bundled" in given:
-        record = read_bundled(job, "record").record
+    if given.supports is not None:
+        return read_supports(job)[0]
+    dataset = _dataset(job, "record")
+    if dataset is None:
+        path = job.path("record", "file", given.file)
+        options = given.given("channel", "column", "units", *given.READING)
+        record = job.located("record", lambda: read_record(path, **options))
     else:
-        path = job.path("record", "file", given["file"])
-        record = _within_messages(job, "record", lambda: _read_record(job, path))
-    return record.scale(given["scale"]) if "scale" in given else record
+        record = dataset.record
+    return record if given.scale is None else record.scale(given.scale)
 
 
 def read_supports(job: Job) -> list[Record]:
     """The motions of several supports, as `read_base_motion`."""
-    if more := [key for key in ("file", "bundled", "column") if key in job.record]:
-        raise ValueError(f"{job.where('record')} {more[0]}: leave it out with supports, which name files and columns")
+    if more := job.record.given("file", "bundled", "column"):
+        raise ValueError(
+            f"{job.where('record')} {[*more][0]}: leave it out with supports, which name files and columns"
+        )
     found = []
-    for text in job.record["supports"]:
+    for text in job.record.supports:
         file, _, column = text.partition(":")
-        given = {key: value for key, value in job.record.items() if key != "supports"} | {"file": file}
-        found.append(read_base_motion(replace(job, kind="", record=given | ({"column": column} if column else {}))))
+        one = replace(job.record, supports=None, file=file, column=column or None)
+        found.append(read_base_motion(replace(job, kind="", record=one)))
     return found
 
 
-def _read_record(job: Job, path: Path) -> Record:
-    given = job.record
-    if path.suffix.lower() in _HDF5:
-        return read_dataset(path).record
-    keys = ("channel", "column", "units", "resample", *_TABLE_KEYS)
-    return read_record(path, **{key: given[key] for key in keys if key in given})
+def reduce_data(
+    job: Job, record: Record | None, measured: Measurements | None
+) -> tuple[Record | None, Measurements | None]:
+    """The first part of the data, reduced to every n-th sample."""
+    duration, every = (None, 1) if job.record is None else (job.record.duration, job.record.every)
+
+    def reduce() -> tuple[Record, Measurements | None]:
+        shorter, fewer = record, measured
+        if duration is not None:
+            shorter, fewer = shorter.trim(0.0, duration), fewer and fewer.trim(0.0, duration)
+        if every != 1:
+            shorter, fewer = shorter.resample(shorter.dt * every), fewer and fewer.decimate(every)
+        return shorter, fewer
+
+    return (record, measured) if record is None else job.located("record", reduce)
 
 
 def read_measured(job: Job, channels: Sequence[Channel], record: Record | None) -> Measurements:
@@ -116,56 +120,55 @@ def read_measured(job: Job, channels: Sequence[Channel], record: Record | None) 
     ValueError, which names the key, if the file does not exist, cannot be read or lacks a column.
     """
     given = job.measurements
-    if not given:
+    if given is None:
         raise ValueError(
             f"{job.where('measurements')} file: this key is missing; give the measured response, such as "
             'file = "top.csv"'
         )
-    _one_source(job, "measurements")
-    if is_dataset(job, "measurements"):
-        measured = (
-            read_bundled(job, "measurements").measurements
-            if "bundled" in given
-            else _within_messages(
-                job, "measurements", lambda: read_dataset(job.path("measurements", "file", given["file"]))
-            ).measurements
-        )
+    dataset = _dataset(job, "measurements")
+    if dataset is None:
+        path = job.path("measurements", "file", given.file)
+        measured = job.located("measurements", lambda: _read_columns(path, given, channels))
     else:
-        path = job.path("measurements", "file", given["file"])
-        measured = _within_messages(job, "measurements", lambda: _read_columns(path, given, channels))
-    if "reversed" in given:
-        measured = _within_messages(job, "measurements", lambda: _turned(measured, given["reversed"]), "reversed: ")
-    measured = _within_messages(job, "measurements", lambda: _left_out(measured, given), "missing: ")
-    measured = _within_messages(job, "measurements", lambda: _straightened(measured, given), "baseline: ")
-    if "channels" in given:
-        measured = _within_messages(job, "measurements", lambda: measured.select(given["channels"]), "channels: ")
-    if record is None or is_dataset(job, "measurements"):
-        return measured
-    return _within_messages(job, "measurements", lambda: within(measured, record), "zero: ")
+        measured = dataset.measurements
+    steps: dict[str, Callable[[Measurements], Measurements]] = {
+        "reversed": lambda found: _turned(found, given.reversed),
+        "missing": lambda found: _left_out(found, given.missing),
+        "baseline": lambda found: _straightened(found, given.baseline),
+        "channels": lambda found: found.select(given.channels),
+    }
+    if record is not None and dataset is None:
+        steps["zero"] = lambda found: within(found, record)
+    for key, step in steps.items():
+        if key == "zero" or getattr(given, key):
+            try:
+                measured = step(measured)
+            except ValueError as error:
+                raise ValueError(f"{job.where('measurements')} {key}: {error}") from error
+    return measured
 
 
-def _read_columns(path: Path, given: dict[str, Any], channels: Sequence[Channel]) -> Measurements:
+def _read_columns(path: Path, given: Measured, channels: Sequence[Channel]) -> Measurements:
     by_name = {channel.name: channel for channel in channels}
-    columns, units = given.get("columns", {name: name for name in by_name}), given.get("units", {})
+    columns, units = given.columns or {name: name for name in by_name}, given.units or {}
     for key, names, known in (("columns", columns, tuple(by_name)), ("units", units, tuple(columns))):
         for name in names:
             if name not in known:
                 raise ValueError(f"{key}: unknown channel {name!r}; {did_you_mean(name, known)}")
-    chosen = [name for name in by_name if name in columns]
     if missing := [name for name in by_name if name not in columns]:
         raise ValueError(
             f"columns: expected a column for each channel of the model, {', '.join(by_name)}; there is none for "
             f"{', '.join(missing)}"
         )
-    options = {key: given[key] for key in ("dt", "time", "time_unit", "skip", "zero", "resample") if key in given}
-    marks = [each for each in given.get("missing", ()) if not isinstance(each, list)]
-    if marks or given.get("missing") == []:
+    options = given.given("zero", *given.READING)
+    marks = [each for each in given.missing or () if not isinstance(each, list)]
+    if marks or given.missing == []:
         options["missing"] = marks
     return read_columns(
         path,
-        [by_name[name] for name in chosen],
-        [columns[name] for name in chosen],
-        [units.get(name) for name in chosen] if units else None,
+        list(by_name.values()),
+        [columns[name] for name in by_name],
+        [units.get(name) for name in by_name] if units else None,
         description=f"measurements of {path.name}",
         **options,
     )
@@ -180,9 +183,9 @@ def _known(measured: Measurements, names: Iterable[str]) -> tuple[str, ...]:
     return known
 
 
-def _left_out(measured: Measurements, given: Mapping[str, Any]) -> Measurements:
+def _left_out(measured: Measurements, missing: Sequence[Any]) -> Measurements:
     """Measurements without the samples at the times that `missing` lists, for one channel or all."""
-    times = [each for each in given.get("missing", ()) if isinstance(each, list)]
+    times = [each for each in missing if isinstance(each, list)]
     if not times:
         return measured
     known = _known(measured, [each[0] for each in times if len(each) == 3])
@@ -198,11 +201,8 @@ def _left_out(measured: Measurements, given: Mapping[str, Any]) -> Measurements:
     return replace(measured, values=values, description=text)
 
 
-def _straightened(measured: Measurements, given: Mapping[str, Any]) -> Measurements:
-    """Measurements less the polynomial through the points of `baseline`, for each channel that it names."""
-    points = given.get("baseline", {})
-    if not points:
-        return measured
+def _straightened(measured: Measurements, points: Mapping[str, Any]) -> Measurements:
+    """Measurements less the polynomial through points of time and level, for each channel that has some."""
     known, values = _known(measured, points), measured.values.copy()
     for name, each in points.items():
         row = known.index(name)
@@ -218,16 +218,6 @@ def _turned(measured: Measurements, names: Sequence[str]) -> Measurements:
     signs = np.where(np.isin(known, names), -1.0, 1.0)[:, None]
     text = f"{measured.description}, reversed: {', '.join(names)}"
     return Measurements(measured.channels, measured.dt, signs * measured.values, text, measured.start)
-
-
-def _within_messages(job: Job, section: str, read: Callable[[], Any], key: str = "") -> Any:
-    """Errors of a reader, with file and section before them."""
-    try:
-        return read()
-    except ValueError as error:
-        if str(error).startswith(f"{job.file.name}: ["):
-            raise
-        raise ValueError(f"{job.where(section)} {key}{error}") from error
 
 
 FEWEST_SAMPLES = 10  # of a channel, where others lie outside the record

@@ -9,32 +9,23 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..checks.finding import labelled
-from ..likelihood.posterior import Posterior
+from ..checks.finding import FindingWarning, labelled
+from ..likelihood.likelihood import FELikelihood
 from ..noise.protocol import follows_response
 from ..prediction.prediction import Prediction
 from ..reporting.other_events import OtherEvent, describe_event
-from ..signals.channels import Channel, Measurements
+from ..signals.channels import Measurements
 from ..signals.records import Record
 from ..simulation.model import SimulationFailed
-from .data import read_base_motion, read_measured
+from .data import read_base_motion, read_measured, reduce_data
 from .job import Job
-from .models import Problem, reduce_data
+from .models import Problem
 from .results import write_csv
 
-__all__ = [
-    "Event",
-    "describe_events",
-    "predict_events",
-    "prediction_options",
-    "propagate_quietly",
-    "read_events",
-    "write_events",
-]
+__all__ = ["Event", "describe_events", "predict_events", "predict_quietly", "read_events", "write_events"]
 
 logger = logging.getLogger(__name__)
 
-_STATES = ("virgin", "end")
 _ENDS = (0.05, 0.5, 0.95)  # quantiles that tables and scores need
 
 
@@ -47,13 +38,11 @@ class Event(NamedTuple):
     options: dict[str, Any]  # state at the beginning and pause before it, for `propagate`
 
 
-def prediction_options(job: Job) -> dict[str, Any]:
-    """Noise, quantiles and seed of predictions, for `fe_likelihoods.propagate`."""
-    return {
-        "noise": job.prediction.get("noise", False),
-        "quantiles": tuple(job.prediction.get("quantiles", (0.05, 0.5, 0.95))),
-        "seed": job.sampler.get("seed", 1),
-    }
+def _histories_of(problem: Problem) -> tuple[FELikelihood, dict[str, str]]:
+    """The likelihood of the measured histories, and its name for `propagate` if there are other data sets."""
+    likelihood = problem.posterior.likelihood
+    parts = getattr(likelihood, "likelihoods", None)
+    return (likelihood, {}) if parts is None else (parts["measurements"], {"part": "measurements"})
 
 
 def read_events(job: Job, problem: Problem) -> tuple[Event, ...]:
@@ -62,57 +51,42 @@ def read_events(job: Job, problem: Problem) -> tuple[Event, ...]:
     ValueError, which names section and key, if a file, a key or a value is wrong, or the model cannot have another
     motion.
     """
-    return tuple(_read_event(job, problem, name) for name in job.events)
+    return tuple(_read_event(job.data_sets()["measurements"], problem, name) for name in job.events)
 
 
 def _read_event(job: Job, problem: Problem, name: str) -> Event:
     given, own = job.events[name], job.of_event(name)
-    where = own.where("record")
-    model = problem.posterior.likelihood.model
+    where, model = own.where("record"), _histories_of(problem)[0].model
     if not hasattr(model, "with_record"):
         raise ValueError(f"{where} a model of kind {job.kind} without [record] has one excitation: leave this out")
-    if "file" not in given and "bundled" not in given:
+    if given.file is None and given.bundled is None:
         raise ValueError(f"{where} file: this key is missing; it is the base motion of the event")
-    state = given.get("from_state", "virgin")
-    if state not in _STATES:
-        raise ValueError(f"{where} from_state: expected one of {', '.join(_STATES)}; got {state!r}")
     record = read_base_motion(own)
-    measured = _measured(own, model.channels, record) if own.measurements else None
+    try:
+        measured = None if own.measurements is None else read_measured(own, model.channels, record)
+    except ValueError as error:
+        raise ValueError(str(error).replace("] file: ", "] measured: ", 1)) from error
     record, measured = reduce_data(own, record, measured)
     if not math.isclose(record.dt, problem.record.dt, rel_tol=1e-9):  # the step that the model was calibrated with
         record = record.resample(problem.record.dt)
         if measured is not None and measured.end > record.time[-1]:  # by less than a step of the model
             measured = measured.trim(0.0, record.time[-1])
-    options = {"from_state": state} | ({"rest": given["rest"]} if "rest" in given else {})
-    return Event(name, record, measured, options)
+    return Event(name, record, measured, given.given("from_state", "rest"))
 
 
-def _measured(own: Job, channels: tuple[Channel, ...], record: Record) -> Measurements:
-    """The measured response; messages name the key of the event."""
-    try:
-        return read_measured(own, channels, record)
-    except ValueError as error:
-        raise ValueError(str(error).replace("] file: ", "] measured: ", 1)) from error
-
-
-def propagate_quietly(*arguments: Any, **options: Any) -> Prediction | dict[str, Prediction]:
-    """The result of `propagate`; its warnings are findings of the result, and other warnings are given afterwards."""
+def predict_quietly(job: Job, problem: Problem, samples: np.ndarray, **options: Any) -> Any:
+    """The result of `propagate` with the settings of a file; its findings are not warned of as well."""
     from ..prediction.propagation import propagate
 
-    kept: set[str] = set()
-    caught: list[warnings.WarningMessage] = []
-    try:
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            found = propagate(*arguments, **options)
-            results = found.values() if isinstance(found, Mapping) else [found]
-            kept.update(finding.message for each in results for finding in each.findings)
-    finally:  # also where all simulations have failed
-        shown: dict[Any, Any] = {}  # equal ones of the same line once, as without this function
-        for each in caught:
-            if str(each.message) not in kept:
-                warnings.warn_explicit(each.message, each.category, each.filename, each.lineno, registry=shown)
-    return found
+    likelihood, part = _histories_of(problem)
+    usual = {
+        "noise": bool(job.prediction.noise),
+        "quantiles": tuple(job.prediction.quantiles),
+        "seed": job.sampler.seed,
+    }
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FindingWarning)
+        return propagate(problem.posterior, samples, cache=likelihood.simulator.cache, **usual | part | options)
 
 
 def predict_events(
@@ -128,7 +102,10 @@ def predict_events(
     found = {}
     for event in events if len(samples) else ():
         try:
-            found[event.name] = _predict_event(job, event, problem.posterior, samples, progress)
+            found[event.name] = job.located(
+                f"events.{event.name}",
+                lambda event=event: _predict_event(job, event, problem, samples, progress),
+            )
         except SimulationFailed as error:
             logger.warning("event %s is left out: %s", event.name, error)
             found[event.name] = error
@@ -136,36 +113,25 @@ def predict_events(
 
 
 def _predict_event(
-    job: Job, event: Event, posterior: Posterior, samples: np.ndarray, progress: bool
+    job: Job, event: Event, problem: Problem, samples: np.ndarray, progress: bool
 ) -> dict[str, Prediction]:
     from ..prediction.quantities import peak
 
-    channels = posterior.likelihood.model.channels
-    options = prediction_options(job) | event.options
-    options["quantiles"] = tuple(sorted({*options["quantiles"], *_ENDS}))
-    if event.measured is not None:  # measurements contain noise
-        options["noise"] = job.prediction.get("noise", True)
-    quantities = {"histories": None, "peaks": [peak(channel.name) for channel in channels]}
-    noises = dict.fromkeys(quantities, options.pop("noise"))
-    if noises["peaks"] and follows_response(posterior.likelihood.noise):
+    likelihood, _ = _histories_of(problem)
+    options = event.options | {"quantiles": tuple(sorted({*job.prediction.quantiles, *_ENDS}))}
+    quantities = {"histories": None, "peaks": [peak(channel.name) for channel in likelihood.model.channels]}
+    wanted = job.prediction.noise
+    wanted = event.measured is not None if wanted is None else wanted  # measurements contain noise
+    noises: dict[str, Any] = dict.fromkeys(quantities, wanted)
+    if wanted and follows_response(likelihood.noise):
         noises["peaks"] = "model"  # errors that are independent from sample to sample raise the largest value
     found: dict[str, Prediction] = {}
-    try:
-        # The second kind finds all responses in the cache; with `[budget] cache = false` it simulates them again.
-        for noise in dict.fromkeys(noises.values()):
-            found |= propagate_quietly(
-                posterior,
-                samples,
-                record=event.record,
-                quantity={name: quantities[name] for name in quantities if noises[name] == noise},
-                cache=posterior.likelihood.simulator.cache,
-                noise=noise,
-                **options,
-                progress=progress,
-            )
-        return found
-    except ValueError as error:
-        raise ValueError(f"{job.file.name}: [events.{event.name}] {error}") from error
+    # The second kind finds all responses in the cache; with `[budget] cache = false` it simulates them again.
+    for noise in dict.fromkeys(noises.values()):
+        some = {name: quantities[name] for name in quantities if noises[name] == noise}
+        more = options | {"record": event.record, "quantity": some, "noise": noise, "progress": progress}
+        found |= predict_quietly(job, problem, samples, **more)
+    return found
 
 
 def describe_events(

@@ -6,16 +6,17 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from . import sections
+from .keys import Key, did_you_mean, keys_of, read_keys
 from .priors import parse_prior
-from .schema import EVENT, FREE_SECTIONS, MODEL_KINDS, SECTIONS, Key, did_you_mean, model_keys, part_keys, read_keys
+from .sections import FREE_SECTIONS, MODEL_KINDS, SECTIONS, USER_MODELS, model_keys, part_keys
 
 __all__ = ["Job", "parse_job", "read_job"]
-
 
 DATA = "measurements", "modes", "load_test"  # sections of data sets; each may have its own model, [modes.model]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Job:
     """Contents of a TOML file, section by section. Values are in SI units; files are relative to `folder`."""
 
@@ -24,17 +25,18 @@ class Job:
     folder: Path
     kind: str  # of the model, one of `MODEL_KINDS`
     model: dict[str, Any]
-    record: dict[str, Any]
-    measurements: dict[str, Any]
     priors: dict[str, str]  # distributions as text, by parameter
-    noise: dict[str, Any]
-    sampler: dict[str, Any]
-    budget: dict[str, Any]
-    prediction: dict[str, Any]
-    modes: dict[str, Any] = field(default_factory=dict)
-    load_test: dict[str, Any] = field(default_factory=dict)
+    events: dict[str, sections.Event]  # to be predicted, by name
+    record: sections.Motion | None = None
+    measurements: sections.Measured | None = None
+    modes: sections.Modes | None = None
+    load_test: sections.LoadTest | None = None
+    noise: sections.Noise | None = None
+    sampler: sections.Sampler = field(default_factory=sections.Sampler)
+    budget: sections.Budget = field(default_factory=sections.Budget)
+    prediction: sections.Predictions = field(default_factory=sections.Predictions)
     own_models: dict[str, tuple[str, dict[str, Any]]] = field(default_factory=dict)  # kind and model of data sets
-    events: dict[str, dict[str, Any]] = field(default_factory=dict)  # keys of the events to predict, by name
+    shared: tuple[str, ...] = ()  # data sets that one run of ``[model]`` answers
     model_section: str = "model"  # the section of the model, such as modes.model
     event: str = ""  # to which record and measurements belong; empty for the calibration
 
@@ -44,31 +46,49 @@ class Job:
         section = self.model_section if section == "model" else section
         return f"{self.file.name}: [{f'events.{self.event}' if own else section}]"
 
+    def located(self, section: str, make: Any) -> Any:
+        """What ``make()`` returns; its errors have file and section before them."""
+        try:
+            return make()
+        except ValueError as error:
+            known = str(error).startswith(f"{self.file.name}:")
+            raise (error if known else ValueError(f"{self.where(section)} {error}")) from error
+
+    @property
+    def has_no_time(self) -> bool:
+        """Whether the data are modes or a load test alone."""
+        return self.measurements is None and (self.modes or self.load_test) is not None
+
+    @property
+    def marginal(self) -> bool:
+        """Whether the levels of the noise are integrated out."""
+        return self.noise is not None and self.noise.marginal
+
     def data_sets(self) -> dict[str, "Job"]:
         """The same update with one data set each, by section; the section may have a model of its own."""
         there = [name for name in DATA if getattr(self, name)] or ["measurements"]
         found = {}
         for name in there:
             kind, model = self.own_models.get(name, (self.kind, self.model))
-            others: dict[str, Any] = {other: {} for other in DATA if other != name and len(there) > 1}
+            others: dict[str, Any] = {other: None for other in DATA if other != name}
             if name != "measurements" and len(there) > 1:
-                others |= {"record": {}, "noise": {}}
+                others |= {"record": None, "noise": None}
             where = f"{name}.model" if name in self.own_models else "model"
             found[name] = replace(self, kind=kind, model=model, model_section=where, **others)
         return found
 
     def of_event(self, name: str) -> "Job":
-        """The same update with record and measurements of one event; `measurements` is empty without them."""
-        given = dict(self.events[name])
-        measured = {"file": given.pop("measured")} if "measured" in given else {}
-        if measured and "zero" in given:
-            measured["zero"] = given.pop("zero")
-        if measured and not measured["file"].lower().endswith((".h5", ".hdf5")):
-            kept = {key: each for key, each in self.measurements.items() if key not in ("file", "bundled", "baseline")}
+        """The same update with record and measurements of one event; `measurements` is None without them."""
+        event, measured = self.events[name], None
+        if event.measured is not None:
+            usual = {} if self.measurements is None else self.measurements.given()
+            if event.measured.lower().endswith((".h5", ".hdf5")):
+                usual = {}
+            kept = {key: value for key, value in usual.items() if key not in ("bundled", "baseline")}
             if "missing" in kept:  # times are those of the other file
                 kept["missing"] = [each for each in kept["missing"] if not isinstance(each, list)]
-            measured = kept | measured
-        return replace(self, record=given, measurements=measured, event=name)
+            measured = sections.Measured(**kept | event.given("zero") | {"file": event.measured})
+        return replace(self, record=event, measurements=measured, event=name)
 
     def path(self, section: str, key: str, name: str) -> Path:
         """An existing file that a key names; ValueError if there is none."""
@@ -76,11 +96,9 @@ class Job:
         if path.is_dir():
             raise ValueError(f"{self.where(section)} {key}: expected a file; {name!r} is a folder")
         if not path.is_file():
-            near = (
-                did_you_mean(path.name, sorted(p.name for p in path.parent.iterdir() if p.is_file()))
-                if (path.parent.is_dir())
-                else f"there is no folder {path.parent}"
-            )
+            near = f"there is no folder {path.parent}"
+            if path.parent.is_dir():
+                near = did_you_mean(path.name, sorted(p.name for p in path.parent.iterdir() if p.is_file()))
             raise ValueError(f"{self.where(section)} {key}: there is no file {path}; {near}")
         return path
 
@@ -106,52 +124,55 @@ def parse_job(text: str, file: Path, folder: Path) -> Job:
         raise ValueError(
             f"{file.name}: not a TOML file: {error}; a text needs quotes, a section is a line such as [record]"
         ) from error
-    sections = (*FREE_SECTIONS, *SECTIONS)
     for name, value in content.items():
-        if name not in sections:
-            raise ValueError(f"{file.name}: [{name}]: unknown section; {did_you_mean(name, sections)}")
+        if name not in (known := (*FREE_SECTIONS, *SECTIONS)):
+            raise ValueError(f"{file.name}: [{name}]: unknown section; {did_you_mean(name, known)}")
         if not isinstance(value, dict):
             raise ValueError(f"{file.name}: {name}: expected a section [{name}]; got {value!r}")
     if "model" not in content:
         raise ValueError(f"{file.name}: [model]: this section is missing; it says what the structure is")
-    kind, model = _read_model(content["model"], f"{file.name}: [model")
-    own = {
-        name: _read_model(content[name].pop("model"), f"{file.name}: [{name}.model")
-        for name in DATA
-        if isinstance(content.get(name, {}).get("model"), dict)
-    }
-    values = {
-        name: read_keys(content[name], keys, f"{file.name}: [{name}]") if name in content else {}
-        for name, keys in SECTIONS.items()
-    }
     data = [name for name in DATA if name in content]
+    given = {name: own for name in data if isinstance(own := content[name].pop("model", None), dict)}
+    base = content["model"]
+    shared = () if base.get("kind") not in USER_MODELS else tuple(name for name in given if "kind" not in given[name])
+    own = {name: _read_model(base | given[name], f"{file.name}: [{name}.model") for name in given if name in shared}
+    own |= {name: _read_model(given[name], f"{file.name}: [{name}.model") for name in given if name not in shared}
+    kind, model = (
+        next(iter(own.values())) if shared and len(own) == len(data) else (_read_model(base, f"{file.name}: [model"))
+    )
+    values: dict[str, Any] = {
+        name: section(**read_keys(content[name], keys_of(section), f"{file.name}: [{name}]"))
+        for name, section in SECTIONS.items()
+        if name in content
+    }
     if data and "measurements" not in data and "record" in content:
         raise ValueError(f"{file.name}: [record]: modes and load tests have no [record]; it belongs to [measurements]")
-    if len(data) > 1 and "events" in content:
-        raise ValueError(f"{file.name}: [events]: only a file with one data set predicts events; got {', '.join(data)}")
-    priors = content.get("priors", {})
-    for name, prior in priors.items():
+    if data and "measurements" not in data and "events" in content:
+        raise ValueError(
+            f"{file.name}: [events]: an event is predicted with the model of [measurements], which is missing"
+        )
+    for name, prior in content.get("priors", {}).items():
         try:
             parse_prior(prior)
         except ValueError as error:
             raise ValueError(f"{file.name}: [priors] {name}: {error}") from None
+    values |= {"kind": kind, "model": model, "own_models": own, "shared": shared}
     events = _read_events(content.get("events", {}), file.name)
-    return Job(file, text, folder, kind, model, priors=priors, events=events, own_models=own, **values)
+    return Job(file=file, text=text, folder=folder, priors=content.get("priors", {}), events=events, **values)
 
 
-def _read_events(given: dict[str, Any], file: str) -> dict[str, dict[str, Any]]:
+def _read_events(given: dict[str, Any], file: str) -> dict[str, sections.Event]:
     events = {}
     for name, keys in given.items():
         if not isinstance(keys, dict):
             raise ValueError(f"{file}: [events] {name}: expected a section [events.{name}]; got {keys!r}")
+        where = f"{file}: [events.{name}]"
         if not re.fullmatch(r"[\w-]+", name):
-            raise ValueError(
-                f"{file}: [events.{name}]: expected a name of letters, digits, - and _, for names of files"
-            )
-        events[name] = read_keys(keys, EVENT, f"{file}: [events.{name}]")
+            raise ValueError(f"{where}: expected a name of letters, digits, - and _, for names of files")
+        events[name] = sections.Event(**read_keys(keys, keys_of(sections.Event), where))
         for key, needed in (("zero", "measured"), ("rest", "from_state")):
             if key in keys and needed not in keys:
-                raise ValueError(f"{file}: [events.{name}] {key}: this key has no effect without {needed}")
+                raise ValueError(f"{where} {key}: this key has no effect without {needed}")
     return events
 
 
@@ -167,12 +188,10 @@ def _read_model(given: dict[str, Any], where: str) -> tuple[str, dict[str, Any]]
     if unknown := [name for name in plain if name not in known]:
         raise ValueError(f"{where}] {unknown[0]}: unknown key of kind {kind}; {did_you_mean(unknown[0], known)}")
     values = read_keys(plain, keys, f"{where}]")
-    for name, keys in parts.items():
-        if name in given:
-            if not isinstance(given[name], dict):
-                raise ValueError(
-                    f"{where}] {name}: expected a section {where.partition(': ')[2]}.{name}]; got {given[name]!r}"
-                )
-            values[name] = read_keys(given[name], keys, f"{where}.{name}]")
+    for name in given.keys() & parts.keys():
+        if not isinstance(given[name], dict):
+            section = f"{where.partition(': ')[2]}.{name}]"
+            raise ValueError(f"{where}] {name}: expected a section {section}; got {given[name]!r}")
+        values[name] = read_keys(given[name], parts[name], f"{where}.{name}]")
     values.pop("kind")
     return kind, values

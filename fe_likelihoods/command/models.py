@@ -1,14 +1,9 @@
-"""The model and the posterior that a TOML file describes."""
+"""The posterior that a TOML file describes: its data sets, their models and likelihoods, and the priors."""
 
-import importlib
-import importlib.util
 import math
 import re
-import sys
 from collections import defaultdict
 from collections.abc import Callable, Mapping
-from dataclasses import replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..cache.simulation_cache import SimulationCache
@@ -16,29 +11,24 @@ from ..likelihood.joint import JointLikelihood
 from ..likelihood.likelihood import FELikelihood
 from ..likelihood.parameters import channels_of_deviations
 from ..likelihood.posterior import Posterior
+from ..models.one_run import one_run
 from ..models.sensed import SensedModel, Sensor
+from ..noise.autoregressive import AutoregressiveNoise
+from ..noise.gaussian import GaussianNoise
 from ..priors.distributions import Distribution, HalfNormal, LogNormal, Uniform
 from ..signals.channels import Channel, Measurements
 from ..signals.records import Record
 from ..simulation.model import Model
-from .data import is_dataset, read_base_motion, read_bundled, read_measured, read_supports
+from .data import is_dataset, read_base_motion, read_bundled, read_measured, reduce_data
 from .job import Job
-from .modes_and_loads import FRAMES, has_no_time, load_likelihood, modal_likelihood
-from .noises import make_noise
+from .keys import did_you_mean, read_by_channel
+from .modes_and_loads import FRAMES, modal_likelihood, modes_of_user, read_load_cases, read_modes
 from .priors import parse_prior
-from .schema import did_you_mean, part_keys
+from .sections import USER_MODELS
+from .structure import built_in, load_function, shear_frame, user_channels, user_model
 
-__all__ = [
-    "USER_MODELS",
-    "Problem",
-    "load_function",
-    "make_problem",
-    "noise_channels_of",
-    "reduce_data",
-    "runs_code_of_user",
-]
+__all__ = ["Problem", "make_problem", "noise_channels_of", "runs_code_of_user"]
 
-USER_MODELS = ("function", "opensees", "executable")
 ERRORS_OF_MODES = {"frequency_error": 0.01, "shape_error": 0.03}  # medians of log-normal priors without one (assumed)
 NOISE_SCALE = 0.3  # half-normal prior of a sigma without one in the file, in root mean squares of the channel (assumed)
 
@@ -52,64 +42,149 @@ class Problem(NamedTuple):
     truth: dict[str, float] | None = None  # parameter values of bundled synthetic data
 
 
+class _DataSet(NamedTuple):
+    """A data set that has been read."""
+
+    job: Job
+    make_model: Callable[[], Any]
+    make_likelihood: Callable[[Any, Any], FELikelihood]  # from its model and a pool
+    response: tuple[tuple[Channel, ...], float, int]  # channels, step and number of samples, of one run for several
+    known: Mapping[str, float] = {}  # errors, by the names of parameters
+    record: Record | None = None
+
+
 def make_problem(job: Job, cache: SimulationCache | None = None) -> Problem:
     """Read the data, make the model and the posterior; ValueError, which names section and key, for any fault."""
-    jobs, made, known, record = job.data_sets(), {}, {}, None
-    for section, each in jobs.items():
-        made[section], numbers, motion = _data_set(each, cache)
-        known, record = known | numbers, motion if motion is not None else record
+    sets = {name: _read(each, cache) for name, each in job.data_sets().items()}
+    models = _of_one_run(job, {name: sets[name] for name in job.shared})
+    made, known, record = {}, {}, None
+    for name, each in sets.items():
+        model = models[name] if name in models else each.job.located("model", each.make_model)
+        made[name] = each.job.located(
+            name, lambda data=each, model=model: data.make_likelihood(model, _workers(data.job))
+        )
+        known, record = known | dict(each.known), each.record or record
     if twice := [name for name in known if name in job.priors]:
         raise ValueError(
             f"{job.where('priors')} {twice[0]}: this error is known from [load_test]: leave one of them out"
         )
-    likelihood = made.popitem()[1] if len(made) == 1 else _located(job, "model", lambda: JointLikelihood(made))
+    likelihood = made.popitem()[1] if len(made) == 1 else job.located("model", lambda: JointLikelihood(made))
     priors, assumed = _make_priors(job, likelihood, known)
     posterior = Posterior(likelihood, priors)
-    posterior = _located(job, "noise", posterior.marginal) if job.noise.get("marginal") else posterior
-    truth = _truth(job, posterior, record) if len(jobs) == 1 else None
-    return Problem(posterior, record, assumed, truth)
+    posterior = job.located("noise", posterior.marginal) if job.marginal else posterior
+    return Problem(posterior, record, assumed, _truth(job, posterior, record) if len(sets) == 1 else None)
 
 
-def _data_set(job: Job, cache: SimulationCache | None) -> tuple[FELikelihood, dict[str, float], Record | None]:
-    """The likelihood of one data set, its known errors by the names of parameters, and its excitation."""
-    if has_no_time(job):
-        return *_without_time(job, cache), None
-    record = read_base_motion(job)
-    sensors = _all_channels(job, record)
-    measured = read_measured(job, sensors, record)
-    record, measured = reduce_data(job, record, measured)
-    model = _located(job, "model", lambda: _make_model(job, record, measured))
-    model = _located(job, "priors", lambda: _with_sensors(job, model))
-    workers = job.budget.get("workers")
-    if workers is not None and job.kind not in USER_MODELS:
+def _workers(job: Job) -> int | None:
+    if job.budget.workers is not None and job.kind not in USER_MODELS and not job.has_no_time:
         raise ValueError(
             f"{job.where('budget')} workers: a built-in model uses all cores by itself; leave this key out"
         )
-    law = _located(job, "noise", lambda: make_noise(job, model))
-    made = _located(job, "measurements", lambda: FELikelihood(model, measured, law, pool=workers, cache=cache))
-    return made, {}, record
+    return job.budget.workers
 
 
-def _without_time(job: Job, cache: SimulationCache | None) -> tuple[FELikelihood, dict[str, float]]:
-    """The likelihood of modes or of a load test, and known errors."""
-    workers = job.budget.get("workers")
-    section = "modes" if job.modes else "load_test"
-    if job.kind not in USER_MODELS and (job.kind not in FRAMES or not job.modes):
-        kinds = (*(FRAMES if job.modes else ()), *USER_MODELS)
+def _read(job: Job, cache: SimulationCache | None) -> _DataSet:
+    section = "modes" if job.modes else "load_test" if job.load_test else "measurements"
+    return job.located(section, lambda: {"modes": _modes, "load_test": _load_test}.get(section, _histories)(job, cache))
+
+
+def _histories(job: Job, cache: SimulationCache | None) -> _DataSet:
+    record = read_base_motion(job)
+    own = job.kind in USER_MODELS
+    if is_dataset(job, "measurements"):
+        channels: tuple[Channel, ...] = ()  # the data set has its channels
+    elif own:
+        channels = user_channels(job)
+    else:
+        names = tuple((job.measurements and job.measurements.columns) or ()) or None
+        channels = job.located("model", lambda: built_in(job, record, names).channels)
+    record, measured = reduce_data(job, record, read_measured(job, channels, record))
+
+    def make_model() -> Model:
+        if own:
+            return user_model(job, user_channels(job), record)
+        return built_in(job, record, tuple(channel.name for channel in measured.channels), measured)
+
+    def make_likelihood(model: Model, pool: Any) -> FELikelihood:
+        sensed = job.located("priors", lambda: _with_sensors(job, model))
+        noise = job.located("noise", lambda: _make_noise(job, sensed.channels))
+        return FELikelihood(sensed, measured, noise, pool=pool, cache=cache)
+
+    step = job.model.get("dt", measured.steps[0])
+    size = job.model.get("n_steps", measured.values.shape[1])
+    return _DataSet(job, make_model, make_likelihood, (channels, step, size), record=record)
+
+
+def _modes(job: Job, cache: SimulationCache | None) -> _DataSet:
+    _check_kind(job, "modes", FRAMES)
+    if job.noise is not None:
+        raise ValueError(f"{job.where('noise')} modes have no such errors: give frequency_cv and others in [modes]")
+    data = read_modes(job)
+    make, channels, n_modes = modes_of_user(job, data) if job.kind in USER_MODELS else (None, (), 0)
+
+    def make_model() -> Any:
+        if job.kind in FRAMES:
+            return shear_frame(job)
+        steps = {} if make else {"dt": 1.0, "n_steps": n_modes}
+        return user_model(job, channels, make=make, **steps)
+
+    return _DataSet(
+        job, make_model, lambda model, pool: modal_likelihood(job, model, data, pool, cache), (channels, 1.0, n_modes)
+    )
+
+
+def _load_test(job: Job, cache: SimulationCache | None) -> _DataSet:
+    _check_kind(job, "load_test", ())
+    channels = user_channels(job)
+    test = read_load_cases(job, channels)
+    response = channels, 1.0, len(test.cases)
+
+    def make_likelihood(model: Model, pool: Any) -> FELikelihood:
+        noise = None if job.noise is None else job.located("noise", lambda: _make_noise(job, channels))
+        return FELikelihood(model, test.measurements, noise, pool, cache=cache)
+
+    return _DataSet(
+        job, lambda: user_model(job, channels, dt=1.0, n_steps=response[2]), make_likelihood, response, test.known
+    )
+
+
+def _make_noise(job: Job, channels: tuple[Channel, ...]) -> Any:
+    given = {} if job.noise is None else job.noise.given("groups", "level", "sensor", "window", "local")
+    if "sensor" in given:
+        given["sensor"] = read_by_channel(given["sensor"], channels, "sensor")
+    if job.noise is None or job.noise.kind == "gaussian":
+        return GaussianNoise(channels, **given)
+    if more := [name for name in given if name != "sensor"]:
+        raise ValueError(f'{more[0]}: the kind "autoregressive" has no such key: leave it out, or leave kind out')
+    return AutoregressiveNoise(channels, **given)
+
+
+def _check_kind(job: Job, section: str, kinds: tuple[str, ...]) -> None:
+    if job.kind not in (*kinds, *USER_MODELS):
         raise ValueError(
-            f"{job.where('model')} kind: with [{section}], expected one of {', '.join(kinds)}; beside other data, "
-            f"[{section}.model] is its own model"
+            f"{job.where('model')} kind: with [{section}], expected one of {', '.join((*kinds, *USER_MODELS))}; beside "
+            f"other data, [{section}.model] is its own model"
         )
 
-    def make_model(make: Any, channels: tuple[Channel, ...], dt: float | None, n_steps: int | None) -> Model:
-        return _user_model(job, None, channels, make, {"dt": dt, "n_steps": n_steps} if n_steps else {})
 
-    if job.modes:
-        made = _located(job, "modes", lambda: modal_likelihood(job, workers, cache, lambda: _frame(job), make_model))
-        return made, {}
-    channels = _user_channels(job)
-    made, known = _located(job, "load_test", lambda: load_likelihood(job, workers, cache, channels, make_model))
-    return made.with_noise(_located(job, "noise", lambda: make_noise(job, made.model))) if job.noise else made, known
+def _of_one_run(job: Job, sets: Mapping[str, _DataSet]) -> Mapping[str, Any]:
+    """Models of the data sets that one run of a user's function or program answers, by section."""
+    if not sets:
+        return {}
+    jobs = {name: each.job for name, each in sets.items()}
+    first = next(iter(jobs.values()))
+    if job.record is not None and "measurements" in sets:
+        raise ValueError(f"{job.where('record')} one run for several data sets reads its motion itself: leave this out")
+    output: Any = (
+        {name: each.model["output"] for name, each in jobs.items()}
+        if first.kind == "executable"
+        else load_function(first, first.model["function"])
+    )
+
+    def make(joined: Any, channels: Any, **steps: Any) -> Model:
+        return user_model(first, tuple(channels), output=joined, **steps)
+
+    return first.located("model", lambda: one_run({name: each.response for name, each in sets.items()}, output, make))
 
 
 def runs_code_of_user(job: Job) -> bool:
@@ -117,17 +192,9 @@ def runs_code_of_user(job: Job) -> bool:
     return any(each.kind in USER_MODELS for each in job.data_sets().values())
 
 
-def _frame(job: Job) -> Any:
-    """A shear frame."""
-    from ..models.linear_structure_parts import ShearFrame
-    from ..models.tall_buildings import GroupedFrame
-
-    return _located(job, "model", lambda: (GroupedFrame if job.kind == "grouped frame" else ShearFrame)(**job.model))
-
-
 def _truth(job: Job, posterior: Posterior, record: Record | None) -> dict[str, float] | None:
     """True values of bundled data: multiples of the nominal values of the built-in structure, where it has these."""
-    if "bundled" not in job.measurements or job.kind not in ("column", "bridge"):
+    if job.measurements is None or job.measurements.bundled is None or job.kind not in ("column", "bridge"):
         return None
     model = posterior.likelihood.model
     model = model.model if isinstance(model, SensedModel) else model
@@ -135,49 +202,6 @@ def _truth(job: Job, posterior: Posterior, record: Record | None) -> dict[str, f
     truth = read_bundled(job, "measurements").attributes["truth"]
     changed = {name for name, value in usual.nominal.items() if not math.isclose(model.nominal[name], value)}
     return {name: truth[name] for name in posterior.parameter_names if name in truth and name not in changed} or None
-
-
-def _located(job: Job, section: str, make: Callable[[], Any]) -> Any:
-    """Errors with file and section before them."""
-    try:
-        return make()
-    except ValueError as error:
-        raise (
-            error if str(error).startswith(f"{job.file.name}:") else ValueError(f"{job.where(section)} {error}")
-        ) from error
-
-
-def _all_channels(job: Job, record: Record | None) -> tuple[Channel, ...]:
-    """Channels that the measurements may have."""
-    if is_dataset(job, "measurements"):
-        return ()  # the data set has its channels
-    if job.kind in USER_MODELS:
-        return _user_channels(job)
-    names = tuple(job.measurements.get("columns", ())) or None
-    return _located(job, "model", lambda: _built_in(job, record, names).channels)
-
-
-def reduce_data(
-    job: Job, record: Record | None, measured: Measurements | None
-) -> tuple[Record | None, Measurements | None]:
-    """The first part of the data, reduced to every n-th sample."""
-    duration, every = job.record.get("duration"), job.record.get("every", 1)
-
-    def reduce() -> tuple[Record | None, Measurements | None]:
-        shorter, fewer = record, measured
-        if duration is not None:
-            shorter, fewer = shorter.trim(0.0, duration), fewer and fewer.trim(0.0, duration)
-        if every != 1:
-            shorter, fewer = shorter.resample(shorter.dt * every), fewer and fewer.decimate(every)
-        return shorter, fewer
-
-    return (record, measured) if record is None else _located(job, "record", reduce)
-
-
-def _make_model(job: Job, record: Record | None, measured: Measurements) -> Model:
-    if job.kind in USER_MODELS:
-        return _user_model(job, record)
-    return _built_in(job, record, tuple(channel.name for channel in measured.channels), measured)
 
 
 def _with_sensors(job: Job, model: Model) -> Model:
@@ -192,137 +216,6 @@ def _with_sensors(job: Job, model: Model) -> Model:
     outputs = {place: sensor for place, sensor in made.items() if place in names}
     inputs = {int(place.partition("_")[2]): sensor for place, sensor in made.items() if place not in names}
     return SensedModel(model, outputs, inputs) if made else model
-
-
-def _built_in(job: Job, record: Record, names: tuple[str, ...] | None, measured: Measurements | None = None) -> Model:
-    values = dict(job.model)
-    if job.kind == "column":
-        from ..models.rc_column import PARAMETERS, RCColumn
-        from ..models.rc_column_parts import LowCycleFatigue
-
-        usual = RCColumn.lhpost(record)
-        for part in part_keys("column"):  # a section of fatigue switches it on
-            if part in values:
-                values[part] = _changed(job, part, getattr(usual, part) or LowCycleFatigue(), values[part])
-        if "units" in values:
-            values["units"] = tuple((dict(usual.units) | values["units"]).items())
-        _check_names(job, "parameters", values.get("parameters", ()), tuple(PARAMETERS))
-        return RCColumn.lhpost(record, **values, outputs=names)
-    if job.kind == "bridge":
-        from ..models.isolated_bridge import IsolatedBridge
-
-        usual = IsolatedBridge(record)
-        for part in ("pier", "bearing", "damper"):
-            pair = getattr(usual, f"{part}s")
-            values[f"{part}s"] = tuple(
-                _changed(job, f"{part}_{i}", pair[i - 1], values.pop(f"{part}_{i}", {})) for i in (1, 2)
-            )
-        if measured is not None:
-            values["every"] = max(1, round(measured.dt / record.dt))
-        _check_names(job, "parameters", values.get("parameters", ()), usual.parameter_names)
-        return IsolatedBridge(record, **values, outputs=names)
-    if job.kind == "oscillator":
-        from ..models.linear_oscillator import LinearOscillator
-
-        return LinearOscillator(record, **values)
-    from ..models.linear_structure import LinearStructure
-    from ..models.linear_structure_parts import BridgeDeck
-
-    if job.kind == "bridge deck":
-        supports = [reduce_data(job, each, None)[0] for each in read_supports(job)]
-        return LinearStructure(BridgeDeck(**values), supports, outputs=names)
-    return LinearStructure(_frame(job), record, outputs=names)
-
-
-def _changed(job: Job, part: str, usual: Any, changes: Mapping[str, Any]) -> Any:
-    """A part of the built-in structure with the values of the file."""
-    changes = dict(changes)
-    if part in ("bars", "hoops") and "diameter" in changes:
-        changes.setdefault("area", None)  # from the new diameter
-    try:
-        return replace(usual, **changes)
-    except ValueError as error:
-        raise ValueError(f"{job.file.name}: [model.{part}] {error}") from error
-
-
-def _check_names(job: Job, key: str, names: Any, known: tuple[str, ...]) -> None:
-    for name in names:
-        if name not in known:
-            raise ValueError(f"{job.where('model')} {key}: unknown {name!r}; {did_you_mean(name, known)}")
-
-
-def _user_channels(job: Job) -> tuple[Channel, ...]:
-    channels = []
-    if "channels" not in job.model or "sensors" in job.model:
-        raise ValueError(
-            f"{job.where('model')} channels: give the channels of the response, such as "
-            '{top = "relative displacement [mm]"}; sensors are for [modes]'
-        )
-    for name, text in job.model["channels"].items():
-        match = re.fullmatch(r"\s*(.+?)\s*\[(.+)\]\s*", text)
-        try:
-            if match is None:
-                raise ValueError(f'expected quantity and unit, such as "displacement [mm]"; got {text!r}')
-            channels.append(Channel(name, match[1], match[2].strip()))
-        except ValueError as error:
-            raise ValueError(f"{job.where('model')} channels: {name}: {error}") from None
-    return tuple(channels)
-
-
-def _user_model(
-    job: Job, record: Record | None, channels: tuple[Channel, ...] = (), make: Any = None, steps: Any = None
-) -> Model:
-    """A model of the user; `channels`, a maker of the model of a function, and `steps` of data without a time."""
-    given = dict(job.model) | (steps or {})
-    names, channels = given.pop("parameters"), _user_channels(job) if make is None and not channels else channels
-    given.pop("channels", None), given.pop("sensors", None)
-    given["depends_on"] = [job.path("model", "depends_on", name) for name in given.get("depends_on", ())]
-    common = ({} if has_no_time(job) else {"record": record}) | given
-    if job.kind == "executable":
-        from ..models.executable import ExecutableModel
-
-        for key in ("templates", "files"):
-            if key in common:
-                common[key] = {name: job.path("model", key, file) for name, file in common[key].items()}
-        command = [
-            str(path.resolve()) if (path := job.folder / word).is_file() else word for word in common.pop("command")
-        ]
-        return ExecutableModel(command, common.pop("templates"), common.pop("output"), names, channels, **common)
-    function = load_function(job, common.pop("function"))
-    if job.kind == "opensees":
-        from ..models.opensees import OpenSeesModel
-
-        return OpenSeesModel(function, names, channels, **common)
-    from ..models.function import FunctionModel
-
-    return (make or FunctionModel)(function, names, channels, **common)
-
-
-def load_function(job: Job, text: str) -> Callable:
-    """The function that ``"file.py:name"`` names, from a module that worker processes can import too.
-
-    ValueError if the file or the function does not exist, the file cannot be imported, or another module has its name.
-    """
-    where = f"{job.where('model')} function:"
-    file, _, name = text.rpartition(":")
-    if not file or not name.isidentifier():
-        raise ValueError(f'{where} expected "file.py:name of the function"; got {text!r}')
-    path = job.path("model", "function", file).resolve()
-    if str(path.parent) not in sys.path:
-        sys.path.insert(0, str(path.parent))
-    importlib.invalidate_caches()
-    found = importlib.util.find_spec(path.stem) if path.stem.isidentifier() else None
-    if found is None or found.origin is None or Path(found.origin).resolve() != path:
-        raise ValueError(f"{where} {path.name} cannot be imported by its name; rename it, for example to my_model.py")
-    try:
-        module = importlib.import_module(path.stem)
-    except Exception as error:
-        raise ValueError(f"{where} {path.name} cannot be imported: {type(error).__name__}: {error}") from error
-    function = vars(module).get(name)
-    if not callable(function):
-        names = tuple(key for key, value in vars(module).items() if callable(value) and not key.startswith("_"))
-        raise ValueError(f"{where} {path.name} has no function {name!r}; {did_you_mean(name, names)}")
-    return function
 
 
 def _make_priors(

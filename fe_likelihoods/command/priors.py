@@ -5,7 +5,7 @@ import re
 
 from ..priors.distributions import Distribution, HalfNormal, LogNormal, TruncatedNormal, Uniform
 from ..units import to_si
-from .schema import split_number
+from .keys import split_number
 
 __all__ = ["FORMS", "parse_prior"]
 

@@ -23,15 +23,7 @@ from ..checks.result import judge_run
 from ..checks.run import read_run
 from ..prediction.prediction import Prediction
 from ..signals.datasets import DAMAGE
-from .events import (
-    Event,
-    describe_events,
-    predict_events,
-    prediction_options,
-    propagate_quietly,
-    read_events,
-    write_events,
-)
+from .events import Event, describe_events, predict_events, predict_quietly, read_events, write_events
 from .job import Job, parse_job, read_job
 from .models import Problem, make_problem, runs_code_of_user
 from .results import write_samples, write_tables
@@ -42,7 +34,6 @@ __all__ = ["CACHE", "Outcome", "default_folder", "is_free", "report_run", "run_j
 SETTINGS, ORIGIN, CHAIN = "settings.toml", "origin.json", "run.h5"
 CACHE = "simulations.sqlite"
 CHANGEABLE = ("budget", "events", "prediction")  # sections that do not change what a run has computed so far
-DRAWS = 100  # of predictions
 
 
 class Outcome(NamedTuple):
@@ -82,7 +73,7 @@ def run_job(
     make_sampler(job, tried)  # before the folder is touched
     events = read_events(job, tried)
     _prepare(job, folder, getattr(tried.posterior, "fingerprint", None), resume, overwrite)
-    problem = make_problem(job, SimulationCache(folder / CACHE) if job.budget.get("cache", True) else None)
+    problem = make_problem(job, SimulationCache(folder / CACHE) if job.budget.cache else None)
     if runs_code_of_user(job) and not (folder / CHAIN).exists():
         refuse_chance(problem.posterior)
     sampler = _stored_sampler(job, problem, folder)
@@ -117,7 +108,7 @@ def report_run(path: Path, runs_code: bool = False) -> Outcome:
             f"the run in {folder} has no samples yet; continue it with: fe-likelihoods run {origin['file']} --out "
             f"{folder}"
         )
-    steps = job.sampler.get("steps", STEPS)
+    steps = job.sampler.steps or STEPS
     if not is_emcee(job) and sampler.iteration >= steps:
         # the annealing is made again without an evaluation; the chain alone has lost which walkers are copies
         with _without_messages("samplers.tempered"):
@@ -198,7 +189,7 @@ def _write(
     measured = {event.name: event.measured for event in events if event.name in predicted and event.measured}
     judged = judge_run(run)
     judgement = judged.judgement
-    samples = write_samples(folder, run, prediction, job.prediction.get("draws", DRAWS), judgement)
+    samples = write_samples(folder, run, prediction, job.prediction.draws, judgement)
     page = folder / "report.html"
     write_page(page, run, prediction, judged, events=predicted, measured=measured, repeat=_command(file, folder))
     tables = write_tables(folder, run, judgement)  # last: they say how many simulations there are
@@ -256,17 +247,12 @@ def _changes(old: str, new: str) -> list[str]:
 
 def _drawn(job: Job, problem: Problem, sampler: Any) -> np.ndarray:
     """Draws of the posterior to predict with, evenly from the chain."""
-    samples, n = sampler.get_chain(flat=True, discard=discarded(job)), job.prediction.get("draws", DRAWS)
+    samples, n = sampler.get_chain(flat=True, discard=discarded(job)), job.prediction.draws
     rows = np.unique(np.linspace(0, len(samples) - 1, min(n, len(samples))).round().astype(int))
-    drawn = samples[rows]
-    return problem.posterior.draw_noise(drawn, job.sampler.get("seed", 1)) if job.noise.get("marginal") else drawn
+    return problem.posterior.draw_noise(samples[rows], job.sampler.seed) if job.marginal else samples[rows]
 
 
 def _predict(job: Job, problem: Problem, drawn: np.ndarray, progress: bool) -> Prediction | None:
     if not len(drawn) or job.modes or job.load_test and job.measurements:  # the report has a figure of each fit
         return None
-    cache = problem.posterior.likelihood.simulator.cache
-    try:
-        return propagate_quietly(problem.posterior, drawn, cache=cache, **prediction_options(job), progress=progress)
-    except ValueError as error:
-        raise ValueError(f"{job.where('prediction')} {error}") from error
+    return job.located("prediction", lambda: predict_quietly(job, problem, drawn, progress=progress))

@@ -4,9 +4,18 @@ import re
 from collections.abc import Collection, Iterable
 from pathlib import Path
 
-from fe_likelihoods.command.models import USER_MODELS
+from fe_likelihoods.command.keys import Key, keys_of
 from fe_likelihoods.command.priors import FORMS
-from fe_likelihoods.command.schema import EVENT, MODEL_KINDS, SECTIONS, USER, Key, model_keys, part_keys
+from fe_likelihoods.command.sections import (
+    MODEL_KINDS,
+    SECTIONS,
+    USER,
+    USER_MODELS,
+    Event,
+    Motion,
+    model_keys,
+    part_keys,
+)
 from fe_likelihoods.units import DIMENSIONS
 
 __all__ = ["PAGE", "key_tables"]
@@ -16,6 +25,8 @@ START, END = ".. keys begin\n", ".. keys end\n"
 
 
 def _kind(key: Key) -> str:
+    if key.kind.startswith("one of "):
+        return ", ".join(f'``"{each}"``' for each in key.kind.removeprefix("one of ").split(", "))
     return f"[{DIMENSIONS[key.kind]}]" if key.kind in DIMENSIONS else key.kind
 
 
@@ -53,13 +64,9 @@ def key_tables() -> str:
         blocks += [_table(", ".join(parts), keys) for keys, parts in seen.items()]
     kinds = ", ".join(f'``"{kind}"``' for kind in USER_MODELS)
     blocks.append(_table(f"``[model]`` of the kinds {kinds}", USER))
-    blocks += [_table(f"``[{section}]``", keys) for section, keys in SECTIONS.items()]
-    blocks.append(
-        _table(
-            "``[events.NAME]``: the keys of ``[record]`` without ``every``, and these",
-            _without(EVENT, SECTIONS["record"]),
-        )
-    )
+    blocks += [_table(f"``[{section}]``", keys_of(each)) for section, each in SECTIONS.items()]
+    title = "``[events.NAME]``: the keys of ``[record]`` without ``supports`` and ``every``, and these"
+    blocks.append(_table(title, _without(keys_of(Event), keys_of(Motion))))
     forms = "".join(f"* {form}\n" for form, _ in FORMS.values())
     blocks.append(f"Distributions of ``[priors]``:\n\n{forms}")
     return "\n".join(blocks)

@@ -16,10 +16,11 @@ from click.testing import CliRunner
 
 from fe_likelihoods import Channel, SimulationCache, read_columns, read_record
 from fe_likelihoods.command.job import parse_job, read_job
+from fe_likelihoods.command.keys import KINDS, read_quantity
 from fe_likelihoods.command.main import _plain_warnings, main
 from fe_likelihoods.command.models import make_problem
 from fe_likelihoods.command.priors import parse_prior
-from fe_likelihoods.command.schema import _KINDS, MODEL_KINDS, model_keys, part_keys, read_quantity
+from fe_likelihoods.command.sections import MODEL_KINDS, model_keys, part_keys
 from fe_likelihoods.command.starting import TEMPLATES
 from fe_likelihoods.models.isolated_bridge_parts import Bearing, Damper, Pier
 from fe_likelihoods.models.rc_column import RCColumn
@@ -133,13 +134,22 @@ def test_keys_are_those_of_the_models():
         keys = (part_keys("column") | part_keys("bridge"))[name]
         assert {key.name for key in keys} == {field.name for field in dataclasses.fields(cls)}, name
     keys = {kind: [*model_keys(kind), *itertools.chain(*part_keys(kind).values())] for kind in MODEL_KINDS}
-    known = {*_KINDS, *DIMENSIONS}
+    known = {*KINDS, *DIMENSIONS}
     assert not [(kind, key.name) for kind, each in keys.items() for key in each if key.kind not in known]
     kinds = {key.name: (key.kind, key.meaning) for key in keys["column"]}
     assert kinds["axial_load"] == (
         "force",
         "Gravity load at the top, positive downwards; default: the weight of `mass`",
     )
+
+
+@pytest.mark.slow  # starts an interpreter
+def test_keys_are_there_without_docstrings():
+    code = "from tests.command.key_tables import PAGE, key_tables; print(key_tables() in PAGE.read_text())"
+    said = subprocess.run(
+        [sys.executable, "-OO", "-c", code], capture_output=True, text=True, check=True, cwd=ROOT
+    ).stdout
+    assert said.splitlines()[-1] == "True"
 
 
 def test_a_section_switches_fatigue_on():
@@ -350,7 +360,11 @@ def test_another_file_of_the_same_name_is_refused(finished):
             "[sampler] kind: expected one of smc, tmcmc, emcee; got 'mcmc'",
         ),
         ("[prediction]", "[budget]\nworkers = 2\n[prediction]", "[budget] workers: a built-in model uses all cores"),
-        ("[prediction]", '[noise]\nkind = "pink"\n[prediction]', "[noise] kind: unknown noise 'pink'"),
+        (
+            "[prediction]",
+            '[noise]\nkind = "pink"\n[prediction]',
+            "[noise] kind: expected one of gaussian, autoregressive; got 'pink'",
+        ),
     ],
 )
 def test_errors_name_the_key(folder, old, new, message):

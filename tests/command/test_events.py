@@ -9,11 +9,13 @@ import warnings
 import numpy as np
 import pytest
 
-from fe_likelihoods import LinearOscillator, Measurements, SimulationCache, SimulationFailed, from_si, propagate
+from fe_likelihoods import LinearOscillator, SimulationCache, SimulationFailed, from_si, propagate
+from fe_likelihoods.command.events import describe_events, predict_events, read_events, write_events
 from fe_likelihoods.command.job import read_job
 from fe_likelihoods.command.models import make_problem
 from fe_likelihoods.models import linear_oscillator
 from fe_likelihoods.prediction.prediction import Prediction
+from fe_likelihoods.prediction.quantities import peak
 from fe_likelihoods.signals.read import read_record
 from tests.command.test_command import OSCILLATOR, call, folder, write_oscillator  # noqa: F401
 from tests.reporting.report_page import read_page
@@ -31,7 +33,7 @@ rest = "1 s"
 """
 
 
-def write_events(folder):  # noqa: F811
+def write_files(folder):  # noqa: F811
     """Beside the files of the oscillator: measurements of another event, and settings with two events."""
     record = read_record(folder / "base.csv")
     response = LinearOscillator(record.scale(0.5), 0.8).simulate([1.1, 0.9]) / [[9.80665], [1e-3]]
@@ -42,7 +44,7 @@ def write_events(folder):  # noqa: F811
 
 @pytest.fixture
 def events(folder):  # noqa: F811
-    write_events(folder)
+    write_files(folder)
     return folder
 
 
@@ -51,7 +53,7 @@ def run_once(tmp_path_factory):
     """A folder with the files of a run with events, and what the run said."""
     path = tmp_path_factory.mktemp("events")
     write_oscillator(path)
-    write_events(path)
+    write_files(path)
     with contextlib.chdir(path):
         return path, call("run", "oscillator.toml", "--out", "r", "--quiet")
 
@@ -124,31 +126,23 @@ def test_an_event_is_added_to_a_finished_run_without_new_samples(events):
     assert (events / "r" / "event-weaker.csv").is_file()
 
 
-class Doubtful(LinearOscillator):
-    """An oscillator of a user, which fails in weak motions, and warns in others."""
+def test_warnings_of_the_model_are_given_and_findings_are_not(events, monkeypatch):
+    (events / "oscillator.toml").write_text(SETTINGS + EVENTS.replace("scale = 0.5", "scale = 0.1"))
+    job, one = read_job("oscillator.toml"), LinearOscillator.simulate
+    problem = make_problem(job)
 
     def simulate(self, theta):
-        if np.abs(self.record.acceleration).max() < 0.9 * np.abs(read_record("base.csv").acceleration).max():
-            raise SimulationFailed("no motion")
         warnings.warn("the oscillator is very soft", UserWarning, stacklevel=1)
-        return super().simulate(theta)
+        return one(self, theta)
 
-
-def test_warnings_of_the_model_are_given_and_findings_are_not(events):
-    from fe_likelihoods.command.events import propagate_quietly
-
-    problem = make_problem(read_job("oscillator.toml"))
-    oscillator = problem.posterior.likelihood.model
-    model, measured = Doubtful(oscillator.record, 0.8), problem.posterior.likelihood.measurements
-    weak = Measurements(measured.channels, measured.dt, 0.1 * measured.values)  # other amplitudes than predicted ones
-    options = {"record": oscillator.record, "calibrated": [weak], "progress": False}
+    monkeypatch.setattr(LinearOscillator, "simulate", simulate)
+    monkeypatch.setattr(LinearOscillator, "simulate_batch", None, raising=False)
+    monkeypatch.delattr(LinearOscillator, "simulate_batch")
+    found = read_events(job, problem)
     with pytest.warns(UserWarning) as caught:
-        found = propagate_quietly(model, np.ones((5, 2)), **options)
-    assert [str(each.message) for each in caught] == ["the oscillator is very soft"]
-    assert len(found.findings) == 1 and "predicted peaks are outside" in found.findings[0].text
-    with pytest.warns(UserWarning) as caught:  # control: what the command does not filter
-        propagate(model, np.ones((5, 2)), **options)
-    assert {str(each.message) for each in caught} == {"the oscillator is very soft", found.findings[0].message}
+        predicted = predict_events(job, found, problem, np.array([[1.0, 1.0, 0.1, 0.005]]), False)
+    assert {str(each.message) for each in caught} == {"the oscillator is very soft"}
+    assert "predicted peaks are outside" in predicted["weaker"]["peaks"].findings[0].text
 
 
 @pytest.mark.slow
@@ -174,9 +168,6 @@ def test_an_event_whose_simulations_all_fail_is_named_in_the_report(events, monk
 
 
 def test_the_prediction_is_that_of_propagate(events, monkeypatch):
-    from fe_likelihoods.command.events import describe_events, predict_events, read_events, write_events
-    from fe_likelihoods.prediction.quantities import peak
-
     job = read_job("oscillator.toml")
     problem = make_problem(job)
     samples = problem.posterior.sample_prior(12, 1)
@@ -197,9 +188,6 @@ def test_the_prediction_is_that_of_propagate(events, monkeypatch):
 
 def test_peaks_with_a_noise_in_shares_have_the_error_of_the_model(events, monkeypatch):
     """Histories have the noise of each sample; no response is simulated twice for the two."""
-    from fe_likelihoods.command.events import predict_events, read_events
-    from fe_likelihoods.prediction.quantities import peak
-
     noise = '[noise]\nlevel = "measured"\nwindow = "1 s"\n'
     text = re.sub(r"(?m)^(sigma_.*|guide = true)\n", "", SETTINGS + EVENTS)
     (events / "oscillator.toml").write_text(text + noise)
@@ -241,8 +229,6 @@ def test_errors_name_section_and_key_before_the_run(events, old, new, message):
 @pytest.mark.parametrize("step", [0.005, 0.04])
 def test_a_motion_with_another_step_is_resampled_to_that_of_the_model(events, step):
     """The keys `every` and `dt` of the calibration record do not act on the event by count."""
-    from fe_likelihoods.command.events import read_events
-
     text = (SETTINGS + EVENTS).replace('file = "base.csv"\n[measure', 'file = "base.csv"\nevery = 2\n[measure')
     record = read_record("base.csv").resample(step)
     rows = [f"{t!r},{a!r}" for t, a in zip(record.time.tolist(), record.acceleration.tolist(), strict=True)]

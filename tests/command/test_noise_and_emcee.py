@@ -59,7 +59,7 @@ def test_noises_are_those_of_python(folder, keys, parameters, options):  # noqa:
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
-        ('kind = "autoregresive"', "[noise] kind: unknown noise 'autoregresive'; did you mean autoregressive?"),
+        ('kind = "autoregresive"', "got 'autoregresive'; did you mean autoregressive?"),
         ('kind = "autoregressive"\ngroups = "all"', '[noise] groups: the kind "autoregressive" has no such key'),
         ('level = "response"\nwindow = "1 s"', '[noise] GaussianNoise: level="response" needs the noise of the sensor'),
         ('level = "response"\n' + SENSOR, '[noise] GaussianNoise: level="response" needs window='),

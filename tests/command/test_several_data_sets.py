@@ -2,11 +2,14 @@
 
 import csv
 import itertools
+import re
+import sys
 
 import numpy as np
 import pytest
 
 from fe_likelihoods import LinearStructure, Record, ShearFrame
+from fe_likelihoods.command.events import describe_events, predict_events, read_events, write_events
 from fe_likelihoods.command.job import read_job
 from fe_likelihoods.command.models import make_problem
 from fe_likelihoods.command.runs import report_run, run_job
@@ -112,6 +115,88 @@ def test_a_check_and_a_run_have_one_report(settings_of, tmp_path):
         report_run(outcome.folder)
 
 
+def test_an_event_is_predicted_with_the_model_of_the_measurements(settings_of, tmp_path):
+    event = '[events.twice]\nfile = "base.csv"\nscale = 2.0\nmeasured = "roof.csv"\n[sampler]'
+    job = read_job(settings_of("[sampler]", event))
+    problem = make_problem(job)
+    (found,) = read_events(job, problem)
+    samples = np.array([[*TRUTH, 1e-6], [*TRUTH, 2e-6]])
+    predicted = predict_events(job, (found,), problem, samples, False)["twice"]
+    roof = problem.posterior.likelihood["measurements"].model.simulate(TRUTH)
+    np.testing.assert_allclose(predicted["histories"].quantile(0.5), 2.0 * roof, atol=1e-4)
+    (sentences,) = describe_events((found,), {"twice": predicted})
+    assert write_events(tmp_path, (found,), (sentences,)) and "Event twice: base" in call("check", "frame.toml")
+    text = (tmp_path / "frame.toml").read_text()
+    start, end = text.index("[record]"), text.index("[priors]")
+    (tmp_path / "frame.toml").write_text(text[:start] + text[end:])
+    with pytest.raises(ValueError, match=r"\[events\]: an event is predicted with the model of \[measurements\]"):
+        read_job(tmp_path / "frame.toml")
+
+
+TOGETHER = """
+import sys
+from pathlib import Path
+import numpy as np
+from fe_likelihoods.modal.mode_models import modal_response
+
+def responses(theta):
+    with open(Path(__file__).with_name("count.txt"), "a") as count:
+        count.write("x")
+    k, time = 9e6 * np.asarray(theta), 0.02 * np.arange(300)
+    matrix = np.array([[k[0] + k[1], -k[1]], [-k[1], k[1]]]) / 1e4
+    values, shapes = np.linalg.eigh(matrix)
+    roof = np.exp(-0.05 * time) * np.cos(np.sqrt(values[0]) * time)
+    modes = modal_response(np.sqrt(values) / (2 * np.pi), shapes.T)
+    return {"modes": modes, "load_test": np.outer([(1.0 / k).sum()], [10e3, 20e3]), "measurements": [roof]}
+
+if __name__ == "__main__":
+    found = responses([float(each) for each in sys.argv[1:]])
+    for name, values in found.items():
+        np.savetxt(f"{name}.txt", np.transpose(values))
+"""
+FUNCTION = 'kind = "function"\nfunction = "together.py:responses"'
+PROGRAM = f"""kind = "executable"
+command = ["{sys.executable}", "together.py", "$stiffness_1", "$stiffness_2"]
+time_limit = 60"""
+
+
+def of_one_run(text, name, model):
+    """Settings whose three data sets one run of a model answers."""
+    end = text.index("[modes]")
+    files = ["", "", ""]
+    if model is PROGRAM:
+        files = [f'output = "{each}.txt"\n' for each in ("modes", "load_test", "measurements")]
+    text = f'[model]\n{model}\nparameters = ["stiffness_1", "stiffness_2"]\n{text[end:]}'.replace("together", name)
+    own = text.index("[load_test.model]")
+    text = text[:own] + text[text.index("[record]") :].replace('[record]\nfile = "base.csv"\n', "")
+    text = re.sub(r"(?m)^damping.*\n", "", text).replace("[modes]\n", "[modes]\nn_modes = 2\n")
+    text += f'[modes.model]\nsensors = ["floor", "roof"]\n{files[0]}'
+    text += f'[load_test.model]\nchannels = {{top = "displacement [mm]"}}\n{files[1]}'
+    return text + f'[measurements.model]\nchannels = {{roof = "acceleration [m/s2]"}}\n{files[2]}'
+
+
+@pytest.mark.parametrize("model", [FUNCTION, pytest.param(PROGRAM, marks=pytest.mark.slow)])
+def test_one_run_answers_three_data_sets(settings_of, tmp_path, model):
+    name = f"together_{next(COUNT)}"
+    (tmp_path / f"{name}.py").write_text(TOGETHER)
+    text = of_one_run(settings_of().read_text(), name, model)
+    (tmp_path / "frame.toml").write_text(text)
+    posterior = make_problem(read_job(tmp_path / "frame.toml")).posterior
+    assert posterior.parameter_names == ["stiffness_1", "stiffness_2", "sigma_roof"]
+    points = [[0.9, 1.1, 0.02], [1.0, 1.1, 0.02], [0.9, 1.0, 0.02]]
+    values = posterior(points)
+    frame = make_problem(read_job(settings_of())).posterior.likelihood
+    others = frame["modes"]([[0.9, 1.1], [1.0, 1.1]]) + frame["load_test"]([[0.9, 1.1], [1.0, 1.1]])
+    parts = posterior.likelihood
+    mine = parts["modes"]([[0.9, 1.1], [1.0, 1.1]]) + parts["load_test"]([[0.9, 1.1], [1.0, 1.1]])
+    np.testing.assert_allclose(mine, others, rtol=1e-6)
+    if model is FUNCTION:
+        assert np.isfinite(values).all() and len((tmp_path / "count.txt").read_text()) == 3
+    (tmp_path / "frame.toml").write_text(text.replace("[measurements]", '[record]\nfile = "base.csv"\n[measurements]'))
+    with pytest.raises(ValueError, match=r"\[record\] one run for several data sets reads its motion itself"):
+        make_problem(read_job(tmp_path / "frame.toml"))
+
+
 @pytest.mark.parametrize(
     ("old", "new", "text"),
     [
@@ -122,7 +207,6 @@ def test_a_check_and_a_run_have_one_report(settings_of, tmp_path):
             '[load_test.model]\nkind = "frame"',
             r"\[load_test.model\] function: unk",
         ),
-        ("[sampler]", '[events.next]\nfile = "base.csv"\n[sampler]', "only a file with one data set predicts events"),
         ("[measurements]", "[measurement]", "unknown section"),
         ('"stiffness_2"]', '"stiffness_3"]', "stiffness_3: this prior is missing"),
     ],

@@ -1,0 +1,267 @@
+"""Keys of the TOML file and their values: kinds, checks, quantities with units, and the reading of one section.
+
+A key is a `Key`, or a field of a frozen dataclass that `key` makes. Messages name the file, the section and the key,
+and propose the nearest known key for an unknown one.
+"""
+
+import dataclasses
+import datetime
+import difflib
+import functools
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, get_type_hints
+
+from ..signals.clock_times import is_clock
+from ..units import DIMENSIONS, to_si
+
+__all__ = [
+    "KINDS",
+    "Key",
+    "did_you_mean",
+    "key",
+    "keys_of",
+    "read_by_channel",
+    "read_keys",
+    "read_quantity",
+    "split_number",
+]
+
+SMALLEST_STRESS = 1e4  # [Pa]; a smaller plain number is in another unit
+CLOCK = "time or clock time"
+
+
+class Key(NamedTuple):
+    """One key of a section.
+
+    Its kind is a name in `KINDS`; a dimension of `fe_likelihoods.units.DIMENSIONS`, for a text with number and unit
+    (``"1.22 m"``) or a number in SI units; "one of " and choices; or "time or clock time".
+    """
+
+    name: str
+    kind: str
+    meaning: str  # for the documentation
+    required: bool = False  # whether it has no default
+
+
+def key(meaning: str, default: Any = None) -> Any:
+    """A field of a section; without a default (None) it may be left out, and ``...`` means that it may not."""
+    return dataclasses.field(metadata={"meaning": meaning}, **({} if default is ... else {"default": default}))
+
+
+@functools.cache
+def keys_of(section: type) -> tuple[Key, ...]:
+    """Keys of a section: kinds from the annotations of its fields, meanings with defaults as TOML writes them."""
+    kinds, found = get_type_hints(section, include_extras=True), []
+    for each in sorted(dataclasses.fields(section), key=lambda each: each.name in getattr(section, "READING", ())):
+        required = each.default is dataclasses.MISSING
+        given = "" if required or each.default is None else f" ({_as_toml(each.default)})"
+        found.append(Key(each.name, kinds[each.name].__metadata__[0], each.metadata["meaning"] + given, required))
+    return tuple(found)
+
+
+def _as_toml(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f'"{value}"' if isinstance(value, str) else str(list(value) if isinstance(value, tuple) else value)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _is_whole(value: Any, least: float = -math.inf) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= least
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str) and bool(value.strip())
+
+
+def _list(fits: Callable[[Any], bool]) -> Callable[[Any], bool]:
+    return lambda value: isinstance(value, list) and all(map(fits, value))
+
+
+def _table(fits: Callable[[Any], bool]) -> Callable[[Any], bool]:
+    return lambda value: isinstance(value, dict) and bool(value) and all(map(fits, value.values()))
+
+
+def _either(*checks: Callable[[Any], bool]) -> Callable[[Any], bool]:
+    return lambda value: any(fits(value) for fits in checks)
+
+
+def _are_probabilities(value: Any) -> bool:
+    return _list(_is_number)(value) and all(0.0 < number < 1.0 for number in value) and len(set(value)) == len(value)
+
+
+def _is_time(value: Any) -> bool:
+    """Whether a value is a pair of times in order, or a name and such a pair."""
+    times = value[1:] if isinstance(value, list) and value and _is_text(value[0]) else value
+    return _list(_is_number)(times) and len(times) == 2 and times[0] <= times[1]
+
+
+def _are_points(value: Any) -> bool:
+    """Whether a value is a list of points [time, value] at different times."""
+    pairs = _list(lambda point: isinstance(point, list) and len(point) == 2)(value) and value
+    return (
+        bool(pairs)
+        and all(map(_is_number, times := [point[0] for point in pairs]))
+        and (all(_is_number(point[1]) or _is_text(point[1]) for point in pairs) and len({*times}) == len(times))
+    )
+
+
+KINDS: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "text": (_is_text, 'a text in quotes, such as "abc"'),
+    "number": (_is_number, "a number"),
+    "whole number": (_is_whole, "a whole number"),
+    "whole number >= 0": (lambda value: _is_whole(value, 0), "a whole number of 0 or more"),
+    "whole number >= 1": (lambda value: _is_whole(value, 1), "a whole number of 1 or more"),
+    "probabilities": (_are_probabilities, "a list of different numbers between 0 and 1, such as [0.05, 0.5, 0.95]"),
+    "yes or no": (lambda value: isinstance(value, bool), "true or false"),
+    "texts": (_list(_is_text), 'a list of texts, such as ["a", "b"]'),
+    "numbers": (_list(_is_number), "a list of numbers, such as [1.0, 2.0]"),
+    "whole numbers": (_list(_is_whole), "a list of whole numbers, such as [1, 2]"),
+    "number or numbers": (
+        _either(_is_number, _list(_is_number)),
+        "a number, or a list of numbers, such as [0.005, 0.01]",
+    ),
+    "text or numbers": (
+        _either(_is_text, _list(_is_number)),
+        "a text in quotes, or a list of numbers, such as [1.0, 5.0]",
+    ),
+    "numbers and times": (
+        _list(_either(_is_number, _is_time)),
+        'a list of numbers, and of times [first, last] in seconds, such as [-9999, [12.3, 12.8], ["top", 3.0, 3.2]]',
+    ),
+    "points by name": (
+        _table(_are_points),
+        'points of time and value by name, such as {top = [[0.0, "0.01 g"], [40.0, "0.03 g"]]}',
+    ),
+    "table of texts": (_table(_is_text), 'texts by name, such as {top = "abc"}'),
+    "table of texts or numbers": (
+        _table(_either(_is_text, _is_whole)),
+        'texts or whole numbers by name, such as {top = "abc"} or {top = 7}',
+    ),
+    "table of quantities": (
+        _table(_either(_is_number, _is_text)),
+        'numbers with units by name, such as {top = "0.01 g"}',
+    ),
+    "table of whole numbers": (_table(_is_whole), "whole numbers by name, such as {top = 2}"),
+    "table of whole numbers or texts": (
+        _either(_table(_is_whole), _list(_is_text)),
+        'whole numbers by name, such as {top = 2}, or a list of names, such as ["top"]',
+    ),
+}
+"""Check of a value, and what a message says was expected, by kind."""
+
+
+def did_you_mean(given: str, known: Sequence[str]) -> str:
+    """The nearest known name as a question, or all known names."""
+    near = difflib.get_close_matches(given.lower(), [name.lower() for name in known], n=1, cutoff=0.55)
+    names = [name for name in known if near and name.lower() == near[0]]
+    return f"did you mean {names[0]}?" if names else f"known are {', '.join(known)}"
+
+
+def split_number(text: str) -> tuple[str, str]:
+    """Number and unit of a text, with or without a space between them."""
+    match = re.match(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", text.strip())
+    number, unit = text.strip().partition(" ")[::2] if match is None else (match[0], text.strip()[match.end() :])
+    return number, unit.strip()
+
+
+_EXAMPLES = {
+    "acceleration": "0.1 g",
+    "velocity": "0.5 m/s",
+    "displacement": "1.22 m",
+    "force": "522 kip",
+    "stress": "42 MPa",
+    "moment": "100 kN m",
+    "curvature": "0.01 1/m",
+    "energy": "1 kJ",
+    "strain": "100 microstrain",
+    "rotation": "5 deg",
+    "time": "20 s",
+}
+
+
+def read_quantity(value: Any, dimension: str) -> float:
+    """A number in SI units, from such a number or a text with number and unit; `dimension` is a key of `DIMENSIONS`.
+
+    ValueError if it is neither, the unit is unknown or of another dimension, or a stress without a unit is below
+    `SMALLEST_STRESS`.
+    """
+    if _is_number(value):
+        if dimension == "stress" and 0.0 < abs(value) < SMALLEST_STRESS:
+            raise ValueError(
+                f"a plain number is in Pa, and {value!r} Pa is far below any strength or modulus; give the unit, such "
+                f'as "{value!r} MPa" or "{value!r} ksi"'
+            )
+        return float(value)
+    example = f"a number in {DIMENSIONS[dimension]}, or a text with a unit such as {_EXAMPLES.get(dimension, '1')!r}"
+    number, unit = split_number(value) if isinstance(value, str) else ("", "")
+    try:
+        found = float(number)
+    except ValueError:
+        found = math.nan
+    if not math.isfinite(found):
+        raise ValueError(f"expected {example}; got {value!r}")
+    if not unit:
+        raise ValueError(f"expected {example}; {value!r} has no unit")
+    try:
+        return to_si(found, unit, dimension).item()
+    except ValueError as error:
+        raise ValueError(f"expected {example}; got {value!r}: {error}") from None
+
+
+def read_by_channel(given: Mapping[str, Any], channels: Sequence[Any], key: str) -> dict[str, float]:
+    """Standard deviations [SI] by the names of `channels`; ValueError, which names the key and the channel."""
+    known, values = {channel.name: channel for channel in channels}, {}
+    for name, value in given.items():
+        if name not in known:
+            raise ValueError(f"{key}: unknown channel {name!r}; {did_you_mean(name, [*known])}")
+        try:
+            values[name] = read_quantity(value, known[name].dimension)
+        except ValueError as error:
+            raise ValueError(f"{key}: {name}: {error}") from None
+        if not values[name] >= 0.0:
+            raise ValueError(f"{key}: {name}: expected a standard deviation; got {value!r}")
+    return values
+
+
+def read_keys(given: Mapping[str, Any], keys: Sequence[Key], where: str) -> dict[str, Any]:
+    """Check the keys of a section as TOML gives it and convert its values, quantities to SI units.
+
+    ValueError, which names file and section (`where`), for an unknown or missing key, or a value of another kind.
+    """
+    known = {each.name: each for each in keys}
+    if unknown := [name for name in given if name not in known]:
+        raise ValueError(f"{where} {unknown[0]}: unknown key; {did_you_mean(unknown[0], tuple(known))}")
+    for each in keys:
+        if each.required and each.name not in given:
+            raise ValueError(f"{where} {each.name}: this key is missing: {each.meaning}")
+    return {name: _read_value(value, known[name].kind, f"{where} {name}") for name, value in given.items()}
+
+
+def _read_value(value: Any, kind: str, where: str) -> Any:
+    if kind == CLOCK:
+        if isinstance(value, datetime.time | datetime.datetime):  # a clock time without quotes
+            value = value.isoformat()
+        if isinstance(value, str) and is_clock(value):
+            return value
+        kind = "time"
+    if kind in DIMENSIONS:
+        try:
+            return read_quantity(value, kind)
+        except ValueError as error:
+            raise ValueError(f"{where}: {error}") from None
+    if kind.startswith("one of "):
+        choices = kind.removeprefix("one of ").split(", ")
+        if value in choices:
+            return value
+        near = difflib.get_close_matches(value, choices, n=1, cutoff=0.55) if isinstance(value, str) else []
+        raise ValueError(f"{where}: expected {kind}; got {value!r}{f'; did you mean {near[0]}?' if near else ''}")
+    fits, expected = KINDS[kind]
+    if not fits(value):
+        raise ValueError(f"{where}: expected {expected}; got {value!r}")
+    return value

@@ -1,0 +1,360 @@
+"""Sections of the TOML file that describes an update: frozen dataclasses, whose fields are the keys.
+
+The annotation of a field is the kind of its key, and `fe_likelihoods.command.keys.key` states meaning and default.
+Keys that are arguments of a class or function have the type, unit and meaning that its docstring states, read from its
+source, so that they are there with the option -OO of Python too.
+"""
+
+import ast
+import functools
+import importlib
+import inspect
+import re
+import textwrap
+from dataclasses import dataclass, fields
+from typing import Annotated, Any, ClassVar
+
+from ..models.executable import ExecutableModel
+from ..models.function import FunctionModel
+from ..noise.gaussian import GaussianNoise
+from ..signals.read import read_record
+from ..units import DIMENSIONS
+from .keys import CLOCK, Key, key
+
+__all__ = [
+    "FREE_SECTIONS",
+    "MODEL_KINDS",
+    "SECTIONS",
+    "USER",
+    "USER_MODELS",
+    "Event",
+    "LoadTest",
+    "Measured",
+    "Modes",
+    "Motion",
+    "Section",
+    "model_keys",
+    "part_keys",
+]
+
+
+@functools.cache
+def _documented(owner: Any) -> dict[str, Key]:
+    """Keys for the arguments of a class or function, from its numpydoc section "Parameters" or "Attributes".
+
+    A float with a unit in its description, such as ``[m]``, is a quantity of this dimension. The meaning is the first
+    sentence of a description, and the sentence that begins with "Default".
+    """
+    tree = ast.parse(textwrap.dedent(inspect.getsource(owner)))
+    text = ast.get_docstring(tree.body[0])
+    section = re.search(r"^(?:Parameters|Attributes)\n-+\n(.*?)(?=^\w[^\n]*\n-+$|\Z)", text, re.M | re.S)
+    found = {}
+    for group, form, text in re.findall(r"^(\w[\w, ]*) : (.+)\n((?:    .*\n?)+)", section[1], re.M):
+        first, *others = re.split(r"(?<=\.) (?=[A-Z])", " ".join(text.split()))
+        kind = _kind(form, first)
+        unit = f" [{DIMENSIONS[kind]}]".replace("2", "²") if kind in DIMENSIONS else ""
+        choices = form.removesuffix(", optional").replace("{", "").replace("}", "") + ": " if "{" in form else ""
+        default = next((f"; d{each[1:]}" for each in others if each.startswith("Default")), "")
+        first = first[0].lower() + first[1:] if choices else first
+        meaning = f"{choices}{first.removesuffix('.').replace(unit, '')}{default.removesuffix('.')}"
+        found |= {name: Key(name, kind, meaning) for name in group.split(", ")}
+    return found
+
+
+_KINDS_OF_TYPES = {
+    "int": "whole number",
+    "bool": "yes or no",
+    "str": "text",
+    "tuple of str": "texts",
+    "sequence of str": "texts",
+    "sequence of int": "whole numbers",
+    "sequence of float": "numbers",
+}
+
+
+def _kind(form: str, meaning: str) -> str:
+    """Kind of a key from the type and the unit that a docstring states; empty if no kind fits."""
+    form = re.split(r" or |, optional", form)[0]
+    if form == "float":
+        unit = next((unit for unit in re.findall(r"\[([^\];]+)[\];]", meaning)), "")
+        return next((name for name, si in DIMENSIONS.items() if si == unit.replace("²", "2")), "number")
+    return "text" if form.startswith("{") else _KINDS_OF_TYPES.get(form, "")
+
+
+def _arguments(owner: Any, names: str = "", *, without: str = "", required: str = "", **kinds: str) -> tuple[Key, ...]:
+    """Keys for arguments of a class or function; names, all by default, are separated by blanks."""
+    found = _documented(owner)
+    return tuple(
+        found[name]._replace(kind=kinds.get(name) or found[name].kind, required=name in required.split())
+        for name in names.split() or found
+        if name not in without.split()
+    )
+
+
+Text, Texts, TextTable = Annotated[Any, "text"], Annotated[Any, "texts"], Annotated[Any, "table of texts"]
+Whole, Wholes = Annotated[Any, "whole number"], Annotated[Any, "whole numbers"]
+Size, Count = Annotated[Any, "whole number >= 0"], Annotated[Any, "whole number >= 1"]
+Number, Errors = Annotated[Any, "number"], Annotated[Any, "number or numbers"]
+Switch, Time, Clock = Annotated[Any, "yes or no"], Annotated[Any, "time"], Annotated[Any, CLOCK]
+Columns, Quantities = Annotated[Any, "table of texts or numbers"], Annotated[Any, "table of quantities"]
+Missing, Points = Annotated[Any, "numbers and times"], Annotated[Any, "points by name"]
+Bundled = Annotated[Any, "one of column-short, column-eq1, column-eq1-eq2, bridge-twin, bridge-means"]
+TextOrNumbers, Probabilities = Annotated[Any, "text or numbers"], Annotated[Any, "probabilities"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Section:
+    """Values of one section; None stands for a key that is left out."""
+
+    def given(self, *names: str) -> dict[str, Any]:
+        """The values of these keys, by default of all, without keys that are left out."""
+        values = {name: getattr(self, name) for name in names or (each.name for each in fields(self))}
+        return {name: value for name, value in values.items() if value is not None}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table(Section):
+    """How a table of samples is read."""
+
+    READING: ClassVar = ("time", "time_unit", "dt", "skip", "resample")
+
+    time: Text = key(_documented(read_record)["time"].meaning)
+    time_unit: Text = key(_documented(read_record)["time_unit"].meaning)
+    dt: Time = key(_documented(read_record)["dt"].meaning)
+    skip: Size = key(_documented(read_record)["skip"].meaning)
+    resample: Time = key(_documented(read_record)["resample"].meaning)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Motion(Table):
+    """Base motion of the calibration or of an event."""
+
+    supports: ClassVar = None
+    every: ClassVar = 1
+
+    file: Text = key(
+        "Acceleration of the base: AT2, V1, V2, SMC, GeoNet, K-NET, ESM, miniSEED, SAC, CSV, Excel, or a data set (.h5)"
+    )
+    bundled: Bundled = key("A bundled synthetic motion, instead of a file")
+    column: Text = key("Column of a CSV file or workbook, component (GeoNet), or file in an archive (V2)")
+    channel: Whole = key("Channel of a V2 file")
+    units: Text = key("Unit of the acceleration, if the file does not state it")
+    scale: Number = key("Factor by which the record is multiplied; -1 for a reversed sensor")
+    duration: Time = key("Length of the first part that is used")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calibration(Motion):
+    """``[record]``."""
+
+    supports: Texts = key(
+        'Motions of several supports instead of file, as "file.csv" or "file.csv:column"; of a bridge deck the base of '
+        "the column, the first end and the second end"
+    )
+    every: Count = key("Keep every n-th sample: a faster simulation with a longer step", 1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Event(Motion):
+    """``[events.NAME]``, which is predicted after the run."""
+
+    measured: Text = key("Measured response in this event, to be compared: a file as in [measurements]")
+    zero: Clock = key("Time in this file at which the base motion begins; by default as in [measurements]")
+    from_state: Annotated[Any, "one of virgin, end"] = key("End: begin with the state after the record", "virgin")
+    rest: Time = key('Pause before the motion, for "end"; 10 s by default')
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measured(Table):
+    """``[measurements]``."""
+
+    file: Text = key("Measured response: CSV, Excel, V2 and other files as in [record], or a data set (.h5)")
+    bundled: Bundled = key("Bundled synthetic measurements, instead of a file")
+    columns: Columns = key("Channel = name of its column in the file, or number in a V2 file")
+    units: TextTable = key("Channel = unit, if the file does not state it")
+    reversed: Texts = key("Channels whose sensor counts the other way round: they are multiplied by -1")
+    channels: Texts = key("Channels to use; by default all")
+    zero: Clock = key("Time in the file at which the base motion begins")
+    missing: Missing = key(
+        "Numbers that stand for missing samples, and times [first, last] that are left out, with the name of a channel "
+        "before them for this one alone [s after zero]"
+    )
+    baseline: Points = key("Channel = points [time, value] of an offset or a drift that is subtracted")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Modes(Section):
+    """``[modes]``."""
+
+    file: Text = key("Identified modes, alone or beside other data: CSV, Excel or MATLAB (`read_modal_data`)", ...)
+    unit: Text = key('Unit of the frequencies, if the file does not state it: "Hz" or "rad/s"')
+    columns: TextTable = key("Sensor of the model = name of its column; by default the column of this name")
+    variables: TextTable = key("Of a MATLAB file: frequencies, shapes and damping = names of the variables")
+    modes: Wholes = key("Numbers of the modes to compare; by default all")
+    mean: Switch = key("Take the mean of several identifications, and their scatter as the errors", False)
+    frequency_cv: Errors = key("Known coefficient of variation of the frequencies, such as 0.005, or one per mode")
+    shape_error: Errors = key("Known standard deviation of a component of a shape with a norm of 1, such as 0.02")
+    unknown_errors: Annotated[Any, "one of common, mode"] = key(
+        "Parameters frequency_error and shape_error, of all modes or of each, are added to the known errors; by "
+        "default where no error is known"
+    )
+    student_t: Number = key("Degrees of freedom of Student-t errors, such as 4, for wrong identifications")
+    n_modes: Count = key("Modes that the model computes (twice as many as were measured)")
+    close: Number = key("Frequencies that differ by less than this share are compared as a plane of shapes (0.02)")
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoadTest(Section):
+    """``[load_test]``."""
+
+    file: Text = key("Load test, alone or beside other data: CSV or Excel with a line for each load case", ...)
+    columns: TextTable = key("Channel = name of its column; by default the column of this name")
+    units: TextTable = key("Channel = unit, if the file does not state it")
+    cases: Text = key("Column with the names of the load cases, or with positions; by default the first one")
+    errors: Quantities = key('Channel = known standard deviation of its sensor, such as "0.1 mm"')
+
+
+@dataclass(frozen=True, kw_only=True)
+class Noise(Section):
+    """``[noise]``."""
+
+    kind: Annotated[Any, "one of gaussian, autoregressive"] = key(
+        "Autoregressive: each error depends on the one before, with a correlation per channel; takes sensor only",
+        "gaussian",
+    )
+    groups: TextOrNumbers = key(_documented(GaussianNoise)["groups"].meaning)
+    level: Text = key(_documented(GaussianNoise)["level"].meaning)
+    sensor: Quantities = key(_documented(GaussianNoise)["sensor"].meaning)
+    window: Time = key(_documented(GaussianNoise)["window"].meaning)
+    local: Number = key(_documented(GaussianNoise)["local"].meaning)
+    marginal: Switch = key("Integrate the levels out; for levels in SI units without bands and sensor", False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sampler(Section):
+    """``[sampler]``."""
+
+    kind: Annotated[Any, "one of smc, tmcmc, emcee"] = key("Sampler", "smc")
+    walkers: Count = key("Number of walkers (500; emcee: 4 per parameter, 32 or more)")
+    steps: Count = key("Sweeps at beta = 1, each of which stores all walkers (4); emcee: iterations")
+    discard: Size = key("Emcee: iterations that are left out as burn-in (half of steps)")
+    seed: Size = key("Seed", 1)
+    guide: Switch = key("Find the posterior from the responses, with hundreds of simulations", False)
+    preset: Annotated[Any, "one of ramancha2022, ramancha2022-constant, ching-chen-2007"] = key("Settings of papers")
+    recycle: Switch = key("Reuse every evaluated point; by default with 150 walkers or more")
+    ess_ratio: Number = key("Share of effective walkers wanted at each stage, without recycling")
+    min_moves: Whole = key("Fewest sweeps per stage")
+    max_moves: Count = key("Most sweeps per stage")
+    max_failure_share: Number = key("Share of failed evaluations at which the run stops (0.5)")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Budget(Section):
+    """``[budget]``."""
+
+    max_simulations: Count = key("Most simulations; the run can be continued with more")
+    workers: Count = key("Processes, for a model of your own (1); built-in models use all cores")
+    cache: Switch = key("Keep every simulation in a file of the folder", True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Predictions(Section):
+    """``[prediction]``."""
+
+    draws: Size = key("Draws of the posterior whose response is predicted; 0 for none", 100)
+    noise: Switch = key("Predict measurements, with their noise; by default only in events with measurements")
+    quantiles: Probabilities = key("Probabilities of the quantiles", (0.05, 0.5, 0.95))
+
+
+SECTIONS: dict[str, type[Section]] = {
+    "record": Calibration,
+    "measurements": Measured,
+    "modes": Modes,
+    "load_test": LoadTest,
+    "noise": Noise,
+    "sampler": Sampler,
+    "budget": Budget,
+    "prediction": Predictions,
+}
+"""Sections besides those of `FREE_SECTIONS`."""
+
+FREE_SECTIONS = {
+    "model": "the structure; its keys depend on `kind`",
+    "priors": "parameter = distribution",
+    "events": "other base motions, one table [events.NAME] for each",
+}
+
+
+USER = (
+    Key("parameters", "texts", "Names of the structural parameters, in the order of theta", True),
+    Key("channels", "table of texts", 'Channels of the response: name = "quantity [unit]", in order'),
+    Key(
+        "sensors",
+        "table of whole numbers or texts",
+        "With [modes], instead of channels: sensor = row of the matrices, from 0, that a function returns; a list of "
+        "names for other models",
+    ),
+    *_arguments(FunctionModel, "dt n_steps time_limit", n_steps="whole number >= 1"),
+    Key("depends_on", "texts", "Files that the response depends on besides the code"),
+    Key("version", "text", "Text that stands for the code in the cache; change it when the results change"),
+)
+"""Keys of ``[model]`` that all models of the user have; a program needs a `time_limit`."""
+
+_FUNCTION = Key("function", "text", 'The function, as "file.py:name"', True)
+_OWN = {
+    "function": (_FUNCTION, *USER, *_arguments(FunctionModel, "isolated")),
+    "opensees": (_FUNCTION, *USER),
+    "executable": (
+        *_arguments(ExecutableModel, "command", required="command"),
+        Key("templates", "table of texts", "Input files: name in the folder of the run = template"),
+        Key("output", "text", "Name of the file with the response", True),
+        *_arguments(ExecutableModel, "columns output_units record_file", output_units="table of texts"),
+        Key("files", "table of texts", "Further files: name in the folder of the run = file"),
+        *(each._replace(required=each.required or each.name == "time_limit") for each in USER),
+    ),
+}
+_COLUMN_PARTS = dict(concrete="Concrete", steel="Steel", bars="Bars", hoops="Hoops", fatigue="LowCycleFatigue")
+_BRIDGE_PARTS = {f"{name.lower()}_{i}": name for name in ("Pier", "Bearing", "Damper") for i in (1, 2)}
+_STOREYS: dict[str, Any] = dict(
+    names="floors masses stiffnesses", required="floors masses stiffnesses", floors="table of whole numbers"
+)
+_BUILT_IN: dict[str, tuple[str, dict[str, Any]]] = {
+    "column": (
+        "rc_column.RCColumn",
+        dict(without=f"loading outputs max_increment {' '.join(_COLUMN_PARTS)}", units="table of texts"),
+    ),
+    "bridge": (
+        "isolated_bridge.IsolatedBridge",
+        dict(without="record piers bearings dampers rubber outputs every vertical"),
+    ),
+    "oscillator": ("linear_oscillator.LinearOscillator", dict(without="record", required="period")),
+    "frame": ("linear_structure_parts.ShearFrame", _STOREYS),
+    "grouped frame": ("tall_buildings.GroupedFrame", dict(names="groups", required="groups")),
+    "bridge deck": ("linear_structure_parts.BridgeDeck", {}),
+}
+_PARTS = {"column": ("rc_column_parts", _COLUMN_PARTS), "bridge": ("isolated_bridge_parts", _BRIDGE_PARTS)}
+MODEL_KINDS = (*_BUILT_IN, *_OWN)
+"""Kinds of ``[model]``."""
+USER_MODELS = tuple(_OWN)
+"""Those that run a function or a program of the user."""
+
+
+def _in_models(name: str) -> Any:
+    """A class of `fe_likelihoods.models`, imported where a file needs it: some import numba."""
+    module, _, name = name.partition(".")
+    return getattr(importlib.import_module(f"fe_likelihoods.models.{module}"), name)
+
+
+def model_keys(kind: str) -> tuple[Key, ...]:
+    """Keys of ``[model]`` for one of `MODEL_KINDS`."""
+    if kind in _OWN:
+        return _OWN[kind]
+    name, options = _BUILT_IN[kind]
+    storeys = model_keys("frame") if kind == "grouped frame" else ()
+    return (*storeys, *_arguments(_in_models(name), **options))
+
+
+def part_keys(kind: str) -> dict[str, tuple[Key, ...]]:
+    """Keys of the tables below ``[model]`` by name; a key that is left out has the value of the built-in structure."""
+    module, names = _PARTS.get(kind, ("", {}))
+    return {part: _arguments(_in_models(f"{module}.{name}")) for part, name in names.items()}
