@@ -11,6 +11,7 @@ import hashlib
 import logging
 import weakref
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -111,7 +112,7 @@ class BuiltInModel(StructuralModel):
         """Units in which the nominal values are shown, by parameter."""
         return self._nominal_units
 
-    @property
+    @cached_property
     def fingerprint(self) -> str:
         """Digest of the declared arguments and the excitation; the code of this library is not part of it."""
         parts = [type(self).__name__, repr([channel.name for channel in self.channels])]

@@ -151,10 +151,13 @@ class ReinforcedSection:
         """Area of the longitudinal bars divided by the area of the core."""
         return self.bars.number * self.bars.area_each / (0.25 * math.pi * self.core_diameter**2)
 
+    @functools.lru_cache(maxsize=64)  # noqa: B019 - equal sections share them, and few are kept
     def fibers(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Fibers of core, cover and bars, each (n, 2): position y [m] and area [m²]."""
+        """Fibers of core, cover and bars, each (n, 2), read-only: position y [m] and area [m²]."""
         core, cover = circular_strips(0.5 * self.diameter, 0.5 * self.core_diameter, self.mesh)
         bars = bar_circle(self.bar_circle_radius, self.bars.number, self.bars.area_each, self.bars.first_angle)
+        for each in (core, cover, bars):
+            each.setflags(write=False)
         return core, cover, bars
 
     def confinement(self, fc: float) -> Confinement:

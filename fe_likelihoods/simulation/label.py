@@ -18,6 +18,7 @@ identifiers, sets in varying order, and file names of notebook cells.
 import ast
 import contextlib
 import functools
+import itertools
 import logging
 import os
 import platform
@@ -149,9 +150,9 @@ class ModelLabel:
 
 def _parts_of(model: Any) -> dict[str, Any]:
     """User class and attributes of an object, without the time limit, which changes no response."""
-    name = type(model).__qualname__
-    attributes = {attribute: value for attribute, value in _state(model).items() if attribute != "time_limit"}
-    return {"class": type(model)} | {f"{name}().{attribute}": value for attribute, value in attributes.items()}
+    kind = type(model)
+    attributes = {f"{kind.__qualname__}().{name}": value for name, value in _state(model) if name != "time_limit"}
+    return {"class": kind} | attributes
 
 
 def _defined_by_user(function: Any) -> bool:
@@ -202,8 +203,6 @@ class _Walk:
         self._packages: set[str] = set()
         self._library: set[str] = set()
         self._words: set[str] = set()
-        self._done: dict[int, tuple[bytes, Any]] = {}
-        self._open: dict[int, int] = {}  # depth of the objects that contain the object being added
 
     def items(self, parts: Mapping[str, Any]) -> dict[str, str]:
         """Digests by name."""
@@ -212,20 +211,21 @@ class _Walk:
         while self._waiting:
             name, value = self._waiting.popitem()
             if name not in items:
-                items[name] = self._digest(value)
+                self._done: dict[int, tuple[bytes, Any]] = {}
+                self._open: dict[int, int] = {}  # depth of the objects that contain the present one
+                try:
+                    items[name] = self._digest(value).hex()
+                except RecursionError:
+                    items[name] = f"deeper than {sys.getrecursionlimit()}"
                 if isinstance(value, str):  # a command or an input file of a program
                     self._words |= set(re.findall(r"\w+", value))
         for module in self._all_modules():
             if module.__name__ not in SCRIPTS:  # of a script, only the parts that the model uses count
                 items[f"source of {module.__name__}"], words = _source(module)
                 self._words |= words
-        for module in self._library:
-            items[f"source of {module}"] = _source(sys.modules[module])[0]
-        for package in self._packages:
-            items[f"package {package}"] = package_version(package)
-        for name in self._words & os.environ.keys() - _OF_SHELLS:
-            items[f"environment {name}"] = os.environ[name]
-        return items
+        items |= {f"source of {module}": _source(sys.modules[module])[0] for module in self._library}
+        items |= {f"package {package}": package_version(package) for package in self._packages}
+        return items | {f"environment {n}": os.environ[n] for n in self._words & os.environ.keys() - _OF_SHELLS}
 
     def _all_modules(self) -> Iterable[types.ModuleType]:
         """The user modules found so far, and the user modules that they name."""
@@ -239,145 +239,101 @@ class _Walk:
                         waiting.append(name)
         return self._modules.values()
 
-    def _digest(self, value: Any) -> str:
-        self._done, self._open, self._hash = {}, {}, blake2b(digest_size=8)
-        try:
-            self._add(value)
-        except RecursionError:
-            self._text(f"deeper than {sys.getrecursionlimit()}")
-        return self._hash.hexdigest()
-
-    def _text(self, text: str) -> None:
-        self._hash.update(text.encode("utf-8", "surrogatepass") + b"\0")
-
-    def _add(self, value: Any) -> None:
-        kind = type(value)
-        if kind in _PLAIN:
-            self._text(f"{kind.__name__} {value!r}")
-        elif id(value) in self._open:  # it contains itself
-            self._text(f"the object {len(self._open) - self._open[id(value)]} levels above")
-        elif len(self._done) < MOST_OBJECTS:
-            self._hash.update(self._apart(value))
-
-    def _apart(self, value: Any) -> bytes:
+    def _digest(self, value: Any) -> bytes:
         """Digest of one value; equal values have equal digests, whether they are one object or several."""
+        if id(value) in self._open:  # it contains itself
+            return f"the object {len(self._open) - self._open[id(value)]} levels above".encode()
         if id(value) not in self._done:
-            outer, self._hash = self._hash, blake2b(digest_size=8)
+            if len(self._done) >= MOST_OBJECTS:
+                return b""
+            digest = blake2b(digest_size=8)
             self._open[id(value)] = len(self._open)
             try:
-                self._add_contents(value)
-                self._done[id(value)] = self._hash.digest(), value  # the object too, so that its id is not reused
+                text, parts = self._contents(value)
+                digest.update(text.encode("utf-8", "surrogatepass"))
+                for part in parts:
+                    digest.update(_bytes_of(part) if type(part) in _PLAIN else self._digest(part))
             finally:
-                self._hash = outer
                 del self._open[id(value)]
+            self._done[id(value)] = digest.digest(), value  # the object too, so that its id is not reused
         return self._done[id(value)][0]
 
-    def _add_contents(self, value: Any) -> None:
+    def _contents(self, value: Any) -> tuple[str, Iterable[Any]]:
+        """A text and other values, which together stand for a value."""
         kind = type(value)
+        name = f"{_name_of(kind.__module__)}.{kind.__qualname__}"
         if kind in _PLAIN:
-            self._text(f"{kind.__name__} {value!r}")
-            return
-        self._text(f"{_name_of(kind.__module__)}.{kind.__qualname__}")
+            return name, [value]
         if isinstance(value, np.ndarray | np.generic) and not value.dtype.hasobject:
-            self._text(f"{value.dtype.str} {value.shape}")
-            self._hash.update(np.ascontiguousarray(value).tobytes())
-        elif isinstance(value, types.CodeType):
-            self._add_code(value)
-        elif isinstance(value, types.FunctionType):
-            self._add_function(value)
-        elif isinstance(value, type):
-            self._add_class(value)
-        elif isinstance(value, types.ModuleType):
-            self._add_module(value)
-        elif isinstance(value, _WRAPPERS):
-            for name in _WRAPPED:
-                self._add(_attribute(value, name))
-        elif isinstance(value, types.BuiltinFunctionType | types.BuiltinMethodType | types.WrapperDescriptorType):
-            self._text(value.__qualname__)
-            if not isinstance(getattr(value, "__self__", None), types.ModuleType | None):
-                self._add(value.__self__)
-        elif kind in (list, tuple):
-            self._add_all(value)
-        elif kind in (set, frozenset):
-            self._text(repr(sorted(map(self._apart, value))))
-        elif isinstance(value, dict | types.MappingProxyType):
-            self._add_all([item for pair in value.items() for item in pair])
-            if kind not in (dict, types.MappingProxyType):
-                self._add_state(value)
-        elif isinstance(value, weakref.ref):
-            self._add(value())
-        elif isinstance(value, logging.Logger):
-            self._text(value.name)
-        elif kind.__module__.partition(".")[0] == "numba":  # the compiled variants change with use
-            self._add(_attribute(value, "py_func") or _attribute(_attribute(value, "_dispatcher"), "py_func"))
-        else:
-            self._add_object(value)
-
-    def _add_all(self, values: Iterable[Any]) -> None:
-        for value in values:
-            self._add(value)
-        self._text("end")
-
-    def _add_code(self, code: types.CodeType) -> None:
-        """Add code without local variable names, line numbers and file name."""
-        arguments = code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]
-        self._text(repr((code.co_name, code.co_names, arguments, code.co_freevars, code.co_flags)))
-        self._hash.update(code.co_code)
-        self._words.update(text for text in code.co_consts if isinstance(text, str))
-        self._add_all(code.co_consts)
-
-    def _add_function(self, function: types.FunctionType) -> None:
-        module = function.__module__ or ""
-        self._text(f"{_name_of(module)}.{function.__qualname__}")
-        if self._is_of_user(module):
-            self._add_all((function.__code__, function.__defaults__, function.__kwdefaults__, function.__closure__))
-            self._add_all({name: value for name, value in vars(function).items() if name != "__wrapped__"}.items())
-            self._add(_attribute(function, "__wrapped__"))
-            for name in sorted(names_in(function.__code__).all & function.__globals__.keys()):
-                self._waiting.setdefault(f"{_name_of(module)}.{name}", function.__globals__[name])
-
-    def _add_class(self, cls: type) -> None:
-        name = f"{_name_of(cls.__module__)}.{cls.__qualname__}"
-        self._text(name)
-        if not self._is_of_user(cls.__module__):
-            return
-        self._add_all(cls.__bases__)
-        if type(cls) is not type:
-            self._add(type(cls))
-        for attribute, member in sorted(vars(cls).items()):
-            if attribute in _OF_CLASSES or isinstance(member, types.MemberDescriptorType):
-                continue
-            self._text(attribute)
-            if isinstance(member, _DATA) and "<locals>" not in name:
-                self._waiting.setdefault(f"{name}.{attribute}", member)
-            else:
-                self._add(member)
-
-    def _add_module(self, module: types.ModuleType) -> None:
-        """Add the data of a user module by value; its functions and classes are in its source."""
-        self._text(module.__name__)
-        for name, value in list(vars(module).items()) if self._is_of_user(module.__name__) else ():
-            if not name.startswith("__") and not isinstance(value, types.ModuleType | type | types.FunctionType):
-                self._waiting.setdefault(f"{module.__name__}.{name}", value)
-
-    def _add_object(self, value: Any) -> None:
-        self._add(type(value))
-        if is_of_user(type(value).__module__) or isinstance(value, types.SimpleNamespace):
-            self._add_state(value)
-            return
-        try:  # the parts that pickle would rebuild it from
-            for part in _parts(value.__reduce_ex__(2)):
-                self._add(part)
+            return f"{name} {value.dtype.str} {value.shape}", [np.ascontiguousarray(value).tobytes()]
+        if isinstance(value, types.CodeType):  # without local variable names, line numbers and file name
+            arguments = value.co_varnames[: value.co_argcount + value.co_kwonlyargcount]
+            self._words.update(text for text in value.co_consts if isinstance(text, str))
+            names = value.co_name, value.co_names, arguments, value.co_freevars, value.co_flags
+            return repr(names), [value.co_code, *value.co_consts]
+        if isinstance(value, types.FunctionType):
+            return self._function(value)
+        if isinstance(value, type):
+            return self._class(value)
+        if isinstance(value, types.ModuleType):  # data by value; functions and classes are in its source
+            for each, member in list(vars(value).items()) if self._is_of_user(value.__name__) else ():
+                if not each.startswith("__") and not isinstance(member, types.ModuleType | type | types.FunctionType):
+                    self._waiting.setdefault(f"{value.__name__}.{each}", member)
+            return f"{name} {value.__name__}", []
+        if isinstance(value, _WRAPPERS):
+            return name, [_attribute(value, each) for each in _WRAPPED]
+        if isinstance(value, types.BuiltinFunctionType | types.BuiltinMethodType | types.WrapperDescriptorType):
+            of = getattr(value, "__self__", None)
+            return f"{name} {value.__qualname__}", [] if isinstance(of, types.ModuleType | None) else [of]
+        if kind in (list, tuple):
+            return name, value
+        if kind in (set, frozenset):
+            return name + repr(sorted(map(self._digest, value))), []
+        if isinstance(value, dict | types.MappingProxyType):
+            state = () if kind in (dict, types.MappingProxyType) else _state(value)
+            return name, [*itertools.chain.from_iterable(value.items()), *state]
+        if isinstance(value, weakref.ref):
+            return name, [value()]
+        if isinstance(value, logging.Logger):
+            return f"{name} {value.name}", []
+        if kind.__module__.partition(".")[0] == "numba":  # the compiled variants change with use
+            return name, [_attribute(value, "py_func") or _attribute(_attribute(value, "_dispatcher"), "py_func")]
+        if is_of_user(kind.__module__) or isinstance(value, types.SimpleNamespace):
+            return name, [kind, *_state(value)]
+        try:  # what pickle would rebuild it from, with iterators as lists
+            parts = value.__reduce_ex__(2)
+            parts = [parts] if isinstance(parts, str) else [*parts[:3], *(part and list(part) for part in parts[3:5])]
         except RecursionError:
             raise
         except Exception:  # foreign code
-            self.opaque.add(f"{type(value).__module__}.{type(value).__qualname__}")
-            self._add_state(value)
+            self.opaque.add(f"{kind.__module__}.{kind.__qualname__}")
+            parts = _state(value)
+        return name, [kind, *parts]
 
-    def _add_state(self, value: Any) -> None:
-        for name, part in sorted(_state(value).items()):
-            self._text(name)
-            self._add(part)
+    def _function(self, function: types.FunctionType) -> tuple[str, list[Any]]:
+        module, code = function.__module__ or "", function.__code__
+        name = f"{_name_of(module)}.{function.__qualname__}"
+        if not self._is_of_user(module):
+            return name, []
+        for each in sorted(names_in(code).all & function.__globals__.keys()):
+            self._waiting.setdefault(f"{_name_of(module)}.{each}", function.__globals__[each])
+        attributes = [pair for pair in vars(function).items() if pair[0] != "__wrapped__"]
+        values = function.__defaults__, function.__kwdefaults__, function.__closure__
+        return name, [code, *values, attributes, _attribute(function, "__wrapped__")]
+
+    def _class(self, cls: type) -> tuple[str, list[Any]]:
+        name = f"{_name_of(cls.__module__)}.{cls.__qualname__}"
+        if not self._is_of_user(cls.__module__):
+            return name, []
+        parts = [*cls.__bases__, type(cls)]
+        for attribute, member in sorted(vars(cls).items()):
+            if attribute in _OF_CLASSES or isinstance(member, types.MemberDescriptorType):
+                continue
+            if isinstance(member, _DATA) and "<locals>" not in name:
+                self._waiting.setdefault(f"{name}.{attribute}", member)
+            else:
+                parts += attribute, member
+        return name, parts
 
     def _is_of_user(self, module: str) -> bool:
         """Whether a module is the user's; other modules are noted, and represented by versions or source digests."""
@@ -392,27 +348,26 @@ class _Walk:
         return False
 
 
+def _bytes_of(plain: Any) -> bytes:
+    """Bytes of a value of one of the types `_PLAIN`, with the type."""
+    text = plain if type(plain) is bytes else repr(plain).encode("utf-8", "surrogatepass")
+    return b"%s %d " % (type(plain).__name__.encode(), len(text)) + text
+
+
 def _name_of(module: str) -> str:
     """Name of a module; ``__main__`` for a script, which has a different name in worker processes."""
     return "__main__" if module in SCRIPTS else module
 
 
-def _parts(reduced: Any) -> list[Any]:
-    """Parts of a ``__reduce_ex__`` result, with iterators as lists."""
-    if isinstance(reduced, str):
-        return [reduced]
-    return [list(part) if place in (3, 4) and part is not None else part for place, part in enumerate(reduced)]
-
-
-def _state(value: Any) -> dict[str, Any]:
-    """Attributes of an object, including slots."""
+def _state(value: Any) -> list[tuple[str, Any]]:
+    """Attributes of an object in alphabetical order, including slots."""
     found = dict(_attribute(value, "__dict__") or {})
     for cls in type(value).__mro__:
         slots = vars(cls).get("__slots__", ())
         for name in (slots,) if isinstance(slots, str) else slots:
             private = name.startswith("__") and not name.endswith("__")
             found[name] = _attribute(value, f"_{cls.__name__.lstrip('_')}{name}" if private else name)
-    return found
+    return sorted(found.items())
 
 
 def _attribute(value: Any, name: str) -> Any:
