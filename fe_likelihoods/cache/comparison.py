@@ -10,7 +10,6 @@ import numpy as np
 
 from ..noise.statistics import Statistic, needs_response
 from ..signals.comparison import Comparison
-from ..simulation.faults import TransientReason
 from ..simulation.files import Opened, observing
 from ..simulation.label import ModelLabel
 from ..simulation.model import Model, misfit_of_responses, most_responses, simulate_batch
@@ -20,8 +19,8 @@ __all__ = [
     "DEFAULT_TOLERANCE",
     "Simulated",
     "VerifyingRun",
+    "difference_in_words",
     "difference_of",
-    "is_transient",
     "largest_difference",
     "observed",
     "response_tolerance",
@@ -96,11 +95,6 @@ def simulate_again(
     return rows
 
 
-def is_transient(reason: str) -> bool:
-    """Whether a simulation failed for a reason other than the model."""
-    return isinstance(reason, TransientReason)
-
-
 # differences ----------------------------------------------------------------------------------------------------------
 
 
@@ -122,6 +116,23 @@ def response_tolerance(model: Model) -> float:
 def difference_of(stored: np.ndarray, new: Simulated, run: VerifyingRun, tolerance: float) -> tuple[int, float] | None:
     """Index and size of the largest difference beyond a tolerance, see `largest_difference`; None without any."""
     return largest_difference(stored, new.misfit, new.norm, tolerance, needs_response(run.statistic))
+
+
+def difference_in_words(
+    earlier: np.ndarray, reason: str, new: Simulated, run: VerifyingRun, tolerance: float, origin: str
+) -> tuple[str, float]:
+    """How a simulation differs from an earlier one, in words and relative to the response norm; empty if it agrees."""
+    if reason or new.reason:
+        was, now = (f"failed ({text})" if text else "succeeded" for text in (reason, new.reason))
+        return ("" if reason and new.reason else f"it {was}; simulated again, it {now}"), 0.0
+    found = difference_of(earlier, new, run, tolerance)
+    if found is None:
+        return "", 0.0
+    index, change = found
+    names = [channel.name for channel in run.model.channels]
+    what = "sum of squared residuals" if index < len(names) else f"statistic {index}"
+    values = f"{origin} {earlier[index]:.17g}, simulated again {new.misfit[index]:.17g}"
+    return f"channel {names[index % len(names)]!r}, {what}: {values}", change
 
 
 def largest_difference(

@@ -191,12 +191,12 @@ class CacheFile:
         """
         if self._connection is None:
             with self._exclusive():
-                self._inode = self._inode_now()
+                self._inode = self.identity
                 self.writable = self._inode is None or (
                     os.access(self.path, os.W_OK) and os.access(self.path.parent, os.W_OK | os.X_OK)
                 )
                 self._connection = self._open() if self.writable else self._open_to_read()
-                self._inode = self._inode_of_cache = self._inode_now()
+                self._inode = self._inode_of_cache = self.identity
             if self._aside is not None and self.writable:
                 aside, self._aside = self._aside, None
                 text = "%s: %d rows were salvaged; the others are lost"
@@ -217,7 +217,7 @@ class CacheFile:
         """
         with _lock, self._exclusive():
             self.close()
-            if self._inode is None or self._inode_now() != self._inode:
+            if self._inode is None or self.identity != self._inode:
                 return
             if self._inode != self._inode_of_cache:
                 self._refuse_other_files()
@@ -233,7 +233,8 @@ class CacheFile:
             self._aside = aside
             logger.warning("%s is damaged (%s): set aside as %s, and a new cache created", self.path, why, aside.name)
 
-    def _inode_now(self) -> tuple[int, int] | None:
+    @property
+    def identity(self) -> tuple[int, int] | None:
         """Device and inode of the file, None if it does not exist."""
         try:
             status = self.path.stat()

@@ -1,4 +1,4 @@
-"""Model labels in a file, the generation of rows that each label belongs to, and their state in a process.
+"""Model labels in a file, the generation of rows that each label belongs to, and which rows a process trusts.
 
 A generation contains the simulations of one state of a model's code. It may have several labels, which gave equal
 results when they were compared (`fe_likelihoods.cache.verification`).
@@ -22,7 +22,7 @@ from .comparison import VerifyingRun
 from .file import CacheFile
 from .rows import source_number
 
-__all__ = ["StoredLabel", "Trust", "labels_of"]
+__all__ = ["StoredLabel", "Trust", "labels_of", "trust_of"]
 
 OWN = 2**40  # `compared` of the label with which a generation began, whose rows need no comparison
 MAX_TRUSTS = 32
@@ -55,27 +55,25 @@ def labels_of(file: CacheFile, source: int) -> list[StoredLabel]:
 class Trust:
     """Label and generation of a model in a file, and which rows are trusted in this process.
 
-    Derived likelihoods and copies share it. In other processes, where `token` identifies it, it starts without trusted
-    rows. `cpu` is the number of the processor, 0 if simulations run on other machines. `stored` has the labels in the
-    file, by the source numbers of models; `generations` are in use for the rows of a fingerprint; `served` and
-    `verified` count rows that were used and compared, by fingerprint and whether any row is a success; rows with the
-    number of the `session` were stored here and need no verification; `stale` has the key of a row that differed, and
-    the error.
+    All likelihoods of this process with the same `key` share it (`trust_of`). `cpu` is the number of the processor, 0
+    if simulations run on other machines. `stored` has the labels in the file, by the source numbers of models;
+    `generations` are in use for the rows of a fingerprint; `served` and `verified` count rows that were used and
+    compared, by fingerprint and whether any row is a success; rows with the number of the `session` were stored here
+    and need no verification; `stale` is the error of a row that differed.
     """
 
-    def __init__(self, label: ModelLabel, is_local: bool, token: str) -> None:
-        self.label, self.is_local, self.token = label, is_local, token
+    def __init__(self, label: ModelLabel, is_local: bool, key: str) -> None:
+        self.label, self.is_local, self.key = label, is_local, key
         self.cpu = zlib.crc32(cpu_name().encode()) if is_local else 0
         self.stored: dict[int, StoredLabel] = {}
         self.generations: dict[str, int] = {}
         self.pause_ends = -np.inf  # of the time in which nothing is verified, since no new simulation ended [s]
-        self.stale: tuple[bytes, Any] | None = None
         self._lock, self._owner = threading.RLock(), os.getpid()
         self.start_again()
 
     def __reduce__(self) -> tuple:
         _remember(self)
-        return _of_token, (self.label, self.is_local, self.token)
+        return trust_of, (self.label, self.is_local, self.key)
 
     @property
     def lock(self) -> threading.RLock:
@@ -88,6 +86,7 @@ class Trust:
         """Verify all rows again, including rows that this process has stored."""
         self.served: Counter[tuple[str, bool]] = Counter()
         self.verified: Counter[tuple[str, bool]] = Counter()
+        self.stale: Any = None
         self.session = secrets.randbits(62)
 
     def find(self, file: CacheFile, run: VerifyingRun) -> StoredLabel | None:
@@ -104,7 +103,7 @@ class Trust:
             known = [each for each in same if Opened(each.files).read_again().files == each.files]
             if known:
                 self.stored[source] = max(known, key=lambda each: each.compared)
-                self._update(file)
+                self._save(file, self.stored.values())
             elif self.stored:  # another length of the record, for example
                 other = next(iter(self.stored.values()))
                 self.put(file, {source}, other.generation, other.compared)
@@ -113,12 +112,8 @@ class Trust:
 
     def put(self, file: CacheFile, sources: Iterable[int], generation: int, compared: int) -> None:
         """Add the label of some models to a generation in the file, after `compared` of its rows were compared."""
-        code, files, labels = self.label.code, self.label.opened.files, []
-        for source in sources:
-            number = self.stored[source].id if source in self.stored else secrets.randbits(62)
-            self.stored[source] = StoredLabel(number, source, code, files, generation, compared)
-            labels.append(self.stored[source])
-        self._write(file, labels)
+        ids = {source: self.stored[source].id if source in self.stored else secrets.randbits(62) for source in sources}
+        self._save(file, [StoredLabel(ids[source], source, "", {}, generation, compared) for source in ids])
 
     def begin(self, file: CacheFile, fingerprint: str, used: set[int]) -> None:
         """Begin a generation, or continue the generation that another process has begun under the same label."""
@@ -134,34 +129,31 @@ class Trust:
         if opened is not None:
             with self.lock:
                 if self.label.add(opened):
-                    self._update(file)
+                    self._save(file, self.stored.values())
 
-    def _update(self, file: CacheFile) -> None:
-        files = self.label.opened.files
-        changed = {source: each._replace(files=files) for source, each in self.stored.items() if each.files != files}
-        self.stored |= changed
-        self._write(file, list(changed.values()))
-
-    @staticmethod
-    def _write(file: CacheFile, labels: list[StoredLabel]) -> None:
-        rows = [each.packed() for each in labels]
+    def _save(self, file: CacheFile, labels: Iterable[StoredLabel]) -> None:
+        """Store labels with the present code and files, where these differ from what is stored."""
+        new = [each._replace(code=self.label.code, files=self.label.opened.files) for each in labels]
+        new = [each for each in new if self.stored.get(each.source) != each]
+        self.stored |= {each.source: each for each in new}
+        rows = [each.packed() for each in new]
         delete = "DELETE FROM labels WHERE id = ? OR (source = ? AND code = ? AND files = ?)"
         insert = "INSERT INTO labels (id, source, code, files, generation, compared, crc) VALUES (?, ?, ?, ?, ?, ?, ?)"
         if rows:
             file.write((delete, [row[:4] for row in rows]), (insert, rows))
 
 
-_trusts: "OrderedDict[str, Trust]" = OrderedDict()  # of this process by token, the most recently used last
+_trusts: "OrderedDict[str, Trust]" = OrderedDict()  # of this process by key, the most recently used last
 
 
-def _of_token(label: ModelLabel, is_local: bool, token: str) -> Trust:
-    """The object of this process with a token: all copies in a process share one."""
-    return _remember(_trusts.get(token) or Trust(label, is_local, token))
+def trust_of(label: ModelLabel, is_local: bool, key: str) -> Trust:
+    """The object of this process with a key; a new one the first time."""
+    return _remember(_trusts.get(key) or Trust(label, is_local, key))
 
 
 def _remember(trust: Trust) -> Trust:
-    _trusts[trust.token] = trust
-    _trusts.move_to_end(trust.token)
+    _trusts[trust.key] = trust
+    _trusts.move_to_end(trust.key)
     while len(_trusts) > MAX_TRUSTS:
         _trusts.popitem(last=False)
     return trust

@@ -13,6 +13,7 @@ aside, and while the file cannot be written, rows wait in memory.
 """
 
 import contextlib
+import functools
 import logging
 import math
 import os
@@ -65,6 +66,7 @@ class CacheInfo(NamedTuple):
     file_bytes: int  # without its write-ahead log [bytes]
 
 
+@functools.lru_cache(typed=True)
 def rows_to_compare(verify: bool | int | str) -> int:
     """Number of rows that are simulated again before rows of an unknown label are used.
 

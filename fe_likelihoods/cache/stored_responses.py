@@ -26,7 +26,7 @@ class StoredResponses:
 
     def __init__(self, model: Model, pool: Any, cache: SimulationCache) -> None:
         self.model, self.pool = model, pool
-        self._verified = VerifiedCache(cache, pool, ModelLabel(model))
+        self._verified = VerifiedCache(cache, pool, ModelLabel(model), model)
         self._shape = len(model.channels), model.n_steps
         self._least = getattr(pool, "n_workers", None) or os.cpu_count() or 1
         if pool is None and not has_batch_method(model):

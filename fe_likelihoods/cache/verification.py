@@ -21,19 +21,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..simulation.faults import TransientReason
 from ..simulation.files import Opened
 from ..simulation.label import ModelLabel
 from ..simulation.local_pool import LocalPool
-from ..simulation.model import SimulationBatch, misfit_of_responses
-from .comparison import (
-    DEFAULT_TOLERANCE,
-    Simulated,
-    VerifyingRun,
-    difference_of,
-    is_transient,
-    simulate_again,
-)
-from .labels import Trust, labels_of
+from ..simulation.model import Model, SimulationBatch, misfit_of_responses
+from .comparison import DEFAULT_TOLERANCE, Simulated, VerifyingRun, difference_in_words, simulate_again
+from .labels import Trust, labels_of, trust_of
 from .rows import CachedRows, Place, Row, pack_rows, reason_of, source_number
 from .simulation_cache import SimulationCache, rows_to_compare
 
@@ -90,12 +84,16 @@ class VerifiedCache:
 
     Its settings `verify` and `tolerance` apply. `model` and `label` are those in whose state the likelihood was made;
     simulations run in `pool`. Counted are rows that were `compared`, `unverified` ones whose new simulation was stopped
-    (not by the model), and the wall time, `seconds`. Another process verifies rows again, once for all copies of this
-    object there.
+    (not by the model), and the wall time, `seconds`. Likelihoods of a process with equal built-in models and one file
+    verify rows once, and so do derived likelihoods and copies; another process verifies them again.
     """
 
-    def __init__(self, cache: SimulationCache, pool: Any, label: ModelLabel) -> None:
-        self._set_up(cache, Trust(label, pool is None or isinstance(pool, LocalPool), secrets.token_hex(16)))
+    def __init__(self, cache: SimulationCache, pool: Any, label: ModelLabel, model: Model) -> None:
+        # user code may depend on what no label contains: there, each model object is verified
+        file = cache.path, cache.file.identity
+        key = secrets.token_hex(16) if label.observes else f"{file} {label.code} {model.fingerprint}"
+        is_local = pool is None or isinstance(pool, LocalPool)
+        self._set_up(cache, trust_of(label, is_local, f"{key} {is_local}"))
 
     def _set_up(self, cache: SimulationCache, trust: Trust) -> None:
         self.cache, self._trust = cache, trust
@@ -187,46 +185,41 @@ class VerifiedCache:
         if self._model is not None and run.model is not self._model:  # another model object was set
             with trust.lock:
                 trust.start_again()
-                trust.stale = None
         self._model = run.model
         while True:
             with trust.lock:
-                if fingerprint not in trust.generations:
-                    found = self._find(fingerprint, run, width)
-                    if found is None:
-                        return CachedRows([None] * len(thetas), width)
-                    trust.generations[fingerprint] = found
-                generation = trust.generations[fingerprint]
+                generation = trust.generations.get(fingerprint) or self._find(fingerprint, run, width)
+                if generation is None:
+                    return CachedRows([None] * len(thetas), width)
+                trust.generations[fingerprint] = generation
             rows = self.cache.look_up(fingerprint, thetas, width, generation, limit)
             if not self.cache.verify or self._verify(fingerprint, rows.rows, generation, run, width):
                 return rows
 
     def _find(self, fingerprint: str, run: VerifyingRun, width: int) -> int | None:
         """The generation of a known label, or one that new simulations agree with, or a new one; None: cannot tell."""
-        trust, cache, kind = self._trust, self.cache, type(run.model).__name__
-        stored, n = trust.find(cache.file, run), rows_to_compare(cache.verify)
-        before, source = 0 if stored is None else stored.compared, source_number(run.fingerprint)
-        if before >= n > 0:
+        trust, cache, n = self._trust, self.cache, rows_to_compare(self.cache.verify)
+        stored, source = trust.find(cache.file, run), source_number(run.fingerprint)
+        before = 0 if stored is None else stored.compared
+        if stored is not None and before >= n:
             return stored.generation
-        present = cache.generations_of(fingerprint) if stored is None else [stored.generation]
-        if stored is None and present and not n:
-            trust.put(cache.file, {source}, present[0], 0)
-            return present[0]
-        rows = {each: cache.candidates(fingerprint, each, width) for each in present}
-        present = [each for each in present if min(n, len(rows[each])) > before]
-        if stored is not None and not present:
-            return stored.generation
-        if not present or time.monotonic() < trust.pause_ends:
-            return None
-        if stored is None:
-            text = (
-                "%s: the code, a file, a package or the machine of this %s is not that of its stored simulations; up "
-                "to %d of them are simulated again, to see whether they can be used"
-            )
-            logger.warning(text, cache.path, kind, min(n, len(rows[present[0]])))
+        generations = cache.generations_of(fingerprint) if stored is None else [stored.generation]
+        if not n and generations:
+            trust.put(cache.file, {source}, generations[0], 0)
+            return generations[0]
+        rows = {each: cache.candidates(fingerprint, each, width) for each in generations}
+        rows = {each: found for each, found in rows.items() if min(n, len(found)) > before}
+        if not rows or time.monotonic() < trust.pause_ends:
+            return None if stored is None or rows else stored.generation
+        self._say_if(
+            stored is None,
+            "the code, a file, a package or the machine of this %s is not that of its stored simulations; up to %d of "
+            "them are simulated again, to see whether they can be used",
+            *(type(run.model).__name__, min(n, len(next(iter(rows.values()))))),
+        )
         start = time.monotonic()
-        for generation in present:
-            chosen = choose_rows(rows[generation], n - before, self._random)
+        for generation, found in rows.items():
+            chosen = choose_rows(found, n - before, self._random)
             result = self._compare(cache.rows_of(chosen), len(chosen), FIRST_COMPARED, run)
             if result.row is not None:
                 continue
@@ -235,9 +228,8 @@ class VerifiedCache:
                 return None
             trust.put(cache.file, {source}, generation, before + result.compared)
             trust.verified[fingerprint, True] += result.compared
-            if stored is None:
-                text = "%s: %d stored simulations of this %s agree with new ones: all are used"
-                logger.warning(text, cache.path, result.compared, kind)
+            text = "%d stored simulations of this %s agree with new ones: all are used"
+            self._say_if(stored is None, text, result.compared, type(run.model).__name__)
             return generation
         self._begin(fingerprint, run)
         return trust.stored[source].generation
@@ -245,8 +237,12 @@ class VerifiedCache:
     def _begin(self, fingerprint: str, run: VerifyingRun) -> None:
         used = {*self.cache.generations_of(fingerprint), *self.cache.generations_of(run.fingerprint)}
         self._trust.begin(self.cache.file, run.fingerprint, used)
-        text = "%s: stored simulations of this %s differ from new ones; they stay in the file and are not used"
-        logger.warning(text, self.cache.path, type(run.model).__name__)
+        text = "stored simulations of this %s differ from new ones; they stay in the file and are not used"
+        self._say_if(True, text, type(run.model).__name__)
+
+    def _say_if(self, condition: bool, text: str, *values: Any) -> None:
+        if condition:
+            logger.warning(f"%s: {text}", self.cache.path, *values)
 
     # comparisons ------------------------------------------------------------------------------------------------------
 
@@ -258,10 +254,7 @@ class VerifiedCache:
             if not others:
                 return True
             if trust.stale is not None:
-                differing, error = trust.stale
-                if self.cache.rows_of([differing]):
-                    raise StaleCache(str(error), error.theta)
-                trust.stale = None
+                raise StaleCache(str(trust.stale), trust.stale.theta)
             if time.monotonic() < trust.pause_ends:
                 return True
             succeeded, latest = [row for row in others if not row.reason], None
@@ -270,25 +263,22 @@ class VerifiedCache:
                 latest = None if latest is None or latest.session == trust.session else latest
             # failures alone do not verify successful rows, which may be used later
             kind = fingerprint, bool(latest or succeeded or trust.served[fingerprint, True])
-            if kind not in trust.verified:
-                # one row suffices for responses and shorter records if other rows of the same code were verified
-                trust.verified[kind] = -1 if trust.served else -FIRST_ROWS
+            # one row suffices for responses and shorter records if other rows of the same code were verified
+            trust.verified.setdefault(kind, -1 if trust.served else -FIRST_ROWS)
             served = trust.served[kind] + len(others)
             due = served // ROWS_PER_VERIFICATION - trust.verified[kind]
             if due > 0:
                 start = time.monotonic()
                 result = self._compare(self._in_order(latest, others), due, due, run)
-                if result.stopped:
-                    n, text = len(result.stopped), "" if result.compared else ". Rows are used without verification"
-                    logger.warning(
-                        "%s: %d of %d stored simulations could not be verified, because the new simulation was stopped "
-                        "(%s)%s",
-                        *(self.cache.path, n, n + result.compared, result.stopped[0], text and f"{text} for a while"),
-                    )
                 if result.row is not None:
                     return self._use_no_rows(result.row, result.new, fingerprint, generation, run)
+                n = len(result.stopped)
+                text = "%d of %d stored simulations could not be verified, because the new simulation was stopped (%s)"
                 if not result.compared:
+                    text += ". Rows are used without verification for a while"
                     self._pause(start)
+                self._say_if(n > 0, text, n, n + result.compared, *result.stopped[:1])
+                if not result.compared:
                     return True
                 # rows that are due and that nobody has requested are not compared later
                 trust.verified[kind] = max(trust.verified[kind] + result.compared, served // ROWS_PER_VERIFICATION)
@@ -312,7 +302,7 @@ class VerifiedCache:
             size *= 4
             thetas = np.array([np.frombuffer(row.theta, dtype="<f8") for row in chosen])
             for row, new in zip(chosen, self._simulate(thetas, run), strict=True):
-                if is_transient(new.reason):
+                if isinstance(new.reason, TransientReason):
                     stopped.append(new.reason)
                 elif self._difference(row, new, run)[0]:
                     return _Comparison(compared, stopped, row, new)
@@ -326,7 +316,7 @@ class VerifiedCache:
         if run.pool is None and label.observes:
             label.has_changed_itself(label.changed(run.model))
         self.seconds += time.perf_counter() - start
-        stopped = sum(is_transient(each.reason) for each in new)
+        stopped = sum(isinstance(each.reason, TransientReason) for each in new)
         self.compared, self.unverified = self.compared + len(new) - stopped, self.unverified + stopped
         return new
 
@@ -336,7 +326,7 @@ class VerifiedCache:
         self._trust.pause_ends = now + max(PAUSE_SECONDS, PAUSE_RATIO * (now - start))
 
     def _difference(self, row: Row, new: Simulated, run: VerifyingRun) -> tuple[str, float]:
-        """How a simulation differs from a stored one, as `_difference`.
+        """How a simulation differs from a stored one, as `difference_in_words`.
 
         A row of another or unknown processor may differ in the last digits.
         """
@@ -345,18 +335,17 @@ class VerifiedCache:
             batch = SimulationBatch(misfit.reshape(1, len(run.model.channels), -1), [""])
             (misfit,), (reason,) = misfit_of_responses(run.model, batch, run.measured, run.statistic)
         other = run.tolerance is None and not row.cpu == self._trust.cpu != 0
-        return _difference(misfit, reason, new, run, max(run.accepted, DEFAULT_TOLERANCE if other else 0.0))
+        tolerance = max(run.accepted, DEFAULT_TOLERANCE if other else 0.0)
+        return difference_in_words(misfit, reason, new, run, tolerance, "stored")
 
     def _use_no_rows(self, row: Row, new: Simulated, fingerprint: str, generation: int, run: VerifyingRun) -> bool:
         """Begin a new generation, if the label was adopted and no row was used; False. `StaleCache` otherwise."""
         trust, theta = self._trust, np.frombuffer(row.theta, dtype="<f8")
         difference, change = self._difference(row, new, run)
-        start = time.perf_counter()
         (once_more,) = simulate_again(run, theta[None])
-        self.seconds += time.perf_counter() - start
         scatter, spread = "", 0.0
-        if not is_transient(once_more.reason):
-            scatter, spread = _difference(new.misfit, new.reason, once_more, run, run.accepted, "first")
+        if not isinstance(once_more.reason, TransientReason):
+            scatter, spread = difference_in_words(new.misfit, new.reason, once_more, run, run.accepted, "first")
         served = trust.served.total()
         trust.start_again()
         labels = labels_of(self.cache.file, source_number(run.fingerprint))
@@ -370,34 +359,16 @@ class VerifiedCache:
         text += f"{difference}. {_NOT_REPEATABLE.format(scatter) if scatter else CHANGED}"
         if served:
             text += f", and discard this run, which has used {served} rows"
-        if spread:
-            text += f", or accept such differences with SimulationCache(path, tolerance={10.0 * spread:.1e})"
-        elif row.reason and not scatter:
+        if row.reason and not scatter:
             text += ". Also do so if failures depend on anything but the parameters, such as a licence"
-        elif 0.0 < change < LARGEST_ROUNDING and not scatter:
+        accepted = 10.0 * spread if scatter else 2.0 * change  # of a model that is not exactly repeatable
+        if spread or (0.0 < change < LARGEST_ROUNDING and not scatter):
             text += (
-                ". If the model is not exactly repeatable, for example on another machine, accept differences of this "
-                f"size, {change:.1e} of the response, with SimulationCache(path, tolerance={2.0 * change:.1e})"
+                ". If such a difference comes from rounding, for example on another machine, accept differences of "
+                f"this size, with SimulationCache(path, tolerance={accepted:.1e})"
             )
-        trust.stale = row.key, StaleCache(text, theta)
-        raise trust.stale[1]
-
-
-def _difference(
-    earlier: np.ndarray, reason: str, new: Simulated, run: VerifyingRun, tolerance: float, origin: str = "stored"
-) -> tuple[str, float]:
-    """How a simulation differs from an earlier one, in words and relative to the response norm; empty if it agrees."""
-    if reason or new.reason:
-        was, now = (f"failed ({text})" if text else "succeeded" for text in (reason, new.reason))
-        return ("" if reason and new.reason else f"it {was}; simulated again, it {now}"), 0.0
-    found = difference_of(earlier, new, run, tolerance)
-    if found is None:
-        return "", 0.0
-    index, change = found
-    names = [channel.name for channel in run.model.channels]
-    what = "sum of squared residuals" if index < len(names) else f"statistic {index}"
-    values = f"{origin} {earlier[index]:.17g}, simulated again {new.misfit[index]:.17g}"
-    return f"channel {names[index % len(names)]!r}, {what}: {values}", change
+        trust.stale = StaleCache(text, theta)
+        raise trust.stale
 
 
 # coverage of the space ------------------------------------------------------------------------------------------------

@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from ..cache.comparison import VerifyingRun, difference_of, is_transient, simulate_again
+from ..cache.comparison import VerifyingRun, difference_of, simulate_again
 from ..cache.simulation_cache import SimulationCache
 from ..cache.verification import VerifiedCache
 from ..noise.statistics import Statistic
 from ..simulation.by_value import is_arriving
-from ..simulation.faults import ChangedModel
+from ..simulation.faults import ChangedModel, TransientReason
 from ..simulation.files import Opened
 from ..simulation.label import ModelLabel
 from ..simulation.model import Model
@@ -45,7 +45,7 @@ class CheckedModel:
 
     def _set_up(self, model: Model, statistic: Statistic | None, cache: SimulationCache | None, pool: Any) -> None:
         self.label = ModelLabel(model, statistic)
-        self.rows = None if cache is None else VerifiedCache(cache, pool, self.label)
+        self.rows = None if cache is None else VerifiedCache(cache, pool, self.label, model)
         self._known = self.label.items | self.label.opened.items() | {_FINGERPRINT: model.fingerprint}
         self._repeated = 0
         self._begin()
@@ -186,7 +186,8 @@ class CheckedModel:
             self._repeated += len(thetas)
             pairs = zip(earlier, new, strict=True)
             agree = (
-                is_transient(n.reason) or not (n.reason or difference_of(e, n, run, run.accepted)) for e, n in pairs
+                isinstance(n.reason, TransientReason) or not (n.reason or difference_of(e, n, run, run.accepted))
+                for e, n in pairs
             )
             return all(agree), [each.misfit for each in new]
 
