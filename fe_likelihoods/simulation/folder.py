@@ -312,31 +312,52 @@ class _Mirror:
     def _build(self) -> None:
         self.path = tempfile.mkdtemp(prefix="run_", dir=self._place)
         self._files: dict[str, tuple[str, Stamp | None]] = {}  # linked files: paths and stamps
-        self._linked: list[str] = []  # linked folders
-        self._folders: dict[str, Stamp | None] = {"": _stamp(self.base)}  # folders of `base` that are shown
-        waiting, left = [("", entry) for entry in _scan(self.base)], _MOST_BELOW
+        self._linked: set[str] = set()  # linked folders
+        self._folders: dict[str, Stamp | None] = {}  # folders of `base` that are shown
+        self._names: dict[str, set[str]] = {}  # what is shown in each of them, besides private files
+        self._left = _MOST_BELOW
+        self._fill("", _scan(self.base))
+        _mark(self.hop)
+
+    def _fill(self, folder: str, entries: list[os.DirEntry]) -> None:
+        """Show entries of a folder of `base`, and those of its subfolders."""
+        waiting = [(folder, entries)]
         while waiting:
-            folder, entry = waiting.pop(0)
-            name = os.path.join(folder, entry.name)
-            most = _MOST_USED if name in self._private else left
-            is_shown = self._may_be_folder(entry) and (name in self._private or not entry.name.startswith("."))
-            entries = _scan(entry.path, most + 1) if is_shown else None
-            if entries is not None and len(entries) <= most:
-                left -= 0 if name in self._private else len(entries)
-                os.mkdir(os.path.join(self.path, name))
-                self._folders[name] = _stamp(entry.path)
-                waiting += [(name, each) for each in entries]
-            elif entry.is_dir():
-                self._link(name)
-                self._linked.append(name)
-            elif name not in self._private:
-                self._link(name)
-                if entry.is_file():
-                    self._files[name] = self._stamped(name)
-        self._names = {name: {entry.name for entry in _scan(os.path.join(self.path, name))} for name in self._folders}
+            folder, entries = waiting.pop(0)
+            self._folders.setdefault(folder, _stamp(os.path.join(self.base, folder)))
+            names = self._names.setdefault(folder, set())
+            for entry in entries:
+                name = os.path.join(folder, entry.name)
+                if (below := self._entries_of(name, entry)) is not None:
+                    os.mkdir(os.path.join(self.path, name))
+                    waiting.append((name, below))
+                elif entry.is_dir():
+                    self._link(name)
+                    self._linked.add(name)
+                elif name not in self._private:
+                    self._link(name)
+                    if entry.is_file():
+                        self._files[name] = self._stamped(name)
+                else:
+                    continue
+                names.add(entry.name)
+        self._settle()
+
+    def _entries_of(self, name: str, entry: os.DirEntry) -> list[os.DirEntry] | None:
+        """Entries of a folder that is shown as a folder; None for what is shown as a link."""
+        if not self._may_be_folder(entry) or (name not in self._private and entry.name.startswith(".")):
+            return None
+        most = _MOST_USED if name in self._private else self._left
+        entries = _scan(entry.path, most + 1)
+        if len(entries) > most:
+            return None
+        self._left -= 0 if name in self._private else len(entries)
+        return entries
+
+    def _settle(self) -> None:
+        """Nothing that was added or removed so far was added or removed by a simulation."""
         for name in self._folders:
             os.utime(os.path.join(self.path, name), ns=(0, 0))
-        _mark(self.hop)
 
     def _may_be_folder(self, entry: os.DirEntry) -> bool:
         """Whether a folder, or a link to one, may be shown as a folder."""
@@ -349,19 +370,32 @@ class _Mirror:
         return path, _stamp(path)
 
     def _link(self, name: str) -> None:
-        os.symlink(os.path.join(self.hop, name), os.path.join(self.path, name))
+        os.symlink(self._through_hop(name), os.path.join(self.path, name))
         _mark(os.path.join(self.path, name))
+
+    def _through_hop(self, name: str) -> str:
+        return os.path.join(self.hop, name)
 
     def prepare(self) -> None:
         """Show what `base` contains now, before a simulation."""
-        for name, stamp in self._folders.items():
+        for name, stamp in list(self._folders.items()):
             folder = os.path.join(self.base, name)
             if stamp is None or _status(folder) != stamp:
                 self._folders[name] = _stamp(folder)
                 private = {n for n in self._private if os.path.dirname(n) == name and n not in self._folders}
-                if {e.name for e in _scan(folder)} - set(map(os.path.basename, private)) != self._names[name]:
+                entries = {entry.name: entry for entry in _scan(folder)}
+                gone = {os.path.join(name, each) for each in self._names[name] - entries.keys()}
+                if gone & self._folders.keys():
                     self._anew()
                     break
+                new = entries.keys() - self._names[name] - set(map(os.path.basename, private))
+                for each in gone:
+                    os.unlink(os.path.join(self.path, each))
+                    self._files.pop(each, None)
+                    self._linked.discard(each)
+                self._names[name] -= set(map(os.path.basename, gone))
+                if gone or new:
+                    self._fill(name, [entries[each] for each in sorted(new)])
         for name in self._private.difference(self._folders, self._linked):
             with contextlib.suppress(FileNotFoundError):
                 shutil.copy2(os.path.join(self.base, name), os.path.join(self.path, name))
@@ -386,8 +420,32 @@ class _Mirror:
 
     def clean(self, anew: bool) -> None:
         """Remove what a simulation has left; with `anew`, the next simulation gets a folder of another name."""
-        if anew or self.has_changed:
+        if anew or not all(self._mend(name) for name in list(self._folders) if not self._is_untouched(name)):
             self._anew()
+
+    def _mend(self, folder: str) -> bool:
+        """Remove what a simulation has added to a folder, and show what it has removed; False if that is too much."""
+        place, missing = os.path.join(self.path, folder), set(self._names[folder])
+        if os.path.islink(place) or not os.path.isdir(place):
+            return False
+        for entry in _scan(place):
+            name = os.path.join(folder, entry.name)
+            is_link, is_folder = entry.is_symlink(), entry.is_dir(follow_symlinks=False)
+            if entry.name in missing and (
+                is_folder if name in self._folders else is_link and os.readlink(entry.path) == self._through_hop(name)
+            ):
+                missing.remove(entry.name)
+            elif is_folder:
+                shutil.rmtree(entry.path, ignore_errors=True)
+            else:
+                os.unlink(entry.path)
+        names = {os.path.join(folder, name) for name in missing}
+        if names & self._folders.keys():
+            return False
+        for name in names:
+            self._link(name)
+        os.utime(place, ns=(0, 0))
+        return True
 
     @property
     def has_changed(self) -> bool:

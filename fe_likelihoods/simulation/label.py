@@ -249,7 +249,13 @@ class _Walk:
             digest = blake2b(digest_size=8)
             self._open[id(value)] = len(self._open)
             try:
-                text, parts = self._contents(value)
+                try:
+                    text, parts = self._contents(value)
+                except RecursionError:
+                    raise
+                except Exception:  # foreign code
+                    self.opaque.add(f"{type(value).__module__}.{type(value).__qualname__}")
+                    text, parts = type(value).__qualname__, [type(value), *_state(value)]
                 digest.update(text.encode("utf-8", "surrogatepass"))
                 for part in parts:
                     digest.update(_bytes_of(part) if type(part) in _PLAIN else self._digest(part))
@@ -300,14 +306,8 @@ class _Walk:
             return name, [_attribute(value, "py_func") or _attribute(_attribute(value, "_dispatcher"), "py_func")]
         if is_of_user(kind.__module__) or isinstance(value, types.SimpleNamespace):
             return name, [kind, *_state(value)]
-        try:  # what pickle would rebuild it from, with iterators as lists
-            parts = value.__reduce_ex__(2)
-            parts = [parts] if isinstance(parts, str) else [*parts[:3], *(part and list(part) for part in parts[3:5])]
-        except RecursionError:
-            raise
-        except Exception:  # foreign code
-            self.opaque.add(f"{kind.__module__}.{kind.__qualname__}")
-            parts = _state(value)
+        parts = value.__reduce_ex__(2)  # what pickle would rebuild it from, with iterators as lists
+        parts = [parts] if isinstance(parts, str) else [*parts[:3], *(part and list(part) for part in parts[3:5])]
         return name, [kind, *parts]
 
     def _function(self, function: types.FunctionType) -> tuple[str, list[Any]]:
@@ -323,7 +323,7 @@ class _Walk:
 
     def _class(self, cls: type) -> tuple[str, list[Any]]:
         name = f"{_name_of(cls.__module__)}.{cls.__qualname__}"
-        if not self._is_of_user(cls.__module__):
+        if not isinstance(cls.__module__, str) or not self._is_of_user(cls.__module__):  # a descriptor in Cython
             return name, []
         parts = [*cls.__bases__, type(cls)]
         for attribute, member in sorted(vars(cls).items()):
