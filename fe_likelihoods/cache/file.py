@@ -83,7 +83,6 @@ class CacheFile:
     def __init__(self, path: str | os.PathLike, timeout: float) -> None:
         self.path = Path(path).resolve()  # SQLite keeps the log next to the target of a link
         self.timeout = float(timeout)
-        self.writable = True
         self.retry_times: dict[str, float] = {}
         self._connection: sqlite3.Connection | None = None
         self._inode: tuple[int, int] | None = None
@@ -109,9 +108,12 @@ class CacheFile:
         if not self.path.exists() and not os.access(folder, os.W_OK | os.X_OK):
             raise ValueError(f"{self.path} cannot be created: {folder} is not writable; give another path")
         with self._exclusive():  # another process may move a damaged file aside between the two questions
-            is_unreadable = self.path.exists() and not os.access(self.path, os.R_OK)
-        if is_unreadable:
-            raise ValueError(f"{self.path} is not readable for this user; change its permissions or give another path")
+            is_there = self.path.exists()
+            is_usable = os.access(self.path, os.R_OK | os.W_OK) and os.access(folder, os.W_OK | os.X_OK)
+        if is_there and not is_usable:
+            raise ValueError(
+                f"{self.path} or its folder is not writable or readable for this user; copy it to another one"
+            )
         with _lock:
             try:
                 self._check_integrity(self.connection())
@@ -141,7 +143,7 @@ class CacheFile:
                     result = action(self.connection())
                 except (sqlite3.Error, UnicodeDecodeError) as error:
                     self.close()
-                    if not self.writable or not _is_damage(error):
+                    if not _is_damage(error):
                         raise
                     self.set_aside(str(error))
                     result = action(self.connection())
@@ -182,7 +184,7 @@ class CacheFile:
             return True
 
         with _lock:
-            return self.writable and self.attempt(what, execute, False)
+            return self.attempt(what, execute, False)
 
     def connection(self) -> sqlite3.Connection:
         """Connection of this process, opened if there is none.
@@ -192,12 +194,9 @@ class CacheFile:
         if self._connection is None:
             with self._exclusive():
                 self._inode = self.identity
-                self.writable = self._inode is None or (
-                    os.access(self.path, os.W_OK) and os.access(self.path.parent, os.W_OK | os.X_OK)
-                )
-                self._connection = self._open() if self.writable else self._open_to_read()
+                self._connection = self._open()
                 self._inode = self._inode_of_cache = self.identity
-            if self._aside is not None and self.writable:
+            if self._aside is not None:
                 aside, self._aside = self._aside, None
                 text = "%s: %d rows were salvaged; the others are lost"
                 logger.warning(text, aside.name, _salvage(aside, self._connection))
@@ -271,7 +270,9 @@ class CacheFile:
             os.close(folder)
 
     def _open(self) -> sqlite3.Connection:
-        connection = self._connect("mode=rwc")
+        uri = f"{self.path.as_uri()}?mode=rwc"
+        connection = sqlite3.connect(uri, uri=True, timeout=self.timeout, isolation_level=None, check_same_thread=False)
+        connection.text_factory = bytes  # damaged texts cannot be decoded
         try:
             if self._is_empty(connection):
                 with transaction(connection):
@@ -287,25 +288,6 @@ class CacheFile:
         except BaseException:
             connection.close()
             raise
-        return connection
-
-    def _open_to_read(self) -> sqlite3.Connection:
-        """Connection to a read-only file, opened as immutable if SQLite cannot create its shared memory."""
-        for options in ("mode=ro", "mode=ro&immutable=1"):
-            connection = self._connect(options)
-            try:
-                self._identify(connection)
-                break
-            except BaseException as error:
-                connection.close()
-                if not isinstance(error, sqlite3.OperationalError) or "immutable" in options:
-                    raise
-        return connection
-
-    def _connect(self, options: str) -> sqlite3.Connection:
-        uri = f"{self.path.as_uri()}?{options}"
-        connection = sqlite3.connect(uri, uri=True, timeout=self.timeout, isolation_level=None, check_same_thread=False)
-        connection.text_factory = bytes  # damaged texts cannot be decoded
         return connection
 
     @staticmethod

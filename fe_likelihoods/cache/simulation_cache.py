@@ -101,7 +101,7 @@ class SimulationCache:
     Parameters
     ----------
     path : path
-        The file; created if it does not exist. A read-only file is used for reading, with a warning.
+        The file; created if it does not exist.
     responses : bool
         Store the response of every simulation. By default, only requested responses are stored
         (`FELikelihood.simulate`, guides).
@@ -167,15 +167,13 @@ class SimulationCache:
         self.verify, self.tolerance = verify, tolerance
         self._begin(CacheFile(path, TIMEOUT))
         self.file.check()
-        if not self.file.writable:
-            self._warn_read_only()
 
     def _begin(self, file: CacheFile) -> None:
         self.file = file
         self.damaged = 0
         self._waiting: list[Row] = []
         self._remark = ""  # that was stored last
-        self._warned_read_only = self._said_evicted = False
+        self._said_evicted = False
 
     def __getstate__(self) -> tuple:
         settings = ("max_response_bytes", "responses", "verify", "tolerance")
@@ -242,9 +240,6 @@ class SimulationCache:
         if not rows and not self._waiting:
             return
         with self.file.lock:
-            if not self.file.writable:
-                self._warn_read_only()
-                return
             rows = self._waiting + rows
             written = self.file.attempt("written", lambda connection: self._insert(connection, rows) or True, False)
             # responses can be computed again
@@ -410,11 +405,6 @@ class SimulationCache:
 
     def _delete(self, keys: Collection[bytes]) -> None:
         self.file.write(("DELETE FROM rows WHERE key = ?", [(key,) for key in keys]), what="repaired")
-
-    def _warn_read_only(self) -> None:
-        if not self._warned_read_only:
-            logger.warning("%s is read-only: new simulations are not stored. Change its permissions or path", self.path)
-        self._warned_read_only = True
 
     def _drop(self, keys: list[bytes]) -> None:
         """Delete rows that do not match their checksum."""
