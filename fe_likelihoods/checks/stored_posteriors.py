@@ -16,8 +16,6 @@ HARMLESS_ERROR = 0.15  # of the means [posterior sd], up to which uneven weights
 
 class _Reweighted(Protocol):
     pareto_shape: float
-    effective_samples: float
-    sample_share: float
     shift: float
 
 
@@ -25,7 +23,7 @@ def check_reweighting(tests: Mapping[str, _Reweighted], error: float, parameters
     """Whether the stored samples of each test suffice; `error` is the largest error of a mean [posterior sd]."""
     found = []
     for name, each in tests.items():
-        numbers = {"shape": each.pareto_shape, "effective": each.effective_samples, "error": error}
+        numbers = {"shape": each.pareto_shape, "error": error}
         if each.pareto_shape > LARGEST_SHAPE:
             text = (
                 f"test {name!r}: the population reaches values that the prior of this test, and therefore its samples, "
@@ -37,9 +35,8 @@ def check_reweighting(tests: Mapping[str, _Reweighted], error: float, parameters
     if not found and error > HARMLESS_ERROR:
         worst = max(tests, key=lambda name: tests[name].shift)
         text = (
-            f"test {worst!r}: the means have errors of up to {error:.1f} posterior standard deviations. Few of its "
-            f"samples are where the population is: their weights have an effective size of "
-            f"{tests[worst].effective_samples:.0f} (median)."
+            f"test {worst!r}: the means have errors of up to {error:.1f} posterior standard deviations, because few of "
+            "its samples are where the population is."
         )
         action = "Give more samples of this test, or draw fresh samples with the population as its prior."
         found.append(Finding("Too few samples of a test", CARE, text, action, {"error": error}))

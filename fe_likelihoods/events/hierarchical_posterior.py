@@ -127,10 +127,8 @@ class HierarchicalPosterior:
 
     The likelihood is taken as zero outside the prior bounds of a test.
 
-    The result is exact up to the finite number of samples if no parameter is common. The exact value of a common
-    parameter is not among the samples, so the density of common and varying parameters is described by a mixture that
-    is fitted to each test's samples: correlations between them are kept, and shapes that the mixture cannot describe
-    are lost, such as the end at a bound of the prior. `Hierarchy` states the errors.
+    The posterior of each test is described by a mixture of normal distributions that is fitted to its samples:
+    correlations are kept, and shapes that the mixture cannot describe are lost. `Hierarchy` states the errors.
 
     Examples
     --------
@@ -206,8 +204,8 @@ class HierarchicalPosterior:
         state.update(repr([list(self.varying), self.common]).encode())
         state.update(complete_repr(self.prior).encode())
         for name, each in self.described.items():
-            state.update(f"{name} {self.tests[name].log_evidence} {each.effective_sample_size}".encode())
-            for array in (each.points, each.log_weights, each.log_prior, each.means, each.covariances):
+            state.update(f"{name} {self.tests[name].log_evidence} {complete_repr(each.prior)}".encode())
+            for array in (each.log_shares, each.means, each.covariances):
                 state.update(np.ascontiguousarray(array).tobytes())
         return state.hexdigest()
 
@@ -255,7 +253,7 @@ class HierarchicalPosterior:
         """
         center, sd = self.population(x)
         columns = [
-            population_marginal(each, center, sd).log_value + (self.tests[name].log_evidence or 0.0)
+            population_marginal(each, center, sd) + (self.tests[name].log_evidence or 0.0)
             for name, each in self.described.items()
         ]
         return np.stack(columns, axis=1)

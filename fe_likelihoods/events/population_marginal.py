@@ -1,21 +1,14 @@
-r"""Marginal likelihood of one test under a normal population of its parameters, from stored posterior samples.
+r"""Marginal likelihood of one test under a normal population of its parameters, from a mixture fitted to its posterior.
 
-With a test's posterior samples :math:`u_j` of weights :math:`w_j`, its prior density :math:`p_0` and its evidence
-:math:`Z`, the marginal likelihood under a population density :math:`p(u \mid \varphi)` is
+With a test's posterior density :math:`q`, the density of its prior :math:`p_0` and its evidence :math:`Z`, the marginal
+likelihood under a population density :math:`p(u \mid \varphi)` is
 
 .. math::
 
-   m(\varphi) = Z \int q(u) \frac{p(u \mid \varphi)}{p_0(u)}\, du
-   \approx Z \sum_j w_j \frac{p(u_j \mid \varphi)}{p_0(u_j)},
+   m(\varphi) = Z \int q(u) \frac{p(u \mid \varphi)}{p_0(u)}\, du .
 
-where :math:`q` is the posterior density. The sum has large errors where the population is much narrower than the
-posterior. Its samples are therefore combined with points of the density proportional to :math:`q\, p(u \mid \varphi)`,
-which is a mixture of normal distributions if :math:`q` is the fitted mixture. See ``docs/theory/hierarchy.rst``.
-
-References
-----------
-E. Veach, L. J. Guibas (1995), Optimally combining sampling techniques for Monte Carlo rendering, Proc. SIGGRAPH 95,
-419-428, doi:10.1145/218380.218498.
+With :math:`q` the fitted mixture of normal distributions, :math:`q\, p(u \mid \varphi)` is a mixture as well, over
+which the inverse prior density is integrated by Gauss-Hermite rules. See ``docs/theory/hierarchy.rst``.
 """
 
 import itertools
@@ -26,31 +19,14 @@ import numpy as np
 
 from .stored_posterior import DescribedPosterior
 
-__all__ = [
-    "PopulationMarginal",
-    "draw_parameters",
-    "draw_products",
-    "inverse_prior",
-    "log_density",
-    "population_marginal",
-    "product_with_population",
-    "sample_weights",
-]
+__all__ = ["draw_parameters", "draw_products", "inverse_prior", "population_marginal"]
 
 _LOG_TWO_PI = np.log(2.0 * np.pi)
 _LARGEST_EXCESS = 3.0  # by which the log inverse prior density may exceed its largest value at the samples
 _CHUNK = 2**15  # values of a temporary array, which fits into the cache of the processor
 _RANDOM_NODES = 128
-_LARGEST_EXPONENT = 700.0
 _DRAWS = 16
 _JITTER = 1e-12
-
-
-class PopulationMarginal(NamedTuple):
-    """Marginal likelihood of a test at n hyper-parameters."""
-
-    log_value: np.ndarray  # (n,), logarithm of the marginal likelihood over the evidence
-    sample_share: np.ndarray  # (n,), of this value from the samples; the rest is from the fitted mixture
 
 
 class Product(NamedTuple):
@@ -61,27 +37,15 @@ class Product(NamedTuple):
     factors: np.ndarray  # matrices A with covariances A A^T (n, n_components, n_varying, n_varying)
 
 
-def population_marginal(described: DescribedPosterior, center: np.ndarray, sd: np.ndarray) -> PopulationMarginal:
-    """Marginal likelihood of a test under normal populations, with n centres (n, d) of its parameters.
+def population_marginal(described: DescribedPosterior, center: np.ndarray, sd: np.ndarray) -> np.ndarray:
+    """Log marginal likelihood (n,) of a test over its evidence, under normal populations with n centres (n, d).
 
     The first n_varying parameters vary between tests, with standard deviations (n, n_varying); the others are common,
     and their centres are their values.
     """
-    size = max(1, _CHUNK // (len(described.points) * sd.shape[-1]))
+    size = max(1, _CHUNK // (len(_nodes(sd.shape[-1])[0]) * len(described.means) * center.shape[-1]))
     parts = [_marginal(described, center[i : i + size], sd[i : i + size]) for i in range(0, max(len(center), 1), size)]
-    return PopulationMarginal(*(np.concatenate(each) for each in zip(*parts, strict=True)))
-
-
-def sample_weights(described: DescribedPosterior, center: np.ndarray, sd: np.ndarray) -> np.ndarray:
-    """Weights (n, m) of a test's samples under n populations, which sum to one in each row; no parameter may be common.
-
-    They are zero in a row where no sample has a density above the smallest float.
-    """
-    log_weights = log_density(described.points, center, sd) + described.log_weights - described.log_prior
-    largest = log_weights.max(axis=1, keepdims=True)
-    weights = np.exp(log_weights - np.where(np.isfinite(largest), largest, 0.0))
-    total = weights.sum(axis=1, keepdims=True)
-    return weights / np.where(total > 0.0, total, 1.0)
+    return np.concatenate(parts)
 
 
 def draw_parameters(
@@ -89,26 +53,13 @@ def draw_parameters(
 ) -> np.ndarray:
     """One draw (n, d) of a test's parameters given each of n hyper-parameters.
 
-    It is chosen among the stored samples and random points from the product of mixture and population, with the weights
-    of `population_marginal`.
+    It is chosen among random points of the product of mixture and population by the inverse prior density. Without any
+    possible point (a test beside the population) the product itself is the best description.
     """
-    result = np.empty((len(center), center.shape[-1]))
-    products = draw_products(described, center, sd, _DRAWS, rng)
-    for i, drawn in enumerate(products):
-        one, spread, points = center[i : i + 1], sd[i : i + 1], drawn
-        weights = inverse_prior(described, drawn)
-        if center.shape[-1] == sd.shape[-1]:
-            share = _share_of_samples(described)
-            points = np.concatenate([described.points, drawn])
-            own = share * np.exp(described.log_weights) * inverse_prior(described, described.points)
-            weights = np.concatenate([own, (1.0 - share) / _DRAWS * weights])
-            log_mass = np.logaddexp.reduce(product_with_population(described, one, spread).log_masses[0])
-            inverse = np.exp(np.minimum(log_mass - log_density(points, one, spread)[0], _LARGEST_EXPONENT))
-            weights /= share * inverse + 1.0 - share
-        total = weights.sum()
-        # without any possible point (a test beside the population) the product itself is the best description
-        result[i] = points[rng.choice(len(points), p=weights / total) if total > 0.0 else -1]
-    return result
+    points = draw_products(described, center, sd, _DRAWS, rng)
+    cumulative = np.cumsum(inverse_prior(described, points), axis=1)
+    chosen = (cumulative < rng.random((len(center), 1)) * cumulative[:, -1:]).sum(axis=1)
+    return points[np.arange(len(center)), chosen]
 
 
 def draw_products(
@@ -131,7 +82,7 @@ def inverse_prior(described: DescribedPosterior, points: np.ndarray) -> np.ndarr
     It is zero outside the bounds of the prior, where the likelihood is taken as zero. Where no samples are, it is
     limited.
     """
-    log_prior, lowest = described.log_prior_at(points), described.log_prior.min()
+    log_prior, lowest = described.log_prior_at(points), described.lowest
     return np.exp(lowest - np.maximum(log_prior, lowest - _LARGEST_EXCESS)) * (log_prior > -np.inf)
 
 
@@ -169,48 +120,17 @@ def _roots(covariances: np.ndarray, largest: np.ndarray) -> np.ndarray:
     return deviations[..., None] * roots
 
 
-def log_density(points: np.ndarray, center: np.ndarray, sd: np.ndarray) -> np.ndarray:
-    """Logarithm of independent normal densities (n, m) at points (m, d) or (n, m, d), for means and sd (n, d)."""
-    total = sum(np.square((points[..., k] - center[:, k, None]) / sd[:, k, None]) for k in range(sd.shape[1]))
-    return -0.5 * total - (np.log(sd).sum(axis=1) + 0.5 * sd.shape[1] * _LOG_TWO_PI)[:, None]
-
-
-def _marginal(described: DescribedPosterior, center: np.ndarray, sd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    n, varying = len(center), sd.shape[-1]
+def _marginal(described: DescribedPosterior, center: np.ndarray, sd: np.ndarray) -> np.ndarray:
+    varying = sd.shape[-1]
     product = product_with_population(described, center, sd)
     node_weights, directions = _nodes(varying)
     nodes = product.means[:, :, None] + np.einsum("ncvw,jw->ncjv", product.factors, directions)
-    is_common = center.shape[-1] > varying
-    values = np.tile(center[:, None, None, varying:], (1, *nodes.shape[1:3], 1))
-    of_prior = inverse_prior(described, np.concatenate([nodes, values], axis=-1)).reshape(n, -1)
-    lowest = described.log_prior.min()
-    log_mass = product.log_masses.max(axis=1)
-    masses = np.exp(product.log_masses - log_mass[:, None])
-    log_mass += np.log(masses.sum(axis=1))
-    masses /= masses.sum(axis=1, keepdims=True)
-    of_mixture = (masses[:, :, None] * node_weights).reshape(n, -1) * of_prior
-    of_samples = np.zeros(n)
-    if not is_common:  # samples of a common parameter do not have its exact value
-        # The mixture of both densities of points is q(u) [s + (1 - s) p(u | phi) / M]: s is the share of the samples,
-        # and q(u) p(u | phi) / M the density of the nodes.
-        share = _share_of_samples(described)
-
-        def ratio(points: np.ndarray) -> np.ndarray:
-            inverse = np.exp(np.minimum(log_mass[:, None] - log_density(points, center, sd), _LARGEST_EXPONENT))
-            return 1.0 / (share * inverse + 1.0 - share)
-
-        of_samples = share * (ratio(described.points) @ np.exp(described.log_weights + lowest - described.log_prior))
-        of_mixture = (1.0 - share) * of_mixture * ratio(nodes.reshape(n, -1, varying))
-    of_mixture = of_mixture.sum(axis=1)
-    total = of_samples + of_mixture
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return log_mass + np.log(total) - lowest, np.where(total > 0.0, of_samples / total, 0.0)
-
-
-def _share_of_samples(described: DescribedPosterior) -> float:
-    """Share of the stored samples among all points: the mixture is worth as many samples as give its error."""
-    size = described.effective_sample_size
-    return size / (size + min(max(described.mixture.fit_error, 1e-3) ** -2, size))
+    common = np.tile(center[:, None, None, varying:], (1, *nodes.shape[1:3], 1))
+    of_prior = inverse_prior(described, np.concatenate([nodes, common], axis=-1)) @ node_weights
+    largest = product.log_masses.max(axis=1, keepdims=True)
+    total = (np.exp(product.log_masses - largest) * of_prior).sum(axis=1)
+    with np.errstate(divide="ignore"):
+        return largest[:, 0] + np.log(total) - described.lowest
 
 
 @cache

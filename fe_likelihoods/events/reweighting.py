@@ -8,8 +8,8 @@ from samplers.estimates.pareto import pareto_shape
 
 from ..checks.finding import Finding
 from ..checks.stored_posteriors import check_reweighting
-from ..text_tables import number, text_table
-from .population_marginal import draw_products, inverse_prior, population_marginal, sample_weights
+from ..text_tables import text_table
+from .population_marginal import draw_products, inverse_prior, population_marginal
 from .stored_posterior import resampled_description
 
 if TYPE_CHECKING:
@@ -26,13 +26,11 @@ _QUANTILE = 0.9  # of the Pareto shapes over the hyper-samples
 class ReweightingCheck(NamedTuple):
     """How well the stored samples of one test serve the hierarchical model.
 
-    Effective samples are NaN with common parameters, whose exact value is not among the samples. The Pareto shape
-    belongs to the upper tail of the inverse prior density over the posterior of the test in the hierarchy: where it is
-    large, this posterior reaches values that the prior of the test, and therefore its samples, leave out.
+    The Pareto shape belongs to the upper tail of the inverse prior density over the posterior of the test in the
+    hierarchy: where it is large, this posterior reaches values that the prior of the test, and therefore its samples,
+    leave out.
     """
 
-    effective_samples: float  # of the weights, median over the hyper-samples
-    sample_share: float  # of the marginal likelihood, mean; the rest is from the fitted mixture
     pareto_shape: float  # 90 % quantile over the hyper-samples
     shift: float  # largest standard error that this test causes in a hyper-parameter's mean [posterior sd]
 
@@ -46,11 +44,8 @@ class HierarchyChecks(NamedTuple):
     findings: tuple[Finding, ...]  # what is not reliable and what to do
 
     def __str__(self) -> str:
-        rows = [("test", "effective", "of samples", "Pareto", "shift")]
-        for name, each in self.tests.items():
-            effective, share = number(each.effective_samples, 4), f"{each.sample_share:.0%}"
-            others = f"{each.pareto_shape:.2f}", f"{each.shift:.2f}"
-            rows.append((name, effective, share, *others))
+        rows = [("test", "Pareto", "shift")]
+        rows += [(name, f"{each.pareto_shape:.2f}", f"{each.shift:.2f}") for name, each in self.tests.items()]
         lines = [text_table(rows)]
         worst = max(self.mean_errors, key=lambda name: self.mean_errors[name])
         lines.append(f"largest error of a mean: {self.mean_errors[worst]:.2f} posterior sd ({worst})")
@@ -65,27 +60,17 @@ def check_hierarchy(posterior: "HierarchicalPosterior", samples: np.ndarray, see
     rng = np.random.default_rng(seed)
     used = samples[np.linspace(0, len(samples) - 1, min(len(samples), _HYPER_SAMPLES)).astype(int)]
     center, sd = posterior.population(used)
-    weighted = not posterior.common
     found, changes = {}, []
     for name, described in posterior.described.items():
-        marginal = population_marginal(described, center, sd)
         change = np.empty((_RESAMPLINGS, len(used)))
         for row in change:
-            row[:] = population_marginal(resampled_description(described, rng), center, sd).log_value
-        change -= marginal.log_value
+            row[:] = population_marginal(resampled_description(described, rng), center, sd)
+        change -= population_marginal(described, center, sd)
         changes.append(change)
-        sizes = np.full(2, np.nan)
         drawn = draw_products(described, center, sd, _DRAWS, rng)
         with np.errstate(divide="ignore"):
             shapes = [pareto_shape(row) for row in np.log(inverse_prior(described, drawn))]
-        if weighted:
-            weights = sample_weights(described, center, sd)
-            square = np.square(weights).sum(axis=1)
-            independent = described.effective_sample_size * np.exp(2.0 * described.log_weights).sum()
-            sizes = np.where(square > 0.0, min(independent, 1.0) / np.where(square > 0.0, square, 1.0), 0.0)
         found[name] = ReweightingCheck(
-            float(np.median(sizes)),
-            float(marginal.sample_share.mean()),
             float(np.sort(shapes)[int(_QUANTILE * (len(shapes) - 1))]),
             float(_mean_errors(used, change)[0].max()),
         )

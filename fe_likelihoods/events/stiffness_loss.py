@@ -1,27 +1,14 @@
 r"""Stiffness loss between two states of a structure, from a calibration before and a calibration after an event.
 
-Each calibration gives a posterior of the same stiffnesses. On the scale of logarithms :math:`x`, each posterior over
-its prior is a likelihood, which is taken as normal. The stiffnesses of both states belong together,
-
-.. math::
-
-   x_i^{\mathrm{after}} = x_i^{\mathrm{before}} + g + e_i + \delta_i, \qquad
-   g \sim N(0, \gamma^2), \quad e_i \sim N(0, \sigma^2),
-
-with a factor g that all stiffnesses share (temperature, mass), a scatter e that has nothing to do with damage, and
-:math:`\delta_i`, which is zero for an intact stiffness and normal for a damaged one. Given the damaged stiffnesses,
-everything is normal, so the evidence of each set of damaged stiffnesses has a closed form. All sets of up to `most`
-stiffnesses are enumerated, and nothing is simulated. The *loss* of a stiffness is
-:math:`1 - \exp(e_i + \delta_i)`; the common factor is no loss.
-
-Calibrations with a wrong model state errors that are too small. Both likelihoods therefore have errors that are f times
-as large as stated, with an unknown factor f, about which the differences of the many intact stiffnesses inform. See
-``docs/stiffness_loss.rst``.
+Each posterior over its prior is a likelihood of the logarithms of the stiffnesses, which is taken as normal. The
+logarithms change by a factor that all share, a scatter, and the damage of a few stiffnesses. Given the damaged ones,
+everything is normal, so that the evidence of each set of them has a closed form; all sets of up to `most` are
+enumerated. The equations are on the page ``docs/stiffness_loss.rst``.
 """
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -29,7 +16,6 @@ import numpy as np
 from ..checks.finding import Finding, judge, labelled
 from ..checks.stiffness import check_most, check_normal
 from ..priors.distributions import Distribution, HalfNormal, LogNormal
-from ..priors.priors import Prior
 from ..text_tables import text_table
 from .scales import scales_of
 from .stored_posterior import StoredPosterior, on_scale
@@ -39,8 +25,8 @@ __all__ = ["StiffnessLoss", "stiffness_loss"]
 _LEAST_INFORMATION = 1.0  # of the data about a direction, relative to the prior, below which it is left to the prior
 _FEWEST_SAMPLES = 5  # effective ones per stiffness, for their covariance
 _NODES = 8, 12  # of the distributions of the spread and of the factor of the errors
-_PRIOR_DRAWS = 20_000  # for the moments of a joint prior
-_BATCH = 50_000  # sets of damaged stiffnesses at a time
+_PRIOR_DRAWS = 20_000  # for the moments of the priors
+_NUMBERS = 5_000_000  # of matrices at a time
 
 
 class StiffnessLoss(NamedTuple):
@@ -172,21 +158,31 @@ def stiffness_loss(
     names = tuple(names)
     _check(names, presence, damaged, common, most, n_draws)
     states = [_state(stored, names) for stored in (before, after)]
-    sets = _sets(len(names), min(most, len(names)), presence)
+    sets, log_prior = _sets(len(names), min(most, len(names)), presence)
     nodes = [
-        _node(*states, factor, scatter, common)
+        _Node(factor, scatter, common, damaged, *_change(*states, factor))
         for factor in _nodes(error, _NODES[1], "error")
         for scatter in _nodes(spread, _NODES[0], "spread")
     ]
-    evidence = np.array([each.log_evidence + _log_evidence_of_sets(each, sets, damaged) for each in nodes])
-    weights = np.exp(evidence - evidence.max())
-    drawn = _draw(nodes, sets, weights / weights.sum(), damaged, common, n_draws, np.random.default_rng(seed))
+    evidence = np.array([log_prior + _log_evidence(node, sets) for node in nodes])
+    rng = np.random.default_rng(seed)
+    cumulative = np.cumsum(np.exp(evidence - evidence.max()))
+    chosen = np.searchsorted(cumulative / cumulative[-1], (np.arange(n_draws) + rng.random()) / n_draws)
+    of_node, of_set = np.unravel_index(np.minimum(chosen, evidence.size - 1), evidence.shape)
+    damage, block = _masks(sets, of_set, len(names)), 1 + _NUMBERS // (len(names) + 1) ** 2
+    change = np.empty((n_draws, len(names) + 1))
+    for k in np.unique(of_node):
+        rows = np.flatnonzero(of_node == k)
+        for part in np.array_split(rows, 1 + len(rows) // block):
+            change[part] = _draw(nodes[k], damage[part], rng)
     findings = [
         each._replace(text=f"In the calibration {when}: {each.text}")
         for when, state in zip(("before", "after"), states, strict=True)
         for each in state.findings
     ]
-    return StiffnessLoss(names, *drawn, (*findings, *check_most(drawn[2], most, len(names))))
+    count, factors = damage.sum(axis=1), np.array([node.error for node in nodes])[of_node]
+    findings += check_most(count, most, len(names))
+    return StiffnessLoss(names, -np.expm1(change[:, :-1]), np.exp(change[:, -1]), count, factors, tuple(findings))
 
 
 class _State(NamedTuple):
@@ -214,74 +210,53 @@ def _state(stored: StoredPosterior, names: tuple[str, ...]) -> _State:
     if n < (fewest := _FEWEST_SAMPLES * d):
         raise ValueError(f"stiffness_loss: {d} stiffnesses need at least {fewest} effective samples; got {n:.0f}")
     covariance *= (n - 1.0) / (n - d - 2.0)  # so that its inverse is right on average
-    center, prior_covariance = _prior_moments(prior)
+    z = np.random.default_rng(0).standard_normal((_PRIOR_DRAWS, prior.dim))
+    z -= z.mean(axis=0)
+    logs = np.log(prior.from_normal(np.linalg.solve(np.linalg.cholesky(z.T @ z / len(z)), z.T).T))
+    center, prior_covariance = logs.mean(axis=0), np.cov(logs.T, bias=True)  # exact for lognormal priors
     factor = np.linalg.cholesky(prior_covariance)
     whitened = np.linalg.solve(factor, np.linalg.solve(factor, covariance).T)
-    variances, directions = np.linalg.eigh(0.5 * (whitened + whitened.T))
+    variances, directions = np.linalg.eigh(_symmetric(whitened))
     precisions = 1.0 / np.maximum(variances, np.finfo(float).tiny)
-    gained = np.where(precisions - 1.0 > _LEAST_INFORMATION, precisions - 1.0, 0.0)
-    seen = gained > 0.0
-    offset = directions.T @ np.linalg.solve(factor, mean - center)
-    peak = center + factor @ directions @ np.where(seen, offset * precisions / np.where(seen, gained, 1.0), 0.0)
-    back = np.linalg.solve(factor.T, directions)
-    scores = np.column_stack([apart, apart @ back[:, seen]])
+    seen = precisions - 1.0 > _LEAST_INFORMATION
+    gained = precisions[seen] - 1.0
+    offset = directions[:, seen].T @ np.linalg.solve(factor, mean - center)
+    peak = center + factor @ directions[:, seen] @ (offset * precisions[seen] / gained)
+    back = np.linalg.solve(factor.T, directions[:, seen])
+    scores = np.column_stack([apart, apart @ back])
     scores /= np.sqrt(weights @ np.square(scores))
     normal = check_normal(weights @ scores**3, weights @ scores**4 - 3.0)
     findings = (*stored.findings, *normal)
     return _State(peak, back * gained @ back.T, int(seen.sum()), center, prior_covariance, findings)
 
 
-def _prior_moments(prior: Prior) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (d,) and covariance (d, d) of the logarithms under a prior."""
-    if set(prior.distributions) == set(prior.names):  # independent
-        z, weights = np.polynomial.hermite_e.hermegauss(40)
-        weights = weights / weights.sum()
-        logs = np.log(prior.from_normal(np.repeat(z[:, None], prior.dim, axis=1)))
-        center = weights @ logs
-        return center, np.diag(weights @ np.square(logs - center))
-    logs = np.log(prior.rvs(_PRIOR_DRAWS, random_state=0))
-    return logs.mean(axis=0), np.cov(logs.T)
-
-
 class _Node(NamedTuple):
-    """Likelihood exp(log_evidence + vector' T - T' matrix T / 2) of the change T (d,) of the damaged stiffnesses.
+    """Likelihood exp(log_evidence + vector' T - T' matrix T / 2) of the change T (d,), and the parts of the change."""
 
-    The scatter and the common factor are integrated out; `covariance` is their posterior covariance if T = 0, and
-    `alone` has the matrix and the vector without them.
-    """
-
+    error: float
+    scatter: float
+    common: float
+    damaged: LogNormal
     matrix: np.ndarray
     vector: np.ndarray
     log_evidence: float
-    covariance: np.ndarray
-    alone: tuple[np.ndarray, np.ndarray]
-    error: float
-    scatter: float
 
 
-def _node(before: _State, after: _State, factor: float, scatter: float, common: float) -> _Node:
-    """The likelihood with a factor of the errors and a scatter, the stiffnesses before integrated out."""
-    center, d = before.center, len(before.center)
+def _change(before: _State, after: _State, factor: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """Matrix, vector and log-evidence of a node: the stiffnesses before are integrated out."""
     first, second = before.information / factor**2, after.information / factor**2
-    peak, later = before.peak - center, after.peak - center
+    peak, later = before.peak - before.center, after.peak - before.center
     precision = np.linalg.inv(before.covariance) + first
     covariance = np.linalg.inv(precision)
     mean = covariance @ (first @ peak)
     # x_before ~ N(mean, covariance), and the likelihood after of x_before + T
-    spread = np.eye(d) + second @ covariance
+    spread = np.eye(len(mean)) + second @ covariance
     matrix = _symmetric(np.linalg.solve(spread, second))
     vector = matrix @ (later - mean)
     of_before = mean @ precision @ mean - peak @ first @ peak - np.linalg.slogdet(precision)[1]
     of_after = -np.linalg.slogdet(spread)[1] - (later - mean) @ vector
     # densities of the peaks, whose errors grow with the factor
-    log_evidence = 0.5 * (of_before + of_after) - (before.seen + after.seen) * np.log(factor)
-    variance = scatter**2 * np.eye(d) + common**2
-    both = np.eye(d) + matrix @ variance
-    damaged = np.linalg.solve(both, vector)
-    log_evidence += 0.5 * vector @ variance @ damaged - 0.5 * np.linalg.slogdet(both)[1]
-    of_scatter = _symmetric(variance @ np.linalg.inv(both))
-    of_damage = _symmetric(np.linalg.solve(both, matrix))
-    return _Node(of_damage, damaged, float(log_evidence), of_scatter, (matrix, vector), factor, scatter)
+    return matrix, vector, 0.5 * (of_before + of_after) - (before.seen + after.seen) * np.log(factor)
 
 
 def _symmetric(matrix: np.ndarray) -> np.ndarray:
@@ -298,86 +273,58 @@ def _nodes(value: Distribution | float, n: int, name: str) -> np.ndarray:
     return nodes
 
 
-class _Sets(NamedTuple):
-    """Sets of m stiffnesses (n, m) for each m, and the logarithms (n,) of their prior probabilities."""
-
-    members: list[np.ndarray]
-    log_prior: list[np.ndarray]
-
-
-def _sets(d: int, most: int, presence: float) -> _Sets:
-    members = [
+def _sets(d: int, most: int, presence: float) -> tuple[list[np.ndarray], np.ndarray]:
+    """Sets of m stiffnesses (n, m) for each m, and the logarithms (n_sets,) of the prior probabilities of all."""
+    sets = [
         np.array(list(itertools.combinations(range(d), m)), dtype=int).reshape(math.comb(d, m), m)
         for m in range(most + 1)
     ]
     share = 1.0 - (1.0 - presence) ** (1.0 / d)  # of each stiffness, independent
-    odds = [m * np.log(share / (1.0 - share)) for m in range(1, most + 1)]
-    total = np.log(sum(len(each) * np.exp(odd) for each, odd in zip(members[1:], odds, strict=True)))
-    logs = [np.log(1.0 - presence), *(np.log(presence) + odd - total for odd in odds)]
-    return _Sets(members, [np.full(len(each), log) for each, log in zip(members, logs, strict=True)])
+    odds = np.repeat(np.arange(most + 1) * np.log(share / (1.0 - share)), [len(each) for each in sets])
+    some = np.log(presence) - np.logaddexp.reduce(odds[1:])
+    return sets, np.concatenate([[np.log(1.0 - presence)], odds[1:] + some])
 
 
-def _given_sets(change: _Node, members: np.ndarray, damaged: LogNormal) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Precision (n, m, m), mean (n, m) and log-evidence (n,) of the damage of sets (n, m), relative to no damage."""
-    m = members.shape[1]
-    mean, variance = np.log(damaged.median), damaged.log_sd**2
-    precision = change.matrix[members[:, :, None], members[:, None, :]] + np.eye(m) / variance
-    vector = change.vector[members] + mean / variance
-    found = np.linalg.solve(precision, vector[:, :, None])[:, :, 0]
-    log_evidence = 0.5 * (vector * found).sum(axis=1) - 0.5 * np.linalg.slogdet(precision)[1]
-    return precision, found, log_evidence - 0.5 * m * (np.log(variance) + mean**2 / variance)
+def _masks(sets: list[np.ndarray], numbers: np.ndarray, d: int) -> np.ndarray:
+    """Which stiffnesses (n, d) the sets of these numbers (n,) contain."""
+    first, masks = 0, np.zeros((len(numbers), d), dtype=bool)
+    for members in sets:
+        rows = np.flatnonzero((numbers >= first) & (numbers < first + len(members)))
+        masks[rows[:, None], members[numbers[rows] - first]] = True
+        first += len(members)
+    return masks
 
 
-def _log_evidence_of_sets(change: _Node, sets: _Sets, damaged: LogNormal) -> np.ndarray:
-    """Logarithms (n_sets,) of prior times evidence of all sets, in order."""
-    found = [sets.log_prior[0]]
-    for members, log_prior in zip(sets.members[1:], sets.log_prior[1:], strict=True):
-        parts = [members[k : k + _BATCH] for k in range(0, len(members), _BATCH)]
-        found.append(log_prior + np.concatenate([_given_sets(change, part, damaged)[2] for part in parts]))
+def _log_evidence(node: _Node, sets: list[np.ndarray]) -> np.ndarray:
+    """Log-evidence (n_sets,) of all sets of damaged stiffnesses; scatter and common factor are integrated out."""
+    d, mean, variance = len(node.vector), np.log(node.damaged.median), node.damaged.log_sd**2
+    both = np.eye(d) + node.matrix @ (other := node.scatter**2 * np.eye(d) + node.common**2)
+    vector = np.linalg.solve(both, node.vector)
+    matrix = _symmetric(np.linalg.solve(both, node.matrix))
+    none = node.log_evidence + 0.5 * node.vector @ other @ vector - 0.5 * np.linalg.slogdet(both)[1]
+    found = []
+    for members in sets:
+        m = members.shape[1]
+        for part in np.array_split(members, 1 + members.size * m // _NUMBERS):
+            precision = matrix[part[:, :, None], part[:, None, :]] + np.eye(m) / variance
+            of_part = vector[part] + mean / variance
+            gain = (of_part * np.linalg.solve(precision, of_part[:, :, None])[:, :, 0]).sum(axis=1)
+            found.append(none + 0.5 * (gain - np.linalg.slogdet(precision)[1]))
+            found[-1] -= 0.5 * m * (np.log(variance) + mean**2 / variance)
     return np.concatenate(found)
 
 
-def _draw(
-    nodes: list[_Node],
-    sets: _Sets,
-    weights: np.ndarray,
-    damaged: LogNormal,
-    common: float,
-    n: int,
-    rng: np.random.Generator,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Losses (n, d), common factors, numbers of damaged stiffnesses and factors of the errors (n,)."""
-    cumulative = np.cumsum(weights.ravel())
-    chosen = np.searchsorted(cumulative / cumulative[-1], (np.arange(n) + rng.random()) / n)
-    node, number = np.unravel_index(np.minimum(chosen, weights.size - 1), weights.shape)
-    d = len(nodes[0].vector)
-    damage, change, factors = np.zeros((n, d)), np.empty((n, d)), np.empty(n)
-    count = np.empty(n, dtype=int)
-    for k in np.unique(node):
-        for rows, members in _rows_by_size(np.flatnonzero(node == k), number, sets):
-            count[rows] = members.shape[1]
-            if members.shape[1]:
-                precision, mean, _ = _given_sets(nodes[k], members, damaged)
-                upper = np.linalg.cholesky(precision).transpose(0, 2, 1)
-                noise = np.linalg.solve(upper, rng.standard_normal((*mean.shape, 1)))[:, :, 0]
-                damage[rows[:, None], members] = mean + noise
-        rows = np.flatnonzero(node == k)
-        each, factor = nodes[k], np.linalg.cholesky(nodes[k].covariance)
-        pull = each.alone[1] - damage[rows] @ each.alone[0]
-        other = pull @ each.covariance + rng.standard_normal((len(rows), d)) @ factor.T
-        precision = 1.0 / common**2 + d / each.scatter**2
-        shared = other.sum(axis=1) / each.scatter**2 / precision + rng.standard_normal(len(rows)) / np.sqrt(precision)
-        factors[rows], change[rows] = np.exp(shared), damage[rows] + other - shared[:, None]
-    return -np.expm1(change), factors, count, np.array([nodes[k].error for k in node])
-
-
-def _rows_by_size(rows: np.ndarray, number: np.ndarray, sets: _Sets) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Draws (n,) whose sets have the same size, and their sets (n, m)."""
-    ends = np.cumsum([len(each) for each in sets.members])
-    size = np.searchsorted(ends, number[rows], side="right")
-    for m in np.unique(size):
-        same = rows[size == m]
-        yield same, sets.members[m][number[same] - (ends[m - 1] if m else 0)]
+def _draw(node: _Node, damage: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Changes (n, d + 1) of the stiffnesses without the common one, and the common one, with damage where (n, d)."""
+    n, d = damage.shape
+    parts = np.column_stack([np.eye(d), np.ones(d)])
+    mean = np.column_stack([np.log(node.damaged.median) * damage, np.zeros(n)])
+    own = node.scatter**2 + node.damaged.log_sd**2 * damage
+    weights = 1.0 / np.column_stack([own, np.full(n, node.common**2)])
+    precision = parts.T @ node.matrix @ parts + weights[:, :, None] * np.eye(d + 1)
+    vector = node.vector @ parts + weights * mean
+    noise = np.linalg.cholesky(precision) @ rng.standard_normal((n, d + 1, 1))  # whose covariance is the precision
+    return np.linalg.solve(precision, vector[:, :, None] + noise)[:, :, 0]
 
 
 def _check(names: tuple[str, ...], presence: float, damaged: LogNormal, common: float, most: int, n: int) -> None:

@@ -216,7 +216,7 @@ class DescribedPosterior(NamedTuple):
 
     points: np.ndarray  # (n, dim)
     log_weights: np.ndarray  # (n,), of weights with sum 1
-    log_prior: np.ndarray  # (n,), of the prior density of the points
+    lowest: float  # logarithm of the smallest prior density of the points
     prior: Prior  # before the change of scale
     scales: Scales
     log_shares: np.ndarray  # (n_components,)
@@ -273,10 +273,8 @@ def describe(stored: StoredPosterior, names: Sequence[str], scales: Scales) -> D
     size = min(stored.effective_sample_size, _MOST)
     if len(stored.samples) > _MOST and not equal:  # resampling adds the error of as many samples
         size = 1.0 / (1.0 / stored.effective_sample_size + 1.0 / _MOST)
-    incomplete = DescribedPosterior(
-        points, log_weights, np.zeros(len(points)), prior, scales, *_components(mixture), mixture, size
-    )
-    return incomplete._replace(log_prior=incomplete.log_prior_at(points))
+    lowest = float(log_density_on_scale(prior, scales, points).min())
+    return DescribedPosterior(points, log_weights, lowest, prior, scales, *_components(mixture), mixture, size)
 
 
 def resampled_description(described: DescribedPosterior, rng: np.random.Generator) -> DescribedPosterior:

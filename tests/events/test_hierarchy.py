@@ -99,7 +99,8 @@ def test_control_the_likelihood_without_the_prior_density_is_wrong(one, monkeypa
     assert np.diff(one.log_likelihood(points)) == pytest.approx(expected, abs=0.05)
     narrow = HierarchicalPosterior(several(DATA[:, :1], ERRORS[:1, :1], 400, 0.5), {"a": LINEAR})
     assert np.diff(narrow.log_likelihood(points)) == pytest.approx(expected, abs=0.3)
-    forgotten = {k: each._replace(log_prior=np.zeros_like(each.log_prior)) for k, each in narrow.described.items()}
+    flat = Prior({"a": Uniform(-50.0, 50.0)})
+    forgotten = {k: each._replace(prior=flat) for k, each in narrow.described.items()}
     monkeypatch.setattr(narrow, "described", forgotten)
     assert abs(np.diff(narrow.log_likelihood(points)) - expected) > 0.6
 
@@ -213,7 +214,6 @@ def test_test_beside_the_population_is_a_warning(one):
     points = np.random.default_rng(1).normal([50.0, 0.3], [0.1, 0.01], (60, 2))
     with pytest.warns(UserWarning, match="the means have errors of up to"):
         result = Hierarchy(one, points)
-    assert result.checks.tests["T0"].effective_samples < 2.0
     assert np.isfinite(result.draw_test("T0", 1)["a"]).all()
 
 
@@ -232,14 +232,12 @@ def test_prior_narrower_than_the_population_is_a_warning_that_names_the_test():
 
 @pytest.mark.parametrize(("n", "is_named"), [(40, True), (1000, False)])
 def test_population_narrower_than_the_samples_is_a_warning_where_it_matters(n, is_named):
-    """The fitted mixture takes over: with 1000 samples its error does no harm, with 40 a test is named."""
+    """With 1000 samples the error of the fitted mixture does no harm, with 40 a test is named."""
     posterior = HierarchicalPosterior(several(DATA[:, :1], ERRORS[:1, :1], n), {"a": LINEAR})
     points = np.random.default_rng(1).normal([1.1, 0.002], [0.1, 0.0002], (60, 2))
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
         checks = Hierarchy(posterior, points).checks
-    assert max(each.effective_samples for each in checks.tests.values()) < 20
-    assert checks.tests["T0"].sample_share < 0.1
     assert ["Give more samples of this test" in str(each.message) for each in found] == [True] * is_named
     change = posterior.log_likelihood(points) - [exact(DATA[:, 0], m, 0.04 + s**2) for m, s in points]
     weights = np.exp(change - change.max())
