@@ -25,7 +25,7 @@ Engineering Mechanics 41, 89-103, doi:10.1016/j.probengmech.2015.06.006.
 
 import math
 from collections.abc import Callable, Generator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from emcee import State
@@ -120,8 +120,8 @@ class _Level:
         self._function, self._failures_exceed, self.bound = function, failures_exceed, -np.inf
         self.evaluations = self.failed = 0
 
-    def evaluate(self, coords: np.ndarray, observe: Callable[[np.ndarray], None] | None = None) -> np.ndarray:
-        """Records (n,) of points: the log-density as log_prior and log_prob (-inf below the bound), values as blobs."""
+    def evaluate(self, coords: np.ndarray, then: Callable[[np.ndarray, np.ndarray], Any]) -> Any:
+        """What `then` makes of points and their records: log-densities (-inf below the bound), values as blobs."""
         records = np.zeros(len(coords), [("log_prob", float), ("log_prior", float), ("blobs", float)])
         records["log_prior"] = -0.5 * np.sum(coords**2, axis=1)  # up to a constant
         values = np.asarray(self._function(coords.copy()), dtype=float)
@@ -135,7 +135,7 @@ class _Level:
         records["blobs"] = np.where(failed, np.inf if self._failures_exceed else -np.inf, values)
         above = (records["blobs"] >= self.bound) & (records["blobs"] > -np.inf)
         records["log_prob"] = np.where(above, records["log_prior"], -np.inf)
-        return records
+        return then(coords, records)
 
 
 def subset_simulation(
@@ -203,7 +203,7 @@ def subset_simulation(
         raise ValueError(f"threshold must be a finite number; got {threshold!r}")
     random = np.random.RandomState(np.random.MT19937(np.random.SeedSequence(seed)))
     level, coords = _Level(function, failures_exceed), random.standard_normal((n, as_whole_number("ndim", ndim)))
-    records = level.evaluate(coords)
+    records = level.evaluate(coords, lambda _, records: records)
     known = records["log_prob"] > -np.inf
     n, kept = int(known.sum()), int(np.ceil(level_probability * known.sum()))
     if kept < FEWEST:

@@ -17,7 +17,7 @@ import logging
 import time
 import uuid
 from collections.abc import Callable, Collection, Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import fields, replace
 from typing import Any
 
@@ -39,7 +39,7 @@ from .output import Output
 from .record import EvaluatedBatch, Incomplete, RunStart
 from .replay import changes, describe_run, differences, open_record
 from .reporting.progress import ANNEALING, Progress, get_progress_bar, show_sweeps
-from .reports import AnnealingResult, warn
+from .reports import AnnealingResult, Report, warn
 from .results import RunResults
 from .settings import Settings, as_whole_number, check_arguments, check_names, most_moves, refuse_unused
 from .tempering.anneal import anneal
@@ -47,7 +47,7 @@ from .tempering.guide import AdaptedGuide, Guide, check_guide
 from .tempering.guided import Guidance, lend
 from .tempering.mutation import MoveSchedule, check_moves
 from .tempering.population import Population, check_size, check_start
-from .tempering.recording import Recording
+from .tempering.recording import Recording, check_end
 
 __all__ = ["TemperedSampler"]
 
@@ -346,7 +346,14 @@ class TemperedSampler(RunResults, EnsembleSampler):
             failures, self._was_reset = self.failure_count, False
             skip = skip_initial_state_check
             if isinstance(state, RunStart):
-                state, skip = self._anneal(state, bar), True
+                start_of_run, stored, skip = state, self._output.last_state(), True
+                try:
+                    with self._annealing(start_of_run, stored, bar) as (steps, guidance, take):
+                        for population, report in steps:
+                            take(population, report)
+                    state = self._annealed(population, guidance, stored)
+                except Incomplete:
+                    state = self._go_on_without_annealing(stored)
             if store and provisional and not self._output.provisional:
                 arguments["iterations"] = iterations = iterations + 1  # in place of the provisional step
             with deferred_interrupts():
@@ -580,8 +587,12 @@ class TemperedSampler(RunResults, EnsembleSampler):
 
     # ------------------------------------------------------------------ annealing
 
-    def _anneal(self, start: RunStart, bar: dict) -> State:
-        """Carry draws of the prior to beta = 1; returns the last stored state of this annealing, if there is one."""
+    @contextmanager
+    def _annealing(self, start: RunStart, stored: State | None, bar: dict) -> Iterator[tuple]:
+        """The steps of an annealing from draws of the prior, its guide, and a function that takes what they report.
+
+        `stored` is the last state at beta = 1 if the run is made again.
+        """
         self._result, self._verdict, self._must_repeat = AnnealingResult(), None, True
         self._evaluator.evaluates_parts = True
         self.random_state = start.random_state
@@ -593,11 +604,9 @@ class TemperedSampler(RunResults, EnsembleSampler):
         if self._given_guide is not None:
             self._guide = AdaptedGuide(self._given_guide, self.ndim)
             guidance = lend(self._guide, get_random(self), remember, self._budget, self.settings.asynchronous)
-        stored = self._output.last_state()
         self._record.is_complete = stored is not None
         population = Population(0.0, start.coords, None, float(self.nwalkers))
         recording = Recording(self._evaluator)
-        steps = anneal(population, self._evaluator, get_random(self), schedule, self.settings, guidance)
         labels = {"desc": ANNEALING, "unit": " evaluations", **(bar["progress_kwargs"] or {})}
         try:
             with (
@@ -605,16 +614,19 @@ class TemperedSampler(RunResults, EnsembleSampler):
                 closing(self._evaluator),
                 Progress(shown, self._evaluator, labels["desc"], self._target.function) as progress,
             ):
-                for population, report in steps:
-                    recording.add(population, report)
-                    self._result = recording.result
-                    progress.show(recording.result, population, report)
-        except Incomplete:
-            return self._go_on_without_annealing(stored)
+
+                def take(population: Population, report: Report) -> None:
+                    self._result = recording.add(population, report)
+                    progress.show(self._result, population, report)
+
+                arguments = population, self._evaluator, get_random(self), schedule, self.settings, guidance
+                yield anneal(*arguments), guidance, take
         finally:
             self._record.is_complete = False
-        recording.check_evidence(population.coords)
-        self._result = self._finished(recording.result, population, guidance)
+
+    def _annealed(self, population: Population, guidance: Guidance | None, stored: State | None) -> State:
+        """The state at beta = 1 that an annealing has led to, or the last `stored` state of a run made again."""
+        self._result = self._finished(self._result, population, guidance)
         if self._result.start is not None and self._result.start.used:
             moves = with_fast_sweeps([GuideMove(self._guide)], self._fast, self.ndim, self.settings.fast_sweeps)
             calibrate_move(moves[0], population.coords, np.full(self.nwalkers, 1.0 / self.nwalkers))
@@ -639,7 +651,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         if stored == made:
             result = result._replace(ladder=self._output.result.ladder)  # with the wall times of the evaluations
         coords, log_prob = self._record.first(self.nwalkers)
-        said = check_likelihood(log_prob, self._target.log_prior(coords))
+        said = check_end(result, population.coords) + check_likelihood(log_prob, self._target.log_prior(coords))
         said += [] if guidance is None else list(guidance.guide.findings)
         for finding in said:
             warn(finding.message)

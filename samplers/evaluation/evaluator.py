@@ -83,8 +83,13 @@ class Evaluator:
     def close(self) -> None:
         """An annealing has ended: nothing runs after `submit`."""
 
-    def evaluate(self, coords: np.ndarray, observe: Callable[[np.ndarray], None] | None = None) -> np.ndarray:
-        """Records (n,) of points (n, ndim): from the record of the run, or from new evaluations.
+    def evaluate(
+        self,
+        coords: np.ndarray,
+        observe: Callable[[np.ndarray], None] | None = None,
+        then: Callable[[np.ndarray, np.ndarray], Any] = lambda coords, records: records,
+    ) -> Any:
+        """Records (n,) of points (n, ndim), known or new; or what ``then(coords, records)`` makes of them.
 
         `observe` is called with points directly before they are evaluated. Raises BudgetExhausted if the points do not
         fit into the limit of simulations.
@@ -97,54 +102,20 @@ class Evaluator:
                 if len(part) > 0:
                     observe(part)
         if len(new) > 0:
-            batches.append(self._evaluate_new(coords[new], whole=len(new) == sum(inside)))
+            arriving = _Arriving(self, coords[new])
+            try:
+                with interrupts_end_the_run():
+                    for answer in self.target.answers(coords[new], self.pool):
+                        arriving.take(answer)
+            except BaseException:  # Ctrl-C, or a pool that cannot go on
+                arriving.store()
+                raise
+            batches.append(arriving.settle(whole=len(new) == sum(inside)))
         self.evaluations += len(asked)
         records = self._pack(log_prior, np.concatenate([old, new]), batches)
         if len(asked) < sum(inside):
             raise BudgetExhausted(records[: np.flatnonzero(inside)[len(asked)]])
-        return records
-
-    def _evaluate_new(self, coords: np.ndarray, whole: bool) -> EvaluatedBatch:
-        """Values of new points (n, ndim), of a `whole` batch or a part of it, entered in the record every 0.05 s.
-
-        Failures are entered when all values have arrived, since they may yet end the run.
-        """
-        results, stored, failed, noted = [], 0, [], time.perf_counter()
-
-        def store() -> tuple[int, float]:
-            """Enter the successes among the values that have arrived."""
-            if len(results) > stored:
-                part = self.as_batch(coords[stored : len(results)], results[stored:])
-                failed.extend(stored + row for row in part.reasons)
-                self.enter(_successes(part))
-            return len(results), time.perf_counter()
-
-        if self.observer is not None:
-            self.observer.submitted(len(coords))
-        try:
-            with interrupts_end_the_run():
-                for answer in self.target.answers(coords, self.pool):
-                    if self.target.vectorize:
-                        break
-                    results.append(answer)
-                    if self.observer is not None:
-                        self.observer.finished(1)
-                    if time.perf_counter() - noted > SECONDS_BETWEEN_NOTES:
-                        stored, noted = store()
-        except BaseException:  # Ctrl-C, or a pool that cannot go on
-            store()
-            raise
-        if self.observer is not None:
-            self.observer.settled()
-        batch = self.as_batch(coords, answer if self.target.vectorize else results)
-        new = batch.rows([*failed, *range(stored, len(coords))])
-        try:
-            self.check_failures(new, self.record.count, len(self.record.failed), whole=whole and stored == 0)
-        except RuntimeError:
-            self.enter(_successes(new))
-            raise
-        self.enter(new)
-        return batch
+        return then(coords, records)
 
     def _prior_of(self, coords: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Log-prior (n,) of points (n, ndim), and which of them lie inside its support, (n,) bool."""
@@ -240,6 +211,57 @@ class Evaluator:
         """Call the function for points (n, ndim), without counting or storing."""
         answers = list(self.target.answers(coords, self.pool))
         return self.as_batch(coords, answers[0] if self.target.vectorize else answers)
+
+
+class _Arriving:
+    """Values of new points (n, ndim) as they arrive: successes are entered in the record every 0.05 s.
+
+    Failures are entered when all values have arrived, since they may yet end the run.
+    """
+
+    def __init__(self, evaluator: Evaluator, coords: np.ndarray):
+        self._evaluator, self._coords = evaluator, coords
+        self._results: Any = []
+        self._failed: list[int] = []
+        self._stored, self._noted = 0, time.perf_counter()
+        if evaluator.observer is not None:
+            evaluator.observer.submitted(len(coords))
+
+    def take(self, answer: Any) -> None:
+        """Take the value of the next point; or of all points, if the function takes a batch."""
+        if self._evaluator.target.vectorize:
+            self._results = answer
+            return
+        self._results.append(answer)
+        if self._evaluator.observer is not None:
+            self._evaluator.observer.finished(1)
+        if time.perf_counter() - self._noted > SECONDS_BETWEEN_NOTES:
+            self.store()
+
+    def store(self) -> None:
+        """Enter the successes among the values that have arrived."""
+        first, count = self._stored, len(self._results)
+        if count > first:
+            part = self._evaluator.as_batch(self._coords[first:count], self._results[first:])
+            self._failed.extend(first + row for row in part.reasons)
+            self._evaluator.enter(_successes(part))
+        self._stored, self._noted = count, time.perf_counter()
+
+    def settle(self, whole: bool) -> EvaluatedBatch:
+        """Enter what is left of a `whole` batch, or of a part of it, and return it; RuntimeError for many failures."""
+        evaluator = self._evaluator
+        if evaluator.observer is not None:
+            evaluator.observer.settled()
+        batch = evaluator.as_batch(self._coords, self._results)
+        new = batch.rows([*self._failed, *range(self._stored, len(self._coords))])
+        counts = evaluator.record.count, len(evaluator.record.failed)
+        try:
+            evaluator.check_failures(new, *counts, whole=whole and self._stored == 0)
+        except RuntimeError:
+            evaluator.enter(_successes(new))
+            raise
+        evaluator.enter(new)
+        return batch
 
 
 def unpack(records: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:

@@ -137,7 +137,7 @@ class Target:
         """What the function returns for each of the points (n, ndim) in turn; with `vectorize`, for all at once."""
         points = self.as_points(coords)
         if self.vectorize:
-            return iter([self.caught(points)])
+            return map(self.caught, [points])
         return map(self.caught, points) if pool is None else _unless_ended(map_in(pool), self.caught, points)
 
     def evaluated(self, coords: np.ndarray, results: Any) -> EvaluatedBatch:

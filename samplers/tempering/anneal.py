@@ -44,7 +44,7 @@ from ..resampling import systematic
 from ..settings import Settings
 from .early_stop import NothingToReport, StoppedEarly
 from .guided import FEWEST_DRAWS, Guidance, RoundsOfGuide, better_of, draw_rounds, start_from_guide, stopped_rounds
-from .mutation import MoveSchedule, Mutated, VisitedPoints
+from .mutation import MoveSchedule, Mutated, VisitedPoints, move_together
 from .pending_points import PendingPoints
 from .population import Density, Population
 from .recycling import Recycled, recycle, submit_start
@@ -174,7 +174,10 @@ def _by_recycling(
         schedule.expect_independence()
         moved = Mutated(population, effective / len(found.coords), 0, 0.0)
     else:
-        moved = yield from move(population, population.founders[0], density, random, schedule, settings)
+        arguments = density, random, schedule, settings, None
+        moved = yield from move(population, population.founders[0], *arguments)
+        if moved.to_sweep is not None:
+            moved = yield from move_together(moved.population, *arguments, moved)
     increment, error = found.log_evidence - found.log_evidence_below_one, found.log_evidence_error
     yield moved.population, Stage(1.0, effective, moved.acceptance, moved.moves, distinct, increment, error)
     if moved.stopped:

@@ -30,7 +30,6 @@ from .mutation import (
     Mutated,
     StartCorrelation,
     VisitedPoints,
-    move_together,
     tempered_log_prob,
     tempered_model,
 )
@@ -51,7 +50,7 @@ def grow_chains(
     """Grow a chain from each distinct point (leader), one step per copy of it, after ``settings.burn_in`` steps of all.
 
     The first step moves all chains together, later ones those that are long enough. With a burn-in, sweeps over all
-    points follow if these are still correlated with the resampled points. `ancestors` (n,) are equal for copies of one
+    points shall follow (`Mutated.to_sweep`) if these are still correlated with the resampled points. `ancestors` (n,) are equal for copies of one
     point.
     """
     beta, coords, records = population.beta, population.coords, population.records
@@ -86,5 +85,4 @@ def grow_chains(
     if settings.burn_in == 0 or grown.correlation < settings.max_correlation:
         return grown
     schedule.follow(ancestors)
-    swept = yield from move_together(population, density, random, schedule, settings, visited, correlation)
-    return swept._replace(moves=grown.moves + swept.moves)
+    return grown._replace(to_sweep=correlation)

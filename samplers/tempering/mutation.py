@@ -6,6 +6,7 @@ with its resampled start (`StartCorrelation`). The chains of transitional Markov
 """
 
 from collections.abc import Callable, Generator, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -113,7 +114,8 @@ class Mutated(NamedTuple):
     """A population after its moves at one beta, with the acceptance over all sweeps and their number.
 
     `correlation` is the largest one left with the resampled population; `stopped`: the limit of simulations ended the
-    moves.
+    moves. Chains that are still correlated with their leaders have a correlation `to_sweep`: all points are then moved
+    together.
     """
 
     population: Population
@@ -121,6 +123,7 @@ class Mutated(NamedTuple):
     moves: int
     correlation: float
     stopped: bool = False
+    to_sweep: "StartCorrelation | None" = None
 
 
 def tempered_log_prob(records: np.ndarray, beta: float) -> np.ndarray:
@@ -168,13 +171,12 @@ def tempered_model(
 ) -> Model:
     """The tempered density as emcee's moves evaluate it; the records of the points are its blobs."""
 
-    def compute_log_prob(coords: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        records = density.evaluate(coords)
+    def tempered(coords: np.ndarray, records: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         if visited is not None:
             visited.add(coords, records)
         return tempered_log_prob(records, beta), records
 
-    return Model(density.evaluate, compute_log_prob, density.map, random)
+    return Model(density.evaluate, partial(density.evaluate, then=tempered), density.map, random)
 
 
 class StartCorrelation:
@@ -222,16 +224,16 @@ def move_together(
     schedule: MoveSchedule,
     settings: Settings,
     visited: VisitedPoints | None = None,
-    correlation: StartCorrelation | None = None,
+    grown: Mutated | None = None,
 ) -> Generator[tuple[Population, Sweep], None, Mutated]:
     """Move equally weighted points equally often, until they are nearly uncorrelated with their start; yields each
     sweep.
 
-    Points that are evaluated are added to `visited`. A given `correlation` belongs to an earlier start.
+    Points that are evaluated are added to `visited`. Chains that have `grown` before count as moves.
     """
     beta, records = population.beta, population.records
-    model = tempered_model(density, beta, random, visited)
-    correlation = StartCorrelation(population.coords, records) if correlation is None else correlation
+    model, made = tempered_model(density, beta, random, visited), 0 if grown is None else grown.moves
+    correlation = StartCorrelation(population.coords, records) if grown is None else grown.to_sweep
     state = State(population.coords, log_prob=tempered_log_prob(records, beta), blobs=records)
     acceptance = []
     while not correlation.is_low_enough(settings):
@@ -240,10 +242,10 @@ def move_together(
             state, accepted = move.propose(model, state)
         except BudgetExhausted:
             share, left = (np.mean(acceptance), correlation.values[-1]) if acceptance else (0.0, 1.0)
-            return Mutated(population, float(share), len(acceptance), left, True)
+            return Mutated(population, float(share), made + len(acceptance), left, True)
         move.tune(state, accepted)
         correlation.update(state.coords, state.blobs)
         acceptance.append(float(np.mean(accepted)))
         population = population._replace(coords=state.coords, records=state.blobs)
         yield population, Sweep(acceptance[-1])
-    return Mutated(population, float(np.mean(acceptance)), len(acceptance), correlation.values[-1])
+    return Mutated(population, float(np.mean(acceptance)), made + len(acceptance), correlation.values[-1])

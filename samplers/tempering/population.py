@@ -23,10 +23,13 @@ class Density(Protocol):
     @property
     def map(self) -> Callable: ...
 
-    def evaluate(self, coords: np.ndarray, observe: Callable[[np.ndarray], None] | None = None) -> np.ndarray:
+    def evaluate(
+        self, coords: np.ndarray, observe: Callable[[np.ndarray], None] | None = None, then: Callable | None = None
+    ) -> np.ndarray:
         """Records (n,) of points (n, ndim), with the fields log_prob, log_prior and, where there are any, blobs.
 
-        `observe` is called with the points directly before they are evaluated, for a guide with a method `observe`.
+        `observe` is called with the points directly before they are evaluated, for a guide with a method `observe`. If
+        `then` is given, ``then(coords, records)`` is returned.
         """
 
     def submit(self, coords: np.ndarray, observe: Callable[[np.ndarray], None] | None = None) -> PendingPoints:

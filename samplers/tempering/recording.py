@@ -12,7 +12,7 @@ from ..judgement.clusters import find_clusters
 from ..reports import AnnealingResult, EarlyStop, GuidedRound, GuidedStart, Report, Restart, Stage, warn
 from .population import Density, Population
 
-__all__ = ["Recording"]
+__all__ = ["Recording", "check_end"]
 
 
 class Recording:
@@ -22,8 +22,8 @@ class Recording:
         self.result, self._density = AnnealingResult(), density
         self._seconds, self._evaluations = time.perf_counter(), density.evaluations
 
-    def add(self, population: Population, report: Report) -> None:
-        """Add a report of `samplers.tempering.anneal.anneal`; a finding is a warning as well."""
+    def add(self, population: Population, report: Report) -> AnnealingResult:
+        """The result with a report of `samplers.tempering.anneal.anneal`; a finding is a warning as well."""
         result = self.result
         if isinstance(report, Stage):
             now = time.perf_counter(), self._density.evaluations
@@ -49,18 +49,18 @@ class Recording:
         if result.finished and population.founders:
             result = result._replace(founders=population.founders[0])
         self.result = result
+        return result
 
-    def check_evidence(self, coords: np.ndarray) -> None:
-        """Judge the estimates of the evidence at the end, with the final points (n, ndim)."""
-        result, stop = self.result, self.result.early_stop
-        if stop is not None and not stop.complete:
-            return  # its points are judged by their weights
-        founders = np.arange(len(coords)) if result.founders is None else result.founders
-        error = result.ladder[-1].log_evidence_error
 
-        def has_several_modes() -> bool:
-            return len(find_clusters(coords[None], founders)) > 1
+def check_end(result: AnnealingResult, coords: np.ndarray) -> list[Finding]:
+    """Findings about the estimates of the evidence at the end, with the final points (n, ndim)."""
+    stop = result.early_stop
+    if stop is not None and not stop.complete:
+        return []  # its points are judged by their weights
+    founders = np.arange(len(coords)) if result.founders is None else result.founders
+    error = result.ladder[-1].log_evidence_error
 
-        for finding in check_evidence(result.log_evidence_ladder, error, result.check, has_several_modes):
-            warn(finding.message)
-            self.result = self.result._replace(findings=(*self.result.findings, finding))
+    def has_several_modes() -> bool:
+        return len(find_clusters(coords[None], founders)) > 1
+
+    return check_evidence(result.log_evidence_ladder, error, result.check, has_several_modes)

@@ -89,7 +89,10 @@ def anneal_by_moves(
         distinct = len(np.unique(population.coords, axis=0))
 
         # 5. move
-        moved = yield from move(population, ancestors, density, random, schedule, settings, visited)
+        arguments = density, random, schedule, settings, visited
+        moved = yield from move(population, ancestors, *arguments)
+        if moved.to_sweep is not None:
+            moved = yield from move_together(moved.population, *arguments, moved)
         population = moved.population
         if moved.stopped:
             raise stop_at(population, log_evidence, standard_error, log_evidence - increment)
@@ -114,7 +117,10 @@ def move(
     settings: Settings,
     visited: VisitedPoints | None = None,
 ) -> Generator[tuple[Population, Sweep], None, Mutated]:
-    """Move resampled points at their beta: all points equally often, or in chains from the distinct points."""
+    """Move resampled points at their beta: all points equally often, or in chains from the distinct points.
+
+    After chains, all points may have to be moved together (`Mutated.to_sweep`).
+    """
     schedule.follow(ancestors)
     if settings.chains == "leaders":
         return grow_chains(population, ancestors, density, random, schedule, settings, visited)
