@@ -2,15 +2,16 @@
 
 emcee's backend writes the chain. In an HDF5 file, the group of the chain has the attribute ``run``, the dataset
 ``tempering`` (JSON), and the group ``restart``: the population at beta = 1, or the state from which a reset chain
-continues. The attribute ``checksum`` of all of this is written last, so that half of a step is found, as a process
-leaves it that was killed while HDF5 wrote. In memory, results are attributes of the backend.
+continues. The attribute ``checksum`` of all of this tells a chain that something else has changed. In memory, results
+are attributes of the backend.
 """
 
 import json
 import logging
 import os
+import tempfile
 import zlib
-from pathlib import Path
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import h5py
@@ -23,8 +24,8 @@ from .emcee_internals import change_blobs, cut_chain, restore_counts, trim_chain
 from .estimates.importance import EvidenceCheck
 from .finding import Finding
 from .judgement.verdict import Verdict
-from .output_file import FileHeld, change_file, open_file, patient_open, read_object
-from .reports import AnnealingResult, Stage, warn
+from .output_file import FileHeld, open_file, replace_group, whole_file
+from .reports import AnnealingResult, Stage
 
 __all__ = ["DAMAGED", "Output", "make_group", "run_of_file"]
 
@@ -32,8 +33,8 @@ logger = logging.getLogger(__name__)
 
 DAMAGED = "damaged"
 CHECKSUM = "checksum"
-ATTRIBUTES = {"version", "nwalkers", "ndim", "has_blobs", "iteration"}  # of every chain of emcee
-STEPS_AT_ONCE = 200  # steps that are read at once for their checksum
+# attributes and datasets of every chain of emcee
+OF_EVERY_CHAIN = {"version", "nwalkers", "ndim", "has_blobs", "iteration", "chain", "log_prob", "accepted"}
 
 
 class Output:
@@ -44,54 +45,33 @@ class Output:
     """
 
     def __init__(self, backend: Backend):
-        self._backend, self._file = backend, patient_open(backend)
+        self._backend, self._file = backend, whole_file(backend)
         self._counts = int(backend.iteration), np.array(backend.accepted)
-        self._summed = 0, 0  # steps, and their checksum
         stored = _read(backend)
         self.result, self.verdict = _parsed(stored)
         self.first_step = stored.get("first_step", 0)
         # the process may have been killed after the provisional step was removed, and before its note was
         self.provisional = stored.get("provisional", False) and int(backend.iteration) > self.first_step
 
+    def whole(self) -> AbstractContextManager:
+        """Context in which a file is changed as a whole (`samplers.output_file`)."""
+        if self._file is None:
+            return nullcontext()
+        self._file.seal = _seal
+        return self._file
+
     def begin(self, run: str) -> None:
-        """A new annealing begins, without results."""
+        """A new annealing begins, without results. OSError or ValueError if a file cannot be written."""
         self.result, self.verdict, self.first_step = AnnealingResult(), None, int(self._backend.iteration)
         self._write(run, keep=False)
+        if self._file is not None:
+            self._file.save()
 
     def step_stored(self) -> None:
         """A step has been stored completely."""
         self._counts = int(self._backend.iteration), np.array(self._backend.accepted)
         if self._file is not None:
-            with self._backend.open("a") as file:
-                self._seal(file[self._backend.name])
-
-    def _seal(self, group: h5py.Group) -> None:
-        """Write the checksum of a chain that is complete, from the checksum of its known steps."""
-        self._summed = _checksum_of_steps(group, *self._summed)
-        group.attrs[CHECKSUM] = _checksum(group, self._summed[1])
-
-    def check_file(self) -> None:
-        """Raise ValueError if another program holds the file, which must be written before a run begins."""
-        if self._file is not None:
-            self._file.write_back(wait=False)
-            open_file(self._backend, "r+").close()
-
-    def keep_in_memory(self) -> None:
-        """From now on, a chain whose file another program holds open is kept in memory, up to `write_behind`."""
-        if self._file is not None:
-            self._file.goes_on = True
-
-    def write_behind(self) -> None:
-        """Write a chain that was kept in memory to the file; warns if another program still holds the file."""
-        if self._file is None:
-            return
-        self._file.goes_on = False
-        if not self._file.write_back(wait=True):
-            warn(
-                f"{self._backend.filename} is still held open by another program, and its last steps are in this "
-                "sampler only. Close the file in the other program and call run_mcmc(None, 0), which writes the steps. "
-                "A new process makes them again from the record beside the file, without a simulation"
-            )
+            self._file.save_now_and_then()
 
     def change_blobs(self, blobs: np.ndarray | None) -> None:
         """Store the blobs of the chain in the type of the blobs (n, ...) that are stored next."""
@@ -104,9 +84,7 @@ class Output:
             flat = converted(stored.reshape(steps * n, *shape), blobs.dtype, tuple(shape))
             return flat.reshape(stored.shape)
 
-        if change_blobs(self._backend, blobs.dtype, convert):
-            self._summed = 0, 0
-            self.step_stored()
+        change_blobs(self._backend, blobs.dtype, convert)
 
     def undo_half_a_step(self) -> None:
         """Remove a step that an error or Ctrl-C has left incomplete."""
@@ -116,12 +94,9 @@ class Output:
             logger.warning("the chain may end with half of a step (%s)", error)
 
     def write(self, result: AnnealingResult, verdict: Verdict | None) -> None:
-        """Store a result. If the file cannot be written, a warning is logged, and the next call stores the result."""
+        """Store a result."""
         self.result, self.verdict = result, verdict
-        try:
-            self._write()
-        except (OSError, FileHeld) as error:
-            logger.warning("ladder and verdict are not stored (%s): the next call of run_mcmc stores them", error)
+        self._write()
 
     def keep_state(self, state: State | None) -> None:
         """Store the state from which a chain without steps continues, also in another process."""
@@ -143,7 +118,7 @@ class Output:
             backend.tempering = contents
             return
         data = np.frombuffer(json.dumps(contents).encode(), dtype=np.uint8)
-        with backend.open("a") as file:
+        with self.whole(), backend.open("a") as file:
             group = file[backend.name]
             if run is not None:
                 group.attrs["run"] = run
@@ -158,7 +133,6 @@ class Output:
                     kept.attrs[f"random_state_{i}"] = value
             group.pop("tempering", None)
             group.create_dataset("tempering", data=data)
-            self._seal(group)
 
     # ------------------------------------------------------------------ the state that a chain goes on from
 
@@ -189,9 +163,10 @@ class Output:
 
     def clear_chain(self, state: State | None) -> None:
         """Remove all steps; the chain continues from `state`."""
-        cut_chain(self._backend, 0)
-        self.first_step, self.provisional = 0, False
-        self.keep_state(state)
+        with self.whole():
+            cut_chain(self._backend, 0)
+            self.first_step, self.provisional = 0, False
+            self.keep_state(state)
 
     def store_provisional_step(self, state: State) -> None:
         """Store the estimate of a run that the limit of simulations ended, as a step that is replaced later."""
@@ -230,32 +205,26 @@ def _parsed(stored: dict[str, Any]) -> tuple[AnnealingResult, Verdict | None]:
     return result, Verdict(status, tuple(reasons), *others, tuple(Finding(*each) for each in findings))
 
 
-def _checksum_of_steps(group: h5py.Group, known: int = 0, checksum: int = 0) -> tuple[int, int]:
-    """Number of steps in a chain, and their CRC-32, from the `checksum` of the first `known` steps."""
-    steps = int(group.attrs["iteration"])
-    if steps < known:
-        known, checksum = 0, 0
-    for first in range(known, steps, STEPS_AT_ONCE):
-        rows = slice(first, min(first + STEPS_AT_ONCE, steps))
-        parts = [group[name][rows] for name in ("chain", "log_prob", "blobs") if name in group]
-        for step in zip(*parts, strict=True):
-            for part in step:
-                checksum = zlib.crc32(part.tobytes(), checksum)
-    return steps, checksum
+def _seal(group: h5py.Group) -> None:
+    """Write the checksum of a chain that is complete."""
+    group.attrs[CHECKSUM] = _checksum(group)
 
 
-def _checksum(group: h5py.Group, of_steps: int) -> int:
-    """CRC-32 of a chain: of its steps, counts, results, restart state and random states."""
-    parts = [(name, group.attrs[name]) for name in group.attrs if name.startswith(("iteration", "random_state_"))]
-    parts += [(name, group[name][...]) for name in ("accepted", "tempering") if name in group]
-    if "restart" in group:
-        parts += [("restart", b"")]
-        parts += [(name, value[...]) for name, value in group["restart"].items()]
-        parts += [(f"restart {name}", value) for name, value in group["restart"].attrs.items()]
-    for name, part in sorted(parts, key=lambda each: each[0]):
-        data = part.tobytes() if hasattr(part, "tobytes") else repr(part).encode()
-        of_steps = zlib.crc32(name.encode() + data, of_steps)
-    return of_steps
+def _checksum(group: h5py.Group) -> int:
+    """CRC-32 of all datasets and attributes of a chain, apart from this number."""
+    found = 0
+
+    def add(name: str, node: h5py.Group | h5py.Dataset) -> None:
+        nonlocal found
+        for key in sorted(node.attrs):
+            if key != CHECKSUM:
+                found = zlib.crc32(f"{name} {key}".encode() + np.asarray(node.attrs[key]).tobytes(), found)
+        if isinstance(node, h5py.Dataset):
+            found = zlib.crc32(name.encode() + node[...].tobytes(), found)
+
+    add("", group)
+    group.visititems(add)
+    return found
 
 
 def run_of_file(backend: HDFBackend) -> str | None:
@@ -267,18 +236,15 @@ def run_of_file(backend: HDFBackend) -> str | None:
     if not os.path.exists(backend.filename) or os.path.getsize(backend.filename) == 0:
         return None
     try:
-        with open_file(backend, "r") as file:
+        with open_file(backend) as file:
             if backend.name not in file:
                 return None
             group = file[backend.name]
-            group.visititems(read_object)
             if not group.attrs.get("iteration", 0) and "run" not in group.attrs and "log_prob" not in group:
                 return None  # emcee was killed while it made the group
-            names = list(group.attrs)  # a kill while one is replaced loses another one, or leaves one twice
-            whole = ATTRIBUTES <= set(names) and len(set(names)) == len(names)
-            whole &= {"chain", "log_prob", "accepted"} <= set(group)
-            if whole and ("run" in group.attrs or "tempering" in group):  # else a chain of emcee
-                whole = group.attrs.get(CHECKSUM) == _checksum(group, _checksum_of_steps(group)[1])
+            whole = OF_EVERY_CHAIN <= {*group.attrs, *group}
+            if "run" in group.attrs or "tempering" in group:  # else a chain of emcee
+                whole &= group.attrs.get(CHECKSUM) == _checksum(group)
             return group.attrs.get("run", "") if whole else DAMAGED
     except FileHeld:
         raise
@@ -288,14 +254,14 @@ def run_of_file(backend: HDFBackend) -> str | None:
 
 def make_group(backend: HDFBackend, nwalkers: int, ndim: int, run: str, damaged: bool = False) -> None:
     """Make the file of a backend, with an empty chain, in one step; other groups of a readable file are kept."""
-
-    def make(path: Path) -> None:
+    with tempfile.TemporaryDirectory() as folder:
         options = {"compression": backend.compression, "compression_opts": backend.compression_opts}
-        made = HDFBackend(str(path), backend.name, dtype=backend.dtype if backend.dtype_set else None, **options)
+        made = HDFBackend(
+            f"{folder}/new.h5", backend.name, dtype=backend.dtype if backend.dtype_set else None, **options
+        )
         made.reset(nwalkers, ndim)
         with made.open("a") as file:
             group = file[made.name]
             group.attrs["run"] = run
-            group.attrs[CHECKSUM] = _checksum(group, _checksum_of_steps(group)[1])
-
-    change_file(backend, make, damaged)
+            _seal(group)
+            replace_group(backend, file, damaged)

@@ -1,177 +1,186 @@
-"""The HDF5 file of a chain, which another program may hold open.
+"""The HDF5 file of a chain, which is replaced as a whole.
 
-emcee opens the file for each step. HDF5 refuses this while another program has the file open, such as a notebook that
-reads it. So a backend waits for the file. If the file is not free in time, a run goes on in a copy of the file in
-memory, and its chain is written when the file is free again.
+emcee opens the file for each step and writes in place. A kill then leaves half of a step, and HDF5 refuses the file
+while another program has it open. So during a call a backend works on a copy of its group in memory, which takes its
+place in the file about every second and at the end, in one step: a reader always finds a whole chain.
 """
 
 import contextlib
 import io
 import logging
 import os
-import shutil
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import h5py
 from emcee.backends import Backend, HDFBackend
 
+from .interrupts import deferred_interrupts
 from .reports import warn
 
-__all__ = ["FileHeld", "PatientOpen", "change_file", "open_file", "patient_open", "read_object"]
+try:
+    from fcntl import LOCK_EX, flock
+except ImportError:  # Windows has no such locks
+    flock = None
+
+__all__ = ["FileHeld", "WholeFile", "open_file", "replace_group", "whole_file"]
 
 logger = logging.getLogger(__name__)
 
 SECONDS, PAUSE = 5.0, 0.05  # longest wait for a file, and between two trials
-TRIALS = 3  # of a file that seems to be truncated
+SECONDS_BETWEEN, SHARE = 1.0, 0.1  # shortest time between two replacements, and their largest share of the time
 
 
 class FileHeld(ValueError):
-    """Another program holds a file open."""
+    """Another program holds a file open to write to it."""
 
 
-class PatientOpen:
+class WholeFile:
     """Takes the place of the method ``open`` of an emcee `HDFBackend`, through which all its methods use the file.
 
-    If `goes_on`, a file that is held open is replaced by its copy in memory; `FileHeld` is raised otherwise.
-    `is_behind` says whether the copy has a chain that the file does not have.
+    It is a context in which they use a copy in memory; `seal` is called with the group before it replaces the stored
+    one. A copy that cannot be written stays.
     """
 
     def __init__(self, backend: HDFBackend):
-        self._backend, self._copy = backend, None
-        self.goes_on = self._has_warned = False
-
-    @property
-    def is_behind(self) -> bool:
-        return self._copy is not None
+        self._backend, self.seal = backend, _nothing
+        self._copy: io.BytesIO | None = None
+        self._depth, self._next = 0, 0.0
 
     def __call__(self, mode: str = "r") -> h5py.File:
-        if self._copy is not None and mode != "r":
-            self.write_back(wait=False)
         if self._copy is None:
-            try:
-                return _wait(self._backend, lambda: type(self._backend).open(self._backend, mode))
-            except FileHeld:
-                if not self.goes_on or not self._take_copy():
-                    raise
+            return type(self._backend).open(self._backend, mode)
         return h5py.File(self._copy, "r" if mode == "r" else "r+")
 
-    def _take_copy(self) -> bool:
-        """Copy the file to memory; False if another program is changing it."""
-        copy = io.BytesIO(Path(self._backend.filename).read_bytes())
-        try:
-            with h5py.File(copy, "r") as file:
-                file[self._backend.name].visititems(read_object)
-        except Exception:  # HDF5 raises nearly anything
-            return False
-        self._copy = copy
-        if not self._has_warned:
-            self._has_warned = True
-            warn(
-                f"{self._backend.filename} is held open by another program: the run goes on, and keeps its chain in "
-                "memory until the file is free. Close the file in the other program"
-            )
-        return True
-
-    def write_back(self, wait: bool) -> bool:
-        """Write a chain in memory to the file if it is free, now or after a wait; returns whether the file has it."""
+    def __enter__(self) -> "WholeFile":
         if self._copy is None:
-            return True
-        name = self._backend.name
+            copy, name = io.BytesIO(), self._backend.name
+            with open_file(self._backend) as file, h5py.File(copy, "w") as ours:
+                file.copy(file[name], ours, name)
+            self._copy = copy
+        self._depth += 1
+        return self
 
-        def change(path: Path) -> None:
-            with h5py.File(path, "a") as file, h5py.File(self._copy, "r") as ours:
-                file.pop(name, None)
-                ours.copy(ours[name], file, name)
-
+    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
+        self._depth -= 1
+        if self._depth > 0:
+            return
         try:
-            open_file(self._backend, "r+", wait).close()
-            change_file(self._backend, change)
-        except (FileHeld, OSError) as error:  # also a full disk: the chain is still in memory
-            logger.info("the chain is kept in memory: %s", error)
-            return False
-        self._copy = None
-        return True
+            self.save()
+            self._copy = None
+        except FileHeld as held:
+            warn(
+                f"{held}: the last steps are in this sampler only. Call run_mcmc(None, 0) later, which writes them. A "
+                "new process makes them again from the record beside the file, without a simulation"
+            )
+        except OSError:
+            if error is None:
+                raise
+            logger.warning("%s cannot be written: the chain is in this sampler only", self._backend.filename)
+
+    def save(self) -> None:
+        """Put the copy in its place in the file; OSError if it cannot be written, `FileHeld` if it is held."""
+        start = time.monotonic()
+        with deferred_interrupts():
+            with h5py.File(self._copy, "r+") as ours:
+                self.seal(ours[self._backend.name])
+            with h5py.File(self._copy, "r") as ours:
+                replace_group(self._backend, ours)
+        now = time.monotonic()
+        self._next = now + max(SECONDS_BETWEEN, (now - start) / SHARE)
+
+    def save_what_is_left(self) -> None:
+        """Write a copy that could not be written before; `FileHeld` or OSError if it still cannot."""
+        if self._copy is not None and self._depth == 0:
+            self.save()
+            self._copy = None
+
+    def save_now_and_then(self) -> None:
+        """Put the copy in its place if that has not been done for a second; later if that fails now."""
+        if time.monotonic() >= self._next:
+            try:
+                self.save()
+            except (OSError, FileHeld) as error:
+                logger.info("the chain is in memory: %s", error)
+                self._next = time.monotonic() + SECONDS
 
 
-def _wait(backend: HDFBackend, opens: Callable[[], h5py.File], wait: bool = True) -> h5py.File:
-    """The file that a function opens; `FileHeld` if another program holds it open, now or after a wait."""
-    end, truncated = time.monotonic() + (SECONDS if wait else 0.0), 0
+def _nothing(group: h5py.Group) -> None:
+    """Seal nothing."""
+
+
+def whole_file(backend: Backend) -> "WholeFile | None":
+    """The method ``open`` of a backend with a file that can be written, from now on a `WholeFile`."""
+    if not isinstance(backend, HDFBackend) or backend.read_only:
+        return None
+    if not isinstance(backend.open, WholeFile):
+        vars(backend)["open"] = WholeFile(backend)
+    return backend.open
+
+
+def open_file(backend: HDFBackend) -> h5py.File:
+    """The file of a backend itself, to be read; `FileHeld` if another program writes to it, also after a wait."""
+    end = time.monotonic() + SECONDS
     while True:
         try:
-            before = _identity(backend)
-            file = opens()
-            if before in (None, _identity(backend)):
-                return file
-            file.close()  # another sampler has replaced the file while it was opened
+            return h5py.File(backend.filename, "r")
         except OSError as error:
-            # HDF5 asks for the size of a file before it locks it, and another sampler may just have written to it
-            truncated += (seems_truncated := "truncated file" in str(error))
-            is_held = isinstance(error, BlockingIOError) or "already open" in str(error)
-            if not is_held and not (seems_truncated and truncated < TRIALS):
+            if not (isinstance(error, BlockingIOError) or "already open" in str(error)):
                 raise
-            if is_held and time.monotonic() >= end:
+            if time.monotonic() >= end:
                 held = f"{backend.filename} is held open by another program ({error})"
                 raise FileHeld(f"{held}: close the file there, and try again") from error
         time.sleep(PAUSE)
 
 
-def _identity(backend: HDFBackend) -> tuple[int, int] | None:
-    """Device and inode of the file of a backend; None if there is no file."""
-    try:
-        status = os.stat(backend.filename)
-    except FileNotFoundError:
-        return None
-    return status.st_dev, status.st_ino
+def replace_group(backend: HDFBackend, ours: h5py.File, anew: bool = False) -> None:
+    """Replace the group of a backend in its file by the group of a file, in one step; what else is there is kept.
 
-
-def open_file(backend: HDFBackend, mode: str, wait: bool = True) -> h5py.File:
-    """The file of a backend itself, not its copy in memory; `FileHeld` if another program holds it open."""
-    return _wait(backend, lambda: h5py.File(backend.filename, mode), wait)
-
-
-def patient_open(backend: Backend) -> PatientOpen | None:
-    """The method ``open`` of a backend with a file that can be written, which waits for the file from now on."""
-    if not isinstance(backend, HDFBackend) or backend.read_only:
-        return None
-    if not isinstance(backend.open, PatientOpen):
-        vars(backend)["open"] = PatientOpen(backend)
-    return backend.open
-
-
-def change_file(backend: HDFBackend, change: Callable[[Path], None], damaged: bool = False) -> None:
-    """Change a copy of the file of a backend, and put it in its place in one step; other groups are kept.
-
-    No other sampler writes to the file meanwhile. A file that is missing, empty or unreadable is made anew, and so is
-    one that is `damaged` so that it cannot be changed.
+    A file that is missing, empty or, if `anew`, cannot be read is made.
     """
-    path = Path(backend.filename).resolve()
-    new, is_new = path.with_name(f"{path.name}.{uuid.uuid4().hex[:8]}.new"), not path.exists()
-    with contextlib.ExitStack() as stack:
+    path, name = Path(backend.filename).resolve(), backend.name
+    new = path.with_name(f"{path.name}.{uuid.uuid4().hex[:8]}.new")
+    with _locked(path.parent), contextlib.ExitStack() as stack:
         stack.callback(new.unlink, missing_ok=True)
-        with contextlib.suppress(OSError):  # it is missing or cannot be read
-            if path.stat().st_size > 0:
-                stack.enter_context(open_file(backend, "r+"))
-                shutil.copyfile(path, new)
-        try:
-            change(new)
-        except Exception:  # HDF5 raises nearly anything
-            if not damaged:
+
+        def write(others: h5py.File | None) -> None:
+            with h5py.File(new, "w") as file:
+                if others is not None:
+                    file.attrs.update(others.attrs)
+                    for key in others:
+                        if key != name:
+                            others.copy(key, file)
+                    file.pop(name, None)  # of a name such as "a/b"
+                ours.copy(ours[name], file, name)
+
+        if path.exists() and path.stat().st_size > 0:
+            try:
+                with open_file(backend) as others:
+                    write(others)
+            except FileHeld:
                 raise
-            new.unlink()
-            change(new)
-        if os.name == "nt":  # Windows replaces no open file
-            stack.pop_all().close()
-        try:
-            (os.link if is_new else os.replace)(new, path)
-        except FileExistsError:  # another sampler has made the file meanwhile
-            change_file(backend, change)
+            except Exception:  # HDF5 raises nearly anything
+                if not anew:
+                    raise
+                write(None)
+        else:
+            write(None)
+        os.replace(new, path)
 
 
-def read_object(_: str, node: h5py.Group | h5py.Dataset) -> None:
-    """Read a complete object of a file."""
-    dict(node.attrs)
-    if isinstance(node, h5py.Dataset):
-        node[...]
+@contextlib.contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Context in which no other sampler replaces a file in a folder."""
+    if flock is None:
+        yield
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        with contextlib.suppress(OSError):  # a file system without locks
+            flock(descriptor, LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)

@@ -276,6 +276,7 @@ class Record:
                 if self._whole == 0:
                     file.truncate(0)
                     if file.write(MAGIC) < len(MAGIC):
+                        file.truncate(0)
                         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.path))
                     self._whole = len(MAGIC)
                 file.truncate(self._whole)

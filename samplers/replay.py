@@ -22,7 +22,7 @@ from emcee.moves import Move
 from .blobs import leaves
 from .moves.population_moves import describe
 from .output import DAMAGED, make_group, run_of_file
-from .output_file import open_file, patient_open
+from .output_file import whole_file
 from .record import EvaluatedBatch, Record, free_name
 from .settings import Settings
 from .tempering.guide import Guide, guide_fingerprint
@@ -44,9 +44,7 @@ def open_record(backend: Backend | None, nwalkers: int, ndim: int, slow: Sequenc
     """
     if not isinstance(backend, HDFBackend) or backend.read_only:
         return Record(slow=slow)
-    if patient_open(backend).is_behind:  # of a sampler whose last steps are in memory only
-        open_file(backend, "r+").close()
-        patient_open(backend).write_back(wait=True)
+    whole_file(backend).save_what_is_left()  # of a sampler whose last steps are in memory only
     path = Path(backend.filename).resolve()
     record = Record(path.with_name(f"{path.name}.{quote(backend.name, safe='')}.record"), slow)
     stored = run_of_file(backend)
@@ -73,8 +71,8 @@ def open_record(backend: Backend | None, nwalkers: int, ndim: int, slow: Sequenc
             aside = free_name(path, "damaged")
             shutil.copyfile(path, aside)
             logger.warning(
-                "%s does not end with a step that this run has stored: it is damaged, its writer was killed, or "
-                "another program has added steps. A copy of it is kept as %s",
+                "%s does not end with a step that this run has stored: it is damaged, or another program has added "
+                "steps. A copy of it is kept as %s",
                 backend.filename,
                 aside,
             )

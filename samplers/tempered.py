@@ -69,7 +69,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         support of the prior are not evaluated. Blobs are stored exactly: without `blobs_dtype`, in a type that holds
         the blobs of the first evaluations, and later blobs that this type cannot hold are refused. With an emcee
         `HDFBackend`, a record of all evaluations is kept beside the file, and a killed run continues without repeating
-        an evaluation (`run_mcmc`). While another program holds the file open, the chain is kept in memory.
+        an evaluation (`run_mcmc`). The file is replaced as a whole, about every second and at the end of a call.
     log_prior_fn : callable, optional
         Log-density of the normalised prior. It takes the same kind of argument as `log_prob_fn` (a point; a batch with
         `vectorize`; a dict with `parameter_names`) but not `args` and `kwargs`. By default ``log_prob_fn.log_prior``.
@@ -340,67 +340,67 @@ class TemperedSampler(RunResults, EnsembleSampler):
         bar = {"progress": progress, "progress_kwargs": progress_kwargs}
         start, provisional, evaluations = time.perf_counter(), self._output.provisional, self.evaluations
         random_state = get_random(self).get_state()
-        try:
-            self._output.keep_in_memory()
-            state = self._first_state(state, skip_initial_state_check)
-            failures, self._was_reset = self.failure_count, False
-            skip = skip_initial_state_check
-            if isinstance(state, RunStart):
-                start_of_run, stored, skip = state, self._output.last_state(), True
-                try:
-                    with self._annealing(start_of_run, stored, bar) as (steps, guidance, take):
-                        for population, report in steps:
-                            take(population, report)
-                    state = self._annealed(population, guidance, stored)
-                except Incomplete:
-                    state = self._go_on_without_annealing(stored)
-            if store and provisional and not self._output.provisional:
-                arguments["iterations"] = iterations = iterations + 1  # in place of the provisional step
-            with deferred_interrupts():
-                set_previous_state(self, State(state, copy=True))  # where the next call goes on after an interrupt
-                self._must_repeat = self._must_repeat and self._result.early_stop is not None
-            self.seconds += time.perf_counter() - start
-            self._evaluator.evaluates_parts = False
-            trim_chain(self.backend)
-            state.blobs = self._evaluator.typed(state.blobs)
-            if store:
-                self._output.change_blobs(state.blobs)
-            ended, advanced, stored, new = self._must_repeat, None, State(state, copy=True), 0
-            steps = () if ended else super().sample(state, skip_initial_state_check=skip, **arguments, progress=False)
-            per_step = 1 if thin else int(thin_by)
-            sweeps = None if iterations is None else iterations * per_step
-            shown = self._evaluator, self._target.function
-            start = time.perf_counter()
+        with self._output.whole():
             try:
-                for advanced in show_sweeps(steps, bar, sweeps, per_step, *shown):
-                    new += 1
-                    with deferred_interrupts():
-                        stored = State(advanced, copy=True)
-                        set_previous_state(self, stored)
-                        if store:
-                            self._output.step_stored()
-                    self._record.drop_old_points()
-                    self.seconds += time.perf_counter() - start
-                    yield advanced
-                    start = time.perf_counter()
-            except BudgetExhausted:
-                ended = True
-            missing = 0 if iterations is None else iterations - new
-            self._judge(missing, stored.coords)
-            if ended:
-                yield from self._end_early(advanced, stored, new, missing, store)
-        except Exception as error:
-            self._undo(random_state)
-            if self.evaluations > evaluations:  # not for an argument that was refused
-                error.add_note(f"{self._kept} When the cause is removed, call run_mcmc again to go on.")
-            raise
-        except (KeyboardInterrupt, SystemExit):
-            with deferred_interrupts():
+                state = self._first_state(state, skip_initial_state_check)
+                failures, self._was_reset = self.failure_count, False
+                skip = skip_initial_state_check
+                if isinstance(state, RunStart):
+                    start_of_run, stored, skip = state, self._output.last_state(), True
+                    try:
+                        with self._annealing(start_of_run, stored, bar) as (steps, guidance, take):
+                            for population, report in steps:
+                                take(population, report)
+                        state = self._annealed(population, guidance, stored)
+                    except Incomplete:
+                        state = self._go_on_without_annealing(stored)
+                if store and provisional and not self._output.provisional:
+                    arguments["iterations"] = iterations = iterations + 1  # in place of the provisional step
+                with deferred_interrupts():
+                    set_previous_state(self, State(state, copy=True))  # where the next call goes on after an interrupt
+                    self._must_repeat = self._must_repeat and self._result.early_stop is not None
+                self.seconds += time.perf_counter() - start
+                self._evaluator.evaluates_parts = False
+                trim_chain(self.backend)
+                state.blobs = self._evaluator.typed(state.blobs)
+                if store:
+                    self._output.change_blobs(state.blobs)
+                ended, advanced, stored, new = self._must_repeat, None, State(state, copy=True), 0
+                steps = (
+                    () if ended else super().sample(state, skip_initial_state_check=skip, **arguments, progress=False)
+                )
+                per_step = 1 if thin else int(thin_by)
+                sweeps = None if iterations is None else iterations * per_step
+                shown = self._evaluator, self._target.function
+                start = time.perf_counter()
+                try:
+                    for advanced in show_sweeps(steps, bar, sweeps, per_step, *shown):
+                        new += 1
+                        with deferred_interrupts():
+                            stored = State(advanced, copy=True)
+                            set_previous_state(self, stored)
+                            if store:
+                                self._output.step_stored()
+                        self._record.drop_old_points()
+                        self.seconds += time.perf_counter() - start
+                        yield advanced
+                        start = time.perf_counter()
+                except BudgetExhausted:
+                    ended = True
+                missing = 0 if iterations is None else iterations - new
+                self._judge(missing, stored.coords)
+                if ended:
+                    yield from self._end_early(advanced, stored, new, missing, store)
+            except Exception as error:
                 self._undo(random_state)
-            logger.warning("interrupted: %s Call run_mcmc again to go on.", self._kept)
-            raise
-        finally:
-            self._output.write_behind()
+                if self.evaluations > evaluations:  # not for an argument that was refused
+                    error.add_note(f"{self._kept} When the cause is removed, call run_mcmc again to go on.")
+                raise
+            except (KeyboardInterrupt, SystemExit):
+                with deferred_interrupts():
+                    self._undo(random_state)
+                logger.warning("interrupted: %s Call run_mcmc again to go on.", self._kept)
+                raise
         if self.failure_count > failures:
             warn(
                 f"{self.failure_count - failures} evaluations failed and count as impossible "
@@ -573,7 +573,6 @@ class TemperedSampler(RunResults, EnsembleSampler):
         log_prior = self._target.log_prior_of_start(coords)
         if not np.array_equal(coords, self._drawn):
             self._target.check_start(coords)
-        self._output.check_file()
         if anew:
             self._forget_run()
         run = {"run": uuid.uuid4().hex, "seed": self._seed, "of_earlier_guides": self._budget.of_guides}

@@ -50,8 +50,8 @@ def grow_chains(
     """Grow a chain from each distinct point (leader), one step per copy of it, after ``settings.burn_in`` steps of all.
 
     The first step moves all chains together, later ones those that are long enough. With a burn-in, sweeps over all
-    points shall follow (`Mutated.to_sweep`) if these are still correlated with the resampled points. `ancestors` (n,) are equal for copies of one
-    point.
+    points shall follow (`Mutated.to_sweep`) if these are still correlated with the resampled points. `ancestors` (n,)
+    are equal for copies of one point.
     """
     beta, coords, records = population.beta, population.coords, population.records
     model = tempered_model(density, beta, random, visited)
