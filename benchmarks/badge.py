@@ -57,7 +57,7 @@ _PRIOR = {
     "shape": Uniform(0.3, 1.0),
 }
 _FRAME = {f"stiffness_{i}": LogNormal(1.0, 0.5) for i in (1, 2, 3)}
-_FRAME |= {f"damping_{i}": LogNormal(0.01, 1.0) for i in (1, 2, 3)} | {"mass_3": LogNormal(1.0, 0.3)}
+_FRAME |= {f"damping_{i}": LogNormal(0.01, 1.0) for i in (1, 2, 3)}
 _SHAKINGS = ((18.0, 26.0), (36.0, 44.0), (54.0, 62.0))  # [s]
 _LONGEST, _BEFORE = 30.0, 4.0  # [s]
 
@@ -109,7 +109,7 @@ class _Frame(NamedTuple):
         measured = replace(raw, values=raw.values - rest)
         for start, stop in _SHAKINGS:
             table = Record("table", raw.dt, measured.channel("table")).trim(9.0, stop)
-            parts = ShearFrame({floor: int(floor) for floor in self.floors}, [1.0] * 3, [2912.0] * 3, (3,))
+            parts = ShearFrame({floor: int(floor) for floor in self.floors}, [1.0] * 3, [2912.0] * 3)
             part = measured.trim(start, stop)
             model = LinearStructure(parts, table, lead=start - 9.0)
             yield _Event(model, part.select(self.floors).values, part.channel("wrong"))

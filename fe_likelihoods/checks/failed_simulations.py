@@ -19,16 +19,13 @@ from .run import FinishedRun
 
 __all__ = ["Failure", "Failures", "failures"]
 
-KEPT_APART = 3  # reasons that differ in their numbers only: these may be codes, such as signal numbers
-
 
 class Failure(NamedTuple):
     """Failures for one reason: how many, and where."""
 
-    reason: str  # with "#" for numbers, where there are more than three with other numbers
+    reason: str  # with "#" for numbers
     count: int
     where: str  # the parameter that tells these failures from successes best, in words
-    ranges: str  # of the parameters, over all recorded failures
     example: str  # parameters of one failure, after its reason where `reason` has "#"
 
 
@@ -121,31 +118,21 @@ def _joined(
 
 
 def _by_reason(run: FinishedRun, source: _Source) -> list[Failure]:
-    """Failures of one model; more than three reasons that differ in their numbers only are one."""
-    common = Counter(map(reason_without_numbers, source.counts))
-
-    def shown(text: str) -> str:
-        return text if common[reason_without_numbers(text)] <= KEPT_APART else reason_without_numbers(text)
-
-    counts: Counter = Counter()
+    """Failures of one model; reasons that differ in their numbers only are one."""
+    counts, rows = Counter(), []
     for text, count in source.counts.items():
-        counts[shown(text)] += count
-    recorded = list(map(shown, source.reasons))
-    return [_failure(run, source, reason, count, recorded) for reason, count in counts.items()]
-
-
-def _failure(run: FinishedRun, source: _Source, reason: str, count: int, recorded: list[str]) -> Failure:
-    """A row for one reason; `recorded` are the reasons of the points that have failed, as they are shown."""
-    chosen = [row for row, each in enumerate(recorded) if each == reason]
-    if not chosen:
-        return Failure(reason, count, "", "", "")
-    failed, names = source.failed[chosen], [run.names[column] for column in source.columns]
-    ends = zip(names, failed.min(axis=0), failed.max(axis=0), strict=True)
-    ranges = ", ".join(f"{name} {low:.4g} to {high:.4g}" for name, low, high in ends)
-    example = ", ".join(f"{name} = {value:.4g}" for name, value in zip(names, failed[0], strict=True))
-    if (text := source.reasons[chosen[0]]) != reason:
-        example = f"{text}: {example}"
-    return Failure(reason, count, _where(run, source, failed), ranges, example)
+        counts[reason_without_numbers(text)] += count
+    names = [run.names[column] for column in source.columns]
+    for reason, count in counts.items():
+        chosen = [row for row, each in enumerate(source.reasons) if reason_without_numbers(each) == reason]
+        where = example = ""
+        if chosen:
+            failed, text = source.failed[chosen], source.reasons[chosen[0]]
+            example = ", ".join(f"{name} = {value:.4g}" for name, value in zip(names, failed[0], strict=True))
+            example = example if text == reason else f"{text}: {example}"
+            where = _where(run, source, failed)
+        rows.append(Failure(reason, count, where, example))
+    return rows
 
 
 def _are_among(points: np.ndarray, others: np.ndarray) -> np.ndarray:

@@ -19,8 +19,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..checks.finding import labelled
-from ..checks.transfer import check_emulator
 from ..emulation.gaussian_process import fit_process, left_out_errors, predict_mean
 from ..likelihood.posterior import Posterior
 from ..prediction.quantities import Quantity, evaluator
@@ -74,8 +72,7 @@ class Sensitivity(NamedTuple):
                 row += [f"{max(self.total[k, i], 0.0):.2f} ± {self.total_error[k, i]:.2f}"]
         shares = ", ".join(f"{number(100.0 * share, 2)} %" for share in self.unexplained)
         lines = [text_table(rows), f"From {self.simulations} simulations; the emulator leaves {shares} unexplained."]
-        found = check_emulator(float(self.unexplained.max()))
-        return "\n".join([*lines, *labelled(found)])
+        return "\n".join(lines)
 
     __repr__ = __str__
 

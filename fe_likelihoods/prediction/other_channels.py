@@ -2,15 +2,13 @@
 
 A calibrated model predicts every floor of a building, but the posterior has noise parameters for the measured floors
 only. An unmeasured channel gets the mean noise parameters of the measured channels with the same quantity. This is an
-assumption, which every such prediction states.
+assumption: the calibration has made the error of the model small at the measured channels only.
 """
 
 from typing import Any
 
 import numpy as np
 
-from ..checks.finding import Finding
-from ..checks.transfer import note_assumed_noise
 from ..likelihood.inputs import check_model
 from ..noise.protocol import noise_channels, noise_title, noise_under
 from ..priors.points import as_points
@@ -22,13 +20,13 @@ __all__ = ["predict_channels_of"]
 
 def predict_channels_of(
     model: Model, source: PredictionSource, samples: Any, noise: bool | str
-) -> tuple[PredictionSource, Any, list[Finding]]:
+) -> tuple[PredictionSource, Any]:
     """Source and samples with which a posterior predicts the channels of another model that has the same parameters.
 
-    The samples get the noise parameters of these channels, if the noise is wanted (`noise` as for `split_samples`). The
-    findings say which channels have the mean noise of which others. ValueError if there is no
-    likelihood; the model has other parameters; or, if the noise is wanted, a channel shares its quantity with no
-    measured channel, a measured channel has another quantity, or the noise has no method ``with_channels``.
+    The samples get the noise parameters of these channels, if the noise is wanted (`noise` as for `split_samples`).
+    ValueError if there is no likelihood; the model has other parameters; or, if the noise is wanted, a channel shares
+    its quantity with no measured channel, a measured channel has another quantity, or the noise has no method
+    ``with_channels``.
     """
     if source.likelihood is None:
         raise ValueError(
@@ -42,7 +40,7 @@ def predict_channels_of(
             f"{', '.join(names)}"
         )
     if not noise:
-        return source._replace(model=model), samples, []
+        return source._replace(model=model), samples
     thetas, _ = split_samples(source, samples, noise)
     calibrated = source.noise
     if not hasattr(calibrated, "with_channels"):
@@ -50,18 +48,17 @@ def predict_channels_of(
             f"{noise_title(calibrated)} does not say what the noise of other channels is: give it a method "
             "with_channels(channels, weights), see fe_likelihoods.noise.protocol.Noise, or predict with noise=False"
         )
-    weights, found = _weights(model, source)
-    other, of_parameters = calibrated.with_channels(model.channels, weights)
+    other, of_parameters = calibrated.with_channels(model.channels, _weights(model, source))
     points = as_points(samples, own + tuple(calibrated.parameter_names))
     samples = np.hstack([thetas, points[:, len(own) :] @ of_parameters.T])
-    return source._replace(model=model, noise=noise_under(other, model)), samples, found
+    return source._replace(model=model, noise=noise_under(other, model)), samples
 
 
-def _weights(model: Model, source: PredictionSource) -> tuple[np.ndarray, list[Finding]]:
-    """Weights (n_channels, n_measured) of the measured channels in each channel of a model, with findings."""
+def _weights(model: Model, source: PredictionSource) -> np.ndarray:
+    """Weights (n_channels, n_measured) of the measured channels in each channel of a model."""
     measured = noise_channels(source.noise, source.model.channels)
     rows = {channel.name: k for k, channel in enumerate(measured)}
-    weights, of_quantity = np.zeros((len(model.channels), len(measured))), {}
+    weights = np.zeros((len(model.channels), len(measured)))
     for row, channel in zip(weights, model.channels, strict=True):
         if channel.name in rows:
             known = measured[rows[channel.name]]
@@ -80,5 +77,4 @@ def _weights(model: Model, source: PredictionSource) -> tuple[np.ndarray, list[F
                 "out of model=, or predict with noise=False"
             )
         row[alike] = 1.0 / len(alike)
-        of_quantity.setdefault(tuple(measured[k].name for k in alike), []).append(channel.name)
-    return weights, note_assumed_noise(of_quantity)
+    return weights

@@ -6,8 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks.finding import Finding, labelled, warn
-from ..checks.transfer import check_interval_samples
+from ..checks.finding import Finding, labelled
 from ..events.ratios import EventRatios
 from ..signals.channels import Channel, Measurements
 from ..signals.comparison import Comparison, compare_with
@@ -162,14 +161,9 @@ class Prediction:
         ValueError
             If the measurements lack a channel or have samples outside the histories, a measured channel is zero or has
             no sample in the part, or the histories are from one sample or have no such quantiles. For other quantities:
-            if the samples are fewer than three, the measured values have another shape, samples of the channel are
-            missing, or measurements are given for a function of the whole response.
-
-        Warns
-        -----
-        UserWarning
-            If less than one sample is expected on each side of the intervals, which then have another level: with
-            fewer than 20 samples for 0.9.
+            if the measured values have another shape, samples of the channel are missing, or measurements are given
+            for a function of the whole response. If less than one sample is expected on each side of the intervals (20
+            samples for 0.9).
 
         Notes
         -----
@@ -276,10 +270,10 @@ class Prediction:
 
 
 def _check_number(n_samples: int, least: int, level: float) -> None:
-    """Raise ValueError for fewer samples than `least`; warn if the ends of an interval are beyond all samples."""
+    """Raise ValueError for fewer samples than `least`, or if the ends of an interval are beyond all samples."""
+    least = max(least, math.ceil(2.0 / (1.0 - level) - 1e-9))
     if n_samples < least:
-        raise ValueError(f"score: expected {least} samples or more, and 20 for intervals of 90 %; got {n_samples}")
-    warn(check_interval_samples(n_samples, math.ceil(2.0 / (1.0 - level) - 1e-9), level), stacklevel=4)
+        raise ValueError(f"score: expected {least} samples or more for intervals of {level:g}; got {n_samples}")
 
 
 def _values_of(compared: np.ndarray | Comparison) -> np.ndarray:

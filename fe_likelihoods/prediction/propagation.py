@@ -187,10 +187,10 @@ def propagate(
     known = calibration_of(posterior_or_model if calibrated is None else list(calibrated))
     posterior_or_model, samples = part_of(posterior_or_model, samples, part, noise)
     calibration = source = read_source(posterior_or_model, pool)
-    assumed, other = [], record is not None or model is not None
+    other = record is not None or model is not None
     moved = record is not None and model is None  # the calibrated model under another motion
     if model is not None:
-        source, samples, assumed = predict_channels_of(model, source, samples, noise)
+        source, samples = predict_channels_of(model, source, samples, noise)
     thetas, sample_noise = split_samples(source, samples, noise, record is not None)
     n = len(thetas)
     probabilities = _probabilities(quantiles)
@@ -241,7 +241,7 @@ def propagate(
                 peaks.add(responses, reasons, members[start : start + batch])
             bar.update(sum(map(len, members[start : start + batch])))
     found = {name: _prediction(each, probabilities, effective, model.dt) for name, each in accumulators.items()}
-    findings = [*assumed, *check_final_values(ends.medians())]
+    findings = check_final_values(ends.medians())
     if other:
         findings += check_peaks(peaks.medians(c.name for c in model.channels), known, alone=calibrated is None)
     if compared:

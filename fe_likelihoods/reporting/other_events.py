@@ -1,13 +1,12 @@
 """Predictions of events other than the calibration event: numbers, scores and sentences about each of them."""
 
-import warnings
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..checks.finding import Finding
-from ..checks.transfer import check_coverage, check_failed_samples, check_scores
+from ..checks.transfer import check_failed_samples
 from ..prediction.prediction import Prediction
 from ..prediction.score_tables import HistoryScores, QuantityScores, central_interval
 from ..prediction.scores import share_within
@@ -57,7 +56,7 @@ class OtherEvent(NamedTuple):
     histories: tuple[HistoryScores, ...]
     values: tuple[QuantityScores, ...]
     sentence: str  # how it was predicted, and how the measurements compare with it
-    findings: tuple[Finding, ...]  # of the predictions, failed samples, scores that could not be computed
+    findings: tuple[Finding, ...]  # of the predictions, and failed samples
 
 
 def as_events(events: Any) -> dict[str, EventPredictions | SimulationFailed]:
@@ -96,34 +95,22 @@ def describe_event(
     findings = list(dict.fromkeys(found for each in predictions.values() for found in each.findings))
     first = next(iter(predictions.values()))
     findings += check_failed_samples(first.failure_reasons if first.n_failed else {})
-    histories, values, numbers = [], [], []
+    histories, values, numbers, told = [], [], [], ""
     for each in predictions.values():
         scores = None
         if measured is not None:
-            scores, told = _scores(each, measured)
-            findings += [each for each in check_scores(told) if each not in findings]
+            try:
+                scores = each.score(measured, LEVEL)
+            except ValueError as error:
+                told = f" No scores: {error}."
         if scores is not None:
             (histories if each.dt is not None else values).append(scores)
         if each.dt is None and each.values is not None:
             numbers += _number_rows(each, scores)
-    for scores in histories:
-        shares = {c.name: float(s) for c, s in zip(scores.channels, scores.coverage_strong, strict=True)}
-        findings += check_coverage(shares, LEVEL)
-    sentence = _sentence(first, measured, histories, numbers)
+    sentence = _sentence(first, measured, histories, numbers) + told
     return OtherEvent(
         name, predictions, measured, tuple(numbers), tuple(histories), tuple(values), sentence, tuple(findings)
     )
-
-
-def _scores(prediction: Prediction, measured: Measurements) -> tuple[HistoryScores | QuantityScores | None, list[str]]:
-    """Scores (None where they cannot be computed), and what was said about them."""
-    try:
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            scores = prediction.score(measured, LEVEL)
-    except ValueError as error:
-        return None, [f"No scores: {error}."]
-    return scores, [str(each.message) for each in caught]
 
 
 def _number_rows(prediction: Prediction, scores: QuantityScores | None) -> list[NumberRow]:

@@ -84,26 +84,10 @@ def test_reasons_that_differ_in_their_numbers_are_one_row(tmp_path):
     assert (row.reason, row.count) == ("no convergence, residual #", found.count)
     assert row.count == posterior.report()["failure_count"] > 130
     stiffness, damping = np.array([list(each["parameters"].values()) for each in posterior.report()["failures"]]).T
-    ends = [f"{each.min():.4g} to {each.max():.4g}" for each in (stiffness, damping)]
-    assert row.ranges == f"stiffness {ends[0]}, damping {ends[1]}"
     first = f"{stiffness[0]:.4g}, damping = {damping[0]:.4g}"
     assert row.example == f"no convergence, residual {stiffness[0]:.9e}: stiffness = {first}"
     assert row.where.startswith("at stiffness above 1.1 (100 %")
-    assert text.count("no convergence, residual") == 2 and row.ranges in text
-
-
-def test_control_few_numbers_may_be_codes():
-    reasons = iter([9, 11, 9] * 500)
-
-    def killed(theta):
-        if theta[0] > 1.1:
-            raise SimulationFailed(f"the worker process died (signal {next(reasons)})")
-        return free_vibration(theta)
-
-    posterior = posterior_of([1.05, 0.8], killed)
-    rows = failures(read_run(run(posterior, steps=1), posterior)).rows
-    assert [row.reason for row in rows] == [f"the worker process died (signal {k})" for k in (9, 11)]
-    assert all("died" not in row.example for row in rows)
+    assert text.count("no convergence, residual") == 2
 
 
 @pytest.mark.slow

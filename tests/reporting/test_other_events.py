@@ -50,7 +50,6 @@ def test_events_have_tables_sentences_and_figures(vibrating, tmp_path):
         in page.text
     )
     assert "There are no measurements to compare with" in page.text
-    assert "less than half of the strong part of top" in page.notes["larger: The measurements are outside of the band"]
     histories = next(table for table in page.tables if table[0][-1] == "In its strong part")[1:]
     scores = events["larger"]["histories"].score(measured["larger"])
     assert [row[0] for row in histories] == ["same", "larger"]
@@ -66,15 +65,15 @@ def test_events_have_tables_sentences_and_figures(vibrating, tmp_path):
 def test_what_speaks_against_an_event_is_said(vibrating, tmp_path):
     sampler, posterior = vibrating
     few = predicted(vibrating, n=8, noise=True)
-    told = describe_event("few", few, posterior.likelihood.measurements).findings
-    assert any("do not have their level" in each.text for each in told)
+    told = describe_event("few", few, posterior.likelihood.measurements).sentence
+    assert "No scores: score: expected 20 samples or more" in told
     far = (Finding("Far", CARE, "The peaks are far away."),)
     found = {name: replace(each, findings=far) for name, each in few.items()}
     assert describe_event("far", found, None).findings == far  # once for all quantities
     silent = describe_event("silent", predicted(vibrating), posterior.likelihood.measurements)
     assert "A band without noise is that of the response" in silent.sentence
     other = describe_event("other", few, Measurements(posterior.likelihood.measurements.channels, 0.02, [[0.0] * 9]))
-    assert any(each.text.startswith("No scores: ") for each in other.findings)
+    assert "No scores: " in other.sentence
 
 
 @pytest.mark.slow
