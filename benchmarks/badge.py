@@ -62,7 +62,7 @@ _SHAKINGS = ((18.0, 26.0), (36.0, 44.0), (54.0, 62.0))  # [s]
 _LONGEST, _BEFORE = 30.0, 4.0  # [s]
 
 _UNIT = {"A unit may be wrong", "A gain may be wrong"}
-_CLOCK = {"Clocks may differ", "Clocks of input recorders may differ"}
+_CLOCK = {"Clocks may differ"}
 _STUCK = {"A sensor was stuck", "A sensor was silent"}
 _OFFSET = {"A measurement may have an offset or a drift", "A channel has an offset", "A channel drifts"}
 

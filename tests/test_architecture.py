@@ -162,7 +162,7 @@ CHECKS = ("samplers/judgement/", "fe_likelihoods/checks/")
 # limits of effort, settings of a search, of an estimate, and of what is printed: they judge nothing
 EFFORT = {"AROUND", "EQUALLY_NEAR", "FEWEST", "FEWEST_DRAWS", "FINE", "FLOOR", "KEPT_APART", "LARGEST_TEST"} | {
     *("LONGEST_LAG", "LONGEST_SHARE", "MOST_DRAWS", "MOST_FAULTS", "MOST_SEARCHED"),
-    *("MOST_PLACES", "MOST_SPIKES", "MOST_STORED", "MOST_VALUES"),
+    *("MOST_PLACES", "MOST_SPIKES", "MOST_VALUES"),
     *("NEAR_ENOUGH", "SAME_UNITS", "SECONDS", "SMOOTH", "TAPER", "TEST_SECONDS", "WIDEST"),
 }
 MAKERS = {"Finding", "warnings.warn", "logger.warning"}

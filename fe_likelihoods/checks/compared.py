@@ -6,13 +6,12 @@ Responses are taken from the caches of the likelihood where they are there; the 
 import logging
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..cache.memory import distinct_keys
 from ..cache.verification import StaleCache
 from ..likelihood.failure_log import TooManyFailures
 from ..likelihood.likelihood import FELikelihood
@@ -25,7 +24,7 @@ from ..signals.channels import Channel, Measurements
 from ..signals.error_measures import relative_errors
 from ..signals.events import find_events
 from ..simulation.faults import ChangedModel
-from ..simulation.model import SimulationFailed, simulate_batch
+from ..simulation.model import SimulationFailed
 from .run import FinishedRun
 from .slow_motion import FEWEST_DRAWS, SlowMotion, slow_motions
 
@@ -35,7 +34,6 @@ logger = logging.getLogger(__name__)
 
 MOST_DRAWS = 100  # of the prior
 SECONDS = 10.0  # of simulations of these draws
-MOST_STORED = 100  # responses of a guide that are compared in addition
 
 
 class Window(NamedTuple):
@@ -54,20 +52,24 @@ class Window(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Compared:
-    """Measurements of one event, and responses to compare with them: the fit, draws of the prior, others of a guide."""
+    """Measurements of one event, and responses to compare with them: the fit, and draws of the prior."""
 
     title: str  # name of the data set and of the event; empty if there is one only
     measurements: Measurements
     responses: np.ndarray  # (n, n_channels, n_samples) at the times of the samples [SI]
     fitted: bool  # whether the first response is the fit, not one more draw of the prior
-    parts: dict[str, np.ndarray]  # shares of each support's motion in the responses of a linear structure
-    draws: slice = field(default_factory=lambda: slice(None))  # the responses that are draws of the prior
+    supports: int = 1  # whose motions excite the model
     modal: "ModalFit | None" = None  # modes of the responses, instead of these
 
     @cached_property
     def slow(self) -> dict[str, SlowMotion]:
         """Channels that follow the draws of the prior where no parameter changes the response, see `slow_motions`."""
-        return slow_motions(self.measurements, self.responses[self.draws]) if self.is_history else {}
+        return slow_motions(self.measurements, self.draws) if self.is_history else {}
+
+    @property
+    def draws(self) -> np.ndarray:
+        """The responses that are draws of the prior."""
+        return self.responses[int(self.fitted) :]
 
     @property
     def is_history(self) -> bool:
@@ -180,7 +182,7 @@ def draws_to_compare(posterior: Posterior, seconds: float | None = None) -> np.n
 def compare(
     likelihood: FELikelihood, points: np.ndarray, fitted: bool, key: str = "", samples: np.ndarray | None = None
 ) -> tuple[Compared, ...]:
-    """Responses at points (n, ndim), and those that a guide has left in memory, beside the measurements of each event.
+    """Responses at points (n, ndim) beside the measurements of each event.
 
     The points are draws of the prior, after the fit if it is `fitted`. Failed simulations are left out; the result is
     empty if all fail, or the first one fails and is the fit. `key` is the name of the data set. Of modal data, modes at
@@ -190,7 +192,7 @@ def compare(
     if likelihood.is_modal:
         modal = _modes(likelihood, points[int(fitted) :], samples if fitted else None)
         no = np.empty((0, *likelihood.measurements.values.shape))
-        return (Compared(key, likelihood.measurements, no, fitted, {}, modal=modal),)
+        return (Compared(key, likelihood.measurements, no, fitted, modal=modal),)
     try:
         batch = likelihood.simulate(points[:, :n])
     except (ChangedModel, StaleCache, TooManyFailures) as error:  # concerns the next sampling, not this result
@@ -199,31 +201,13 @@ def compare(
     good = [i for i, reason in enumerate(batch.reasons) if not reason]
     if not good or (fitted and good[0]):
         return ()
-    found = [batch.response[i] for i in good]
-    parts = _support_parts(likelihood.model, points[good, :n], batch.response[good])
-    if not parts:
-        known = likelihood.simulator.response_memory.responses(likelihood.model.fingerprint)
-        simulated = set(distinct_keys(points[:, :n])[0])
-        others = [each for each in known if each not in simulated]
-        for place in np.unique(np.linspace(0, len(others) - 1, min(len(others), MOST_STORED)).astype(int)):
-            found.append(known[others[place]])
-    measured = likelihood.measurements.values
-
-    def at_samples(response: np.ndarray) -> np.ndarray:
-        return measured - likelihood.residuals_of(response)
-
-    responses = np.stack([at_samples(each) for each in found])
-    sampled = {name: np.stack([at_samples(one) for one in each]) for name, each in parts.items()}
+    responses = np.stack(
+        [likelihood.measurements.values - likelihood.residuals_of(each) for each in batch.response[good]]
+    )
+    supports = len(getattr(likelihood.model, "supports", ()))
     return tuple(
-        Compared(
-            window.title,
-            window.measurements,
-            window.of(responses),
-            fitted,
-            {name: window.of(each) for name, each in sampled.items()},
-            slice(int(fitted), len(good)),
-        )
-        for window in windows_of(likelihood, key)
+        Compared(each.title, each.measurements, each.of(responses), fitted, supports)
+        for each in windows_of(likelihood, key)
     )
 
 
@@ -240,21 +224,6 @@ def _modes(likelihood: Any, draws: np.ndarray, samples: np.ndarray | None) -> Mo
             logger.warning("modes are not compared: %s", error)
             found.append(None)
     return ModalFit(likelihood, found[0], samples, found[1])
-
-
-def _support_parts(model: Any, thetas: np.ndarray, responses: np.ndarray) -> dict[str, np.ndarray]:
-    """Contribution of each support to the responses (n, n_channels, n_steps); empty unless they add up to these."""
-    supports = getattr(model, "supports", ())
-    if len(supports) < 2 or not hasattr(model, "with_record"):
-        return {}
-    names = [support.name or f"support {k + 1}" for k, support in enumerate(supports)]
-    names = [f"{name} ({k + 1})" if names.count(name) > 1 else name for k, name in enumerate(names)]
-    found = {}
-    for k, name in enumerate(names):
-        alone = model.with_record([each if i == k else each.scale(0.0) for i, each in enumerate(supports)])
-        found[name] = simulate_batch(alone, thetas).response
-    rest = np.abs(responses - sum(found.values())).max()
-    return found if rest <= 1e-6 * np.abs(responses).max() else {}
 
 
 def fit_data_sets(run: FinishedRun) -> Fits:

@@ -13,7 +13,7 @@ geometric mean, of the errors of the best response. Study ``fit_gate`` of docs/r
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import combinations
 from typing import NamedTuple
 
@@ -32,17 +32,15 @@ FACTOR = 1.5  # from which a factor may be one between units
 LONGEST_LAG, LONGEST_SHARE = 5.0, 0.2  # [s], and as a share of the record
 MOST_VALUES = 2**24  # of responses that are compared at once
 MOST_FAULTS = 4  # that are found one after the other
-# Share of its gain with which a fault competes: half a period is nearly a sign, and all late supports an early sensor.
-# Without it, 3 of 12 late or early sensors of real decks are taken for late supports.
-SIMPLE = {"factor": 1.0, "swap": 1.0, "lag": 0.85, "input lag": 0.75}
+SIMPLE = 0.85  # share of its gain with which a lag competes with a sign: half a period is nearly one
 SAME_UNITS = 1.25  # ratio of a factor to one between units, up to which it is named after them
 EQUALLY_NEAR, NEAR_ENOUGH = 0.01, 0.03  # differences of logarithms of ratios that are named together
 
 
 class Fault(NamedTuple):
-    """A fault of channels, or of supports (input lag), that explains the measurements better."""
+    """A fault of channels that explains the measurements better."""
 
-    kind: str  # "factor", "sign", "lag", "swap" or "input lag"
+    kind: str  # "factor", "sign", "lag" or "swap"
     names: tuple[str, ...]
     value: float  # measurements / responses [-], or time by which they are late [s]; NaN for a sign and a swap
     before: float  # error of the channels for the best response (RRMSE, geometric mean)
@@ -56,16 +54,13 @@ class _Hypothesis(NamedTuple):
     channels: tuple[int, ...]
     errors: np.ndarray  # (n, n of these channels), logarithms, of each response
     value: np.ndarray  # (n,) factor or lag that gives these errors
-    names: tuple[str, ...] = ()  # of supports
 
 
-def find_faults(
-    measurements: Measurements, responses: np.ndarray, parts: Mapping[str, np.ndarray] | None = None
-) -> tuple[Fault, ...]:
+def find_faults(measurements: Measurements, responses: np.ndarray) -> tuple[Fault, ...]:
     """Faults that explain measurements better than any of the responses does without them, the strongest first.
 
-    Responses (n, n_channels, n_samples) [SI] have any parameters; `parts` are their parts by the name of the support
-    that causes them, and add up to them. Each fault is found after those before it are corrected.
+    Responses (n, n_channels, n_samples) [SI] have any parameters. Each fault is found after those before it are
+    corrected.
     """
     values = np.asarray(measurements.values, dtype=float)
     there, usable = np.isfinite(values), np.flatnonzero(np.nan_to_num(values).any(axis=1))
@@ -77,44 +72,33 @@ def find_faults(
     steps, starts = (np.array(each)[usable] for each in (measurements.steps, measurements.starts))
     alike = [(channel.dimension, *when) for channel, *when in zip(channels, steps, starts, strict=True)]
     y = np.where(there, values, 0.0)[usable]
-
-    def at_samples(given: np.ndarray) -> np.ndarray:
-        return np.where(there[usable], np.asarray(given, dtype=float)[kept][:, usable], 0.0)
-
-    r = at_samples(responses)
-    chosen = np.argsort(_log_errors(y, r).sum(axis=1), kind="stable")[: max(8, MOST_VALUES // y.size)]
-    r, found = r[chosen], list[Fault]()
-    pieces = {name: at_samples(each)[chosen] for name, each in (parts or {}).items()}
+    r, found = np.where(there[usable], responses[kept][:, usable], 0.0), list[Fault]()
+    r = r[np.argsort(_log_errors(y, r).sum(axis=1), kind="stable")[: max(8, MOST_VALUES // y.size)]]
     while len(found) < MOST_FAULTS:
         errors = _log_errors(y, r)
         best, most, explained = int(np.argmin(errors.sum(axis=1))), 0.0, None
-        for each in _hypotheses(y, r, pieces, alike, steps, errors):
+        for each in _hypotheses(y, r, alike, steps, errors):
             c = list(each.channels)
             total = errors.sum(axis=1) + (each.errors - errors[:, c]).sum(axis=1)
             row = int(np.argmin(total))
             gain, before, after = errors[best].sum() - total[row], errors[best, c].mean(), each.errors[row].mean()
             value = float(each.value[row])
             is_large = value < 0.0 or _is_factor(value) if each.kind == "factor" else True
-            if "lag" in each.kind:  # one step is a convention of files
+            if each.kind == "lag":  # one step is a convention of files
                 is_large = measurements.is_history and round(abs(value) / steps[c].max()) > 1
             clear = after < min(math.log(BETTER) + before, math.log(EXPLAINED)) and gain > -math.log(BETTER) * len(c)
-            if is_large and clear and SIMPLE[each.kind] * gain > most:
-                most, explained = SIMPLE[each.kind] * gain, (each, value, math.exp(before), math.exp(after))
+            gain *= SIMPLE if each.kind == "lag" else 1.0
+            if is_large and clear and gain > most:
+                most, explained = gain, (each, value, math.exp(before), math.exp(after))
         if explained is None:
             break
         each, value, *change = explained
-        names = each.names or tuple(channels[c].name for c in each.channels)
+        names = tuple(channels[c].name for c in each.channels)
         if each.kind == "factor" and value < 0.0:
             found.append(Fault("sign", names, math.nan, *change))
         if each.kind != "factor" or _is_factor(abs(value)):
-            # a motion that is recorded late causes a response that must be earlier
-            stated = {"factor": abs(value), "input lag": -value}.get(each.kind, value)
-            found.append(Fault(each.kind, names, stated, *change))
-        r = r if each.kind == "input lag" else _corrected(each, value, r, steps)
-        for name in each.names or pieces:
-            pieces[name] = _corrected(each, value, pieces[name], steps)
-        if each.kind == "input lag":
-            r = np.sum(list(pieces.values()), axis=0)
+            found.append(Fault(each.kind, names, abs(value) if each.kind == "factor" else value, *change))
+        r = _corrected(each, value, r, steps)
     return tuple(found)
 
 
@@ -148,7 +132,6 @@ def _log_errors(y: np.ndarray, r: np.ndarray) -> np.ndarray:
 def _hypotheses(
     y: np.ndarray,
     r: np.ndarray,
-    parts: Mapping[str, np.ndarray],
     alike: Sequence[tuple],
     steps: np.ndarray,
     errors: np.ndarray,
@@ -173,43 +156,26 @@ def _hypotheses(
         if alike[i] == alike[j] and (swapped < errors[:, [j, i]]).all(axis=1).any():
             yield _Hypothesis("swap", (j, i), swapped, np.full(len(r), np.nan))
     lags, by_lag = _lag_errors(y, r, steps)
-    if len(lags) < 2:
-        return
-    for group in dict.fromkeys([*single, every]):
-        yield _best_lag("lag", group, by_lag, lags)
-    names = list(parts) if len(parts) > 1 else []
-    late = [(name,) for name in names] + [tuple(n for n in names if n != name) for name in names if len(names) > 2]
-    for supports in late:  # each one, and all but one
-        moving = np.sum([parts[name] for name in supports], axis=0)
-        yield _best_lag("input lag", every, _lag_errors(y, moving, steps, r - moving)[1], lags, supports)
+    for group in dict.fromkeys([*single, every]) if len(lags) > 1 else ():
+        chosen = by_lag[:, list(group)]
+        best = np.argmin(chosen.sum(axis=1), axis=1)
+        yield _Hypothesis("lag", group, np.take_along_axis(chosen, best[:, None, None], axis=2)[..., 0], lags[best])
 
 
-def _best_lag(
-    kind: str, group: tuple[int, ...], by_lag: np.ndarray, lags: np.ndarray, names: tuple[str, ...] = ()
-) -> _Hypothesis:
-    """A lag of some channels, the best one of each response; `by_lag` is (n, n_channels, n_lags)."""
-    chosen = by_lag[:, list(group)]
-    best = np.argmin(chosen.sum(axis=1), axis=1)
-    return _Hypothesis(kind, group, np.take_along_axis(chosen, best[:, None, None], axis=2)[..., 0], lags[best], names)
-
-
-def _lag_errors(
-    y: np.ndarray, moving: np.ndarray, steps: np.ndarray, fixed: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Lags (n_lags,) [s], and logarithms of the errors (n, n_channels, n_lags) of ``fixed + moving(t - lag)``.
+def _lag_errors(y: np.ndarray, r: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lags (n_lags,) [s], and logarithms of the errors (n, n_channels, n_lags) of ``r(t - lag)``.
 
     Before its first sample a response is at rest; where a shifted response has ended, nothing is compared.
     """
     n, coarse = y.shape[1], float(steps.max())
     count = int(min(LONGEST_LAG, LONGEST_SHARE * n * float(steps.min())) / coarse)
     lags = coarse * np.arange(-count, count + 1)
-    found, size = np.empty((*moving.shape[:2], len(lags))), 2 ** (2 * n - 1).bit_length()
+    found, size = np.empty((*r.shape[:2], len(lags))), 2 ** (2 * n - 1).bit_length()
     for c, step in enumerate(steps):
         k = np.rint(lags / step).astype(int)
-        target = np.broadcast_to(y[c] if fixed is None else y[c] - fixed[:, c], (len(moving), n))
-        products = np.fft.irfft(np.fft.rfft(target, size) * np.fft.rfft(moving[:, c], size).conj(), size)[:, k % size]
-        ends, power, own = n - np.maximum(-k, 0), _sums(moving[:, c]), _sums(y[None, c])[0]
-        squares = _sums(target)[:, ends] + power[:, n - np.maximum(k, 0)] - power[:, np.maximum(-k, 0)] - 2.0 * products
+        products = np.fft.irfft(np.fft.rfft(y[c], size) * np.fft.rfft(r[:, c], size).conj(), size)[:, k % size]
+        ends, power, own = n - np.maximum(-k, 0), _sums(r[:, c]), _sums(y[None, c])[0]
+        squares = own[ends] + power[:, n - np.maximum(k, 0)] - power[:, np.maximum(-k, 0)] - 2.0 * products
         own = np.where(own[ends] < 0.5 * own[-1], 0.0, own[ends])  # too little is left to compare
         with np.errstate(divide="ignore"):
             shares = np.maximum(squares, 0.0) / np.where(own > 0.0, own, 1.0)

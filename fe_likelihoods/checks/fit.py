@@ -95,17 +95,14 @@ def check_responses(compared: Iterable[Compared]) -> list[Finding]:
     found, compared = [], list(compared)
     modal, compared = [each.modal for each in compared if each.modal], [each for each in compared if not each.modal]
     for each in compared:
-        faults = find_faults(each.measurements, each.responses, each.parts)
+        faults = find_faults(each.measurements, each.responses)
         slow = {(fault.kind, *fault.names): (fault, band) for fault, band in find_slow_faults(each.slow)}
-        if any(fault.kind == "input lag" for fault in faults):  # of which the outputs' lags are a consequence
-            slow = {key: fault for key, fault in slow.items() if key[0] != "lag"}
         for fault in faults:
             own = [slow.pop((fault.kind, name))[0].value for name in fault.names if (fault.kind, name) in slow]
             found.append(_of_a_fault(each, fault._replace(value=float(np.median(own))) if own else fault, WRONG))
         found += [_of_a_fault(each, fault, WRONG, band) for fault, band in slow.values()]
         if each.fitted:
-            parts = {name: values[each.draws] for name, values in each.parts.items()}
-            before = find_faults(each.measurements, each.responses[each.draws], parts)
+            before = find_faults(each.measurements, each.draws)
             known = {fault.kind for fault in (*faults, *(fault for fault, _ in slow.values()))}
             found += [_of_a_fault(each, fault, CARE) for fault in before if fault.kind not in known]
     unexplained = all(each.severity != WRONG for each in found)
@@ -163,21 +160,11 @@ def _of_a_fault(compared: Compared, fault: Fault, severity: str, band: tuple[flo
         kind = "Channels may be swapped"
         text = f"The channels {where} may be exchanged: the other way round, {better}."
         action = "Check the columns of the file and the places of sensors."
-    elif fault.kind == "input lag":  # a motion that is recorded late must be shifted to earlier times
-        kind = "Clocks of input recorders may differ"
-        text = (
-            f"The motion of {where} seems to be {late} than the other motions and the measured response: without this "
-            f"lag, {better}. The clocks of recorders may differ."
-        )
-        action = (
-            "Compare the clocks of the recorders, with `align`, and shift the record before you use the result, or "
-            "make the lag a parameter (inputs= of SensedModel)."
-        )
     else:
         kind = "Clocks may differ"
         verb = "are" if len(fault.names) > 1 else "is"
         text = f"The {which} of {where} {verb} {late} than the response: with this lag, {better}."
-        text += " The clock of a support's recorder may be the wrong one as well." if compared.parts else ""
+        text += " The clock of a support's recorder may be the wrong one as well." if compared.supports > 1 else ""
         action = CLOCKS
     return Finding(kind, severity, text, action, numbers | {fault.kind: fault.value})
 

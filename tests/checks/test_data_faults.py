@@ -89,17 +89,6 @@ def test_two_faults_are_found_one_after_the_other():
     assert {fault.kind for fault in faults} == {"factor", "sign"}
 
 
-def test_a_late_support_is_told_from_a_late_sensor():
-    """Two parts of a response, one of which has another clock."""
-    one, other = RESPONSES, np.stack([MODEL.with_record(MOTION.scale(-0.7)).simulate(t) for t in [[0.6, 1.0]] * 40])
-    parts = {"left": one, "right": np.roll(other, 90, axis=-1)}
-    values = TRUE + np.roll(later(other[0], 2 * LATE), 90, axis=-1)
-    (fault,) = find_faults(measured(values, 0.03), sum(parts.values()), parts)
-    assert (fault.kind, fault.names) == ("input lag", ("right",))
-    assert fault.value == pytest.approx(-0.2, abs=0.05)  # the motion of the model is early
-    assert find_faults(measured(TRUE + parts["right"][0], 0.03), sum(parts.values()), parts) == ()
-
-
 def test_missing_samples_and_failed_responses_are_left_out():
     values = -TRUE.copy()
     values[0, 100:160] = np.nan

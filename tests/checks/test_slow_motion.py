@@ -94,7 +94,7 @@ def findings(values, fit, draws):
     model = deck(np.random.default_rng(3))
     responses = np.stack([fit, *draws])[:, None]
     measured = Measurements(model.channels, STEP, values[None])
-    return {each.kind: each for each in check_responses([Compared("", measured, responses, True, {}, slice(1, None))])}
+    return {each.kind: each for each in check_responses([Compared("", measured, responses, True)])}
 
 
 def test_what_a_fit_makes_up_for_is_wrong_and_a_right_fit_is_left_alone():
@@ -168,9 +168,9 @@ def test_a_damping_that_no_structure_has_speaks_against_a_fit_unless_gains_and_c
     rng = np.random.default_rng(6)
     model = deck(rng)
     draws, true = draws_of(model, rng)[:, None], model.simulate([4.5, 0.35, 0.7])
-    known = Compared("", Measurements(model.channels, STEP, true), draws, False, {})
+    known = Compared("", Measurements(model.channels, STEP, true), draws, False)
     noise = 9.0 * true.std() * rng.standard_normal(true.shape)
-    unknown = Compared("", Measurements(model.channels, STEP, true + noise), draws, False, {})
+    unknown = Compared("", Measurements(model.channels, STEP, true + noise), draws, False)
     assert check_damping(model, np.array([4.5, 0.25, 0.5]), [unknown]) == []
     (found,) = check_damping(model, np.array([9.9, 0.6, 0.5]), [known, unknown])
     assert found.severity == "wrong" and found.numbers == {"damping": 0.6}
