@@ -16,6 +16,7 @@ from .rows import as_table, machine, write_json
 
 BENCHMARKS: dict[str, Callable[..., Iterable[tuple]]] = {
     "badge": badge.badge,
+    "supports": badge.supports,
     "simulation": column.simulation,
     "batch": column.batch,
     "sensors": column.sensors,
@@ -34,6 +35,7 @@ BENCHMARKS: dict[str, Callable[..., Iterable[tuple]]] = {
 }
 QUICK: dict[str, dict[str, Any]] = {
     "badge": {"structures": ("Meloland",)},
+    "supports": {"structures": ("Meloland", "Meloland along")},
     "job": {"limit": 20.0},
     "truth": {"families": ("sharp", "two"), "ratios": (1.0,), "walkers": (200,)},
     "samplers": {"targets": ("T3",)},

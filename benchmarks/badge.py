@@ -12,6 +12,7 @@ A row counts, for a fault, the cases whose judgement is not "use" and names the 
 The data are no part of this project (docs/real_data.rst). Set FE_SHARED to a folder that has them in ``measured``.
 """
 
+import itertools
 import warnings
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
@@ -40,13 +41,14 @@ from fe_likelihoods import (
     read_record,
 )
 from fe_likelihoods.checks.finding import Judgement, judge
+from fe_likelihoods.checks.slow_motion import support_gains, supports_apart
 from fe_likelihoods.emulation.modes import find_modes
 from fe_likelihoods.emulation.target import ResponseTarget
 
 from .rows import Row
 from .targets import SHARED
 
-__all__ = ["badge"]
+__all__ = ["badge", "supports"]
 
 _FOLDER = SHARED / "measured"
 _MEMBERS = ("CHAN{:d}.V2", "CHAN{:02d}.V2", "CHAN{:03d}.V2", "chan{:03d}.v2")
@@ -173,6 +175,46 @@ def badge(repeats: int = 1, structures: tuple[str, ...] = tuple(_STRUCTURES), ev
     for fault, each in counts.items():
         note = "; ".join(f"{text} {count}" for text, count in notes[fault].most_common())
         rows += [Row(fault, status, float(count), f"of {each.total()}", note) for status, count in each.most_common()]
+    return rows
+
+
+def supports(repeats: int = 1, structures: tuple[str, ...] = tuple(_STRUCTURES)) -> list[Row]:
+    """Gain and sign of supports by the slow motion of the others; limits chosen with the other structures alone.
+
+    Each support has 2 times, half, the negative of its motion, and g read as m/s². The limits with the fewest right
+    events named, and then the most wrong ones, are chosen from a grid; "as set" are those of the library.
+    """
+    decks = [name for name in structures if isinstance(_STRUCTURES[name], _Deck)]
+    grid = [*itertools.product((0.8, 0.85, 0.9, 0.95), (7, 14, 21, 28), (1.3, 1.4, 1.5, 1.75, 2.0)), None]
+    scores: dict[str, np.ndarray] = {}  # right events named, and wrong ones named, by limits (n_limits, 2)
+    sizes: dict[str, np.ndarray] = {}
+    for name in decks:
+        scores[name], sizes[name] = np.zeros((len(grid), 2)), np.zeros(2)
+        for event in _STRUCTURES[name].events():
+            motions = [each.acceleration for each in event.model.supports]
+            step, known = event.model.supports[0].dt, {}
+            wrong = [(k, factor) for k in range(len(motions)) for factor in (2.0, 0.5, -1.0, 1.0 / 9.80665)]
+            sizes[name] += 1, len(wrong)
+            for row, limits in enumerate(grid):
+                options = () if limits is None else limits[:2]
+                if options not in known:
+                    known[options] = support_gains(motions, step, *options)
+                limit = () if limits is None else limits[2:]
+                scores[name][row, 0] += bool(supports_apart(known[options], *limit))
+                for k, factor in wrong:
+                    spoiled = {
+                        pair: gain * (factor if pair[0] == k else 1.0 / factor if pair[1] == k else 1.0)
+                        for pair, gain in known[options].items()
+                    }
+                    scores[name][row, 1] += k in supports_apart(spoiled, *limit)
+    rows = []
+    for name in decks:
+        others = sum(scores[each] for each in decks if each != name)
+        best = min(range(len(grid) - 1), key=lambda row: (others[row, 0], -others[row, 1]))
+        (false, named), (events, cases) = scores[name][best], sizes[name]
+        note = f"of {cases:.0f}; {false:.0f} of {events:.0f} right ones; coherence, lines, ratio {grid[best]}"
+        note += f"; as set {scores[name][-1, 1]:.0f} and {scores[name][-1, 0]:.0f}"
+        rows.append(Row("supports named", name, named, "", note))
     return rows
 
 

@@ -16,10 +16,8 @@ from ..cache.verification import StaleCache
 from ..likelihood.failure_log import TooManyFailures
 from ..likelihood.likelihood import FELikelihood
 from ..likelihood.posterior import Posterior
-from ..noise.autoregressive import AutoregressiveNoise
-from ..noise.known import KnownNoise
 from ..noise.marginal import sampled_noise
-from ..noise.residuals import ResidualChecks, innovations, residual_checks
+from ..noise.residuals import ResidualChecks, residual_checks
 from ..signals.channels import Channel, Measurements
 from ..signals.error_measures import relative_errors
 from ..signals.events import find_events
@@ -98,20 +96,13 @@ class ChannelFit(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """Measurements and responses of one data set or event.
-
-    The noise says how the likelihood treats successive errors: as independent ("white"), with a correlation
-    ("autoregressive") or with a spectrum ("bands"; the innovations or the whitened residuals are checked then), or as
-    fewer independent ones ("effective"). Where its level depends on the response, residuals are divided by it before
-    the checks.
-    """
+    """Measurements and responses of one data set or event; residuals are checked as the noise whitens them."""
 
     title: str  # name of the data set and of the event; empty if there is one only
     measurements: Measurements
     responses: dict[str, np.ndarray]  # (n_channels, n_samples) [SI], before and after the update
     residuals: np.ndarray | None  # (n_channels, n_samples) [SI], measured minus simulated
     channels: tuple[ChannelFit, ...]
-    noise: str
     modal: ModalFit | None = None  # of modal data, instead of responses and residuals
     deviations: np.ndarray | None = None  # of the errors, of the shape of the residuals [SI]; None if not known
 
@@ -241,7 +232,7 @@ def fit_data_sets(run: FinishedRun) -> Fits:
         draws = draws_to_compare(run.posterior)[:, columns]
         compared += compare(likelihood, np.stack([point, *draws]), True, key, run.samples[:, columns])
         if likelihood.is_modal:
-            fits.append(Fit(key, likelihood.measurements, {}, None, (), "modal", compared[-1].modal))
+            fits.append(Fit(key, likelihood.measurements, {}, None, (), compared[-1].modal))
             continue
         batch = likelihood.simulate(np.stack([start[columns], point])[:, :n])
         residuals = {}
@@ -278,23 +269,15 @@ def _split(
     values: Mapping[str, float],
 ) -> list[Fit]:
     """One fit per event, from residuals (n_channels, n_samples) by name; `values` are the parameters of the fit."""
-    sampled = sampled_noise(likelihood.noise)
-    if isinstance(sampled, KnownNoise):
-        sampled, values = sampled.noise, {**values, **sampled.known}
-    fewer = getattr(sampled, "effective_samples", None)
-    noise = "autoregressive" if isinstance(sampled, AutoregressiveNoise) else "white"
-    noise = "bands" if getattr(sampled, "n_bands", 1) > 1 else noise
-    noise = "effective" if fewer is not None else noise
-    checked = residuals.get(names[1])
-    if checked is not None and hasattr(sampled, "whitened"):
-        parameters = np.array([values[name] for name in sampled.parameter_names])
-        checked = sampled.whitened(checked, likelihood.measurements.values - checked, parameters)
-    fits, history, deviations = [], likelihood.measurements.is_history, None
-    if not history:  # samples without an order
+    sampled, checked, deviations, fits = sampled_noise(likelihood.noise), residuals.get(names[1]), None, []
+    parameters = np.array([values.get(name, np.nan) for name in sampled.parameter_names])
+    if not likelihood.measurements.is_history:  # samples without an order
         checked = None
-        if hasattr(sampled, "standard_deviations") and set(sampled.parameter_names) <= set(values):
-            parameters = np.array([values[name] for name in sampled.parameter_names])
+        if hasattr(sampled, "standard_deviations") and np.isfinite(parameters).all():
             deviations = sampled.standard_deviations(parameters[None])[0][:, None]
+    elif checked is not None and hasattr(sampled, "whitened"):
+        checked = sampled.whitened(checked, likelihood.measurements.values - checked, parameters)
+    fewer = getattr(sampled, "effective_samples", None)
     for window in windows_of(likelihood, key):
         part = window.measurements
         own = {name: window.of(each) for name, each in residuals.items()}
@@ -302,25 +285,20 @@ def _split(
         missing, channels = np.full(part.n_channels, np.nan), []
         left = None if checked is None else window.of(checked)
         for row, channel in enumerate(part.channels):
-            rho = values.get(f"rho_{channel.name}") if noise == "autoregressive" else 0.0
-            checks = None if left is None else _check(left[[row]], rho)
+            checks = None if left is None else _check(left[[row]])
             samples = int(np.isfinite(part.values[row]).sum())
             assumed = samples if fewer is None else min(np.broadcast_to(fewer, part.n_channels)[row], samples)
             before, after = (float(errors.get(name, missing)[row]) for name in names)
             channels.append(ChannelFit(channel, samples, before, after, checks, float(assumed)))
         responses = {name: part.values - each for name, each in own.items()}
         errors_of = None if deviations is None else deviations[window.rows]
-        residuals_of = own.get(names[1])
-        fits.append(Fit(window.title, part, responses, residuals_of, tuple(channels), noise, deviations=errors_of))
+        fits.append(Fit(window.title, part, responses, own.get(names[1]), tuple(channels), deviations=errors_of))
     return fits
 
 
-def _check(residuals: np.ndarray, rho: float | None) -> ResidualChecks | None:
-    """The checks of one channel's residuals (1, n_samples); None where there is nothing to check.
-
-    There are too few samples, no correlation `rho` of an autoregressive noise, or the fit is exact.
-    """
+def _check(residuals: np.ndarray) -> ResidualChecks | None:
+    """The checks of one channel's residuals (1, n_samples); None for too few samples, or an exact fit."""
     try:
-        return None if rho is None else residual_checks(innovations(residuals, [rho]) if rho else residuals)
+        return residual_checks(residuals)
     except ValueError:
         return None

@@ -19,7 +19,7 @@ from .compared import ChannelFit, Compared, Fit, Fits, compare, data_sets_of, dr
 from .data_faults import BETTER, EXPLAINED, Fault, describe_unit, find_faults
 from .finding import CARE, CORRELATED, HALF, NOTE, SMALL_PROBABILITY, SURE, WRONG, Finding, percent
 from .modal_faults import check_modes
-from .slow_motion import find_slow_faults, supports_apart
+from .slow_motion import find_slow_faults, support_gains, supports_apart
 from .steps import motions_to_replace
 from .table import Moments, ParameterRow, rows_of
 
@@ -117,7 +117,7 @@ def check_supports(model: Any) -> list[Finding]:
     if len({(each.n_steps, each.dt) for each in motions}) != 1:
         return []
     found, unknown = [], getattr(model, "inputs", ())  # whose gains are parameters of a `SensedModel`
-    apart = supports_apart([each.acceleration for each in motions], motions[0].dt)
+    apart = supports_apart(support_gains([each.acceleration for each in motions], motions[0].dt))
     for k, gain in ((k, gain) for k, gain in apart.items() if k not in unknown):
         unit = describe_unit(abs(gain), "acceleration")
         kind = "A sign may be wrong" if gain < 0.0 else "A unit may be wrong" if unit else "A gain may be wrong"
@@ -410,5 +410,4 @@ def residual_sentence(fit: Fit, each: ChannelFit) -> str:
     where = _where([each.channel.name], fit)
     if each.checks is None:
         return f"{where}: the residuals could not be checked (too few samples, or an exact fit)."
-    left = "what the noise model leaves (innovations, or whitened residuals): "
-    return f"{where}: {left if fit.noise in ('autoregressive', 'bands') else ''}{describe_residuals(each.checks)[0]}"
+    return f"{where}: {describe_residuals(each.checks)[0]}"

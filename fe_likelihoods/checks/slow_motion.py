@@ -22,7 +22,15 @@ from .data_faults import FACTOR, Fault
 from .finding import SURE
 from .sensor_faults import runs_of
 
-__all__ = ["FEWEST_DRAWS", "SlowMotion", "compare_slow_motion", "find_slow_faults", "slow_motions", "supports_apart"]
+__all__ = [
+    "FEWEST_DRAWS",
+    "SlowMotion",
+    "compare_slow_motion",
+    "find_slow_faults",
+    "slow_motions",
+    "support_gains",
+    "supports_apart",
+]
 
 FEWEST_DRAWS = 5  # of the prior
 AGREE = 0.1  # difference of a draw from the median, half of the draws: gains of 45 right fits are then 0.96 to 1.21
@@ -140,20 +148,27 @@ def find_slow_faults(known: Mapping[str, SlowMotion]) -> list[tuple[Fault, tuple
     return found
 
 
-def supports_apart(motions: Sequence[np.ndarray], step: float) -> dict[int, float]:
-    """Gains of supports, by number, whose slow motion (n,) has another sign or size than that of all others known."""
-    moving = [k for k, motion in enumerate(motions) if np.any(motion)]
-    n = len(motions[0])
-    spectra = {k: _spectra(motions[k], np.ones(n, dtype=bool)) for k in moving}
-    gains: dict[int, list[float]] = {k: [] for k in moving}
-    for k, other in permutations(moving, 2):
+def support_gains(
+    motions: Sequence[np.ndarray], step: float, coherent: float = COHERENT, lines: int = 2 * SMOOTH
+) -> dict[tuple[int, int], float]:
+    """Gains of supports (k, other), in the lowest band in which their motions (n,) are coherent, where there is one."""
+    n, gains = len(motions[0]), {}
+    spectra = {k: _spectra(motion, np.ones(n, dtype=bool)) for k, motion in enumerate(motions) if np.any(motion)}
+    for k, other in permutations(spectra, 2):
         own, reference = (_smooth(np.abs(spectra[i]) ** 2) for i in (k, other))
         cross = np.abs(_smooth(spectra[k] * spectra[other].conj())) ** 2
-        band = _lowest_band(cross > COHERENT * own * reference, int(np.argmax(reference)))
+        band = _lowest_band(cross > coherent * own * reference, int(np.argmax(reference)))
         if band is not None:
-            band = slice(band.start, min(band.stop, band.start + 2 * SMOOTH))
-            gains[k].append(_in_band(spectra[k], spectra[other], band, n, step).gain)
-    apart = {
-        k: [each for each in found if each < 0.0 or abs(np.log(each)) > np.log(FACTOR)] for k, found in gains.items()
-    }
-    return {k: float(np.median(found)) for k, found in apart.items() if found and len(found) == len(gains[k])}
+            band = slice(band.start, min(band.stop, band.start + lines))
+            gains[k, other] = _in_band(spectra[k], spectra[other], band, n, step).gain
+    return gains
+
+
+def supports_apart(gains: Mapping[tuple[int, int], float], limit: float = FACTOR) -> dict[int, float]:
+    """Gains of supports, by number, whose slow motion has another sign or size than that of all others known."""
+    found = {}
+    for k in sorted({k for k, _ in gains}):
+        own = [gain for (one, _), gain in gains.items() if one == k]
+        if all(gain < 0.0 or abs(np.log(gain)) > np.log(limit) for gain in own):
+            found[k] = float(np.median(own))
+    return found

@@ -11,7 +11,7 @@ import numpy as np
 from ..signals.channels import Channel
 from .gaussian import HALF_LOG_TWO_PI
 from .options import PerChannel, checked_channels, sensor_levels, shown, weighted
-from .residuals import lag_one_sums
+from .residuals import innovations, lag_one_sums
 from .sample_counts import SampleCounts
 
 __all__ = ["AutoregressiveNoise"]
@@ -156,6 +156,14 @@ class AutoregressiveNoise:
     def lag_one_correlations(self, parameters: np.ndarray) -> np.ndarray:
         """Correlation of successive errors [-], (n, n_channels), from parameters (n, 2 n_channels)."""
         return np.asarray(parameters, dtype=float)[..., len(self.channels) :]
+
+    def whitened(self, residuals: np.ndarray, response: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+        """Innovations (n_channels, n_samples) of residuals; NaN in a channel of zeros alone."""
+        found = np.full(residuals.shape, np.nan)
+        for row, rho in enumerate(self.lag_one_correlations(parameters)):
+            if np.nan_to_num(residuals[row]).any() and abs(rho) < 1.0:
+                found[row, 1:] = innovations(residuals[[row]], np.array([rho]))[0]
+        return found
 
     def with_channels(
         self, channels: Sequence[Channel], weights: np.ndarray

@@ -24,7 +24,7 @@ _METHODS = {
     "log_densities": 2,
 }
 _AGAIN = "under", "with_measurements"  # methods that return the noise for other data
-_OF_THE_NOISE = "channels", "statistic", "level", "gap_shares"
+_OF_THE_NOISE = "channels", "statistic", "level", "gap_shares", "effective_samples"
 
 
 class KnownNoise:

@@ -51,10 +51,10 @@ def test_a_fault_that_draws_show_before_a_run_is_named_after_it():
     assert check_responses([compared(OSCILLATION, [0.99 * OSCILLATION, *draws])]) == []
 
 
-def fits_of(errors, noise="white", assumed=None):
+def fits_of(errors, assumed=None):
     checks = residual_checks(errors[None])
     channel = ChannelFit(TOP[0], errors.size, 0.5, 0.1, checks, float(errors.size if assumed is None else assumed))
-    return Fits((Fit("", Measurements(TOP, 0.02, errors[None]), {}, errors[None], (channel,), noise),), "", "", 0, ())
+    return Fits((Fit("", Measurements(TOP, 0.02, errors[None]), {}, errors[None], (channel,)),), "", "", 0, ())
 
 
 def test_correlated_errors_are_a_note_with_the_factor_in_the_first_sentence(rng):
@@ -71,7 +71,7 @@ def test_correlated_errors_are_a_note_with_the_factor_in_the_first_sentence(rng)
         str(judgement)
         == f"Use: standard deviations count {found.numbers['factor']:.2g} times, because errors are correlated."
     )
-    assert check_residuals(fits_of(slow, "effective", found.numbers["factor"] ** -2 * 4000)) == []
+    assert check_residuals(fits_of(slow, found.numbers["factor"] ** -2 * 4000)) == []
     assert describe_residuals(residual_checks(white[None]))[0].startswith("White: ")
     assert describe_residuals(residual_checks(slow[None]))[0].startswith("Correlated (0.9")
     assert describe_residuals(residual_checks(np.array([[1.0, -2.0]])))[0].startswith("Not checked: 2 samples")
