@@ -35,7 +35,7 @@ BENCHMARKS: dict[str, Callable[..., Iterable[tuple]]] = {
 }
 QUICK: dict[str, dict[str, Any]] = {
     "badge": {"structures": ("Meloland",)},
-    "supports": {"structures": ("Meloland", "Meloland along")},
+    "supports": {"structures": ("Meloland", "Painter Street")},
     "job": {"limit": 20.0},
     "truth": {"families": ("sharp", "two"), "ratios": (1.0,), "walkers": (200,)},
     "samplers": {"targets": ("T3",)},

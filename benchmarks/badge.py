@@ -179,10 +179,11 @@ def badge(repeats: int = 1, structures: tuple[str, ...] = tuple(_STRUCTURES), ev
 
 
 def supports(repeats: int = 1, structures: tuple[str, ...] = tuple(_STRUCTURES)) -> list[Row]:
-    """Gain and sign of supports by the slow motion of the others; limits chosen with the other structures alone.
+    """Gain and sign of supports by the slow motion of the others; limits chosen with the other bridges alone.
 
     Each support has 2 times, half, the negative of its motion, and g read as m/s². The limits with the fewest right
-    events named, and then the most wrong ones, are chosen from a grid; "as set" are those of the library.
+    events named, then the most wrong ones, then the largest ratio and coherence, are chosen from a grid; "as set" are
+    the limits of the library.
     """
     decks = [name for name in structures if isinstance(_STRUCTURES[name], _Deck)]
     grid = [*itertools.product((0.8, 0.85, 0.9, 0.95), (7, 14, 21, 28), (1.3, 1.4, 1.5, 1.75, 2.0)), None]
@@ -209,8 +210,9 @@ def supports(repeats: int = 1, structures: tuple[str, ...] = tuple(_STRUCTURES))
                     scores[name][row, 1] += k in supports_apart(spoiled, *limit)
     rows = []
     for name in decks:
-        others = sum(scores[each] for each in decks if each != name)
-        best = min(range(len(grid) - 1), key=lambda row: (others[row, 0], -others[row, 1]))
+        others = sum(scores[each] for each in decks if each.split()[0] != name.split()[0])
+        order = {row: (*others[row], limits) for row, limits in enumerate(grid[:-1])}
+        best = min(order, key=lambda row: (order[row][0], -order[row][1], -order[row][2][2], -order[row][2][0]))
         (false, named), (events, cases) = scores[name][best], sizes[name]
         note = f"of {cases:.0f}; {false:.0f} of {events:.0f} right ones; coherence, lines, ratio {grid[best]}"
         note += f"; as set {scores[name][-1, 1]:.0f} and {scores[name][-1, 0]:.0f}"

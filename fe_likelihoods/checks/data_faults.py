@@ -32,7 +32,6 @@ FACTOR = 1.5  # from which a factor may be one between units
 LONGEST_LAG, LONGEST_SHARE = 5.0, 0.2  # [s], and as a share of the record
 MOST_VALUES = 2**24  # of responses that are compared at once
 MOST_FAULTS = 4  # that are found one after the other
-SIMPLE = 0.85  # share of its gain with which a lag competes with a sign: half a period is nearly one
 SAME_UNITS = 1.25  # ratio of a factor to one between units, up to which it is named after them
 EQUALLY_NEAR, NEAR_ENOUGH = 0.01, 0.03  # differences of logarithms of ratios that are named together
 
@@ -87,7 +86,6 @@ def find_faults(measurements: Measurements, responses: np.ndarray) -> tuple[Faul
             if each.kind == "lag":  # one step is a convention of files
                 is_large = measurements.is_history and round(abs(value) / steps[c].max()) > 1
             clear = after < min(math.log(BETTER) + before, math.log(EXPLAINED)) and gain > -math.log(BETTER) * len(c)
-            gain *= SIMPLE if each.kind == "lag" else 1.0
             if is_large and clear and gain > most:
                 most, explained = gain, (each, value, math.exp(before), math.exp(after))
         if explained is None:

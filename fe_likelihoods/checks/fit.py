@@ -41,7 +41,6 @@ SAME_AS_PRIOR = 0.9  # ratio of the standard deviations of posterior and prior: 
 NEAR_BOUND = 0.1  # distance of the 5 % or 95 % quantile from a bound, in 90 % intervals and in prior deviations
 LARGE_ERROR = HALF  # RRMSE of a channel that is hardly reproduced: a quarter of its power is left
 LARGE_DAMPING = 0.3  # in 9 of 37 right fits of decks on abutments, and in 5 of 8 with a gain of one half
-WEAK = 0.2  # lag-one correlation that hardly changes intervals: (1 + 0.2^2) / (1 - 0.2^2) = 1.08 in the variance
 FEWEST = 10  # samples that the tests of correlation and distribution need
 REVERSED = "Where the sensor counts the other way, name it in `reversed` of [measurements], or change its sign."
 CLOCKS = "Check the time at which the base motion begins (zero in [measurements]) and the clocks; see `align`."
@@ -241,7 +240,7 @@ def _is_noise(residuals: np.ndarray) -> bool:
         checks = residual_checks(residuals)
     except ValueError:  # hardly any sample
         return True
-    return abs(checks.lag_one[0]) < WEAK and checks.normal[0] > SMALL_PROBABILITY
+    return min(checks.white[0], checks.normal[0]) > SMALL_PROBABILITY
 
 
 def edges(rows: Sequence[ParameterRow]) -> dict[str, tuple[str, float, float]]:
@@ -386,7 +385,7 @@ def check_residuals(fits: Fits) -> list[Finding]:
 
 
 def _is_coloured(each: ChannelFit) -> bool:
-    return each.checks.white[0] < SMALL_PROBABILITY and abs(each.checks.lag_one[0]) > WEAK
+    return each.checks.white[0] < SMALL_PROBABILITY
 
 
 def describe_residuals(checks: ResidualChecks) -> list[str]:
@@ -399,8 +398,6 @@ def describe_residuals(checks: ResidualChecks) -> list[str]:
         text = f"Correlated ({lag:.2f} from sample to sample): {n:.0f} samples are worth {worth:.0f} independent ones."
         if white >= SMALL_PROBABILITY:
             text = "White: no correlation from sample to sample was found."
-        elif abs(lag) < WEAK:
-            text = f"Nearly white: the correlation from sample to sample, {lag:.2f}, changes intervals little."
         found.append(f"{text} Not normal: look at the tails." if normal < SMALL_PROBABILITY else text)
     return found
 

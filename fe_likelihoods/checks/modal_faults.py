@@ -12,11 +12,11 @@ from scipy.stats import chi2
 
 from ..text_tables import listed
 from .data_faults import FACTOR, SAME_UNITS
-from .finding import CARE, SMALL_PROBABILITY, TAIL, WRONG, Finding
+from .finding import CARE, HALF, SMALL_PROBABILITY, TAIL, WRONG, Finding
 
 __all__ = ["check_modes"]
 
-RESEMBLES = 0.5  # MAC; one shape cannot have more than this with two orthogonal ones
+RESEMBLES = HALF  # MAC; one shape cannot have more than this with two orthogonal ones
 # Mean MAC of the best draw that asks for a fault of a sensor, and the share of 1 - MAC that is left without it: in
 # 0 of 120 right and 231 of 240 wrong cases (shear frames, shape errors of 0.02 and 0.1).
 POOR, MENDED = 0.97, 0.4

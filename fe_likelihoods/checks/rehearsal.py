@@ -16,8 +16,6 @@ from ..emulation.modes import Mode, find_modes
 from ..emulation.target import ResponseTarget
 from ..likelihood.likelihood import FELikelihood
 from ..likelihood.posterior import Posterior
-from ..noise.gaussian import GaussianNoise
-from ..priors.distributions import HalfNormal
 from ..simulation.model import SimulationBatch, simulate_batch
 from .finding import CARE, WRONG, Finding, by_severity
 from .fit import check_responses, check_supports, compare, draws_to_compare
@@ -237,31 +235,15 @@ def _check_best_fit(stage: _Stage, posterior: Posterior, seconds: float) -> _Bes
         why = f"the test takes about {15 * (n + 1)} simulations of {seconds:.2g} s, in the run"
         return _BestFit(not_tested(posterior.likelihood, why))
     try:
-        target, mode, searched = _search(stage, posterior, limit)
+        target = ResponseTarget(posterior)
+        search = find_modes(posterior, starts=1, max_simulations=limit)
     except (ValueError, np.linalg.LinAlgError) as error:
         return _BestFit(not_tested(posterior.likelihood, f"no fit was found: {error}"))
-    if mode is None:
-        return _BestFit(not_tested(posterior.likelihood, "no fit was found"), searched)
+    if not search.modes:
+        return _BestFit(not_tested(posterior.likelihood, "no fit was found"), search.simulations)
+    mode = search.modes[0]
     factor = np.linalg.cholesky(mode.covariance)
     around = target.parameters(mode.coords + np.random.default_rng(1).standard_normal((400, len(factor))) @ factor.T)
-    test = halve_steps(target.posterior, mode.parameters, around.std(axis=0), stage.simulate)
+    test = halve_steps(posterior, mode.parameters, around.std(axis=0), stage.simulate)
     # without convergence neither shares nor the cost of a search are known
-    return _BestFit(test, searched, (target.posterior, mode)) if mode.converged else _BestFit(test)
-
-
-def _search(stage: _Stage, posterior: Posterior, limit: float) -> tuple[ResponseTarget, Mode | None, float]:
-    """The best fit from the median of the prior, under white noise where the level follows the response."""
-    likelihood, given = posterior.likelihood, posterior
-    try:
-        target = ResponseTarget(posterior)
-    except ValueError:
-        measured = likelihood.measurements
-        likelihood = likelihood.with_noise(GaussianNoise(measured.channels))
-        levels = dict(zip(likelihood.noise.parameter_names, measured.root_mean_squares, strict=True))
-        known = posterior.prior.subset(likelihood.model.parameter_names).distributions
-        posterior = Posterior(likelihood, known | {name: HalfNormal(float(rms)) for name, rms in levels.items()})
-        target = ResponseTarget(posterior)
-    search = find_modes(posterior, starts=1, max_simulations=limit)
-    if posterior is not given:
-        stage.count(_made(posterior))
-    return target, search.modes[0] if search.modes else None, search.simulations
+    return _BestFit(test, search.simulations, (posterior, mode)) if mode.converged else _BestFit(test)

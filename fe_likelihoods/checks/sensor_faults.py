@@ -9,19 +9,20 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .finding import HALF
+
 __all__ = ["SensorFault", "find_sensor_faults", "runs_of"]
 
 FEWEST = 50  # samples that are judged
 MATTERS = 0.25  # of the peak, or of the standard deviation: smaller parts hardly change a sum of squares
-STILL = 5  # steps for which an extremum may stand still, and steps beside it; right channels: between small steps only
-ACTIVE, DIGITS = 0.02, 3.0  # the steps beside, in usual and in smallest steps; right: 0.02 (8 smallest), 0.11 (4)
-CLIPPED = 3  # equal samples at the largest or smallest value; right channels: 2
+DIGITS = 3.0  # the steps beside, in smallest steps; without it, 10 of 181 right channels are named for 4
+STILL = 3  # equal samples at an extremum, and steps beside a flat part; right channels: 2, or between small steps
 LONG, VANISHED = 1.5, 10.0  # for so many periods a signal is never so much smaller than beside; right: 5.8
 FAINT = 4.0  # the same for white noise; right: 2.5
 SPIKE = 18.0  # ratio to the errors of interpolation around it; right channels: 15.9
 LEVEL = 0.02  # smallest mean of a tenth of a channel, or change of such means, in peaks; right channels: 0.012
 SMOOTH = 0.9  # share of the variance of these means in a polynomial; right channels: 0.8
-STEADY = 0.5  # rate of a drift in the first and last third, as a share of the whole; after yielding: 0
+STEADY = HALF  # rate of a drift in the first and last third, as a share of the whole; after yielding: 0
 WHITE = 0.25  # largest autocorrelation at lags of one to six samples; right channels: 0.37; noise is 3/4 of the power
 WIDEST, AROUND, MOST_SPIKES = 3, 10, 200  # samples of a spike, samples around it that are looked at, and their number
 
@@ -91,9 +92,8 @@ def _flat_parts(x: np.ndarray) -> list[tuple[int, int]]:
     The top of a smooth wave is flat as well, but the steps beside it are small.
     """
     steps, equal = np.abs(np.diff(x)), _round_off(x)
-    known = steps[np.isfinite(steps)]
-    least = max(ACTIVE * float(np.sqrt(np.square(known).mean())), DIGITS * known[known > equal].min(initial=np.inf))
-    found = []
+    known, found = steps[np.isfinite(steps)], []
+    least = DIGITS * known[known > equal].min(initial=np.inf)
     if np.count_nonzero(known > equal) < FEWEST:  # steps are what it consists of
         return []
     for first, last in runs_of(steps <= equal):
@@ -110,7 +110,7 @@ def _clipped(x: np.ndarray) -> tuple[tuple[int, int], ...]:
     flat = _flat_parts(x)
     for top in (np.nanmax(x), np.nanmin(x)):
         at = np.abs(x - top) <= equal
-        if sum(last - first + 1 for first, last in flat if at[first]) >= CLIPPED:
+        if sum(last - first + 1 for first, last in flat if at[first]) >= STILL:
             found += [(first, stop - 1) for first, stop in runs_of(at)]
     return tuple(sorted(found))
 
