@@ -90,8 +90,8 @@ def vibrating():
 def page(vibrating, tmp_path_factory):
     sampler, posterior = vibrating
     path = tmp_path_factory.mktemp("report") / "folder" / "vibration.html"
-    prediction = propagate(posterior, sampler.get_chain(flat=True)[-10:], noise=True, progress=False)
-    peaks = propagate(posterior, sampler.get_chain(flat=True)[-10:], quantity=peak("top"), progress=False)
+    prediction = propagate(posterior, sampler.get_chain(flat=True)[-20:], noise=True, progress=False)
+    peaks = propagate(posterior, sampler.get_chain(flat=True)[-20:], quantity=peak("top"), progress=False)
     named = {"Free vibration": prediction, "Peaks": peaks}
     measured = {"Free vibration": posterior.likelihood.measurements}
     assert report(sampler, posterior, named, path, truth=TRUTH, measured=measured) == path
