@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -46,10 +47,10 @@ print(json.dumps([*first, time.perf_counter() - start, len(compiled.buffer) / 2]
 """
 
 
-def _run(code: str, cache: str | None = None) -> list[float]:
+def _run(code: str, cache: str | None = None, root: Path = ROOT) -> list[float]:
     """Seconds that `code` prints in a new interpreter, with the folder `cache` for compiled kernels if given."""
     environment = dict(os.environ) | ({} if cache is None else {"FE_LIKELIHOODS_CACHE": cache})
-    run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=environment, capture_output=True, text=True)
+    run = subprocess.run([sys.executable, "-c", code], cwd=root, env=environment, capture_output=True, text=True)
     if run.returncode:
         raise RuntimeError(f"the process ended with code {run.returncode}: {run.stderr[-2000:]}")
     return json.loads(run.stdout)
@@ -70,12 +71,15 @@ def imports(repeats: int) -> list[Row]:
 
 
 def compilation(repeats: int) -> list[Row]:
-    """Wall time of the first likelihood of both posteriors, with compilation and with kernels read from disk."""
+    """Wall time of the first likelihood of both posteriors: compiled, with kernels on disk, and in another checkout."""
     rows = []
     for name in ("bridge_column", "isolated_bridge"):
-        with tempfile.TemporaryDirectory() as cache:
+        with tempfile.TemporaryDirectory() as cache, tempfile.TemporaryDirectory() as other:
             cold = _run(FIRST_EVALUATION.format(name), cache)
             found = [_run(FIRST_EVALUATION.format(name), cache) for _ in range(repeats)]
+            for part in ("fe_likelihoods", "samplers", "data"):
+                shutil.copytree(ROOT / part, Path(other) / part)
+            shared = _run(FIRST_EVALUATION.format(name), cache, Path(other))
             size = sum(file.stat().st_size for file in Path(cache).rglob("*") if file.is_file())
         warm, cpu, again, compiled = (median(column) for column in zip(*found, strict=True))
         note = f"CPU {cold[1]:.1f} s, {cold[3]:.0f} kernels; once for each version; at most {LIMIT_COMPILATION:g}"
@@ -88,6 +92,7 @@ def compilation(repeats: int) -> list[Row]:
                 "s",
                 f"CPU {cpu:.2f} s, {compiled:.0f} compiled, {size / 2**20:.1f} MiB on disk",
             ),
+            Row("first likelihood, CPU time", f"{name}, another checkout", shared[1], "s", f"{shared[3]:.0f} compiled"),
             Row("first likelihood, wall time", f"{name}, the second one", again, "s"),
         ]
     return rows

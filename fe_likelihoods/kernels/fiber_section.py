@@ -28,20 +28,13 @@ from typing import NamedTuple
 import numpy as np
 
 from . import bar_fatigue, concrete04
+from .bars import bar_stress, commit_bars, initialise_bars, sum_bars, switch_backbones
 from .concrete04 import envelope, unloading
 from .jit import SUM_REORDERING, kernel
 from .reinforcing_steel import E0 as STEEL_E0
 from .reinforcing_steel import EP as STEEL_EP
 from .reinforcing_steel import F0 as STEEL_F0
-from .reinforcing_steel import (
-    VIRGIN_LIMIT,
-    YIELD_STRAIN,
-    monotonic_stress_tangent,
-    stress_tangent,
-    switch_backbone,
-    update,
-    virgin_stress_tangent,
-)
+from .reinforcing_steel import VIRGIN_LIMIT, YIELD_STRAIN, virgin_stress_tangent
 
 __all__ = ["Sections", "reset", "forces", "commit", "cross_jumps", "fiber_stress"]
 
@@ -67,8 +60,9 @@ class Sections(NamedTuple):
     failure: np.ndarray  # (bar_fatigue.N_FAILURE,), or (0,) for bars that do not fail
     concrete_memory: np.ndarray  # (n_sections, 5, n_concrete) eps_min, eps_max, eps_end, slope, tension slope
     steel_memory: np.ndarray  # (n_sections, n_bars, N_STATE of reinforcing_steel or bar_fatigue)
+    steel_trial: np.ndarray  # like steel_memory, after the last trial that left the curve of a bar
+    paths: np.ndarray  # (n_sections, N_PATH, n_bars or more) curves of the bars (`bars`)
     virgin: np.ndarray  # (n_sections,) 1 while no bar has been committed beyond yield, else 0
-    trial: np.ndarray  # (N_STATE,) scratch
 
 
 @kernel
@@ -79,6 +73,7 @@ def reset(sections):
     sections.virgin[:] = 1.0
     n_sections, _, n = concrete_memory.shape
     for j in range(n_sections):
+        initialise_bars(sections.steel_memory[j], sections.paths[j], sections.steel)
         for i in range(n):
             ec = sections.concrete[0 if i < sections.core_count else 1, _EC]
             concrete_memory[j, 0, i] = 0.0
@@ -104,33 +99,6 @@ def _sum_envelope(e0, kappa, j, core_count, y, area, concrete, concrete_memory):
             k_axial += ea
             k_coupling -= ea * yi
             k_bending += ea * yi * yi
-    return n_force, moment, k_axial, k_coupling, k_bending
-
-
-@kernel
-def _bar(strain, memory, steel, failure, virgin, trial):
-    """Return stress and tangent of one bar at a trial strain."""
-    if failure.shape[0] > 0:
-        return bar_fatigue.stress_tangent(strain, memory, steel, failure, trial)
-    if virgin == 1.0:
-        return monotonic_stress_tangent(strain, steel)
-    return stress_tangent(strain, memory, steel, trial)
-
-
-@kernel
-def _sum_bars(e0, kappa, j, bar_y, bar_area, steel, failure, steel_memory, virgin, trial):
-    """Sum over the bars, one after the other, if some are near or beyond yield."""
-    n_force, moment, k_axial, k_coupling, k_bending = 0.0, 0.0, 0.0, 0.0, 0.0
-    for i in range(steel_memory.shape[1]):
-        yi = bar_y[i]
-        stress, tangent = _bar(e0 - yi * kappa, steel_memory[j, i], steel, failure, virgin[j], trial)
-        force = stress * bar_area[i]
-        ea = tangent * bar_area[i]
-        n_force += force
-        moment -= force * yi
-        k_axial += ea
-        k_coupling -= ea * yi
-        k_bending += ea * yi * yi
     return n_force, moment, k_axial, k_coupling, k_bending
 
 
@@ -210,18 +178,8 @@ def forces(e0, kappa, j, sections):
                 k_coupling + bars_coupling,
                 k_bending + bars_bending,
             )
-    a, b, c, d, e = _sum_bars(
-        e0,
-        kappa,
-        j,
-        bar_y,
-        bar_area,
-        steel,
-        sections.failure,
-        sections.steel_memory,
-        sections.virgin,
-        sections.trial,
-    )
+    memory, trial, path = sections.steel_memory[j], sections.steel_trial[j], sections.paths[j]
+    a, b, c, d, e = sum_bars(e0, kappa, bar_y, bar_area, memory, trial, steel, sections.failure, path)
     return n_force + a, moment + b, k_axial + c, k_coupling + d, k_bending + e
 
 
@@ -238,19 +196,6 @@ def _commit_concrete(e0, kappa, j, core_count, y, concrete, concrete_memory):
             concrete_memory[j, 2, i] = eps_end
             concrete_memory[j, 3, i] = slope
             concrete_memory[j, 4, i] = tension_slope
-
-
-@kernel
-def _commit_bars(e0, kappa, j, bar_y, steel, failure, steel_memory, virgin):
-    """Advance the bar memory of a section that is, or has been, committed beyond yield."""
-    if virgin[j] == 1.0:
-        virgin[j] = 0.0
-        steel_memory[j] = 0.0
-    for i in range(steel_memory.shape[1]):
-        if failure.shape[0] > 0:
-            bar_fatigue.update(e0 - bar_y[i] * kappa, steel_memory[j, i], steel, failure)
-        else:
-            update(e0 - bar_y[i] * kappa, steel_memory[j, i], steel)
 
 
 @kernel(inline=True, fastmath=SUM_REORDERING)
@@ -274,7 +219,9 @@ def commit(e0, kappa, j, sections):
         for i in range(bar_y.shape[0]):
             beyond += 1.0 if abs(e0 - bar_y[i] * kappa) >= limit else 0.0
     if beyond > 0.0:
-        _commit_bars(e0, kappa, j, bar_y, steel, sections.failure, sections.steel_memory, virgin)
+        virgin[j] = 0.0
+        memory, trial, path = sections.steel_memory[j], sections.steel_trial[j], sections.paths[j]
+        commit_bars(e0, kappa, bar_y, memory, trial, steel, sections.failure, path)
 
 
 @kernel
@@ -307,10 +254,10 @@ def cross_jumps(e0, kappa, j, sections):
         concrete_memory[j, 4, i] = tension_slope
         count += 1
     if sections.virgin[j] == 0.0:
-        for i in range(sections.steel_memory.shape[1]):
-            bar = sections.steel_memory[j, i]
-            count += switch_backbone(bar, sections.steel)
-            if sections.failure.shape[0] > 0:
+        count += switch_backbones(sections.steel_memory[j], sections.steel, sections.failure, sections.paths[j])
+        if sections.failure.shape[0] > 0:
+            for i in range(sections.steel_memory.shape[1]):
+                bar = sections.steel_memory[j, i]
                 if bar[bar_fatigue.DAMAGE] >= NEAR_JUMP and bar[bar_fatigue.FRACTURED] == 0.0:
                     bar[bar_fatigue.FRACTURED] = 1.0
                     count += 1
@@ -322,8 +269,8 @@ def fiber_stress(e0, kappa, j, i, sections):
     """Return the stress [Pa] of one fiber of section `j` at a strain; bar k has the number i = -1 - k."""
     if i < 0:
         k = -1 - i
-        strain, memory = e0 - sections.bar_y[k] * kappa, sections.steel_memory[j, k]
-        return _bar(strain, memory, sections.steel, sections.failure, sections.virgin[j], sections.trial)[0]
+        strain, memory, trial = e0 - sections.bar_y[k] * kappa, sections.steel_memory[j, k], sections.steel_trial[j, k]
+        return bar_stress(strain, memory, trial, sections.steel, sections.failure, sections.paths[j], k)[0]
     memory, constants = sections.concrete_memory[j], sections.concrete[0 if i < sections.core_count else 1]
     extremes = memory[0, i], memory[1, i], memory[2, i], memory[3, i], memory[4, i]
     return concrete04.stress_tangent(e0 - sections.y[i] * kappa, *extremes, constants)[0]

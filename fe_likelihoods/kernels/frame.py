@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from . import bar_fatigue, concrete04, fiber_section, reinforcing_steel
+from .bars import N_PATH
 from .beam_column import HEAD, PER_SECTION, Elements, advance, initialise
 from .corotational import BasicForces, add_to_stiffness, deformations
 from .fiber_section import Sections
@@ -130,8 +131,9 @@ def allocate(
             failure=np.zeros(bar_fatigue.N_FAILURE if bars_fail else 0),
             concrete_memory=np.zeros((n_sections, 5, len(concrete))),
             steel_memory=np.zeros((n_sections, len(bars), n_bar_state)),
+            steel_trial=np.zeros((n_sections, len(bars), n_bar_state)),
+            paths=np.zeros((n_sections, N_PATH, len(padded_bars))),
             virgin=np.zeros(n_sections),
-            trial=np.zeros(n_bar_state),
         ),
         elements=Elements(
             points=np.ascontiguousarray(points, dtype=float),

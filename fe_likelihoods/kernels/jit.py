@@ -1,9 +1,11 @@
 """The decorator that compiles kernels, and a disk cache that is never stale.
 
-numba identifies cached machine code by the file that defines a function. It does not notice an edit of a kernel that
-this function calls in another file, and would keep using the old machine code. Here the cache folder is named after a
-hash over all kernel sources: any edit opens a new folder, and an unchanged library starts without compiling. Caches of
-simulations use the hash as the code of built-in models (`fe_likelihoods.simulation.label`).
+numba identifies cached machine code by the path of the file that defines a function. It does not notice an edit of a
+kernel that this function calls in another file, and would keep using the old machine code; and it compiles an equal
+copy of the library again. Here the cache folder is named after numba's version and a hash over all kernel sources, and
+a kernel is found there by its module and the content of its file: any edit opens a new folder, and all equal copies of
+the library, in any checkout or environment of a user, start without compiling. Caches of simulations use the hash as
+the code of built-in models (`fe_likelihoods.simulation.label`).
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ from pathlib import Path
 from typing import IO
 
 import numba
-from numba.core import event
+from numba.core import caching, event
 from numba.core.compiler_lock import global_compiler_lock
 
 try:
@@ -98,7 +100,7 @@ def _find_cache_folder() -> str | None:
             if root == shared:  # its name is known to others, who can create it first
                 _private_folder(root)
             os.makedirs(root, exist_ok=True)
-            folder = _private_folder(os.path.join(root, f"kernels-{KERNEL_HASH}"))
+            folder = _private_folder(os.path.join(root, f"kernels-{KERNEL_HASH}-numba{numba.__version__}"))
             with tempfile.TemporaryFile(dir=folder):
                 return folder
         except OSError:
@@ -194,6 +196,31 @@ def _compile_in_one_process(kernel: numba.core.dispatcher.Dispatcher) -> None:
     kernel.compile = compile_alone
 
 
+class _Locator(caching.UserProvidedCacheLocator):
+    """Finds the machine code of a kernel by its package and the content of its file, whatever the path."""
+
+    def __init__(self, function: Callable, file: str) -> None:
+        self._py_file, self._lineno = file, function.__code__.co_firstlineno
+        self._cache_path = os.path.join(CACHE_FOLDER, (function.__module__ or "").rpartition(".")[0] or "kernels")
+
+    def get_source_stamp(self) -> str:
+        """Hash of the file: kernels outside this folder are not in the name of the cache folder."""
+        return hashlib.blake2b(Path(self._py_file).read_bytes(), digest_size=8).hexdigest()
+
+    @classmethod
+    def from_function(cls, function: Callable, file: str) -> _Locator | None:
+        """A locator; None, and numba's own error, for a function without a file."""
+        return cls(function, file) if os.path.exists(file) else None
+
+
+class _CacheImpl(caching.CompileResultCacheImpl):
+    _locator_classes = [_Locator]
+
+
+class _Cache(caching.FunctionCache):
+    _impl_class = _CacheImpl
+
+
 def kernel(
     function: Callable | None = None, *, inline: bool = False, fastmath: set[str] | bool = False, cache: bool = True
 ) -> Callable:
@@ -209,20 +236,9 @@ def kernel(
     if function is None:
         return lambda f: kernel(f, inline=inline, fastmath=fastmath, cache=cache)
     cache = cache and not inline and CACHE_FOLDER is not None
-    before = numba.config.CACHE_DIR
-    if CACHE_FOLDER is not None:
-        numba.config.CACHE_DIR = CACHE_FOLDER  # numba reads it at decoration; it is restored below
-    try:
-        compiled = numba.njit(
-            nogil=True,
-            error_model="numpy",
-            cache=cache,
-            forceinline=inline,
-            fastmath=fastmath,
-            _nrt=False,
-        )(function)
-    finally:
-        numba.config.CACHE_DIR = before
-    if cache and flock is not None and compiled is not function:  # the same where numba is switched off
-        _compile_in_one_process(compiled)
+    compiled = numba.njit(nogil=True, error_model="numpy", forceinline=inline, fastmath=fastmath, _nrt=False)(function)
+    if cache and compiled is not function:  # the same where numba is switched off
+        compiled._cache = _Cache(function)
+        if flock is not None:
+            _compile_in_one_process(compiled)
     return compiled

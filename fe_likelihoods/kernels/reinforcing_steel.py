@@ -47,8 +47,6 @@ __all__ = [
     "curve_slot",
     "backbone",
     "virgin_stress_tangent",
-    "monotonic_stress_tangent",
-    "stress_tangent",
     "switch_backbone",
     "stress_history",
     "transition",
@@ -340,46 +338,6 @@ def update(eps, state, c):
     state[XC] = x
     state[SC] = s
     return s / (1.0 + eps), (modulus - s) / ((1.0 + eps) * (1.0 + eps))
-
-
-@kernel
-def monotonic_stress_tangent(eps, c):
-    """Return engineering stress and tangent of the backbone; a bar stays on it until it is committed beyond yield."""
-    s, modulus = backbone(math.log(1.0 + eps) if eps > -0.95 else math.nan, c)
-    return s / (1.0 + eps), (modulus - s) / ((1.0 + eps) * (1.0 + eps))
-
-
-@kernel
-def stress_tangent(eps, state, c, trial):
-    """Return engineering stress and tangent at the trial strain `eps` without changing `state`.
-
-    `trial` (N_STATE,) is scratch. A trial that continues on its branch needs no copy of the memory.
-    """
-    x = math.log(1.0 + eps) if eps > -0.95 else math.nan
-    b = int(state[BRANCH])
-    if b > 2:
-        curve = state[curve_slot(b) :]
-        up = b % 4 <= 1
-        if (state[XC] <= x < curve[XB] - TIE) if up else (curve[XB] + TIE < x <= state[XC]):
-            s, modulus = evaluate_curve(x, curve)
-            return s / (1.0 + eps), (modulus - s) / ((1.0 + eps) * (1.0 + eps))
-    elif b > 0:
-        # The stress follows from a backbone alone if the strain goes on, if it reverses below yield (the memory does
-        # not change), and if it passes zero, on the other backbone.
-        sign = 1.0 if b == 1 else -1.0
-        origin, other = (state[OP], state[ON]) if b == 1 else (state[ON], state[OP])
-        onwards = sign * (x - state[XC]) >= 0.0
-        e = sign * (x - origin)
-        if onwards or e < c[YP]:
-            if e <= 0.0 and not onwards:
-                origin = other
-            if origin == 0.0 and abs(eps) < c[VIRGIN_LIMIT]:
-                return virgin_stress_tangent(eps, c[E0], c[EP], c[F0])
-            s, modulus = backbone(x - origin, c)
-            return s / (1.0 + eps), (modulus - s) / ((1.0 + eps) * (1.0 + eps))
-    for i in range(N_STATE):
-        trial[i] = state[i]
-    return update(eps, trial, c)
 
 
 @kernel

@@ -119,7 +119,7 @@ def material_curves(
         concrete04.stress_history(path, constants, stress)
         curves.append(MaterialCurve(name, path, stress))
     path = _path("steel", steel)
-    stress, memory = np.empty_like(path), np.zeros(len(sections.trial))
+    stress, memory = np.empty_like(path), np.zeros(sections.steel_memory.shape[-1])
     if sections.failure.size:
         bar_fatigue.stress_history(path, memory, sections.steel, sections.failure, stress)
     else:
