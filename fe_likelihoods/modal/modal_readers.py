@@ -24,8 +24,10 @@ _WORDS = {
     "temperature": ("temperature", "temp"),
     "set": ("set", "identification"),
     "mode": ("mode",),
+    "quality": ("mac", "automac", "mpc", "mpd", "mcf", "complexity", "order", "quality", "confidence"),
 }
 _NAMES = {"f": "frequency", "f_hz": "frequency", "fn": "frequency", "fn_hz": "frequency", "xi": "damping", "no": "mode"}
+_BY_UNIT = {"s": "period", "sec": "period", "°c": "temperature", "degc": "temperature", "c": "temperature"}  # of T
 
 
 def read_modal_data(
@@ -42,11 +44,11 @@ def read_modal_data(
     ----------
     source : path, or result of an identification
         * A CSV file, a text file or a workbook with a header line and a line for each mode: a column ``frequency`` with
-          its unit, such as ``frequency_Hz``, or ``period_s``; optional columns ``mode`` (its number), ``damping``,
-          ``frequency_std`` [Hz] or ``frequency_cv``, ``temperature`` [°C] and ``set`` (the number of the
-          identification, where there are several); all other columns of
-          numbers are sensors. A table with a column for each mode
-          is transposed.
+          its unit, such as ``frequency_Hz``, or ``period_s`` (or ``T [s]``); optional columns ``mode`` (its number),
+          ``damping``, ``frequency_std`` [Hz] or ``frequency_cv``, ``temperature`` [°C] and ``set`` (the number of the
+          identification, where there are several). What describes an identification, such as ``MAC`` or ``order``, is
+          left out, which the description says. All other columns of numbers are sensors. A table with a column for each
+          mode is transposed.
         * A MATLAB file (``.mat``, up to version 7.2) with the `variables`, the modes in the columns of the shapes.
         * A result of pyOMA2, such as ``ssi.result`` after the choice of the modes: ``Fn``, ``Phi``, ``Xi``, ``Fn_std``,
           ``Phi_std``.
@@ -104,7 +106,9 @@ def _names_of(table: Table) -> list[str]:
 
 def _kind(name: str) -> str:
     """What a column is, by its name; empty for a sensor."""
-    name = re.sub(r"[\[(].*", "", name.lower()).strip(" ._")
+    name, unit = re.fullmatch(r"\s*(.*?)[\s._]*(?:[\[(](.*?)[\])]?)?\s*", name.lower(), re.S).groups()
+    if of_t := re.fullmatch(r"tn?(?:_(\w+))?", name):
+        return _BY_UNIT.get((unit or of_t[1] or "").strip(), "")
     words = set(re.split(r"[^a-z]+", name))
     return next((kind for kind, known in _WORDS.items() if words & set(known)), _NAMES.get(name, ""))
 
@@ -127,12 +131,17 @@ def _of_table(table: Table, sensors: Sequence[str], unit: str | None, options: d
     names = _names_of(table)
     kinds = list(map(_kind, names))
     found = {what: kinds.index(what) if what in kinds else None for what in _WORDS}
+    left_out = [name for name, kind in zip(names, kinds, strict=True) if kind == "quality" and name not in sensors]
+    notes = [f"without {', '.join(left_out)}"] if left_out else []
+    notes += ["frequencies from periods"] if found["frequency"] is None else []
+    options["description"] = ", ".join([options["description"], *notes])
     if found["frequency"] is None and found["period"] is None:
         raise ValueError(
             f"{table.file}: expected a column of frequencies, such as frequency_Hz; the columns are {', '.join(names)}"
         )
     texts = [place for place, column in enumerate(table.columns) if column.kind == "text"]  # such as remarks
-    others = [name for place, name in enumerate(names) if place not in (*found.values(), *texts)]
+    taken = [*(place for what, place in found.items() if what != "quality"), *texts, *map(names.index, left_out)]
+    others = [name for place, name in enumerate(names) if place not in taken]
     if unknown := [name for name in sensors if name not in others]:
         raise ValueError(f"{table.file}: no columns {', '.join(unknown)}; the sensors are {', '.join(others)}")
     sensors = tuple(sensors) or tuple(others)

@@ -151,7 +151,8 @@ def plot_modes(modes: PredictedModes, before: PredictedModes | None = None, labe
     Returns
     -------
     matplotlib Figure
-        With axes for the frequencies, as multiples of the measured ones, and for the shape of each mode.
+        With axes for the frequencies, as multiples of the measured ones and with the errors of a frequency
+        (`PredictedModes.interval`), and for the shape of each mode.
     """
     import matplotlib.pyplot as plt
 
@@ -164,11 +165,11 @@ def plot_modes(modes: PredictedModes, before: PredictedModes | None = None, labe
     first, *others = grid.ravel()
     places, measured = np.arange(data.n_modes), data.mean_frequencies
     if before is not None:
-        middle, reach = _interval(before.frequencies / measured)
+        middle, reach = _of_frequencies(before, measured)
         first.errorbar(
             places - 0.2, middle, reach, fmt="D", color=GREY, fillstyle="none", label="prior, 90 %", capsize=3
         )
-    middle, reach = _interval(modes.frequencies / measured)
+    middle, reach = _of_frequencies(modes, measured)
     first.errorbar(places + 0.2, middle, reach, fmt="s", color=BLUE, markersize=3, label=label, capsize=3)
     errors = modes.paired.frequency_cv
     text = "measured" if errors is None else "measured, with its standard deviation"
@@ -197,6 +198,12 @@ def plot_modes(modes: PredictedModes, before: PredictedModes | None = None, labe
     unique = dict(zip(labels, handles, strict=True))
     figure.legend(unique.values(), unique, loc="outside lower center", ncols=3, frameon=False, fontsize="small")
     return figure
+
+
+def _of_frequencies(modes: PredictedModes, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Medians (m,) of frequencies as multiples of measured ones, and the distances (2, m) to the ends of 90 %."""
+    middle, (low, high) = np.median(modes.frequencies, axis=0), modes.interval()
+    return middle / measured, np.stack([middle - low, high - middle]) / measured
 
 
 def _interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

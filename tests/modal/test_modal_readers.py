@@ -35,6 +35,9 @@ def test_other_layouts_of_a_table(tmp_path):
     for lines in (
         ("Mode No.;Natural frequency [Hz];a;b;c", "1;1,0;1;2;3", "2;3,0;-2;-1;2"),
         ("mode,period [s],a,b,c", "1,1.0,1,2,3", f"2,{1 / 3!r},-2,-1,2"),
+        ("T [s],a,b,c,MAC [%],MPC", "1.0,1,2,3,99.5,0.98", f"{1 / 3!r},-2,-1,2,97.1,0.99"),
+        ("order;T_s;a;b;c", "10;1,0;1;2;3", f"12;{str(1 / 3).replace('.', ',')};-2;-1;2"),
+        ("f [Hz],T (°C),a,b,c,mac", "1,20,1,2,3,1", "3,20,-2,-1,2,1"),
         ("f [Hz],a,b,c,remark", "1,1,2,3,good", "3,-2,-1,2,poor"),
         ("omega_rad/s,a,b,c", "6.283185307179586,1,2,3", "18.84955592153876,-2,-1,2"),
         (",mode 1,mode 2", "frequency [Hz],1.0,3.0", "a,1,-2", "b,2,-1", "c,3,2"),
@@ -48,8 +51,13 @@ def test_other_layouts_of_a_table(tmp_path):
     np.testing.assert_allclose(data.frequency_cv, [0.01, 0.02], rtol=1e-12)
     data = read_modal_data(written(tmp_path, "frequency_Hz,cv [%],a", "1.0,1,1", "3.0,2,1"))
     np.testing.assert_allclose(data.frequency_cv, [0.01, 0.02], rtol=1e-12)
-    with pytest.raises(ValueError, match="unit of the periods"):
-        read_modal_data(written(tmp_path, "period,a", "1.0,1"))
+    data = read_modal_data(written(tmp_path, "T [s],a,MAC,order", "1.0,1,0.98,8", "0.5,1,0.99,8"))
+    assert data.description == "modes.csv, without MAC, order, frequencies from periods"
+    data = read_modal_data(written(tmp_path, "f_Hz,T_C,a,MAC", "1.0,12,1,2", "2.0,12,1,3"), ["a", "MAC"])  # a sensor
+    assert data.sensors == ("a", "MAC") and data.temperatures == [12.0] and data.description == "modes.csv"
+    for head in ("period,a", "T,a"):
+        with pytest.raises(ValueError, match="unit of the periods|expected a column of frequencies"):
+            read_modal_data(written(tmp_path, head, "1.0,1"))
 
 
 def test_units_are_stated_or_given(tmp_path):

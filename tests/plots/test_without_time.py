@@ -44,5 +44,7 @@ def test_frequencies_and_shapes_of_modes():
     heights = [bar.get_height() for bar in shapes[0].patches]
     np.testing.assert_allclose(heights, np.median(modes.shapes[:, 0], axis=0))
     np.testing.assert_allclose(modes.shapes[:, 0] @ data.shapes[0, 0], modes.assurance[:, 0])
+    ends = np.array([segment[:, 1] for segment in first.containers[1][2][0].get_segments()]).T
+    np.testing.assert_allclose(ends, modes.interval() / data.mean_frequencies)  # with the errors of a frequency
     alone = ModalLikelihood(frame, ModalData([0.98, 2.6], frequency_cv=0.01)).predict_modes(np.ones((1, 2)))
     assert len(plot_modes(alone).axes) == 1
