@@ -3,8 +3,10 @@
 import datetime
 import json
 import re
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -69,21 +71,14 @@ def _quoted(text: str) -> str:
 
 def _cells(values: np.ndarray, step: float) -> tuple[str, ...]:
     """Cells below `_HEAD`, of accelerations [m/s²]."""
-    return (
-        str(values.size),
-        f"{step:g}",
-        number((values.size - 1) * step, 4),
-        number(from_si(np.abs(values).max(), "g")),
-    )
+    peak = number(from_si(np.abs(values).max(), "g"))
+    return str(values.size), f"{step:g}", number((values.size - 1) * step, 4), peak
 
 
 def _name_of_channel(text: str, taken: set[str]) -> str:
     """A name for a channel, from the name of its column without the unit."""
     base = re.sub(r"[^A-Za-z0-9_]+", "_", re.sub(r"[\[(].*$", "", text)).strip("_").lower() or "channel"
-    name, count = base, 1
-    while name in taken:
-        count += 1
-        name = f"{base}_{count}"
+    name = next(name for k in range(1, len(taken) + 2) if (name := base if k == 1 else f"{base}_{k}") not in taken)
     taken.add(name)
     return name
 
@@ -103,62 +98,63 @@ def _texts(channels: list[Screened]) -> list[str]:
     return [f"CAUTION: {each.kind}: {each.text}" for each in check_sensors(channels)]
 
 
+class _Series(NamedTuple):
+    """One acceleration of a file that has several."""
+
+    column: str | int  # by which the readers know it
+    name: str  # for a channel
+    cells: tuple[str, ...]  # of the table, before and after those of `_HEAD`
+    after: tuple[str, ...]
+    parse: Callable[[], Any]
+
+
 def _v2(path: Path) -> _Lines:
-    channels = find_v2_channels(path)
-    numbers, files = [channel.channel for channel in channels], [channel.file for channel in channels]
-    rows, columns, refused, screened = [("channel", *_HEAD, "label", "file")], [], [], list[Screened]()
-    taken: set[str] = set()
+    channels, found = find_v2_channels(path), []
+    numbers = [channel.channel for channel in channels]
     for channel in channels:
         file = channel.file.removeprefix(f"{path}/") if channel.file != str(path) else path.name
         alone = channel.channel is not None and numbers.count(channel.channel) == 1
-        column = channel.channel if alone else file
-        try:
-            series = parse_v2(channel)
-            values = to_si(series.values, series.unit, "acceleration")
-            step = series.dt if series.times is None else uniform_times(series.times, None, channel.file).step
-        except ValueError as error:
-            refused.append(f"not read: {error}")
-            continue
-        rows.append((str(channel.channel or "-"), *_cells(values, step), channel.label, file))
-        if series.times is not None:
-            refused.append(f"uneven times in channel {column}: give resample = {step:.6g}")
-        if not alone and files.count(channel.file) > 1:
-            refused.append(f"{file} has channel {channel.channel or '-'} and others, which it does not number apart")
-            continue
-        columns.append((_name_of_channel(f"ch{channel.channel}" if alone else file, taken), column))
-        if series.times is None:
-            screened += _screen(columns[-1][0], from_si(values, "g"), "g", step)
-    text = [f"{len(columns)} channels of acceleration", text_table(rows), *refused, *_texts(screened)]
-    if len({row[1:3] for row in rows[1:]}) > 1:
-        text.append(
-            "The channels differ in samples or step: they may be of several recorders, whose clocks may differ."
-        )
-    if not columns:
-        return _Lines(text)
-    first = columns[0][1]
-    line = f"channel = {first}" if isinstance(first, int) else f"column = {_quoted(first)}"
-    measured = [f"columns = {_inline(columns)}    # channel of the model = channel of the file"]
-    return _Lines(text, [f"{line}    # the channel of the base motion"], measured + repair_lines(screened))
+        column, name = (channel.channel, f"ch{channel.channel}") if alone else (file, file)
+        cells = (str(channel.channel or "-"),), (channel.label, file)
+        found.append(_Series(column, name, *cells, partial(parse_v2, channel)))
+    return _several("channels", ("channel", *_HEAD, "label", "file"), found)
 
 
 def _geonet(path: Path) -> _Lines:
     components = parse_geonet(read_text(path), str(path))
-    rows = [("component", *_HEAD)]
-    for component, series in components:
-        rows.append((component, *_cells(to_si(series.values, series.unit), series.dt)))
-    given, taken = [component for component, _ in components], set[str]()
-    names = [(_name_of_channel(name, taken), name) for name in given if given.count(name) == 1]
-    text = [f"{len(components)} components of acceleration", text_table(rows)]
-    text += [f"the component {name!r} is there {given.count(name)} times" for name in given if given.count(name) > 1][
-        :1
-    ]
-    if not names:
+    found = [_Series(name, name, (name,), (), lambda series=series: series) for name, series in components]
+    return _several("components", ("component", *_HEAD), found)
+
+
+def _several(what: str, head: tuple[str, ...], series: list[_Series]) -> _Lines:
+    """Several accelerations, which readers know by numbers or names."""
+    given, taken = [each.column for each in series], set[str]()
+    rows, columns, refused, screened = [head], [], [], list[Screened]()
+    for each in series:
+        try:
+            parsed = each.parse()
+            values, times = to_si(parsed.values, parsed.unit, "acceleration"), getattr(parsed, "times", None)
+            step = parsed.dt if times is None else uniform_times(times, None, str(each.column)).step
+        except ValueError as error:
+            refused.append(f"not read: {error}")
+            continue
+        rows.append((*each.cells, *_cells(values, step), *each.after))
+        if times is not None:
+            refused.append(f"uneven times in channel {each.column}: give resample = {step:.6g}")
+        if (count := given.count(each.column)) > 1:
+            refused.append(f"{each.column!r} is there {count} times, and no number tells them apart")
+            continue
+        columns.append((_name_of_channel(each.name, taken), each.column))
+        screened += _screen(columns[-1][0], from_si(values, "g"), "g", step) if times is None else []
+    text = [f"{len(columns)} {what} of acceleration", text_table(rows), *dict.fromkeys(refused), *_texts(screened)]
+    if len({row[1:3] for row in rows[1:]}) > 1:
+        text.append(f"The {what} differ in samples or step: they may be of several recorders, whose clocks may differ.")
+    if not columns:
         return _Lines(text)
-    return _Lines(
-        text,
-        [f"column = {_quoted(names[0][1])}"],
-        [f"columns = {_inline(names)}    # channel of the model = component"],
-    )
+    first = columns[0][1]
+    line = f"channel = {first}" if isinstance(first, int) else f"column = {_quoted(first)}"
+    measured = [f"columns = {_inline(columns)}    # channel of the model = {what} of the file"]
+    return _Lines(text, [f"{line}    # the base motion"], measured + repair_lines(screened))
 
 
 def _record_text(record: Record) -> list[str]:
@@ -196,7 +192,7 @@ def _dataset(path: Path) -> _Lines:
 
 def _table(path: Path) -> _Lines:
     table = read_table(path)
-    options, remarks = _sampling(table)
+    options, remarks, step = _sampling(table)
     rows: list[tuple[str, ...]] = [("column", "unit", "numbers", "missing", "smallest", "largest")]
     columns, unstated, marks, screened = [], [], set(), list[Screened]()
     taken: set[str] = set()
@@ -215,13 +211,15 @@ def _table(path: Path) -> _Lines:
         if names.count(name) > 1:
             remarks.append(f"the name {name!r} is that of several columns: rename them")
             continue
-        channel = _name_of_channel(name if table.named else f"column {name}", taken)
-        columns.append((channel, name))
-        screened += _screen_column(
-            table, options, channel, np.where(np.isin(values, list(marks)), np.nan, values), unit
-        )
+        columns.append((_name_of_channel(name if table.named else f"column {name}", taken), name))
+        if step is not None:
+            values = np.where(np.isin(values, list(marks)), np.nan, values)
+            if any(each.startswith("resample") for each in options):
+                values = uniform_times(row_times(table), None, table.file).interpolate(values)
+            start = table_start(table, step, 0.0 if table.clock is None else _clock_text(table))
+            screened += _screen(columns[-1][0], values, unit or "", step, start)
         if unit is None or dimension_of(unit) is None:
-            unstated.append((channel, "?"))
+            unstated.append((columns[-1][0], "?"))
     text = [f"a table of {len(table.lines)} rows", text_table(rows), *remarks, *_texts(screened)]
     repairs = repair_lines(screened, {"missing": sorted(marks)})
     if marks and not any(each.startswith("missing") for each in repairs):
@@ -239,63 +237,40 @@ def _table(path: Path) -> _Lines:
     return _Lines(text, [*base, *options], measured + repairs)
 
 
-def _screen_column(table: Table, options: list[str], name: str, values: np.ndarray, unit: str | None) -> list[Screened]:
-    """Faults of a column, at the times that the lines for the TOML file give; nothing without times."""
-    if any(each.startswith("dt") for each in options):
-        return []
-    zero = 0.0 if table.clock is None else _clock_text(table)
-    try:
-        if any(each.startswith("resample") for each in options):
-            even = uniform_times(row_times(table), None, table.file)
-            return _screen(name, even.interpolate(values), unit or "", even.step, table_start(table, even.step, zero))
-        skipped = any(each.startswith("skip") for each in options)
-        step = table_step(table._replace(stated=Statements()) if skipped else table)
-    except ValueError:  # a remark says so
-        return []
-    return _screen(name, values, unit or "", step, table_start(table, step, zero))
-
-
-def _lines_above(table: Table) -> int:
-    """Number of lines above the header line of a table."""
-    return table.lines[0] - 1 - table.named - any(column.below for column in table.columns)
-
-
 def _clock_text(table: Table) -> str:
     """The first clock time of a table, as `zero` takes it."""
     clock = table.clock
-    seconds = datetime.timedelta(seconds=clock.seconds)
-    text = str((datetime.datetime.min + seconds).time())
+    text = str((datetime.datetime.min + datetime.timedelta(seconds=clock.seconds)).time())
     return text if clock.day is None else f"{datetime.date.fromordinal(clock.day)} {text}"
 
 
-def _sampling(table: Table) -> tuple[list[str], list[str]]:
-    """Keys that the times need, and what is said about them."""
+def _sampling(table: Table) -> tuple[list[str], list[str], float | None]:
+    """Keys that the times need, what is said about them, and the step that these keys give, if they do."""
     try:
         step = table_step(table)
     except ValueError as error:
         if table.time is None:
-            return ['dt = "? s"    # write it: the file has no times'], ["no column of times"]
+            return ['dt = "? s"    # write it: the file has no times'], ["no column of times"], None
         try:
-            table_step(table._replace(stated=Statements()))
-            above = _lines_above(table)  # with the other step
+            step = table_step(table._replace(stated=Statements()))
+            above = table.lines[0] - 1 - table.named - any(column.below for column in table.columns)
             lines = [f"skip = {above}    # the step of the times, without the text above the table"] if above else []
-            return lines, [f"times: {error}"]
+            return lines, [f"times: {error}"], step if above else None
         except ValueError:
             pass
         try:
             times = row_times(table)
             even = uniform_times(times, None, table.file)
         except ValueError:
-            return [], [f"times: {error}"]
+            return [], [f"times: {error}"], None
         steps = np.diff(times)
         text = f"times: uneven, steps of {steps.min():.4g} to {steps.max():.4g} s"
         if even.gaps.size:
             text += f", {even.gaps.size} gap(s), the largest of {steps.max():.4g} s after {times[steps.argmax()]:.6g} s"
         if not even.kept.all():
             text += f", {(~even.kept).sum()} row(s) of a repeated time, the first at {times[~even.kept][0]:.6g} s"
-        return [f"resample = {even.step:.6g}"], [text]
+        return [f"resample = {even.step:.6g}"], [text], even.step
     column = None if table.time is None else table.columns[table.time]
     start = "" if column is None else f", from {column.values[0]:.10g} in column {column.name!r}"
-    if table.clock is not None:
-        start += f", first clock time {_clock_text(table)}"
-    return [], [f"times: step {step:g} s ({1 / step:g} per second){start}"]
+    start += "" if table.clock is None else f", first clock time {_clock_text(table)}"
+    return [], [f"times: step {step:g} s ({1 / step:g} per second){start}"], step

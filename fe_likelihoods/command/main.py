@@ -15,12 +15,13 @@ from typing import Any
 
 import click
 
+from .starting import TEMPLATES, write_templates
+
 __all__ = ["NOT_USABLE", "main"]
 
 ERROR, INTERRUPTED = 1, 130
 NOT_USABLE = 3
 _FILE = click.Path(path_type=Path)
-_KINDS = ("column", "bridge", "opensees", "function", "executable", "modal", "load-test")
 
 
 @contextlib.contextmanager
@@ -159,12 +160,10 @@ def report(run: Path, run_code: bool) -> None:
 
 
 @main.command()
-@click.argument("kind", type=click.Choice(_KINDS))
+@click.argument("kind", type=click.Choice(list(TEMPLATES)))
 @click.argument("folder", type=_FILE)
 def new(kind: str, folder: Path) -> None:
     """Write a commented TOML file of KIND to FOLDER to start from; it runs as it is, with synthetic data."""
-    from .starting import write_templates
-
     files = write_templates(kind, folder)
     click.echo(f"Written to {folder}/: {', '.join(files)}. The data are SYNTHETIC.")
     click.echo(f"Next: fe-likelihoods check {folder / kind}.toml")

@@ -544,7 +544,7 @@ def test_an_archive_that_holds_channels_twice_is_listed_in_valid_toml(tmp_path):
             archive.writestr(name, content)
         archive.writestr("twice.v2", one + other)
     found = describe_data(path)
-    assert found.count("twice.v2 has channel 1 and others") == 2
+    assert "'twice.v2' is there 2 times" in found
     columns = sections(found)["measurements"]["columns"]
     assert sorted(columns.values()) == ["CHAN1.V2", "chan1-v2.v2", "copy/CHAN1.V2"]
     peaks = {name: np.abs(read_record(path, name).acceleration).max() for name in columns.values()}
@@ -568,7 +568,7 @@ def test_components_and_columns_that_are_there_twice_are_listed_in_valid_toml(tm
     path = tmp_path / "a.V2A"
     path.write_text(text(*geonet({"N 1": VALUES, "Up": VALUES}, 0.02), *geonet({"Up": VALUES, "n": VALUES}, 0.02)))
     found = describe_data(path)
-    assert "the component 'Up' is there 2 times" in found
+    assert "'Up' is there 2 times" in found
     assert sorted(sections(found)["measurements"]["columns"].values()) == ["N", "n"]
     path = tmp_path / "a.csv"
     path.write_text("time_s,Top (g),top [g],a_g,a_g\n0.00,1,2,3,4\n0.01,1,2,3,4\n")
