@@ -1,6 +1,6 @@
 """Repeated simulations, and how much two simulations with the same parameters may differ."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -66,27 +66,22 @@ class Simulated(NamedTuple):
 
 
 @contextmanager
-def observed(label: ModelLabel | None, pool: Any, complete: Callable[[Opened | None], None]) -> Iterator[None]:
-    """Pass what the simulations in a ``with`` block open to `complete`, if the label observes simulations."""
+def observed(label: ModelLabel | None, pool: Any) -> Iterator[None]:
+    """Add what the simulations in a ``with`` block open to the label, if it observes simulations."""
     if label is None or not label.observes:
         yield
         return
     with observing() as observer:
         yield
-    complete(observer.result(label.known) if pool is None else Opened(observer.noted))
+    label.add(observer.result(label.known) if pool is None else Opened(observer.noted))
 
 
-def simulate_again(
-    run: VerifyingRun,
-    thetas: np.ndarray,
-    label: ModelLabel | None = None,
-    complete: Callable[[Opened | None], None] | None = None,
-) -> list[Simulated]:
-    """New simulations; if the model's label is given, what they open is passed to the function `complete`."""
+def simulate_again(run: VerifyingRun, thetas: np.ndarray, label: ModelLabel | None = None) -> list[Simulated]:
+    """New simulations; if the model's label is given, what they open is added to it."""
     rows = []
     size = most_responses(run.model)
     for start in range(0, len(thetas), size):
-        with observed(label, run.pool, complete):
+        with observed(label, run.pool):
             batch = simulate_batch(run.model, thetas[start : start + size], run.pool)
         misfit, reasons = misfit_of_responses(run.model, batch, run.measured, run.statistic)
         with np.errstate(over="ignore", invalid="ignore"):

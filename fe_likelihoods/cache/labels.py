@@ -103,7 +103,7 @@ class Trust:
             known = [each for each in same if Opened(each.files).read_again().files == each.files]
             if known:
                 self.stored[source] = max(known, key=lambda each: each.compared)
-                self._save(file, self.stored.values())
+                self.save(file)
             elif self.stored:  # another length of the record, for example
                 other = next(iter(self.stored.values()))
                 self.put(file, {source}, other.generation, other.compared)
@@ -113,7 +113,7 @@ class Trust:
     def put(self, file: CacheFile, sources: Iterable[int], generation: int, compared: int) -> None:
         """Add the label of some models to a generation in the file, after `compared` of its rows were compared."""
         ids = {source: self.stored[source].id if source in self.stored else secrets.randbits(62) for source in sources}
-        self._save(file, [StoredLabel(ids[source], source, "", {}, generation, compared) for source in ids])
+        self.save(file, [StoredLabel(ids[source], source, "", {}, generation, compared) for source in ids])
 
     def begin(self, file: CacheFile, fingerprint: str, used: set[int]) -> None:
         """Begin a generation, or continue the generation that another process has begun under the same label."""
@@ -124,16 +124,10 @@ class Trust:
         self.put(file, {*self.stored, source_number(fingerprint)}, generation, OWN)
         self.generations.clear()
 
-    def complete(self, file: CacheFile, opened: Opened | None) -> None:
-        """Add what simulations opened to the label."""
-        if opened is not None:
-            with self.lock:
-                if self.label.add(opened):
-                    self._save(file, self.stored.values())
-
-    def _save(self, file: CacheFile, labels: Iterable[StoredLabel]) -> None:
-        """Store labels with the present code and files, where these differ from what is stored."""
-        new = [each._replace(code=self.label.code, files=self.label.opened.files) for each in labels]
+    def save(self, file: CacheFile, labels: Iterable[StoredLabel] = ()) -> None:
+        """Store labels, or all known ones, with the present code and files, where these differ from what is stored."""
+        now = {"code": self.label.code, "files": self.label.opened.files}
+        new = [each._replace(**now) for each in labels or self.stored.values()]
         new = [each for each in new if self.stored.get(each.source) != each]
         self.stored |= {each.source: each for each in new}
         rows = [each.packed() for each in new]

@@ -33,91 +33,79 @@ def thetas_of(keys: Sequence[bytes], n_structural: int) -> np.ndarray:
     return np.frombuffer(b"".join(keys), dtype=float).reshape(len(keys), n_structural).copy()
 
 
-def _as_limit(name: str, what: str, value: Any) -> int:
-    """A cache limit as int; ValueError for anything but a whole number of 0 or more."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0:
-        raise ValueError(f"{name} must be the {what}, a whole number of 0 or more; got {value!r}")
-    return int(value)
+class _Memory:
+    """Outcomes by key, the oldest first, of at most `most` in size. Threads may share it.
 
-
-class MemoryCache:
-    """Least-recently-used cache of statistics of at most `rows` simulations, by the bytes of the structural parameters.
-
-    Failures are cached as NaN, with their reasons. Threads may share the cache. It is empty after unpickling, because
-    its contents would dominate the size of the pickle. ValueError if `rows` is not a whole number or is negative.
+    An outcome is a value, or a text: the reason of a failure. It is empty after unpickling, because its contents would
+    dominate the size of the pickle. ValueError if `most` is not a whole number of 0 or more.
     """
 
-    def __init__(self, rows: int) -> None:
-        self.rows = _as_limit("memory_rows", "number of simulations to cache in memory", rows)
-        self._misfits: OrderedDict[bytes, bytes] = OrderedDict()  # from the least to the most recently used
-        self._reasons: dict[bytes, str] = {}
-        self._lock = threading.Lock()
+    _what = ""
+
+    def __init__(self, most: int) -> None:
+        if isinstance(most, bool) or not isinstance(most, int | np.integer) or most < 0:
+            raise ValueError(f"{self._what}, a whole number of 0 or more; got {most!r}")
+        self.most, self._lock = int(most), threading.Lock()
+        self.clear()
 
     def __reduce__(self) -> tuple:
-        return type(self), (self.rows,)
+        return type(self), (self.most,)
 
     def __len__(self) -> int:
-        return len(self._misfits)
+        return len(self._outcomes)
+
+    def clear(self) -> None:
+        """Drop all outcomes."""
+        self._outcomes: OrderedDict[Any, Any] = OrderedDict()
+
+
+class MemoryCache(_Memory):
+    """Least-recently-used cache of statistics of at most `most` simulations, by the bytes of structural parameters."""
+
+    _what = "memory_rows must be the number of simulations to cache in memory"
 
     def look_up(self, keys: Sequence[bytes], width: int) -> tuple[np.ndarray, list[bool]]:
         """Cached statistics (n, width) of n distinct keys, NaN if failed or not cached, and whether each is cached."""
         found = []
         with self._lock:
             for key in keys:
-                misfit = self._misfits.get(key)
-                if misfit is not None:
-                    self._misfits.move_to_end(key)
-                found.append(misfit)
+                outcome = self._outcomes.get(key)
+                if outcome is not None:
+                    self._outcomes.move_to_end(key)
+                found.append(outcome)
         unknown = _NAN * width
-        filled = bytearray().join([unknown if misfit is None else misfit for misfit in found])  # makes a writable array
-        misfits = np.frombuffer(filled, dtype=float).reshape(len(keys), width)
-        return misfits, [misfit is not None for misfit in found]
+        # a bytearray makes a writable array
+        filled = bytearray().join([each if isinstance(each, bytes) else unknown for each in found])
+        return np.frombuffer(filled, dtype=float).reshape(len(keys), width), [each is not None for each in found]
 
     def successes(self, n_structural: int) -> np.ndarray:
         """Structural parameters (n, n_structural) of cached simulations that did not fail."""
         with self._lock:
-            keys = [key for key, misfit in self._misfits.items() if not np.isnan(np.frombuffer(misfit)).any()]
+            keys = [key for key, outcome in self._outcomes.items() if isinstance(outcome, bytes)]
         return thetas_of(keys, n_structural)
 
-    def clear(self) -> None:
-        """Drop all rows."""
-        with self._lock:
-            self._misfits.clear()
-            self._reasons.clear()
-
-    def store(self, keys: Sequence[bytes], misfits: np.ndarray, reasons: Sequence[str]) -> None:
+    def store(self, keys: Sequence[bytes], statistics: np.ndarray, reasons: Sequence[str]) -> None:
         """Cache the statistics (n, width) of n distinct keys, and the reasons of failures; empty for others."""
+        outcomes = [reason or row.tobytes() for row, reason in zip(statistics, reasons, strict=True)]
         with self._lock:
-            self._misfits.update(zip(keys, map(np.ndarray.tobytes, misfits), strict=True))
-            self._reasons.update((key, reason) for key, reason in zip(keys, reasons, strict=True) if reason)
-            while len(self._misfits) > self.rows:
-                self._reasons.pop(self._misfits.popitem(last=False)[0], None)
+            self._outcomes.update(zip(keys, outcomes, strict=True))
+            while len(self._outcomes) > self.most:
+                self._outcomes.popitem(last=False)
 
     def reason(self, key: bytes) -> str:
         """Reason of a cached failure; empty for others."""
-        return self._reasons.get(key, "")
+        outcome = self._outcomes.get(key)
+        return outcome if isinstance(outcome, str) else ""
 
 
-class ResponseMemory:
-    """The most recently stored responses in double precision, and reasons of failures, in at most `max_bytes` [bytes].
+class ResponseMemory(_Memory):
+    """The most recently stored responses in double precision, and reasons of failures, in at most `most` bytes.
 
-    Likelihoods with the same model or shortened versions of it share one. Threads may share it. It is empty after
-    unpickling, like a `MemoryCache`. The oldest are dropped (`dropped` counts them); the first time, a message at level
-    INFO. ValueError if `max_bytes` is not a whole number or is negative.
+    Likelihoods with the same model or shortened versions of it share one. The oldest are dropped (`dropped` counts
+    them); the first time, a message at level INFO.
     """
 
-    def __init__(self, max_bytes: int) -> None:
-        self.max_bytes = _as_limit("memory_bytes", "size of the responses to keep in memory [bytes]", max_bytes)
-        self.dropped = 0
-        self._outcomes: OrderedDict[tuple[str, bytes], np.ndarray | str] = OrderedDict()  # the oldest first
-        self._bytes = 0
-        self._lock = threading.Lock()
-
-    def __reduce__(self) -> tuple:
-        return type(self), (self.max_bytes,)
-
-    def __len__(self) -> int:
-        return len(self._outcomes)
+    _what = "memory_bytes must be the size of the responses to keep in memory [bytes]"
 
     def look_up(self, fingerprint: str, keys: Sequence[bytes]) -> list[np.ndarray | str | None]:
         """Stored outcomes for a model's fingerprint and keys from `distinct_keys`; None where nothing is stored.
@@ -135,35 +123,28 @@ class ResponseMemory:
 
     def store(self, fingerprint: str, keys: Sequence[bytes], outcomes: Iterable[np.ndarray | str]) -> None:
         """Store copies of responses, and reasons of failures; drops the oldest outcomes beyond the limit."""
-        if not self.max_bytes:
-            return
         with self._lock:
-            for key, outcome in zip(keys, outcomes, strict=True):
-                self._remove((fingerprint, key))
+            for key, outcome in zip(keys, outcomes, strict=True) if self.most else ():
+                self._bytes += _size(outcome) - _size(self._outcomes.pop((fingerprint, key), None))
                 self._outcomes[fingerprint, key] = outcome if isinstance(outcome, str) else np.array(outcome)
-                self._bytes += _size(outcome)
-                while self._bytes > self.max_bytes:
-                    self._remove(next(iter(self._outcomes)))
+                while self._bytes > self.most:
+                    self._bytes -= _size(self._outcomes.popitem(last=False)[1])
                     if not self.dropped:
                         logger.info(
                             "responses are dropped from memory, the oldest first, because they have more than %d bytes "
                             "(memory_bytes); they are simulated again if they are needed and in no cache on disk",
-                            self.max_bytes,
+                            self.most,
                         )
                     self.dropped += 1
 
     def clear(self) -> None:
-        """Drop all responses."""
-        with self._lock:
-            self._outcomes.clear()
-            self._bytes = 0
-
-    def _remove(self, key: tuple[str, bytes]) -> None:
-        outcome = self._outcomes.pop(key, None)
-        if outcome is not None:
-            self._bytes -= _size(outcome)
+        """Drop all outcomes."""
+        super().clear()
+        self._bytes = self.dropped = 0
 
 
-def _size(outcome: np.ndarray | str) -> int:
+def _size(outcome: np.ndarray | str | None) -> int:
     """Bytes of an outcome in the response memory."""
+    if outcome is None:
+        return 0
     return _ENTRY_BYTES + (len(outcome) if isinstance(outcome, str) else outcome.nbytes)

@@ -22,7 +22,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..simulation.faults import TransientReason
-from ..simulation.files import Opened
 from ..simulation.label import ModelLabel
 from ..simulation.local_pool import LocalPool
 from ..simulation.model import Model, SimulationBatch, misfit_of_responses
@@ -112,10 +111,6 @@ class VerifiedCache:
         """Label of the model."""
         return self._trust.label
 
-    def complete(self, opened: Opened | None) -> None:
-        """Add what simulations opened to the model's label."""
-        self._trust.complete(self.cache.file, opened)
-
     def share_trust(self, other: "VerifiedCache") -> None:
         """Trust rows that another object has verified or stored, if its model has the same code."""
         if other.label.code == self.label.code:
@@ -142,6 +137,7 @@ class VerifiedCache:
                     return
                 trust.begin(self.cache.file, run.fingerprint, set())
                 stored = trust.find(self.cache.file, run)
+            trust.save(self.cache.file)
             place = Place(stored.generation, trust.cpu, trust.session)
         rows = []
         if misfit is not None:
@@ -312,7 +308,7 @@ class VerifiedCache:
 
     def _simulate(self, thetas: np.ndarray, run: VerifyingRun) -> list[Simulated]:
         start, label = time.perf_counter(), self.label
-        new = simulate_again(run, thetas, label, self.complete)
+        new = simulate_again(run, thetas, label)
         if run.pool is None and label.observes:
             label.has_changed_itself(label.changed(run.model))
         self.seconds += time.perf_counter() - start

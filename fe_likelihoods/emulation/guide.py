@@ -125,7 +125,7 @@ class ResponseGuide:
 
     def __init__(self, posterior: Any, starts: int = 6) -> None:
         starts = check_starts(starts)
-        fewest = min(part.simulator.memory_cache.rows for part, _ in posterior.likelihood.parts())
+        fewest = min(part.simulator.memory_cache.most for part, _ in posterior.likelihood.parts())
         if fewest < _FEWEST_CACHED:
             raise ValueError(
                 f"a guide needs a likelihood with memory_rows of {_FEWEST_CACHED} or more, so that no simulation is "
@@ -408,11 +408,11 @@ class ResponseGuide:
         most = self._starts * max(self._target.n_structural, POINTS_PER_STEP)
         for part, _ in self._posterior.likelihood.parts():
             needed = 8 * most * len(part.model.channels) * part.model.n_steps
-            if part.simulator.response_memory.max_bytes < needed:
+            if part.simulator.response_memory.most < needed:
                 raise ValueError(
                     f"an asynchronous run with a guide needs a likelihood with memory_bytes of {needed} or more, which "
                     "holds the responses that arrive together, so that none is simulated twice; got "
-                    f"{part.simulator.response_memory.max_bytes}"
+                    f"{part.simulator.response_memory.most}"
                 )
 
     def _counted(self, search: Generator[float, None, Any]) -> Generator[float, None, Any]:

@@ -19,7 +19,6 @@ from ..cache.verification import VerifiedCache
 from ..noise.statistics import Statistic
 from ..simulation.by_value import is_arriving
 from ..simulation.faults import ChangedModel, TransientReason
-from ..simulation.files import Opened
 from ..simulation.label import ModelLabel
 from ..simulation.model import Model
 
@@ -44,8 +43,8 @@ class CheckedModel:
         self._set_up(model, statistic, cache, pool)
 
     def _set_up(self, model: Model, statistic: Statistic | None, cache: SimulationCache | None, pool: Any) -> None:
-        self.label = ModelLabel(model, statistic)
-        self.rows = None if cache is None else VerifiedCache(cache, pool, self.label, model)
+        self._label = ModelLabel(model, statistic)
+        self.rows = None if cache is None else VerifiedCache(cache, pool, self._label, model)
         self._known = self.label.items | self.label.opened.items() | {_FINGERPRINT: model.fingerprint}
         self._repeated = 0
         self._begin()
@@ -55,38 +54,31 @@ class CheckedModel:
         self.unchecked: list[np.ndarray] = []
         self._points: list[tuple[np.ndarray, np.ndarray]] = []  # first and latest success: parameters, statistics
         self._not_before, self._last_seconds, self._is_due = -np.inf, np.inf, False
+        self._seconds = 0.0  # of simulations since the last comparison
         self._was_sent = False  # from another process, by a pool whose workers import the code
 
     def __getstate__(self) -> tuple:
-        return self.rows, self.label, self._known, self._repeated, os.getpid()
+        return self.rows, self._label, self._known, self._repeated, os.getpid()
 
     def __setstate__(self, state: tuple) -> None:
-        self.rows, self.label, self._known, self._repeated, pid = state
+        self.rows, self._label, self._known, self._repeated, pid = state
         self._begin()
         self._was_sent = pid != os.getpid() and not is_arriving()  # by value
-        self._share_label()
 
-    def _share_label(self) -> None:
-        """Use the label of the rows, shared by likelihoods with the same model and file."""
-        self.label = self.label if self.rows is None else self.rows.label
+    @property
+    def label(self) -> ModelLabel:
+        """Label of the model; likelihoods that share a trust in rows have one."""
+        return self._label if self.rows is None else self.rows.label
 
     @property
     def compared(self) -> int:
         """Number of earlier simulations that were compared with a new one."""
         return self._repeated + (0 if self.rows is None else self.rows.compared)
 
-    def complete(self, opened: Opened | None) -> None:
-        """Add the files that simulations opened to the model's label."""
-        if self.rows is None:
-            self.label.add(opened)
-        else:
-            self.rows.complete(opened)
-
     def share_trust(self, other: "CheckedModel") -> None:
         """Trust rows that another simulator has verified or stored, unless its code differs."""
         if self.rows is not None and other.rows is not None:
             self.rows.share_trust(other.rows)
-            self._share_label()
 
     def before(self, run: VerifyingRun, earlier: Callable[[], list]) -> None:
         """Compare the model before simulations, unless the last comparison was too recent.
@@ -114,12 +106,12 @@ class CheckedModel:
     ) -> bool:
         """Compare the model after simulations, if `before` did and, with a pool, they took long; whether it compared.
 
-        Not while others run (`last` is false). `seconds` is the wall time; with a pool that runs without interruption,
-        the time since the last comparison. Raises `ChangedModel`, as `before`.
+        Not while others run (`last` is false). `seconds` is the wall time. Raises `ChangedModel`, as `before`.
         """
         self.unchecked.append(thetas)
+        self._seconds += seconds
         here = run.pool is None
-        due = self._is_due and last and (here or _SHARE_OF_TIME * seconds >= self._last_seconds)
+        due = self._is_due and last and (here or _SHARE_OF_TIME * self._seconds >= self._last_seconds)
         succeeded = [row for row, reason in enumerate(reasons) if not reason]
         points = [(thetas[row].copy(), misfit[row].copy()) for row in succeeded[:1] + succeeded[-1:]]
         if not here and not self._points:
@@ -175,7 +167,7 @@ class CheckedModel:
             self.label.has_changed_itself(changed)
             self._renew(self._changed(run.model, run.model.fingerprint))
         self.unchecked.clear()
-        self._last_seconds = time.monotonic() - start
+        self._last_seconds, self._seconds = time.monotonic() - start, 0.0
 
     def _repeat(self, run: VerifyingRun) -> bool:
         """Whether the repeated simulations give the earlier results, or the model is not repeatable."""

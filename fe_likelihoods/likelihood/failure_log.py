@@ -74,11 +74,10 @@ class FailureLog:
         reason, seconds = split_seconds(reason)
         if not self.count or (transient and not self.transient):
             logger.warning(
-                "A simulation failed (%s) at %s; its log-likelihood is -inf%s. Further failures are counted without a "
-                "message, see posterior.report()",
+                "A simulation failed (%s) at %s%s. Further failures are counted without a message",
                 reason,
                 ", ".join(f"{name} = {value:.4g}" for name, value in parameters.items()),
-                " in this run, and a later run simulates the point again" if transient else "",
+                "; a later run simulates the point again" if transient else "",
             )
         self.count += 1
         self.transient += transient

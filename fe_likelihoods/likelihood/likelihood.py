@@ -391,8 +391,8 @@ class FELikelihood(SumOfParts):
             noise,
             own.pool,
             cache=own.cache,
-            memory_rows=own.memory_cache.rows,
-            memory_bytes=own.response_memory.max_bytes,
+            memory_rows=own.memory_cache.most,
+            memory_bytes=own.response_memory.most,
             max_failure_share=own.failures.max_share,
         )
         other.simulator.share(own)

@@ -119,7 +119,7 @@ class _Running:
         self.owner, self.lock = os.getpid(), threading.RLock()
         self.simulations: set[Simulation] = set()
         self.functions: dict[bool, tuple[Model, Callable]] = {}  # that are sent, so that each is pickled once
-        self.since = self.counted_until = 0.0  # wall time of the first of them, and of the last arrival [s]
+        self.counted_until = 0.0  # time of the last arrival [s]
 
 
 class Simulator:
@@ -259,7 +259,7 @@ class Simulator:
         while len(left):
             self._check_before(request.run)
             some, start = left[: self._chunk(len(left), full)], time.perf_counter()
-            with observed(self._checked.label, self.pool, self._checked.complete):
+            with observed(self._checked.label, self.pool):
                 if self.pool is None or self._returns_responses(full):
                     values, reasons = simulate_batch(self.model, request.thetas[some], self.pool)
                 else:
@@ -431,7 +431,7 @@ class Simulator:
         with running.lock:
             if not running.simulations:
                 running.functions.clear()
-                running.since = running.counted_until = time.perf_counter()
+                running.counted_until = time.perf_counter()
             function = self._sent_function(request.responses is not None)
             futures = self.pool.submit_all(function, list(request.thetas[rows]))
             sent = [Simulation(request, int(row), future) for row, future in zip(rows, futures, strict=True)]
@@ -456,7 +456,7 @@ class Simulator:
                 running.simulations.discard(simulation)
                 try:
                     outcome, opened = unpack(future.result(), self.pool)
-                    self._checked.complete(opened)
+                    self._checked.label.add(opened)
                     of_requests.setdefault(simulation.request, []).append((simulation, outcome))
                 except CancelledError:
                     simulation.error = RuntimeError("the pool was closed before a simulation had finished")
@@ -535,7 +535,8 @@ class Simulator:
         if self.when_simulated is not None:
             self.when_simulated(len(thetas))
         run = request.run if request.run.model is self.model else self._run  # the model may have been replaced
-        self._check_after(run, thetas, statistics, reasons, seconds)
+        last = self._in_pool is None or not self._running.simulations
+        self._drop_if_changed(self._checked.after, run, thetas, statistics, reasons, seconds, last)
         self._checked.has_results = True
         self.memory_cache.store(keys, statistics, reasons)
         if full:
@@ -557,38 +558,24 @@ class Simulator:
     def _check_before(self, run: VerifyingRun) -> None:
         """Check failures and the model before simulations, not after them, so that finished simulations are stored."""
         self.check_failures()
-        try:
-            self._checked.before(run, self._earlier_point)
-        except ChangedModel:
-            self._drop_unchecked(run)
-            raise
+        self._drop_if_changed(self._checked.before, run, self._earlier_point)
 
     def _earlier_point(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Parameters and statistics of a successful simulation in memory, if there is one, to be run again."""
         thetas = self.memory_cache.successes(self.n_structural)[:1]
-        return list(
-            zip(thetas, self.memory_cache.look_up([each.tobytes() for each in thetas], self.n_numbers)[0], strict=True)
-        )
+        statistics, _ = self.memory_cache.look_up([each.tobytes() for each in thetas], self.n_numbers)
+        return list(zip(thetas, statistics, strict=True))
 
-    def _check_after(
-        self, run: VerifyingRun, thetas: np.ndarray, statistics: np.ndarray, reasons: list[str], seconds: float
-    ) -> None:
-        """Compare the model after simulations, if that is due."""
-        if self.streams:
-            seconds = time.perf_counter() - self._running.since
-        last = self._in_pool is None or not self._running.simulations
+    def _drop_if_changed(self, compare: Callable[..., Any], run: VerifyingRun, *arguments: Any) -> None:
+        """Compare the model; if it has changed, drop what was simulated since the last comparison, on either side."""
         try:
-            self._checked.after(run, thetas, statistics, reasons, seconds, last)
+            compare(run, *arguments)
         except ChangedModel:
-            self._drop_unchecked(run)
+            self._clear()
+            if self.cache is not None and self._checked.unchecked:
+                unchecked = np.concatenate(self._checked.unchecked)
+                self._checked.rows.discard(unchecked, self._key, run.fingerprint)
             raise
-
-    def _drop_unchecked(self, run: VerifyingRun) -> None:
-        """Drop the simulations since the last comparison, which may be from before or after a change of the model."""
-        self._clear()
-        if self.cache is not None and self._checked.unchecked:
-            unchecked = np.concatenate(self._checked.unchecked)
-            self._checked.rows.discard(unchecked, self._key, run.fingerprint)
 
 
 def _arrive(arrived: SimpleQueue, simulation: Simulation, _: Any) -> None:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..cache.stored_responses import StoredResponses
+from ..likelihood.simulator import Simulator
 from ..signals.records import Record
 from ..simulation.model import Model, SimulationBatch, simulate_batch
 
@@ -27,10 +27,10 @@ class Excitation(NamedTuple):
     n_steps: int  # samples in the prediction
     from_state: str  # at the beginning of the prediction, "virgin" or "end"
 
-    def simulate(self, thetas: np.ndarray, pool: Any = None, stored: StoredResponses | None = None) -> SimulationBatch:
+    def simulate(self, thetas: np.ndarray, pool: Any = None, stored: Simulator | None = None) -> SimulationBatch:
         """Responses (n, n_channels, n_steps) of the prediction at parameter sets (n, n_parameters).
 
-        With `stored`, responses to the whole excitation are looked up and stored there.
+        With `stored`, responses to the whole excitation are looked up in its cache and stored there.
         """
         batch = simulate_batch(self.model, thetas, pool) if stored is None else stored.simulate(thetas)
         return SimulationBatch(np.ascontiguousarray(batch.response[:, :, self.first :]), batch.reasons)

@@ -28,11 +28,11 @@ import numpy as np
 from tqdm import tqdm
 
 from ..cache.simulation_cache import SimulationCache
-from ..cache.stored_responses import StoredResponses
 from ..checks.finding import warn
 from ..checks.screening import check_gaps
 from ..checks.steps import check_same_response
 from ..checks.transfer import check_bandwidth, check_final_values, check_peaks
+from ..likelihood.simulator import Simulator
 from ..noise.protocol import noise_under
 from ..signals.channels import Measurements
 from ..signals.records import Record
@@ -223,8 +223,8 @@ def propagate(
     batch = max(1, min(batch, _LARGEST_BATCH if together else _LARGEST_SERIAL_BATCH))
     stored = None
     if cache is not None:
-        cache = cache if isinstance(cache, SimulationCache) else SimulationCache(cache)
-        stored = StoredResponses(model, source.executor, cache)
+        nothing = Measurements(model.channels, model.dt, np.zeros((len(model.channels), model.n_steps)))
+        stored = Simulator(model, nothing, pool=source.executor, cache=cache, memory_rows=0, memory_bytes=0)
     peaks, ends = Peaks(), Ends(wanted.values(), model)
     compared = moved and state == "virgin" and calibration.likelihood is not None
     first: tuple[np.ndarray, np.ndarray] | None = None  # parameters of a sample, and its response to another motion

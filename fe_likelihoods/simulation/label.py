@@ -111,14 +111,12 @@ class ModelLabel:
         """What simulations of this process opened; None before the first simulation."""
         return self.opened if self._was_observed else None
 
-    def add(self, opened: Opened | None, here: bool = True) -> bool:
-        """Add what simulations opened (`here`: in this process); returns whether there was anything new."""
+    def add(self, opened: Opened | None, here: bool = True) -> None:
+        """Add what simulations opened (`here`: in this process)."""
         self._was_observed = self._was_observed or (here and opened is not None)
-        if opened is None or opened.files.keys() <= self.opened.files.keys():
-            return False
-        self.opened = opened | self.opened
-        _opened[self.code] = self.opened
-        return True
+        if opened is not None and not opened.files.keys() <= self.opened.files.keys():
+            self.opened = opened | self.opened
+            _opened[self.code] = self.opened
 
     def present(self, model: Any) -> dict[str, str]:
         """The items of a model in its present state, and of the files that simulations opened."""

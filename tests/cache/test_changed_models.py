@@ -258,9 +258,6 @@ def test_another_processor_may_differ_in_the_last_digits(workshop, monkeypatch):
 
 def test_how_many_rows():
     assert [rows_to_compare(verify) for verify in (True, "5 %", "2%", 7, False)] == [59, 59, 149, 7, 0]
-    for wrong in (0, -1, "5", "0 %", "100 %", None, 2.5):
-        with pytest.raises(ValueError, match="verify must be"):
-            rows_to_compare(wrong)
 
 
 @pytest.mark.parametrize("ndim", [1, pytest.param(3, marks=pytest.mark.slow), pytest.param(6, marks=pytest.mark.slow)])

@@ -55,7 +55,7 @@ def test_a_run_does_not_hold_its_responses_in_memory():
         return np.tensordot(theta, shapes, axes=1)
 
     posterior = HardPosterior("linear", prior, respond=respond, truth=(1.1, 0.9), **size).posterior(1)
-    posterior.likelihood.simulator.response_memory.max_bytes = 2**24
+    posterior.likelihood.simulator.response_memory.most = 2**24
     guide, limit = posterior.guide(), 400
     sampler = SMCSampler(100, 2, posterior, vectorize=True, guide=guide, max_simulations=limit, seed=1)
     tracemalloc.start()

@@ -132,7 +132,7 @@ def test_what_cannot_be_asynchronous_is_refused():
     with pytest.raises(TypeError, match="asynchronous"), ThreadPoolExecutor(1) as pool:
         TMCMCSampler(N, 2, posterior, pool=pool, guide=guide, asynchronous=True)
     emulated = symmetric()
-    emulated.likelihood.simulator.response_memory.max_bytes = 1000
+    emulated.likelihood.simulator.response_memory.most = 1000
     sampler = SMCSampler(N, 2, emulated, vectorize=True, guide=emulated.guide(), asynchronous=True)
     with pytest.raises(ValueError, match="memory_bytes of 57600 or more"):
         sampler.run_mcmc(None, 0)

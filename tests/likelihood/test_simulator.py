@@ -177,8 +177,6 @@ def test_responses_in_memory_are_bounded(thetas, caplog):
     assert likelihood.simulations == len(good)
     np.testing.assert_array_equal(likelihood.simulate(good).response, expected)
     assert likelihood.simulations == 2 * len(good) - 10
-    with pytest.raises(ValueError, match="memory_bytes must be"):
-        likelihood_of(Line(), memory_bytes=1.5)
 
 
 @pytest.mark.parametrize("model", [Line, Batched])

@@ -23,7 +23,7 @@ from fe_likelihoods.signals.channels import Channel
 from fe_likelihoods.simulation import folder
 from fe_likelihoods.simulation.executors import LocalPool, as_executor
 from fe_likelihoods.simulation.faults import UnusableModel
-from fe_likelihoods.simulation.folder import Observed
+from fe_likelihoods.simulation.folder import Observed, Sender, run_in_folder
 from fe_likelihoods.simulation.model import simulate_batch
 
 CHANNELS = [Channel("top", "displacement", "mm")]
@@ -166,6 +166,36 @@ def test_nothing_is_left_for_the_next_simulation(start, pool):
         old(start / name, Path(name).stem)
     assert simulate_batch(model(untidy), THETAS, pool).response.tolist() == [[[1.0, 1.0]]] * len(THETAS)
     assert {str(path.relative_to(start)) for path in start.rglob("*")} == set(expected)
+
+
+def test_only_what_was_changed_is_linked_again(start, monkeypatch, tmp_path_factory):
+    """A folder with many files costs a simulation that writes one of them no link of the others."""
+    for k in range(50):
+        old(start / f"f{k}.txt", str(k))
+    monkeypatch.setattr(folder, "_mirror", None)
+    sender, made, link = Sender(b"another", str(start), str(tmp_path_factory.mktemp("place")), ""), [], os.symlink
+    monkeypatch.setattr(os, "symlink", lambda *names: made.append(names) or link(*names))
+
+    def simulate(change):
+        change()
+        return sorted(os.listdir()), Path("f3.txt").read_text()
+
+    def links(change):
+        made.clear()
+        seen = run_in_folder(simulate, change, sender)[0]
+        return len(made), seen
+
+    names = sorted(os.listdir())
+    links(lambda: None)
+    assert links(lambda: Path("out.txt").write_text("1")) == (0, (sorted([*names, "out.txt"]), "3"))
+    assert links(lambda: Path("f3.txt").write_text("own")) == (1, (names, "own"))
+    assert links(lambda: os.unlink("f4.txt")) == (1, (sorted({*names} - {"f4.txt"}), "3"))
+    (start / "f5.txt").unlink()
+    old(start / "new.txt", "n")
+    names = sorted({*names, "new.txt"} - {"f5.txt"})
+    assert links(lambda: os.mkdir("sub")) == (1, (sorted([*names, "sub"]), "3"))  # new.txt
+    assert links(lambda: None) == (0, (names, "3"))
+    assert (start / "f4.txt").read_text() == "4"
 
 
 def test_nothing_is_left_by_a_simulation_that_exits(start):
