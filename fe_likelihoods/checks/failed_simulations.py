@@ -36,8 +36,6 @@ class Failures(NamedTuple):
     count: int
     attempts: int
     unknown: str = ""  # what is not known about them
-    prior_failed: int = 0  # of the prior draws with which the run began; 0 if not known
-    prior_draws: int = 0
     near: NearFailures = NearFailures(0, 0)  # among the posterior samples, and all evaluated points there
 
     @property
@@ -108,13 +106,7 @@ def _joined(
     rows = [row for source in sources for row in _by_reason(run, source)]
     rows.sort(key=lambda row: -row.count)
     count = sum(row.count for row in rows) if count is None else count
-    draws = getattr(run.sampler, "prior_draws", None)
-    prior = (0, 0)
-    # the first failures are recorded, and the draws of the prior are the first points
-    if draws is not None and (count <= sum(len(source.failed) for source in sources)):
-        bad = np.any([_are_among(draws[:, each.columns], each.failed) for each in sources], axis=0)
-        prior = (int(bad.sum()), len(draws))
-    return Failures(tuple(rows), count, max(attempts, count), unknown, *prior, _near_the_samples(run, sources))
+    return Failures(tuple(rows), count, max(attempts, count), unknown, _near_the_samples(run, sources))
 
 
 def _by_reason(run: FinishedRun, source: _Source) -> list[Failure]:

@@ -42,8 +42,30 @@ NEAR_BOUND = 0.1  # distance of the 5 % or 95 % quantile from a bound, in 90 % i
 LARGE_ERROR = HALF  # RRMSE of a channel that is hardly reproduced: a quarter of its power is left
 LARGE_DAMPING = 0.3  # in 9 of 37 right fits of decks on abutments, and in 5 of 8 with a gain of one half
 FEWEST = 10  # samples that the tests of correlation and distribution need
-REVERSED = "Where the sensor counts the other way, name it in `reversed` of [measurements], or change its sign."
-CLOCKS = "Check the time at which the base motion begins (zero in [measurements]) and the clocks; see `align`."
+FAULTS = {
+    "factor": (
+        "A {what} may be wrong",
+        "Responses times {value:.3g} fit the {which} of {where} much better: {better}. The {which} and the model "
+        "differ by this factor{units}.",
+        "Check the gain of the sensor, and the units of file, model (it returns SI units) and base motion.",
+    ),
+    "sign": (
+        "A sign may be wrong",
+        "Response and measurements have opposite signs: {where}; with the other sign, {better}.",
+        "Where the sensor counts the other way, name it in `reversed` of [measurements], or change its sign.",
+    ),
+    "swap": (
+        "Channels may be swapped",
+        "The channels {where} may be exchanged: the other way round, {better}.",
+        "Check the columns of the file and the places of sensors.",
+    ),
+    "lag": (
+        "Clocks may differ",
+        "The {which} of {where} {are} {value:.3g} s {late} than the response: with this lag, {better}.{support}",
+        "Check the time at which the base motion begins (zero in [measurements]) and the clocks; see `align`.",
+    ),
+}
+"""Kind, text and action of each fault of data."""
 
 
 def check_fit(posterior: Posterior, samples: Any = None) -> tuple[Finding, ...]:
@@ -135,37 +157,27 @@ def _where(names: Sequence[str], compared: Compared | Fit) -> str:
 
 def _of_a_fault(compared: Compared, fault: Fault, severity: str, band: tuple[float, float] | None = None) -> Finding:
     """A fault in words, and the band [Hz] in which it was found; one that limits a fit was seen among draws alone."""
-    where, numbers = _where(fault.names, compared), {"before": fault.before, "after": fault.after}
     better = f"the error (RRMSE) is {percent(fault.after)} instead of {percent(fault.before)}"
     better += "" if severity == WRONG else " for the best draw of the prior; the fit may make up for it"
     if band is not None:
         better += f" between {band[0]:.2g} and {band[1]:.2g} Hz, where parameters hardly change the response"
-    which = "measurements" if len(fault.names) > 1 else "measurement"
-    late = f"{abs(fault.value):.3g} s {'later' if fault.value > 0.0 else 'earlier'}"
-    if fault.kind == "factor":
-        dimensions = sorted({each.dimension for each in compared.measurements.channels if each.name in fault.names})
-        units = " or ".join(filter(None, dict.fromkeys(describe_unit(fault.value, each) for each in dimensions)))
-        kind = "A unit may be wrong" if units else "A gain may be wrong"
-        text = (
-            f"Responses times {fault.value:.3g} fit the {which} of {where} much better: {better}. The {which} and the "
-            f"model differ by this factor{f', about the ratio of {units}' if units else ''}."
-        )
-        action = "Check the gain of the sensor, and the units of file, model (it returns SI units) and base motion."
-    elif fault.kind == "sign":
-        kind = "A sign may be wrong"
-        text = f"Response and measurements have opposite signs: {where}; with the other sign, {better}."
-        action = REVERSED
-    elif fault.kind == "swap":
-        kind = "Channels may be swapped"
-        text = f"The channels {where} may be exchanged: the other way round, {better}."
-        action = "Check the columns of the file and the places of sensors."
-    else:
-        kind = "Clocks may differ"
-        verb = "are" if len(fault.names) > 1 else "is"
-        text = f"The {which} of {where} {verb} {late} than the response: with this lag, {better}."
-        text += " The clock of a support's recorder may be the wrong one as well." if compared.supports > 1 else ""
-        action = CLOCKS
-    return Finding(kind, severity, text, action, numbers | {fault.kind: fault.value})
+    dimensions = sorted({each.dimension for each in compared.measurements.channels if each.name in fault.names})
+    near = [describe_unit(fault.value, each) for each in dimensions] if fault.kind == "factor" else []
+    units, several = " or ".join(filter(None, dict.fromkeys(near))), len(fault.names) > 1
+    words = {
+        "where": _where(fault.names, compared),
+        "better": better,
+        "which": "measurements" if several else "measurement",
+        "are": "are" if several else "is",
+        "value": abs(fault.value),
+        "late": "later" if fault.value > 0.0 else "earlier",
+        "what": "unit" if units else "gain",
+        "units": f", about the ratio of {units}" if units else "",
+        "support": " The clock of a support's recorder may be the wrong one as well." if compared.supports > 1 else "",
+    }
+    kind, text, action = FAULTS[fault.kind]
+    numbers = {"before": fault.before, "after": fault.after, fault.kind: fault.value}
+    return Finding(kind.format(**words), severity, text.format(**words), action, numbers)
 
 
 def _check_offset(compared: Compared) -> list[Finding]:

@@ -260,19 +260,15 @@ def _check_failures(run: FinishedRun, failed: Failures) -> list[Finding]:
     if not failed.count:
         return []
     share = failed.count / max(failed.attempts, 1)
-    of_prior = f", among them {failed.prior_failed} of {failed.prior_draws} draws of the prior"
     text = (
-        f"{failed.count} of {failed.attempts} simulations failed ({100.0 * share:.2g} %)"
-        f"{of_prior if failed.prior_draws else ''}. A failed simulation counts as impossible: the posterior has no "
-        "samples there."
+        f"{failed.count} of {failed.attempts} simulations failed ({100.0 * share:.2g} %). A failed simulation counts "
+        "as impossible: the posterior has no samples there."
     )
     action = (
         "See the table of failures. If the parameters there are plausible, mend the model and run again; if they are "
         "not, a narrower prior saves these simulations."
     )
-    largest = max(share, failed.prior_failed / max(failed.prior_draws, 1))
-    severity = CARE if largest > TAIL else NOTE
-    found = [Finding("Simulations failed", severity, text, action, {"share": largest})]
+    found = [Finding("Simulations failed", CARE if share > TAIL else NOTE, text, action, {"share": share})]
     said = run.verdict is not None and run.verdict.near_failures is not None
     return found if said or (run.is_inconclusive and not run.tempered) else found + check_failed_region(failed.near)
 

@@ -142,43 +142,43 @@ def _key(name: str) -> str:
     return name if re.fullmatch(r"[\w-]+", name, re.ASCII) else json.dumps(name, ensure_ascii=False)
 
 
-_KINDS = {
-    "clipped": "A sensor is clipped",
-    "stuck": "A sensor was stuck",
-    "spikes": "A channel has spikes",
-    "offset": "A channel has an offset",
-    "drift": "A channel drifts",
-    "noise": "A channel is mostly noise",
+_FAULTS = {
+    "clipped": (
+        "A sensor is clipped",
+        "{name} has exactly its largest or smallest value for several samples in a row, {when}.",
+    ),
+    "stuck": ("A sensor was stuck", "{name} stands still {when}, while it moves before and after."),
+    "spikes": ("A channel has spikes", "{name} has spikes of one to three samples {when}."),
+    "offset": ("A channel has an offset", "{name} has the same mean in all its parts, about {level}."),
+    "drift": ("A channel drifts", "{name} has a mean that changes steadily, from {level}."),
+    "noise": (
+        "A channel is mostly noise",
+        "{name} has samples that hardly depend on each other (correlation {size:.2f}).",
+    ),
 }
 
 
 def check_sensors(channels: Sequence[Screened]) -> list[Finding]:
     """Findings about faults of sensors, one for each channel and kind, with times and the line that deals with it."""
     found = []
-    for channel in channels:
-        name = f"The motion {channel.name}" if channel.is_motion else channel.name
-        unit = f" {channel.unit}" if channel.unit else ""
-        for fault in channel.faults:
-            only = channel._replace(faults=(fault,))
-            places = [first if first == last else f"{first} to {last}" for first, last in only.missing()]
-            when = f"at {', '.join(places[:MOST_PLACES])} s"
-            when += f" and {len(places) - MOST_PLACES} more places" if len(places) > MOST_PLACES else ""
-            level = " to ".join(f"{value:.3g}" for value in fault.level[:: max(len(fault.level) - 1, 1)])
-            text = {
-                "clipped": f"{name} has exactly its largest or smallest value for several samples in a row, {when}.",
-                "stuck": f"{name} stands still {when}, while it moves before and after.",
-                "spikes": f"{name} has spikes of one to three samples {when}.",
-                "offset": f"{name} has the same mean in all its parts, about {level}{unit}.",
-                "drift": f"{name} has a mean that changes steadily, from {level}{unit}.",
-                "noise": f"{name} has samples that hardly depend on each other (correlation {fault.size:.2f}).",
-            }[fault.kind]
-            action = "Check the file, or take another record of the motion: a motion needs all samples."
-            if not channel.is_motion:
-                line = repair_lines([only])[0]
-                action = f"In [measurements] of a TOML file: {line.removeprefix('# ')}"
-                action += ". If it moved so: nothing." if fault.level else "."
-            severity = NOTE if fault.kind == "noise" else CARE
-            found.append(Finding(_KINDS[fault.kind], severity, text, action, {channel.name: float(fault.size)}))
+    for channel, fault in ((each, fault) for each in channels for fault in each.faults):
+        only = channel._replace(faults=(fault,))
+        places = [first if first == last else f"{first} to {last}" for first, last in only.missing()]
+        more = f" and {len(places) - MOST_PLACES} more places" if len(places) > MOST_PLACES else ""
+        level = " to ".join(f"{value:.3g}" for value in fault.level[:: max(len(fault.level) - 1, 1)])
+        kind, text = _FAULTS[fault.kind]
+        text = text.format(
+            name=f"The motion {channel.name}" if channel.is_motion else channel.name,
+            when=f"at {', '.join(places[:MOST_PLACES])} s{more}",
+            level=f"{level} {channel.unit}".rstrip(),
+            size=fault.size,
+        )
+        action = "Check the file, or take another record of the motion: a motion needs all samples."
+        if not channel.is_motion:
+            action = f"In [measurements] of a TOML file: {repair_lines([only])[0].removeprefix('# ')}"
+            action += ". If it moved so: nothing." if fault.level else "."
+        severity = NOTE if fault.kind == "noise" else CARE
+        found.append(Finding(kind, severity, text, action, {channel.name: float(fault.size)}))
     return found
 
 

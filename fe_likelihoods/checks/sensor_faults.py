@@ -16,7 +16,7 @@ __all__ = ["SensorFault", "find_sensor_faults", "runs_of"]
 FEWEST = 50  # samples that are judged
 MATTERS = 0.25  # of the peak, or of the standard deviation: smaller parts hardly change a sum of squares
 DIGITS = 3.0  # the steps beside, in smallest steps; without it, 10 of 181 right channels are named for 4
-STILL = 3  # equal samples at an extremum, and steps beside a flat part; right channels: 2, or between small steps
+STILL = 3  # equal samples at an extremum, half of those elsewhere; right channels: 2, or between small steps
 LONG, VANISHED = 1.5, 10.0  # for so many periods a signal is never so much smaller than beside; right: 5.8
 FAINT = 4.0  # the same for white noise; right: 2.5
 SPIKE = 18.0  # ratio to the errors of interpolation around it; right channels: 15.9
@@ -97,7 +97,7 @@ def _flat_parts(x: np.ndarray) -> list[tuple[int, int]]:
     if np.count_nonzero(known > equal) < FEWEST:  # steps are what it consists of
         return []
     for first, last in runs_of(steps <= equal):
-        sides = (steps[max(first - STILL, 0) : first], steps[last : last + STILL])
+        sides = (steps[max(first - 2 * STILL, 0) : first], steps[last : last + 2 * STILL])
         beside = [np.square(side[np.isfinite(side)]).mean() for side in sides if np.isfinite(side).any()]
         if beside and min(beside) >= least**2:
             found.append((first, last))
@@ -119,9 +119,9 @@ def _stuck(x: np.ndarray) -> tuple[tuple[int, int], ...]:
     """Samples at which the sensor stood still, or had only electronic noise for longer than a period of the motion."""
     still, level = np.zeros(len(x), dtype=bool), float(np.nanstd(x))
     for first, last in _flat_parts(x):
-        still[first : last + 1] |= last - first > STILL
+        still[first : last + 1] |= last - first >= 2 * STILL
     period = 2.0 * np.pi * level / np.sqrt(np.nanmean(np.square(np.diff(x))))
-    length, beside = max(int(LONG * period), STILL + 1), max(int(0.5 * period), 3)
+    length, beside = max(int(LONG * period), 2 * STILL), max(int(0.5 * period), 3)
     if len(x) > 2 * (length + beside):
         quiet, sides = _moving_deviation(x, length), _moving_deviation(x, beside)
         for least in MATTERS * 2.0 ** np.arange(4):

@@ -8,9 +8,7 @@ import struct
 import subprocess
 import sys
 import termios
-from concurrent.futures import ThreadPoolExecutor
 
-import emcee
 import numpy as np
 import pytest
 
@@ -26,7 +24,6 @@ from fe_likelihoods import (
 )
 from samplers import SMCSampler
 from samplers.reporting import progress
-from tests.contract.targets import Gaussian
 
 RUN = [sys.executable, "-m", "tests.reporting.progress_run"]
 
@@ -118,31 +115,6 @@ def bars(monkeypatch):
     return made
 
 
-def pointwise(ndim=3):
-    """A log-density of single points with its prior."""
-    gaussian = Gaussian(ndim, 0.3)
-
-    def log_prob(x):
-        return gaussian(x)
-
-    log_prob.log_prior, log_prob.sample_prior, log_prob.ndim = gaussian.log_prior, gaussian.sample_prior, ndim
-    return log_prob
-
-
-@pytest.mark.parametrize("kind", ["serial", "pool", "asynchronous"])
-def test_the_bar_moves_with_every_point(bars, kind):
-    with ThreadPoolExecutor(4) as pool:
-        options = {} if kind == "serial" else {"pool": pool, "asynchronous": kind == "asynchronous"}
-        sampler = SMCSampler(60, 3, pointwise(), seed=1, recycle=True, **options)
-        sampler.run_mcmc(None, 0, progress=True)
-    counts = [n for n, _, _ in bars[0].shown]
-    assert counts[-1] == sampler.evaluations and counts == sorted(counts)
-    if kind != "asynchronous":  # whose points may arrive together
-        assert set(range(sampler.evaluations + 1)) == set(counts)
-    running = [int(shown.get("running", 0)) for _, _, shown in bars[0].shown]
-    assert max(running) >= 60 and running[-1] == 0
-
-
 def oscillating(names=("a", "b")):
     """A likelihood of a cheap model, whose simulations fail where `a` is above 1.6."""
     channels = (Channel("top", "displacement", "mm"),)
@@ -162,19 +134,6 @@ def posterior_of(likelihood):
     return Posterior(
         likelihood, {name: TruncatedNormal(1.0, 0.3) for name in names} | {name: HalfNormal(0.002) for name in sigmas}
     )
-
-
-def test_the_bar_moves_within_a_batch(bars):
-    posterior = posterior_of(oscillating())
-    sampler = SMCSampler(32, posterior.ndim, posterior, vectorize=True, seed=1, recycle=True)
-    sampler.run_mcmc(None, 0, progress=True)
-    shown = bars[0].shown
-    counts = {n for n, _, _ in shown}
-    assert 0 <= shown[-1][0] - sampler.evaluations <= 0.01 * sampler.evaluations  # repeated points are known
-    assert any(0 < n < 32 for n in counts)  # within the first batch
-    assert int(shown[-1][2]["failures"]) == posterior.report()["failure_count"] > 0
-    assert int(shown[-1][2]["simulations"]) == posterior.report()["simulations"]
-    assert posterior.likelihood.simulator.when_simulated is None
 
 
 def test_figures_of_a_bar_are_those_since_it_began(bars):
@@ -203,28 +162,3 @@ def test_parts_of_a_joint_likelihood_are_parts_of_a_point():
     posterior.when_simulated(None)
     posterior(points + 0.01)
     assert sum(heard) == pytest.approx(5.0)
-
-
-def test_points_of_the_record_are_shown_at_once(bars, tmp_path):
-    calls = []
-
-    class Interrupted(Gaussian):
-        def __call__(self, x):
-            calls.append(len(np.atleast_2d(x)))
-            if len(calls) == 4:
-                raise KeyboardInterrupt
-            return super().__call__(x)
-
-    def run():
-        backend = emcee.backends.HDFBackend(str(tmp_path / "run.h5"))
-        sampler = SMCSampler(60, 3, Interrupted(3, 0.02), vectorize=True, seed=1, recycle=True, backend=backend)
-        sampler.run_mcmc(None, 0, progress=True)
-        return sampler
-
-    with pytest.raises(KeyboardInterrupt):
-        run()
-    kept = sum(calls[:3])
-    sampler = run()
-    counts = [n for n, _, _ in bars[1].shown]
-    assert counts[-1] == sampler.evaluations > kept
-    assert kept in counts
