@@ -131,10 +131,8 @@ class ResponseTarget:
                 return []
             missing = likelihood.measured.missing
             steps[missing[:, 1:] | missing[:, :-1]] = 0.0
-            if not steps.any():
-                return []
         parts = []
-        for seconds in growing_durations(steps, measurements.dt, shares)[:-1]:
+        for seconds in growing_durations(steps, measurements.dt, shares)[:-1] if steps.any() else ():
             try:
                 parts.append(self.posterior.first(measurements.start + seconds))
             except ValueError:
