@@ -101,10 +101,6 @@ def describe_run(
     The function and the guide are identified by their attributes ``fingerprint``; a guide without one by its class, a
     function without one not at all.
     """
-
-    def plain(value: Any) -> str:
-        return f"{value.__module__}.{value.__qualname__}"  # a setting that is a function
-
     header = {
         "log_prob_fn": getattr(function, "fingerprint", None),
         **described,
@@ -113,7 +109,7 @@ def describe_run(
         "probabilities": [float(probability) for probability in probabilities],
         "guide": None if guide is None else guide_fingerprint(guide),
     }
-    return json.loads(json.dumps(header, default=plain))
+    return json.loads(json.dumps(header))
 
 
 def differences(stored: dict, ours: dict) -> list[str]:

@@ -45,8 +45,8 @@ class Settings:
     coefficient_of_variation : float, optional
         Wanted coefficient of variation of the incremental weights in each stage. It replaces `ess_ratio`: n weights
         with this coefficient have an effective sample size of n / (1 + coefficient²).
-    resampling : str or callable
-        Name of a scheme in `samplers.resampling`, or a function of (weights, random) that returns indices.
+    resampling : {"systematic", "multinomial"}
+        Scheme of `samplers.resampling`.
     min_moves, max_moves : int
         Smallest and largest number of ensemble sweeps per stage; equal for a fixed number. The default of `max_moves`
         belongs to 20 parameters or fewer; samplers add 3 for each further parameter (`most_moves`).
@@ -86,7 +86,7 @@ class Settings:
     ess_rule: str = "constant"
     ess_floor: float = 0.0
     coefficient_of_variation: float | None = None
-    resampling: str | Callable = "systematic"
+    resampling: str = "systematic"
     min_moves: int = 2
     max_moves: int = 7
     max_correlation: float = 0.15
@@ -114,11 +114,7 @@ class Settings:
             ("ess_rule", self.ess_rule in ("constant", "declining"), '"constant" or "declining"'),
             ("ess_floor", self.ess_floor >= 0.0, "non-negative"),
             ("coefficient_of_variation", variation is None or 0.0 < variation < np.inf, "positive and finite"),
-            (
-                "resampling",
-                callable(self.resampling) or self.resampling in RESAMPLING,
-                f"a function or in {[*RESAMPLING]}",
-            ),
+            ("resampling", self.resampling in RESAMPLING, f"in {[*RESAMPLING]}"),
             ("min_moves", 1 <= self.min_moves <= self.max_moves, f"between 1 and max_moves = {self.max_moves}"),
             ("max_correlation", 0.0 < self.max_correlation <= 1.0, "above 0 and at most 1"),
             ("chains", self.chains in ("equal", "leaders"), '"equal" or "leaders"'),
@@ -137,7 +133,7 @@ class Settings:
     @property
     def resample(self) -> Callable:
         """The resampling scheme."""
-        return self.resampling if callable(self.resampling) else RESAMPLING[self.resampling]
+        return RESAMPLING[self.resampling]
 
     def target(self, last_target: float, n_walkers: int) -> float:
         """Wanted effective sample size of a stage, from the previous target (n_walkers before the first stage)."""

@@ -34,7 +34,7 @@ from .judgement.checks import check_likelihood
 from .judgement.failures import judged_failures
 from .judgement.verdict import CONVERGED, describe_early_stop, independent_points, judge
 from .moves.fast_parameters import with_fast_sweeps
-from .moves.population_moves import GuideMove, RandomWalkMove, calibrate_move
+from .moves.population_moves import GuideMove, RandomWalkMove, calibrate_move, without_unfitted
 from .output import Output
 from .record import EvaluatedBatch, Incomplete, RunStart
 from .replay import changes, describe_run, differences, open_record
@@ -362,6 +362,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
                 self.seconds += time.perf_counter() - start
                 self._evaluator.evaluates_parts = False
                 trim_chain(self.backend)
+                moves, probabilities = get_moves(self)
+                set_moves(self, without_unfitted(moves), probabilities)
                 state.blobs = self._evaluator.typed(state.blobs)
                 if store:
                     self._output.change_blobs(state.blobs)
@@ -665,7 +667,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         warn(
             f"the annealing in {self._place} cannot be made again: another processor, or another version of NumPy or "
             "SciPy, computes other bits, or its record has lost points. The chain goes on from its last stored state, "
-            "with its stored results, and the moves are fitted to it anew"
+            "with its stored results, by differential evolution instead of moves that were fitted to the annealing"
         )
         self._result, self._verdict = self._output.result, self._output.verdict
         self._budget.take_from_record()

@@ -61,6 +61,11 @@ class WithFastSweeps(Move):
         self.move, self.sweeps = move, sweeps
         self._walk, self._accepted = FastWalk(indices), np.empty(0)
 
+    @property
+    def is_fitted(self) -> bool:
+        """Whether walk and move were calibrated."""
+        return self._walk.is_fitted and getattr(self.move, "is_fitted", True)
+
     def calibrate(
         self, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None, mixture: Mixture | None = None
     ) -> None:

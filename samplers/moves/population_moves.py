@@ -6,15 +6,13 @@ for all walkers at once, and fitted in units of the weighted standard deviations
 parameters (2e-4 s and 3e10 Pa) cause no numerical problem. Acceptances are derived in ``docs/theory/tempering``.
 """
 
-import copy
 import math
-import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import numpy as np
 from emcee import State
-from emcee.moves import MHMove, Move
+from emcee.moves import DEMove, MHMove, Move
 
 from ..proposals.basins import find_basins, with_components
 from ..proposals.mixture import (
@@ -37,6 +35,7 @@ __all__ = [
     "RandomWalkMove",
     "calibrate_move",
     "describe",
+    "without_unfitted",
 ]
 
 # Probabilities of the three kernels of MixtureMove: independence, local walk, differences.
@@ -57,12 +56,6 @@ REDRAWS = 20
 UNIT_SCALE_SHARE = 0.1
 # Crossover probabilities of the difference steps: one is chosen per sweep and walker.
 CROSSOVERS = (1.0 / 3.0, 2.0 / 3.0, 1.0)
-
-# A proposal that is fitted to fewer points than this times ndim + 1 may be so narrow in a direction that a chain of
-# thousands of steps has a wrong variance.
-FEWEST_PER_DIMENSION = 5
-# Spread of points in a direction, relative to their standard deviations, below which it counts as none.
-SMALLEST_SPREAD = 1e-8
 
 Inside = Callable[[np.ndarray], np.ndarray]
 
@@ -97,81 +90,37 @@ def calibrate_move(
         move.calibrate(coords, weights, inside)
 
 
-def _first_half(coords: np.ndarray) -> np.ndarray:
-    """Which walkers (n, ndim) are at the first half of the distinct points, in the order of the walkers.
-
-    Copies of one point are in the same half, so that a proposal is never fitted to a point that it moves, and each half
-    has half the distinct points. Without copies, it is the first half of the walkers.
-    """
-    _, first, place = np.unique(coords, axis=0, return_index=True, return_inverse=True)
-    return np.argsort(np.argsort(first))[place.reshape(-1)] < len(first) // 2
-
-
-def _check_half(coords: np.ndarray) -> None:
-    """ValueError if the points (n, ndim) in half the walkers span no volume; a warning if they are few."""
-    places, ndim = np.unique(coords, axis=0), coords.shape[1]
-    sd = places.std(axis=0)
-    standard = (places - places.mean(axis=0)) / np.where(sd > 0.0, sd, 1.0)
-    advice = "start from more walkers, or from different points, such as draws of the prior"
-    if np.linalg.matrix_rank(standard, tol=SMALLEST_SPREAD * np.sqrt(len(places))) < ndim:
-        raise ValueError(
-            f"a move is fitted to half of the walkers to move the other half, which needs points that span all {ndim} "
-            f"dimensions; got {len(places)} distinct points that do not: {advice}"
-        )
-    fewest = FEWEST_PER_DIMENSION * (ndim + 1)
-    if len(places) < fewest:
-        warnings.warn(
-            f"a move is fitted to {len(places)} distinct points, half of the walkers' points, in {ndim} dimensions, "
-            f"and may be too narrow: a long chain can have wrong variances. With fewer than {fewest} points in a half, "
-            f"{advice}",
-            stacklevel=2,
-        )
-
-
 class _FittedMove(MHMove):
-    """A Metropolis-Hastings move of the whole ensemble, whose proposal is fitted to weighted points.
-
-    Without a calibration (in a plain EnsembleSampler, or in a run that continues a chain without its record), two
-    copies are fitted to one half of the walkers each, and move the other half: a proposal that is fitted to the points
-    that it moves would make their tails too light for many sweeps.
-    """
+    """A Metropolis-Hastings move of the whole ensemble, whose proposal is fitted to weighted points before."""
 
     def __init__(self):
-        super().__init__(self._draw_all)
-        self._halves: tuple[_FittedMove, ...] = ()
-        self._in_first = np.empty(0, dtype=bool)  # which walkers the first of the halves moves
+        super().__init__(self._draw_if_fitted)
 
     @property
-    def _is_fitted(self) -> bool:
+    def is_fitted(self) -> bool:
+        """Whether the move was calibrated; otherwise it cannot propose."""
         raise NotImplementedError
 
     def _draw(self, coords: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
         """Proposed points and log-ratios of proposal densities for points (n, ndim)."""
         raise NotImplementedError
 
-    def _draw_all(self, coords: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
-        self._fit_halves(coords)
-        if not self._halves:
-            return self._draw(coords, random)
-        proposed, log_ratios = np.empty_like(coords), np.empty(len(coords))
-        for half, rows in zip(self._halves, (self._in_first, ~self._in_first), strict=True):
-            proposed[rows], log_ratios[rows] = half._draw(coords[rows], random)
-        return proposed, log_ratios
+    def _draw_if_fitted(self, coords: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+        if not self.is_fitted:
+            raise ValueError(
+                f"{type(self).__name__} is fitted to the stages of an annealing: use it in SMCSampler or TMCMCSampler, "
+                "and emcee's own moves in EnsembleSampler"
+            )
+        return self._draw(coords, random)
 
-    def _fit_halves(self, coords: np.ndarray) -> None:
-        """Without a calibration, fit a copy to each half of the walkers (n, ndim)."""
-        if self._is_fitted or (self._halves and len(coords) == len(self._in_first)):
-            return
-        halves, in_first = (copy.deepcopy(self), copy.deepcopy(self)), _first_half(coords)
-        for half, others in zip(halves, (coords[~in_first], coords[in_first]), strict=True):
-            _check_half(others)
-            half.calibrate(others, np.full(len(others), 1.0 / len(others)))
-        self._halves, self._in_first = halves, in_first
 
-    def tune(self, state: State, accepted: np.ndarray) -> None:
-        """Adapt the scale; nothing by default."""
-        for half in self._halves:
-            half.tune(state, accepted)
+def without_unfitted(moves: Sequence[Move]) -> list[Move]:
+    """The moves, with emcee's differential evolution instead of those that are not fitted.
+
+    They belong to an annealing that is not made again. A fit to the points that it moves would make tails too light:
+    heavy tails kept 0.94 of their variance; differential evolution takes its steps from the other half of the walkers.
+    """
+    return [move if getattr(move, "is_fitted", True) else DEMove() for move in moves]
 
 
 class RandomWalkMove(_FittedMove):
@@ -209,13 +158,13 @@ class RandomWalkMove(_FittedMove):
         self._log_factor = 0.0
 
     @property
-    def _is_fitted(self) -> bool:
+    def is_fitted(self) -> bool:
+        """Whether the move was calibrated."""
         return self._root is not None
 
     def calibrate(self, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None) -> None:
         """Fit the covariance to points (n, ndim) with normalised weights (n,)."""
         self._root = location_and_root(coords, weights)[1]
-        self._halves = ()
 
     @property
     def root(self) -> np.ndarray | None:
@@ -229,7 +178,6 @@ class RandomWalkMove(_FittedMove):
 
     def tune(self, state: State, accepted: np.ndarray) -> None:
         """If `adapt`, increase the scale when the acceptance exceeds the target, and decrease it otherwise."""
-        super().tune(state, accepted)
         if self.adapt:
             target = 0.23 + 0.21 / state.coords.shape[1] if self.target is None else self.target
             self._log_factor += float(np.mean(accepted)) - target
@@ -278,7 +226,8 @@ class MixtureMove(_FittedMove):
         self._independence_accepted = False
 
     @property
-    def _is_fitted(self) -> bool:
+    def is_fitted(self) -> bool:
+        """Whether the move was calibrated."""
         return self._mixture is not None
 
     @property
@@ -303,7 +252,7 @@ class MixtureMove(_FittedMove):
         self._inside = inside
         self._archive = to_component_space(self._mixture, coords)
         self._cumulated = np.cumsum(weights)
-        self._current, self._independence_accepted, self._halves = None, False, ()
+        self._current, self._independence_accepted = None, False
         self._part, self._mixtures = None, []
         if mixture is None and coords.shape[1] >= FEWEST_DIMENSIONS:
             self._mixtures = leave_out(self._mixture, coords, weights, np.arange(len(coords)) % PARTS)
@@ -331,23 +280,16 @@ class MixtureMove(_FittedMove):
 
     def tune(self, state: State, accepted: np.ndarray) -> None:
         """Adapt the scale of the kernel used last, or record whether independent draws have a high acceptance."""
-        super().tune(state, accepted)
         share = float(np.mean(accepted))
         if self._current == 0:
             self._independence_accepted = share > HIGH_ACCEPTANCE
         else:
             self._log_factors[self._current] += share - TARGET_ACCEPTANCE
 
-    def _draw_all(self, coords, random):
+    def _draw(self, coords, random):
         # A random choice, not a counter: a resumed run continues identically from the stored random state alone.
         shares = KERNEL_PROBABILITIES_IF_ACCEPTED if self._independence_accepted else KERNEL_PROBABILITIES
         self._current = 0 if self._current is None else random.choice(len(self._kernels), p=shares)
-        self._fit_halves(coords)
-        for half in self._halves:
-            half._current = self._current
-        return super()._draw_all(coords, random)
-
-    def _draw(self, coords, random):
         kernel, fitted = self._kernels[self._current], self._mixture
         if not self._mixtures or self._part is None or len(self._part) != len(coords):
             return kernel(coords, random)

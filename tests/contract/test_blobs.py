@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from samplers import SMCSampler, TMCMCSampler
-from samplers.blobs import joined, stacked
 from tests.contract.targets import Gaussian
 
 N, NDIM, BIG = 24, 2, 2**60 + 1
@@ -174,14 +173,3 @@ def test_blobs_of_some_points_only_are_refused(where, first, tmp_path):
     )  # fmt: skip
     with pytest.raises(ValueError, match="must return blobs with every point or with none"):
         run(posterior, tmp_path / "run.h5" if where == "file" else None)
-
-
-def test_arrays_of_batches():
-    assert joined([np.array([1]), np.array([0.5])]).tolist() == [1.0, 0.5]
-    assert joined([np.array([BIG]), np.array([0.5])]).tolist() == [BIG, 0.5]
-    of_two_lengths = joined([np.array([[1, 2]]), np.array([[1]])])
-    assert [type(row) for row in of_two_lengths] == [np.ndarray] * 2  # as one batch of two lengths would have them
-    assert [row.tolist() for row in of_two_lengths] == [[1, 2], [1]]
-    assert joined([np.array([b"a"]), np.array([1.0])]).tolist() == [b"a", 1.0]
-    assert stacked([(1,), (2**63,), (-1,)]).tolist() == [1, 2**63, -1]
-    assert stacked([(1,), (2.5,)]).dtype == float and stacked([(1,), (2,)]).dtype == int

@@ -12,7 +12,6 @@ from samplers.moves.population_moves import RandomWalkMove
 from samplers.presets import CHING_CHEN_2007, RAMANCHA_2022_CONSTANT, RAMANCHA_2022_LITERAL
 from samplers.reporting.summary import ladder_table, summary
 from samplers.reports import AnnealingResult
-from samplers.resampling import multinomial
 from tests.contract.targets import Box, Gaussian
 
 N = 40
@@ -112,11 +111,6 @@ def test_presets_targets_and_moves():
     assert RAMANCHA_2022_LITERAL["moves"]._root is None  # the sampler works on copies
 
 
-@pytest.mark.parametrize("resampling", ["multinomial", "systematic", multinomial])
-def test_resampling_by_name_or_function(resampling):
-    assert annealed(resampling=resampling).ladder[-1].beta == 1.0
-
-
 def test_annealing_is_done_once():
     posterior = Gaussian()
     sampler = annealed(posterior, nsteps=2)
@@ -170,9 +164,6 @@ def test_published_tmcmc_grows_chains_from_leaders():
     assert {s.moves for s in burnt.ladder} == {6}
     stage = burnt.ladder[2]
     assert 5 * stage.distinct_ancestors + 200 <= stage.evaluations < 6 * 200
-
-
-# ---------------------------------------------------------------- storage
 
 
 # ---------------------------------------------------------------- errors, warnings

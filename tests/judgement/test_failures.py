@@ -7,7 +7,6 @@ from scipy import stats
 
 from samplers import SMCSampler, TMCMCSampler
 from samplers.evaluation.user_target import Target
-from samplers.judgement import failures
 from samplers.judgement.failures import NearFailures, failures_near, judged_failures
 from tests.contract.targets import Box, Gaussian
 
@@ -227,17 +226,6 @@ def test_scattered_failures_are_told_from_those_that_fill_a_hole(rng):
     for fails, is_scattered in ((rng.random(1500) < 0.08, True), (np.linalg.norm(points, axis=1) < 0.4, False)):
         found = failures_near(samples, points[fails], points[~fails])
         assert found.scattered == is_scattered and found.borders != is_scattered and found.adjoining > 40
-
-
-def test_the_latest_points_count(monkeypatch, rng):
-    monkeypatch.setattr(failures, "KEPT_POINTS", 100)
-    samples, coords = rng.standard_normal((50, 2)), 0.1 * rng.standard_normal((140, 2))
-    log_prob = np.where(np.arange(140) < 40, -np.inf, 0.0)
-
-    def failed_of_the_first(n):
-        return judged_failures(coords[:n], log_prob[:n], np.zeros(n, bool), samples, np.arange(2), True).failed
-
-    assert failed_of_the_first(40) == 40 and failed_of_the_first(140) == 0
 
 
 @pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")

@@ -10,8 +10,7 @@ from scipy import stats
 
 from samplers import MixtureMove, RandomWalkMove, SMCSampler, TemperedSampler, TMCMCSampler
 from samplers.emcee_internals import get_moves
-from samplers.moves.fast_parameters import FastWalk, WithFastSweeps
-from samplers.presets import CHING_CHEN_2007, RAMANCHA_2022_CONSTANT, RAMANCHA_2022_LITERAL
+from samplers.moves.fast_parameters import WithFastSweeps
 from tests.contract.targets import Gaussian, WithBlobs
 from tests.statistics.test_posteriors import deviations, evidence_deviation, runs, within
 
@@ -92,36 +91,6 @@ def test_conjugate_sample(mode, seed):
     assert within(evidence_deviation(samplers, posterior.log_evidence), samplers)
 
 
-class WrongMove(WithFastSweeps):
-    """Fast sweeps with a drift that the acceptance ratio does not contain."""
-
-    def __init__(self, move, indices):
-        super().__init__(move, indices, sweeps=5)
-        walk, draw = self._walk, self._walk.get_proposal
-
-        def drift(coords, random):
-            proposed, factors = draw(coords, random)
-            proposed[:, walk.indices] += walk.root.diagonal()
-            return proposed, factors
-
-        walk.get_proposal = drift
-
-    def __deepcopy__(self, memo):  # a copy would have a closure of the original
-        return self
-
-
-def test_wrong_fast_sweeps_are_detected(seed):
-    """Negative control: the criterion of the test above fails for a wrong move."""
-    posterior = NormalInverseGamma()
-    samplers = []
-    for k in range(8):
-        sampler = SMCSampler(200, 2, posterior, vectorize=True, seed=[seed, k], recycle=False, fast_sweeps=0)
-        sampler._first_moves = [WrongMove(MixtureMove(), (1,))], np.ones(1)  # in place of correct moves
-        sampler.run_mcmc(None, 4)
-        samplers.append(sampler)
-    assert not within(deviations(samplers, 0.5, lambda x: x[:, 1] < posterior.median), samplers)
-
-
 class Still(emcee.moves.Move):
     """An expensive move that never moves."""
 
@@ -162,17 +131,6 @@ def test_fast_sweeps_alone_keep_the_target_and_the_other_coordinates(ensemble):
     assert stats.ks_2samp(state.coords[:10_000, 1], start[10_000:, 1]).pvalue > 1e-4
 
 
-def test_the_walk_has_the_conditional_covariance(rng):
-    covariance = np.array([[1.0, 0.9, 0.2], [0.9, 1.0, 0.5], [0.2, 0.5, 2.0]]) * np.outer([1, 1e6, 1], [1, 1e6, 1])
-    points = rng.multivariate_normal(np.zeros(3), covariance, size=100_000)
-    for fast, slow in (([1], [0, 2]), ([0, 2], [1])):
-        walk = FastWalk(fast)
-        walk.calibrate(points, np.full(len(points), 1.0 / len(points)))
-        cross = covariance[np.ix_(fast, slow)]
-        expected = covariance[np.ix_(fast, fast)] - cross @ np.linalg.solve(covariance[np.ix_(slow, slow)], cross.T)
-        assert walk.root @ walk.root.T == pytest.approx(expected, rel=0.05)
-
-
 @pytest.mark.filterwarnings("ignore:stuck")
 def test_fast_parameters_move_when_the_expensive_move_does_not(seed):
     """If the expensive move is almost never accepted, the fast parameters still change."""
@@ -191,19 +149,6 @@ def test_fast_parameters_move_when_the_expensive_move_does_not(seed):
 
 
 # ---------------------------------------------------------------- when it is off
-
-
-@pytest.mark.parametrize("preset", [CHING_CHEN_2007, RAMANCHA_2022_LITERAL, RAMANCHA_2022_CONSTANT])
-def test_presets_make_no_fast_sweeps(preset, seed):
-    Sampler = TMCMCSampler if preset is CHING_CHEN_2007 else SMCSampler
-    chains, calls = [], []
-    for posterior in (Gaussian(), Noisy()):
-        sampler = Sampler(60, 3, posterior, vectorize=True, seed=seed, **preset)
-        sampler.run_mcmc(None, 3)
-        chains.append(sampler.get_chain())
-        calls.append(posterior.calls)
-    np.testing.assert_array_equal(*chains)
-    assert calls[0] == calls[1]
 
 
 def kinds(posterior, Sampler=SMCSampler, **kwargs):
