@@ -16,6 +16,7 @@ import numpy as np
 from ..noise.protocol import noise_title
 from ..noise.statistics import needs_response, sums_of_squares
 from ..signals.comparison import Comparison, measured_values
+from ..simulation.model import derivatives_batch, has_jacobian
 from .quadratic import check_quadratic
 
 __all__ = ["DataSets"]
@@ -67,9 +68,10 @@ class _DataSet(NamedTuple):
 class DataSets:
     """All data sets of an `FELikelihood` or a `JointLikelihood`; `model` is the only model, or what is read of several.
 
-    `measured` are the values (n_channels, n_samples) [SI], `statistic` is that of the residuals, and `with_gaps` says
-    whether samples are missing or have times of their own. ValueError for statistics that are not quadratic in the
-    residuals, or a noise whose level depends on the response.
+    `measured` are the values (n_channels, n_samples) [SI], `statistic` is that of the residuals, `with_gaps` says
+    whether samples are missing or have times of their own, and `differentiable` whether all models know their
+    derivatives. ValueError for statistics that are not quadratic in the residuals, or a noise whose level depends on
+    the response.
     """
 
     def __init__(self, likelihood: Any) -> None:
@@ -87,6 +89,8 @@ class DataSets:
         self._n_numbers = numbers
         likelihoods = [part.likelihood for part in self._parts]
         self.with_gaps = any(isinstance(each.measured, Comparison) for each in likelihoods)
+        self.differentiable = all(has_jacobian(each.model) for each in likelihoods)
+        self.kinds = " or ".join(dict.fromkeys(type(each.model).__name__ for each in likelihoods))
         if len(self._parts) == 1 and likelihood is likelihoods[0]:
             self.model = likelihood.model
             self.measured, self.statistic = measured_values(likelihood.measured), self._parts[0].statistic
@@ -146,6 +150,30 @@ class DataSets:
                     reasons[row] = reason
                 left = left[[not reason for reason in batch.reasons]]
         return [residuals, statistics, np.frombuffer(json.dumps(reasons).encode(), dtype=np.uint8)]
+
+    def derivatives(self, thetas: np.ndarray) -> np.ndarray:
+        """Derivatives (n, n_structural, n_channels, n_steps) of the responses by the models' ``jacobian``.
+
+        In single precision, as residuals.
+        """
+        found = np.zeros((*thetas.shape, len(self.measured), self.model.n_steps), np.float32)
+        for part in self._parts:
+            model = part.likelihood.model
+            own = derivatives_batch(model, thetas[:, part.structural], part.likelihood.simulator.pool)
+            found[:, part.structural, part.channels, : model.n_steps] = own
+        return found
+
+    def of_residuals(self, slopes: np.ndarray) -> np.ndarray:
+        """Derivatives (n, d, n_channels, n_samples) of the residuals, by those (n, d, n_channels, n_steps) of responses."""
+        found = np.zeros((*slopes.shape[:2], *self.measured.shape))
+        for part in self._parts:
+            measured = part.likelihood.measured
+            own = slopes[:, :, part.channels, : part.likelihood.model.n_steps]
+            if isinstance(measured, Comparison):
+                own = [[measured.at_samples(np.ascontiguousarray(each)) for each in rows] for rows in own]
+                own = np.where(measured.missing, 0.0, own)
+            found[:, :, part.channels, part.samples] = -own
+        return found
 
     def recall(self, thetas: np.ndarray, statistics: np.ndarray, reasons: Sequence[str]) -> None:
         """Cache what an earlier run has found, as `Simulator.recall`."""

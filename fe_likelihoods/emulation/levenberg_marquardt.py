@@ -301,7 +301,7 @@ class _Climb:
             if worst < _CHECKED_ERROR:
                 return
         raise ValueError(
-            f"the derivatives of {type(target.model).__name__}.jacobian differ from a difference of two simulations by "
+            f"the derivatives of {target.kinds}.jacobian differ from a difference of two simulations by "
             f"{100.0 * worst:.0f} % of the norm; expected at most {100.0 * _CHECKED_ERROR:.0f} %: return the "
             "derivatives of the response, in the units of the response [SI], by "
             f"{', '.join(target.model.parameter_names)}, or leave jacobian out"

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..signals.durations import growing_durations
-from ..simulation.model import derivatives_batch, has_jacobian, most_responses
+from ..simulation.model import most_responses
 from .archive import Archive
 from .data_sets import DataSets
 
@@ -108,7 +108,7 @@ class ResponseTarget:
         self.take_scale("logarithms")
         self.archive = Archive(self.statistic, self.measured.shape)
         self._simulated: set[bytes] = set()
-        self.differentiable = has_jacobian(self.model)
+        self.differentiable, self.kinds = self._data.differentiable, self._data.kinds
         self.unchecked = [True] if self.differentiable else []
         self.scales = np.nanstd(self.measured, axis=1)
         self.scales[self.scales == 0.0] = 1.0
@@ -321,19 +321,13 @@ class ResponseTarget:
         n, d = coords.shape
         thetas = self.structural_parameters(coords)
 
-        def compute() -> list[np.ndarray]:
-            return [derivatives_batch(self.model, thetas, self.posterior.likelihood.simulator.pool).astype(np.float32)]
-
         text = f"derivatives of {self.model.fingerprint}".encode()
-        found = remember(hashlib.blake2b(text + thetas.tobytes(), digest_size=16).hexdigest(), compute)[0]
+        key = hashlib.blake2b(text + thetas.tobytes(), digest_size=16).hexdigest()
+        (found,) = remember(key, lambda: [self._data.derivatives(thetas)])
         moved = coords[:, None] + _MAP_STEP * np.stack([np.eye(d), -np.eye(d)])[:, None]
         ahead, behind = self.structural_parameters(moved.reshape(-1, d)).reshape(2, n, d, d)
         by_coords = np.einsum("nzp,npct->nzct", (ahead - behind) / (2.0 * _MAP_STEP), found.astype(float))
-        if not self.with_gaps:
-            return -by_coords
-        comparison = self.posterior.likelihood.measured
-        at_samples = [[comparison.at_samples(each) for each in rows] for rows in by_coords]
-        return np.where(comparison.missing, 0.0, -np.array(at_samples))
+        return self._data.of_residuals(by_coords)
 
     def evaluation_queue(self) -> Any:
         """Where points are evaluated while others are waited for; `run` finds their responses in the cache."""

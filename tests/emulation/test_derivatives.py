@@ -152,15 +152,32 @@ def test_parts_of_a_record_have_derivatives_of_their_length():
     assert search.modes[0].parameters[:2] == pytest.approx([1.1, 0.9], abs=0.1)
 
 
-def test_a_joint_likelihood_makes_differences():
-    counted = Counted(slopes)
-    model = FunctionModel(free_vibration, NAMES, CHANNELS, DT, N_STEPS, jacobian=counted)
+def two_events(jacobian, second_values=None):
+    """Two data sets of different length; the second has its own damping."""
+    model = FunctionModel(free_vibration, NAMES, CHANNELS, DT, N_STEPS, jacobian=jacobian)
+    shorter = FunctionModel(
+        lambda theta: free_vibration(theta)[:, :150],
+        NAMES,
+        CHANNELS,
+        DT,
+        150,
+        jacobian=None if jacobian is None else lambda theta: jacobian(theta)[:, :, :150],
+    )
+    values = noisy(shorter, seed=2).values
+    second = Measurements(CHANNELS, DT, values if second_values is None else second_values(values))
     sigmas = {"sigma_top": HalfNormal(0.01), "sigma_base": HalfNormal(20.0)}
-    parts = {f"event {seed}": FELikelihood(model, noisy(model, seed=seed)).marginal(sigmas) for seed in (1, 2)}
-    prior = {"stiffness": TruncatedNormal(1.0, 0.3), "damping": TruncatedNormal(1.0, 0.3)}
-    search = find_modes(Posterior(JointLikelihood(parts), prior), starts=3, seed=1)
-    assert counted.calls == 0
-    assert search.modes[0].parameters == pytest.approx(TRUTH, abs=0.05)
+    parts = {"first": FELikelihood(model, noisy(model, seed=1)), "second": FELikelihood(shorter, second)}
+    joint = JointLikelihood({key: part.marginal(sigmas) for key, part in parts.items()}, separate=["damping"])
+    return Posterior(joint, {name: TruncatedNormal(1.0, 0.3) for name in joint.parameter_names})
+
+
+def test_joint_likelihoods_use_derivatives():
+    counted = Counted(slopes)
+    with_derivatives, without = (find_modes(two_events(each), starts=3, seed=1) for each in (counted, None))
+    assert counted.calls > 0 and with_derivatives.simulations < without.simulations
+    (mode,), (expected,) = with_derivatives.modes, without.modes
+    assert np.abs((mode.coords - expected.coords) / np.sqrt(np.diag(expected.covariance))).max() < 1.0
+    assert mode.log_evidence == pytest.approx(expected.log_evidence, abs=0.5)
 
 
 # the chain rule ----------------------------------------------------------------------------------------------
@@ -191,19 +208,21 @@ def histories(target, numbers):
 
 
 @pytest.mark.parametrize("values", [None, with_gaps])
-@pytest.mark.parametrize("prior", PRIORS.values(), ids=PRIORS)
+@pytest.mark.parametrize("prior", [*PRIORS.values(), None], ids=[*PRIORS, "joint"])
 def test_derivatives_of_residuals_by_coordinates(prior, values):
-    target = ResponseTarget(posterior_of(prior=prior, values=values))
-    at, step = np.array([[0.3, -0.7], [1.2, 0.4]]), 2e-3
+    target = ResponseTarget(two_events(slopes, values) if prior is None else posterior_of(prior=prior, values=values))
+    rows = slice(2, 4) if prior is None else slice(0, 2)  # of the data with gaps
+    d = target.n_structural
+    at, step = np.array([[0.3, -0.7, 0.2], [1.2, 0.4, -0.3]])[:, :d], 2e-3
     found = histories(target, target.derivatives(at))
-    assert found.shape == (2, 2, 2, N_STEPS)
+    assert found.shape == (2, d, rows.stop, N_STEPS)
     for coords, each in zip(at, found, strict=True):
         ahead, behind = (
-            histories(target, target.run(coords + sign * step * np.eye(2)).numbers) for sign in (1.0, -1.0)
+            histories(target, target.run(coords + sign * step * np.eye(d)).numbers) for sign in (1.0, -1.0)
         )
         expected = (ahead - behind) / (2.0 * step)
         assert_close(each, expected)
-        assert values is None or not each[:, 0, 20:50].any()
+        assert values is None or not each[:, rows][:, 0, 20:50].any()
 
 
 def test_derivatives_at_other_times_than_the_response():
