@@ -36,6 +36,7 @@ from ..simulation.model import (
     Model,
     SimulationBatch,
     has_batch_method,
+    has_jacobian,
     misfit_batch,
     misfit_of_responses,
     most_responses,
@@ -161,9 +162,11 @@ class Simulator:
         self._seconds = 0.0
         self.when_simulated: Callable[[int], None] | None = None
         self._in_pool: _Running | None = None
+        # responses of the last request to a model with derivatives, by its fingerprint and keys: a gradient may follow
+        self._latest: list[tuple[str, bytes, np.ndarray | str]] = []
 
     def __getstate__(self) -> dict:
-        return self.__dict__ | {"pool": None, "when_simulated": None, "_in_pool": None}
+        return self.__dict__ | {"pool": None, "when_simulated": None, "_in_pool": None, "_latest": []}
 
     # counts and identity ------------------------------------------------------------------------------------------
 
@@ -294,7 +297,10 @@ class Simulator:
 
     def _look_up(self, keys: list[bytes], which: list[int], full: bool) -> _Request:
         """What is known of distinct keys, which is counted; `which` has the key of every requested row."""
-        request = _Request(keys, full, self._run)
+        request, latest = _Request(keys, full, self._run), self._latest
+        self._latest = []
+        for fingerprint, key, outcome in latest if full else ():
+            self.response_memory.store(fingerprint, [key], [outcome])
         request.statistics, known = self.memory_cache.look_up(keys, self.n_numbers)
         request.known = np.array(known, dtype=bool) | ~request.finite
         request.done = request.known.copy()
@@ -515,7 +521,7 @@ class Simulator:
         return functions[with_response][1]
 
     def _returns_responses(self, full: bool) -> bool:
-        return full or (self.cache is not None and self.cache.responses)
+        return full or has_jacobian(self.model) or (self.cache is not None and self.cache.responses)
 
     def _record(
         self, request: _Request, rows: Sequence[int], values: np.ndarray, reasons: list[str], seconds: float
@@ -542,8 +548,12 @@ class Simulator:
         if full:
             outcomes = [reason or response for reason, response in zip(why, responses, strict=True)]
             self.response_memory.store(run.fingerprint, keys, outcomes)
+        elif has_jacobian(self.model) and len(self._latest) < most_responses(self.model):
+            outcomes = [reason or response for reason, response in zip(why, responses, strict=True)]
+            self._latest += zip([run.fingerprint] * len(keys), keys, outcomes, strict=True)
         if self.cache is not None:
-            self._checked.rows.store(self._key, thetas, statistics, reasons, responses, seconds, run)
+            stored = responses if full or self.cache.responses else None
+            self._checked.rows.store(self._key, thetas, statistics, reasons, stored, seconds, run)
             self.cache.store_remark(self.model)
         for place, row in enumerate(rows):
             request.fill(row, statistics[place], reasons[place], responses[place] if full else None)
