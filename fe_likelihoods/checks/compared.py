@@ -120,8 +120,8 @@ class Fits(NamedTuple):
 
 def data_sets_of(posterior: Any) -> list[tuple[str, FELikelihood, np.ndarray]]:
     """Name (empty if there is one only), likelihood and columns of the parameters of each data set."""
-    keys = getattr(posterior.likelihood, "likelihoods", {"": None})
-    return [(key, *part) for key, part in zip(keys, posterior.likelihood.parts(), strict=True)]
+    likelihood = posterior.likelihood
+    return [(key, *part) for key, part in zip(likelihood.likelihoods, likelihood.parts(), strict=True)]
 
 
 def windows_of(likelihood: FELikelihood, key: str = "") -> list[Window]:

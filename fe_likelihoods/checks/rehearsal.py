@@ -99,12 +99,13 @@ def check_model(posterior: Posterior, events: Mapping[str, Any] | None = None, *
     []
     """
     found: list[Finding] = []
-    keys = getattr(posterior.likelihood, "likelihoods", {"": None})
     mean = posterior.prior.mean()
     with tqdm(total=0, disable=not progress, unit="simulation", desc="check") as bar, _announced(posterior, bar):
         stage, before = _Stage(bar), _made(posterior)
         seconds, compared = 0.0, []
-        for key, (likelihood, columns) in zip(keys, posterior.likelihood.parts(), strict=True):
+        for key, (likelihood, columns) in zip(
+            posterior.likelihood.likelihoods, posterior.likelihood.parts(), strict=True
+        ):
             theta = mean[columns][: len(likelihood.model.parameter_names)]
             batch = likelihood.simulate(theta[None])
             if batch.reasons[0]:

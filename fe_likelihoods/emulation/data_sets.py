@@ -164,7 +164,7 @@ class DataSets:
         return found
 
     def of_residuals(self, slopes: np.ndarray) -> np.ndarray:
-        """Derivatives (n, d, n_channels, n_samples) of the residuals, by those (n, d, n_channels, n_steps) of responses."""
+        """Derivatives (n, d, n_channels, n_samples) of residuals, from derivatives (n, d, n_channels, n_steps)."""
         found = np.zeros((*slopes.shape[:2], *self.measured.shape))
         for part in self._parts:
             measured = part.likelihood.measured

@@ -49,6 +49,7 @@ class FunctionLikelihood(SumOfParts):
     """
 
     fast_parameters = ()
+    likelihoods = {}
 
     def __init__(
         self,
@@ -65,9 +66,14 @@ class FunctionLikelihood(SumOfParts):
         if unknown := set(units or ()) - set(names):
             raise ValueError(f"FunctionLikelihood: units of {', '.join(sorted(unknown))}, which are no parameters")
         self.function, self.parameter_names, self.vectorize = function, names, vectorize
-        self.parameters = tuple(Parameter(name, (units or {}).get(name, "")) for name in names)
+        self._units = dict(units or {})
         self._failures = FailureLog(names, 1.0)
         self._evaluations = 0
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Names and units of the parameters."""
+        return tuple(Parameter(name, self._units.get(name, "")) for name in self.parameter_names)
 
     def log_likelihood(self, x: Any, inside: Any = True) -> np.ndarray | float:
         """Log-likelihood (n,) of points (n, ndim), or a float; -inf where the function fails and not `inside`."""
@@ -96,17 +102,9 @@ class FunctionLikelihood(SumOfParts):
         self._failures.count_outcomes(rows, reasons)
         return values
 
-    def parts(self) -> list:
-        """No models."""
-        return []
-
     def possible(self, rows: np.ndarray) -> np.ndarray:
         """Whether each of the points (n, ndim) is finite."""
         return np.isfinite(rows).all(axis=1)
-
-    def fault(self, x: Any) -> str:
-        """Empty: failures are answers of the function."""
-        return ""
 
     def density_parts(self) -> list[str]:
         """Texts that identify the density: names, and code and values of the function."""

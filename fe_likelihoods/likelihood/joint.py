@@ -5,20 +5,16 @@ test, or tests of several specimens, then inform the parameters that they have i
 model, noise, pool and caches.
 """
 
-import hashlib
-import json
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from ..noise.marginal import sampled_noise
-from ..priors.distributions import Distribution, RandomState
 from ..priors.points import as_points
 from .likelihood import FELikelihood
-from .parameters import Parameter, channels_of_deviations
-from .sum_of_parts import COUNTS, SumOfParts
+from .parameters import channels_of_deviations
+from .sum_of_parts import SumOfParts
 
 __all__ = ["JointLikelihood"]
 
@@ -94,7 +90,7 @@ class JointLikelihood(SumOfParts):
                 n_structural = len(likelihood.model.parameter_names)
                 names = likelihood.parameter_names
                 for name in names[:n_structural] if kind == "structural" else names[n_structural:]:
-                    joint, unit = self._joint_name(key, name), _unit(likelihood, name)
+                    joint, unit = self.name_of(key, name), _unit(likelihood, name)
                     other, source, other_kind = first.setdefault(joint, (key, name, kind))
                     if source != name:
                         raise ValueError(
@@ -115,7 +111,7 @@ class JointLikelihood(SumOfParts):
                         )
         self.parameter_names = tuple(first)
         self._columns = {
-            key: [self.parameter_names.index(self._joint_name(key, name)) for name in likelihood.parameter_names]
+            key: [self.parameter_names.index(self.name_of(key, name)) for name in likelihood.parameter_names]
             for key, likelihood in self.likelihoods.items()
         }
         kinds = [kind for *_, kind in first.values()]
@@ -127,9 +123,16 @@ class JointLikelihood(SumOfParts):
             raise ValueError(f"no likelihood {name!r}; the likelihoods are {', '.join(map(repr, self.likelihoods))}")
         return self.likelihoods[name]
 
-    def parts(self) -> list[tuple[FELikelihood, list[int]]]:
-        """The likelihoods in the order of their evaluation, with the indices of their parameters."""
-        return [(likelihood, self._columns[key]) for key, likelihood in self.likelihoods.items()]
+    def name_of(self, key: str, name: str) -> str:
+        """Name that a parameter of one likelihood has in the joint likelihood."""
+        return f"{name}_{key}" if name in self.separate else name
+
+    def with_likelihoods(self, likelihoods: Mapping[str, FELikelihood]) -> "JointLikelihood":
+        """The same sum of other likelihoods, some of whose parameters may be missing."""
+        left = {name for likelihood in likelihoods.values() for name in likelihood.parameter_names}
+        result = JointLikelihood(likelihoods, separate=[name for name in self.separate if name in left])
+        result.separate = self.separate  # also names of noise that `draw_noise` draws
+        return result
 
     def samples_of(self, name: str, samples: Any, noise: bool = False) -> dict[str, np.ndarray]:
         """Parameter samples for one likelihood, under its own names.
@@ -166,80 +169,10 @@ class JointLikelihood(SumOfParts):
             samples = dict(zip(names, as_points(samples, names).T, strict=True))
         wanted = list(likelihood.model.parameter_names)
         wanted += sampled_noise(likelihood.noise).parameter_names if noise else ()
-        missing = [joint for each in wanted if (joint := self._joint_name(name, each)) not in samples]
+        missing = [joint for each in wanted if (joint := self.name_of(name, each)) not in samples]
         if missing:
             raise ValueError(f"the samples have no {', '.join(missing)}, which the likelihood {name!r} needs")
-        return {each: np.asarray(samples[self._joint_name(name, each)]) for each in wanted}
-
-    def report(self) -> dict:
-        """Summary of all simulations, and under ``"likelihoods"`` a summary for each, see `Posterior.report`."""
-        parts = {key: likelihood.report() for key, likelihood in self.likelihoods.items()}
-        total = {name: sum(part[name] for part in parts.values()) for name in COUNTS}
-        total["failures"] = [{"likelihood": key, **each} for key, part in parts.items() for each in part["failures"]]
-        total["failure_reasons"] = dict(sum((Counter(part["failure_reasons"]) for part in parts.values()), Counter()))
-        return total | {"likelihoods": parts}
-
-    # identity ----------------------------------------------------------------------------------------------------
-
-    @property
-    def fingerprint(self) -> str:
-        """Hex digest of everything the cached statistics depend on."""
-        return _digest([likelihood.fingerprint for likelihood in self.likelihoods.values()])
-
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """Units, nominal values and labels of the parameters."""
-        described: dict[str, Parameter] = {}
-        for key, likelihood in self.likelihoods.items():
-            for each in likelihood.parameters:
-                joint = self._joint_name(key, each.name)
-                described.setdefault(joint, each._replace(name=joint))
-        return tuple(described[name] for name in self.parameter_names)
-
-    def density_parts(self) -> list[str]:
-        """Texts that identify the density, as `FELikelihood.density_parts`."""
-        parts: list[str] = []
-        for key, likelihood in self.likelihoods.items():
-            parts += [json.dumps(self._columns[key]), *likelihood.density_parts()]
-        return [*self.parameter_names, *parts]
-
-    def marginal(self, priors: Mapping[str, Distribution]) -> "JointLikelihood":
-        """The same likelihood with the standard deviations of white noise integrated out, see `Posterior.marginal`.
-
-        Raises
-        ------
-        ValueError
-            As `FELikelihood.marginal`, and if a noise parameter belongs to several likelihoods: its integral is not a
-            product.
-        """
-        owners = Counter(column for columns in self._columns.values() for column in columns)
-        if shared := [self.parameter_names[place] for place in self.fast_parameters if owners[place] > 1]:
-            raise ValueError(
-                f"{', '.join(shared)} belong to several likelihoods and cannot be integrated out; give each likelihood "
-                f"its own with separate={shared!r}"
-            )
-        parts = {}
-        for key, likelihood in self.likelihoods.items():
-            names = {name: self._joint_name(key, name) for name in likelihood.parameter_names}
-            parts[key] = likelihood.marginal({name: priors[joint] for name, joint in names.items() if joint in priors})
-        structural = {name for likelihood in parts.values() for name in likelihood.parameter_names}
-        result = JointLikelihood(parts, separate=[name for name in self.separate if name in structural])
-        result.separate = self.separate  # names of the noise that `draw_noise` draws
-        return result
-
-    def draw_noise(self, x: Any, rng: RandomState = None) -> dict[str, np.ndarray]:
-        """Complete samples (n,) of all parameters from structural ones (n, ndim), see `Posterior.draw_noise`."""
-        points = np.atleast_2d(as_points(x, self.parameter_names))
-        rng = np.random.default_rng(rng) if isinstance(rng, int | np.integer) else rng
-        named = dict(zip(self.parameter_names, points.T, strict=True))
-        for key, likelihood in self.likelihoods.items():
-            drawn = likelihood.draw_noise(points[:, self._columns[key]], rng)
-            named |= {self._joint_name(key, name): values for name, values in drawn.items()}
-        return named
-
-    def _joint_name(self, key: str, name: str) -> str:
-        """Name that a parameter of one likelihood has in the joint likelihood."""
-        return f"{name}_{key}" if name in self.separate else name
+        return {each: np.asarray(samples[self.name_of(name, each)]) for each in wanted}
 
 
 def _unit(likelihood: FELikelihood, name: str) -> str | None:
@@ -253,7 +186,3 @@ def _unit(likelihood: FELikelihood, name: str) -> str | None:
         return f"multiples of {nominal[name]:.12g}" if isinstance(nominal, Mapping) and name in nominal else None
     channels = channels_of_deviations(likelihood.noise, model.channels)
     return channels[name].si_unit if name in channels else None
-
-
-def _digest(parts: Sequence[str]) -> str:
-    return hashlib.blake2b(json.dumps(list(parts)).encode(), digest_size=16).hexdigest()

@@ -16,12 +16,9 @@ import numpy as np
 
 from ..cache.simulation_cache import SimulationCache
 from ..noise.gaussian import GaussianNoise
-from ..noise.marginal import MarginalNoise
 from ..noise.protocol import Noise, noise_of_part, noise_statistic, noise_under
 from ..noise.sample_counts import count_samples
-from ..priors.distributions import Distribution, RandomState, as_generator
-from ..priors.multivariate import as_distribution
-from ..priors.points import as_points, complete_repr
+from ..priors.points import complete_repr
 from ..signals.channels import Measurements
 from ..signals.comparison import Comparison
 from ..signals.events import join_measurements
@@ -29,7 +26,6 @@ from ..signals.sampling import same_step
 from ..simulation.model import Model, SimulationBatch, SimulationFailed, first_part, simulate_batch
 from .data_identity import data_digests
 from .inputs import check_model, check_noise, match_measurements
-from .parameters import Parameter, describe_parameters
 from .simulator import Simulator
 from .sum_of_parts import SumOfParts
 
@@ -136,7 +132,8 @@ class FELikelihood(SumOfParts):
         self.parameter_names = structural + others
         if len(set(self.parameter_names)) != len(self.parameter_names):
             raise ValueError(f"the names of model and noise must differ; got {', '.join(self.parameter_names)}")
-        self.fast_parameters = tuple(range(len(structural), len(self.parameter_names)))
+        self._columns = {"": list(range(len(self.parameter_names)))}
+        self.fast_parameters = tuple(self._columns[""][len(structural) :])
         self.simulator = Simulator(
             model,
             measurements,
@@ -152,6 +149,11 @@ class FELikelihood(SumOfParts):
 
     def __getstate__(self) -> dict:
         return self.__dict__ | {"shortened": []}
+
+    @property
+    def likelihoods(self) -> dict[str, "FELikelihood"]:
+        """This likelihood, under an empty name."""
+        return {"": self}
 
     @property
     def model(self) -> Model:
@@ -172,11 +174,6 @@ class FELikelihood(SumOfParts):
     def fingerprint(self) -> str:
         """Hex digest of everything the statistics are known to depend on, see `Simulator.fingerprint`."""
         return self.simulator.fingerprint
-
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """Units, nominal values and labels of the parameters."""
-        return describe_parameters(self.model, self.noise)
 
     def data_digests(self) -> list[str]:
         """Digests of the compared samples, one for each event; one digest if there are no events."""
@@ -298,10 +295,6 @@ class FELikelihood(SumOfParts):
                 self.simulator.failures.add(rows[row, : self.simulator.n_structural], reason)
         return np.where(usable, values, -np.inf)
 
-    def parts(self) -> list[tuple["FELikelihood", list[int]]]:
-        """This likelihood with the indices of its parameters."""
-        return [(self, list(range(len(self.parameter_names))))]
-
     def possible(self, rows: np.ndarray) -> np.ndarray:
         """Whether each of the points (n, ndim) is finite and has possible noise parameters; nothing is simulated."""
         possible = np.isfinite(rows).all(axis=1)
@@ -313,13 +306,7 @@ class FELikelihood(SumOfParts):
         return possible
 
     def density_parts(self) -> list[str]:
-        """Texts that identify the density: fingerprint of the statistics, and class, parameters and repr of the noise.
-
-        Raises
-        ------
-        ValueError
-            If the ``repr`` of the noise does not show its values.
-        """
+        """Fingerprint of the statistics, and class, parameters and repr of the noise."""
         noise = self.noise
         return [self.fingerprint, type(noise).__qualname__, *noise.parameter_names, complete_repr(noise)]
 
@@ -334,46 +321,6 @@ class FELikelihood(SumOfParts):
         1
         """
         return self.simulator.report()
-
-    def marginal(self, priors: Mapping[str, Distribution]) -> "FELikelihood":
-        """The same likelihood with the standard deviations of its white noise integrated out (`Posterior.marginal`).
-
-        Parameters
-        ----------
-        priors : mapping of str to Distribution
-            Priors of the noise parameters; others may be among them.
-
-        Returns
-        -------
-        FELikelihood
-
-        Raises
-        ------
-        ValueError
-            If the noise is not white, has sensor noise, or is integrated out already.
-        """
-        names = self.parameter_names[self.simulator.n_structural :]
-        if joint := [name for name in names if name not in priors]:
-            raise ValueError(
-                f"{', '.join(joint)} have a joint prior distribution and cannot be integrated out; give them "
-                "independent priors"
-            )
-        known = {name: as_distribution(name, priors[name]) for name in names}
-        return self.with_noise(MarginalNoise(self.noise, known))
-
-    def draw_noise(self, x: Any, rng: RandomState = None) -> dict[str, np.ndarray]:
-        """Complete samples (n,) of all parameters from structural ones (n, ndim), see `Posterior.draw_noise`."""
-        if not isinstance(self.noise, MarginalNoise):
-            raise ValueError(
-                f"the noise parameters {', '.join(self.noise.parameter_names)} are in the samples of this posterior; "
-                "draw_noise is for posteriors from which they are integrated out, see marginal()"
-            )
-        points = np.atleast_2d(as_points(x, self.parameter_names))
-        drawn = self.noise.noise.parameter_names
-        uniform = as_generator(rng).random((len(points), len(drawn)))
-        sigmas = self.noise.draw(self.misfit(points), self.n_samples, uniform)
-        names = (*self.parameter_names, *drawn)
-        return dict(zip(names, np.hstack([points, sigmas]).T, strict=True))
 
     def with_noise(self, noise: Noise) -> "FELikelihood":
         """The same likelihood with another noise.

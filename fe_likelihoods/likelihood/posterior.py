@@ -10,6 +10,7 @@ import hashlib
 import json
 from collections.abc import Callable, Mapping
 from functools import cached_property
+from numbers import Real
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,7 +22,6 @@ from ..simulation.model import has_jacobian
 from .evaluation_queue import EvaluationQueue
 from .gradient import likelihood_gradient, slopes_along
 from .joint import JointLikelihood
-from .known_errors import without_known
 from .likelihood import FELikelihood
 from .parameters import Parameter
 from .predictive_draws import MeasuredData, PredictiveDraws, measured_data, predictive_draws
@@ -69,7 +69,9 @@ class Posterior:
         prior: Prior | Mapping[str, Distribution],
     ) -> None:
         if isinstance(prior, Mapping):
-            likelihood, prior = without_known(likelihood, prior)
+            known = {name: float(value) for name, value in prior.items() if isinstance(value, Real)}
+            likelihood = likelihood.with_known(known) if known else likelihood
+            prior = {name: each for name, each in prior.items() if name not in known}
         self.likelihood = likelihood
         prior = prior if isinstance(prior, Prior) else Prior(prior)
         self.prior = prior.reorder(likelihood.parameter_names)

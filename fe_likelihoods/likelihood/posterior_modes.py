@@ -22,7 +22,6 @@ from scipy.special import logsumexp
 from ..emulation.modes import Mode, find_modes
 from ..simulation.model import SimulationFailed, derivatives_batch, has_jacobian
 from ..text_tables import text_table
-from .joint import JointLikelihood
 from .likelihood import FELikelihood
 
 __all__ = ["PosteriorMode", "PosteriorModes", "posterior_modes"]
@@ -219,14 +218,11 @@ def _responses(part: Any, thetas: np.ndarray) -> np.ndarray:
 
 def _linear_posterior(posterior: Any, tangents: Sequence[_Tangent]) -> Any:
     """The posterior with linear models in place of its own: nothing is simulated."""
-    parts = [
-        FELikelihood(_Linear(part.model, *tangent), part.measurements, part.noise)
-        for (part, _), tangent in zip(posterior.likelihood.parts(), tangents, strict=True)
-    ]
-    if isinstance(posterior.likelihood, JointLikelihood):
-        keys, separate = posterior.likelihood.likelihoods, posterior.likelihood.separate
-        return type(posterior)(JointLikelihood(dict(zip(keys, parts, strict=True)), separate=separate), posterior.prior)
-    return type(posterior)(parts[0], posterior.prior)
+    parts = {
+        key: FELikelihood(_Linear(part.model, *tangent), part.measurements, part.noise)
+        for (key, part), tangent in zip(posterior.likelihood.likelihoods.items(), tangents, strict=True)
+    }
+    return type(posterior)(posterior.likelihood.with_likelihoods(parts), posterior.prior)
 
 
 def _top(linear: Any, x: np.ndarray, sd: np.ndarray, bounds: np.ndarray) -> np.ndarray:

@@ -17,8 +17,8 @@ from ..signals.comparison import Comparison
 from ..signals.records import Record
 from ..simulation.model import SimulationFailed
 from .block_likelihood import BlockLogLikelihood, block_log_likelihood, choose_blocks, describe_blocks
-from .joint import JointLikelihood
 from .likelihood import FELikelihood
+from .sum_of_parts import SumOfParts
 
 if TYPE_CHECKING:
     from ..noise.protocol import Noise
@@ -87,7 +87,7 @@ class PredictiveDraws(NamedTuple):
     notes: tuple[str, ...]
 
 
-def measured_data(likelihood: FELikelihood | JointLikelihood) -> MeasuredData:
+def measured_data(likelihood: SumOfParts) -> MeasuredData:
     """Measurements and excitation of a likelihood; nothing is simulated."""
     channels, excitations, steps = [], [], {}
     for prefix, each, _ in _named_parts(likelihood):
@@ -104,7 +104,7 @@ def measured_data(likelihood: FELikelihood | JointLikelihood) -> MeasuredData:
 
 
 def predictive_draws(
-    likelihood: FELikelihood | JointLikelihood, samples: np.ndarray, block: float | None = None, seed: int = 0
+    likelihood: SumOfParts, samples: np.ndarray, block: float | None = None, seed: int = 0
 ) -> PredictiveDraws:
     """Responses, replicated measurements and block log-likelihood of samples, see `Posterior.predictive_draws`."""
     samples = np.atleast_2d(np.asarray(samples, dtype=float))
@@ -139,12 +139,9 @@ def predictive_draws(
     return PredictiveDraws(responses, replicates, joined, tuple(notes))
 
 
-def _named_parts(likelihood: FELikelihood | JointLikelihood) -> Iterator[tuple[str, FELikelihood, list[int]]]:
-    parts = likelihood.parts()
-    joint = isinstance(likelihood, JointLikelihood)
-    names = [f"{key}_" for key in likelihood.likelihoods] if joint else [""] * len(parts)
-    for name, (part, columns) in zip(names, parts, strict=True):
-        yield name, part, columns
+def _named_parts(likelihood: SumOfParts) -> Iterator[tuple[str, FELikelihood, list[int]]]:
+    for key, (part, columns) in zip(likelihood.likelihoods, likelihood.parts(), strict=True):
+        yield f"{key}_" if key else "", part, columns
 
 
 def _compared(likelihood: FELikelihood) -> np.ndarray:

@@ -1,19 +1,27 @@
-"""A log-likelihood as a sum over its parts, each of which has one model and one data set."""
+"""A log-likelihood as a sum over its data sets, each of which has one model; most have one data set."""
 
-from abc import abstractmethod
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Mapping
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
+from ..noise.known import KnownNoise
+from ..noise.marginal import MarginalNoise
+from ..priors.distributions import Distribution, RandomState, as_generator
+from ..priors.multivariate import as_distribution
 from ..priors.points import as_points
 from ..simulation.faults import TransientReason
 from ..simulation.model import split_seconds
 from .data_identity import combined_digest
+from .parameters import Parameter, describe_parameters
 
 __all__ = ["COUNTS", "SumOfParts"]
 
-COUNTS = (  # numbers of the report, which are added for several parts
+COUNTS = (  # numbers of the report, which are added for several data sets
     "simulations",
     "verifications",
     "unverified",
@@ -26,18 +34,46 @@ COUNTS = (  # numbers of the report, which are added for several parts
 
 
 class SumOfParts:
-    """Base class of `FELikelihood`, which is its only part, and `JointLikelihood`. The parts are independent."""
+    """Base class of `FELikelihood`, which is its only data set, and `JointLikelihood`, whose data are independent."""
 
     parameter_names: tuple[str, ...]
+    fast_parameters: tuple[int, ...]
     is_modal: ClassVar[bool] = False  # whether the data are natural frequencies and mode shapes
 
-    @abstractmethod
-    def parts(self) -> list[tuple[Any, list[int]]]:
-        """The likelihoods in the order of their evaluation, with the indices of their parameters."""
+    likelihoods: Mapping[str, Any]  # an `FELikelihood` for each, in the order of their evaluation; "" for the only one
+    _columns: dict[str, list[int]]  # indices of their parameters
 
-    @abstractmethod
-    def report(self) -> dict:
-        """Summary of the simulations, see `Posterior.report`."""
+    def parts(self) -> list[tuple[Any, list[int]]]:
+        """The data sets in the order of their evaluation, with the indices of their parameters."""
+        return [(likelihood, self._columns[key]) for key, likelihood in self.likelihoods.items()]
+
+    def name_of(self, key: str, name: str) -> str:
+        """Name that a parameter of a data set has here."""
+        return name
+
+    def with_likelihoods(self, likelihoods: Mapping[str, Any]) -> Self:
+        """The same likelihood with other data sets under the same names."""
+        return next(iter(likelihoods.values()), self)
+
+    def with_known(self, known: Mapping[str, float]) -> Self:
+        """The same likelihood with known values of parameters of the noise, which are parameters no more.
+
+        ValueError if one is another parameter.
+        """
+        noise = [self.parameter_names[place] for place in self.fast_parameters]
+        if others := [name for name in known if name not in noise]:
+            raise ValueError(
+                f"a number in the prior is a known parameter of the noise; the noise has no {', '.join(others)}, its "
+                f"parameters are {', '.join(noise) or 'none'}: fix others in the model, or give a distribution"
+            )
+        parts = {}
+        for key, part in self.likelihoods.items():
+            names = {name: self.name_of(key, name) for name in part.noise.parameter_names}
+            own = {name: known[ours] for name, ours in names.items() if ours in known}
+            parts[key] = part.with_noise(KnownNoise(part.noise, own)) if own else part
+        return self.with_likelihoods(parts)
+
+    # densities ----------------------------------------------------------------------------------------------------
 
     def __call__(self, x: Any) -> np.ndarray | float:
         """Same as `log_likelihood`."""
@@ -61,8 +97,8 @@ class SumOfParts:
         Returns
         -------
         float or (n,) float
-            -inf where a simulation fails, where the noise parameters are impossible for one part (nothing is simulated
-            there) and where x is not finite; never NaN. Where one part is -inf, later parts are not simulated.
+            -inf where a simulation fails, where the noise parameters are impossible for one data set (nothing is
+            simulated there) and where x is not finite; never NaN. Where one is -inf, later ones are not simulated.
         """
         points = as_points(x, self.parameter_names)
         rows = points if points.ndim == 2 else points[None]
@@ -102,6 +138,24 @@ class SumOfParts:
                 return split_seconds(reason)[0]
         return ""
 
+    # description --------------------------------------------------------------------------------------------------
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Units, nominal values and labels of the parameters."""
+        described: dict[str, Parameter] = {}
+        for key, part in self.likelihoods.items():
+            for each in describe_parameters(part.model, part.noise):
+                name = self.name_of(key, each.name)
+                described.setdefault(name, each._replace(name=name))
+        return tuple(described[name] for name in self.parameter_names)
+
+    @property
+    def fingerprint(self) -> str:
+        """Hex digest of everything the cached statistics are known to depend on, see `Simulator.fingerprint`."""
+        parts = json.dumps([part.fingerprint for part in self.likelihoods.values()])
+        return hashlib.blake2b(parts.encode(), digest_size=16).hexdigest()
+
     @property
     def data_fingerprint(self) -> str:
         """Hex digest of the samples that are compared: equal for likelihoods of the same data.
@@ -109,10 +163,81 @@ class SumOfParts:
         The order of the channels and of data sets has no effect. Times count from the start of each event and missing
         samples do not count, so that it is the same for EQ2 alone and for EQ2 after an EQ1 that is not compared.
         """
-        return combined_digest([digest for part, _ in self.parts() for digest in part.data_digests()])
+        return combined_digest([digest for part in self.likelihoods.values() for digest in part.data_digests()])
+
+    def density_parts(self) -> list[str]:
+        """Texts that identify the density; ValueError if the ``repr`` of a noise does not show its values."""
+        parts = list(self.parameter_names)
+        for part, columns in self.parts():
+            parts += [json.dumps(columns), *part.density_parts()]
+        return parts
+
+    def report(self) -> dict:
+        """Summary of all simulations, and under ``"likelihoods"`` a summary for each, see `Posterior.report`."""
+        parts = {key: part.report() for key, part in self.likelihoods.items()}
+        total = {name: sum(part[name] for part in parts.values()) for name in COUNTS}
+        total["failures"] = [{"likelihood": key, **each} for key, part in parts.items() for each in part["failures"]]
+        total["failure_reasons"] = dict(sum((Counter(part["failure_reasons"]) for part in parts.values()), Counter()))
+        return total | {"likelihoods": parts}
 
     def __getattr__(self, name: str) -> Any:
         """An entry of the report, such as ``simulations`` or ``failures``."""
         if name not in (*COUNTS, "failures", "failure_reasons"):
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
         return self.report()[name]
+
+    # noise that is integrated out ---------------------------------------------------------------------------------
+
+    def marginal(self, priors: Mapping[str, Distribution]) -> Self:
+        """The same likelihood with the standard deviations of white noise integrated out, see `Posterior.marginal`.
+
+        Parameters
+        ----------
+        priors : mapping of str to Distribution
+            Priors of the noise parameters; others may be among them.
+
+        Returns
+        -------
+        FELikelihood or JointLikelihood
+
+        Raises
+        ------
+        ValueError
+            If the noise is not white, has sensor noise, or is integrated out already; if a noise parameter has a joint
+            prior distribution with others, or belongs to several data sets: its integral is not a product.
+        """
+        noise = [self.parameter_names[place] for place in self.fast_parameters]
+        if correlated := [name for name in noise if name not in priors]:
+            raise ValueError(
+                f"{', '.join(correlated)} have a joint prior distribution and cannot be integrated out; give them "
+                "independent priors"
+            )
+        owners = Counter(column for _, columns in self.parts() for column in columns)
+        if shared := [self.parameter_names[place] for place in self.fast_parameters if owners[place] > 1]:
+            raise ValueError(
+                f"{', '.join(shared)} belong to several likelihoods and cannot be integrated out; give each likelihood "
+                f"its own with separate={shared!r}"
+            )
+        parts = {}
+        for key, part in self.likelihoods.items():
+            names = {name: self.name_of(key, name) for name in part.noise.parameter_names}
+            known = {name: as_distribution(name, priors[ours]) for name, ours in names.items()}
+            parts[key] = part.with_noise(MarginalNoise(part.noise, known))
+        return self.with_likelihoods(parts)
+
+    def draw_noise(self, x: Any, rng: RandomState = None) -> dict[str, np.ndarray]:
+        """Complete samples (n,) of all parameters from structural ones (n, ndim), see `Posterior.draw_noise`."""
+        points = np.atleast_2d(as_points(x, self.parameter_names))
+        rng = as_generator(rng)
+        named = dict(zip(self.parameter_names, points.T, strict=True))
+        for key, part in self.likelihoods.items():
+            if not isinstance(part.noise, MarginalNoise):
+                raise ValueError(
+                    f"the noise parameters {', '.join(part.noise.parameter_names)} are in the samples of this "
+                    "posterior; draw_noise is for posteriors from which they are integrated out, see marginal()"
+                )
+            names, own = part.noise.noise.parameter_names, points[:, self._columns[key]]
+            uniform = rng.random((len(own), len(names)))
+            drawn = part.noise.draw(part.misfit(own), part.n_samples, uniform)
+            named |= {self.name_of(key, name): sigmas for name, sigmas in zip(names, drawn.T, strict=True)}
+        return named

@@ -49,10 +49,7 @@ class PredictedValue(NamedTuple):
 
 def data_sets(run: FinishedRun) -> list[DataSet]:
     """The data sets of a likelihood; empty for another posterior."""
-    if run.likelihood is None:
-        return []
-    keys = getattr(run.likelihood, "likelihoods", {"": None})
-    return [_data_set(key, likelihood) for key, (likelihood, _) in zip(keys, run.likelihood.parts(), strict=True)]
+    return [] if run.likelihood is None else [_data_set(*each) for each in run.likelihood.likelihoods.items()]
 
 
 def _data_set(key: str, likelihood: FELikelihood) -> DataSet:

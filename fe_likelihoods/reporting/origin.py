@@ -9,7 +9,6 @@ from typing import Any
 from samplers.smc import FEWEST_TO_RECYCLE
 
 from ..checks.run import FinishedRun
-from ..likelihood.joint import JointLikelihood
 
 __all__ = ["fingerprints", "how_to_repeat", "sampler_settings", "versions"]
 
@@ -37,10 +36,8 @@ def fingerprints(run: FinishedRun) -> list[tuple[str, str]]:
             digest = f"none: {error}"
         if digest:
             found.append(("posterior" if name == "fingerprint" else "data", str(digest)))
-    if isinstance(run.likelihood, JointLikelihood):
-        found += [(f"model of {key}", each.model.fingerprint) for key, each in run.likelihood.likelihoods.items()]
-    elif run.likelihood is not None:
-        found.append(("model", run.likelihood.model.fingerprint))
+    for key, each in {} if run.likelihood is None else run.likelihood.likelihoods.items():
+        found.append((f"model of {key}" if key else "model", each.model.fingerprint))
     return found
 
 
