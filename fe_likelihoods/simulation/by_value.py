@@ -10,7 +10,6 @@ notebook functions work. The worker imports this library, installed packages and
 * A worker refuses everything if its version of this library has different source code.
 """
 
-import builtins
 import contextlib
 import dis
 import functools
@@ -52,7 +51,6 @@ _LOCKS = (type(threading.Lock()), type(threading.RLock()))
 _CACHED = type(functools.cache(len))
 _CODE = (types.FunctionType, type, _CACHED)
 _OF_THE_IMPORT = {"__builtins__", "__loader__", "__spec__", "__cached__"}
-_OF_A_FUNCTION = tuple(f"__{name}__" for name in "name qualname defaults kwdefaults annotations doc module".split())
 _COMPILED = tuple(importlib.machinery.EXTENSION_SUFFIXES)
 _lock = threading.RLock()
 _arriving: dict[str, types.ModuleType] | None = None  # modules of the function that is being loaded
@@ -218,7 +216,6 @@ class _Pickler(cloudpickle.Pickler):
     def __init__(self, file: io.BytesIO) -> None:
         super().__init__(file, protocol=5)
         self.registered: list[types.ModuleType] = []
-        self._namespaces: dict[str, _Namespace] = {}
         self._of_user: dict[Any, types.ModuleType | None] = {}
 
     def _module(self, name: Any) -> types.ModuleType | None:
@@ -269,25 +266,17 @@ class _Pickler(cloudpickle.Pickler):
         return _new_module, (name,), (parent, sent), None, None, _fill_module
 
     def _function(self, function: types.FunctionType) -> Any:
-        """Reduce a function; a user function gets the namespace of its module."""
-        module, names = self._module(function.__globals__.get("__name__")), names_in(function.__code__)
+        """Reduce a function; a user function gets the namespace of its module, and the modules that it imports."""
+        module = self._module(function.__globals__.get("__name__"))
         if module is None or vars(module) is not function.__globals__:
             self._module(function.__module__)
             return super().reducer_override(function)
-        namespace = self._namespaces.setdefault(module.__name__, _Namespace(module))
-        used = {}
-        if module.__name__ in SCRIPTS:
-            used = {name: value for name, value in vars(module).copy().items() if name in names.all}
-        imported = _resolved(names.imported, module.__dict__.get("__package__") or "")
-        state = (
-            used,
-            [*filter(None, map(self._module, imported)), *_named_modules(vars(module), names.all)],
-            {name: getattr(function, name) for name in _OF_A_FUNCTION},
-            [cell for cell in function.__closure__ or ()],
-            vars(function),
-        )
-        code = function.__code__
-        return _new_function, (code, namespace, len(code.co_freevars)), state, None, None, _fill_function
+        # where cloudpickle keeps the future globals of the functions of a module
+        self.globals_ref.setdefault(id(function.__globals__), _Namespace(module))
+        reduced = self._dynamic_function_reduce(function)
+        imported = _resolved(names_in(function.__code__).imported, module.__dict__.get("__package__") or "")
+        reduced[2][1]["_cloudpickle_submodules"].extend(filter(None, map(self._module, imported)))
+        return reduced
 
 
 class _Names(NamedTuple):
@@ -324,42 +313,17 @@ def _resolved(imported: frozenset[str], package: str) -> set[str]:
     return found
 
 
-def _named_modules(values: Mapping[str, Any], names: frozenset[str]) -> list[types.ModuleType]:
-    """Modules that code names, also as ``package.module``; a worker must import them too."""
-    found = []
-    for module in [values[name] for name in sorted(names & values.keys())]:
-        if isinstance(module, types.ModuleType):
-            inner = {name: sys.modules.get(f"{module.__name__}.{name}") for name in names & vars(module).keys()}
-            found += [module, *(_named_modules(inner, names) if hasattr(module, "__path__") else ())]
-    return found
+class _Namespace(NamedTuple):
+    """The globals of a module; a receiving process uses those of its copy of the module, this one a copy of them."""
 
-
-def _new_function(code: types.CodeType, namespace: dict[str, Any], n_cells: int) -> types.FunctionType:
-    namespace.setdefault("__builtins__", builtins)
-    cells = tuple(types.CellType() for _ in range(n_cells)) or None  # as a function that was not sent
-    return types.FunctionType(code, namespace, None, None, cells)
-
-
-def _fill_function(function: types.FunctionType, state: tuple) -> None:
-    used, _, attributes, cells, others = state
-    if _arriving is not None:
-        function.__globals__.update(used)
-    for name, value in attributes.items():
-        setattr(function, name, value)
-    for cell, sent in zip(function.__closure__ or (), cells, strict=True):
-        with contextlib.suppress(ValueError):  # an empty cell
-            cell.cell_contents = sent.cell_contents
-    vars(function).update(others)
-
-
-class _Namespace:
-    """The globals of a module; the receiving process uses the globals of its own copy of the module."""
-
-    def __init__(self, module: types.ModuleType) -> None:
-        self._module = module
+    module: types.ModuleType
 
     def __reduce__(self) -> tuple:
-        return vars, (self._module,)
+        return _globals_of, (self.module,)
+
+
+def _globals_of(module: types.ModuleType) -> dict[str, Any]:
+    return vars(module).copy() if _arriving is None else vars(module)
 
 
 def _new_module(name: str) -> types.ModuleType:
