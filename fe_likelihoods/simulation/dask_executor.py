@@ -5,13 +5,11 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
 from functools import cache, partial
 from queue import Empty, SimpleQueue
 from typing import Any
-
-from samplers.interrupts import SentFunction
 
 from .faults import TransientReason
 from .local_pool import Outcome, results_of
@@ -22,7 +20,7 @@ __all__ = ["DaskExecutor", "wait_for_nanny"]
 logger = logging.getLogger(__name__)
 
 SECONDS_BETWEEN_CHECKS = 5.0  # of the workers
-SECONDS_TO_RETURN = 15.0  # until a nanny has restarted a worker process
+CHECKS_UNTIL_LOST = 3  # in which a job has no worker: a nanny restarts a worker process within 15 s
 LONGEST_WITHOUT_WORKER = 3600.0  # [s] that simulations wait while a cluster has no worker
 _NO_WORKERS = (
     "the dask cluster has had no worker for {:g} s: start workers or scale the cluster, or wait longer by "
@@ -34,7 +32,7 @@ _DIED = TransientReason("the worker process died in every attempt of dask")
 class _Item(Future):
     """Future of one item; `was_lost` says that dask has given it up, because workers died that had received it."""
 
-    def __init__(self, function: SentFunction, item: Any) -> None:
+    def __init__(self, function: Callable, item: Any) -> None:
         super().__init__()
         self.function, self.item, self.was_lost = function, item, False
 
@@ -50,16 +48,14 @@ class DaskExecutor(PoolExecutor):
     Parameters
     ----------
     pool : dask.distributed.Client
-    resources : dict of str to float, optional
-        Worker resources that one simulation needs, such as ``{"GPU": 1}``.
     longest_wait : float, optional
-        How long simulations wait for a cluster without workers before the run ends with an error [s]; one hour by
-        default. Increase it if jobs wait longer in the queue of the machine.
+        How long simulations wait for a cluster without workers before the run ends with an error [s]. Increase it if
+        jobs wait longer in the queue of the machine.
 
     Raises
     ------
     ValueError
-        If `longest_wait` or an amount of `resources` is not positive.
+        If `longest_wait` is not positive.
 
     Examples
     --------
@@ -75,28 +71,20 @@ class DaskExecutor(PoolExecutor):
     other_processes = True
     submits = True
 
-    def __init__(
-        self, pool: Any, resources: Mapping[str, float] | None = None, longest_wait: float | None = None
-    ) -> None:
+    def __init__(self, pool: Any, longest_wait: float = LONGEST_WITHOUT_WORKER) -> None:
         super().__init__(pool)
-        self.resources = dict(resources or {})
-        if longest_wait is not None and not longest_wait > 0:
-            raise ValueError(f"longest_wait must be a positive number of seconds, or None; got {longest_wait!r}")
-        if any(not amount > 0 for amount in self.resources.values()):
-            raise ValueError(f"resources must be positive amounts by name, such as {{'GPU': 1}}; got {resources}")
+        if not longest_wait > 0:
+            raise ValueError(f"longest_wait must be a positive number of seconds; got {longest_wait!r}")
         self._longest_wait = longest_wait
         self._lock = threading.RLock()
         self._sent: dict[Any, _Item] = {}  # by dask's future
         self._lost: deque[_Item] = deque()
         self._ended: SimpleQueue | None = None  # dask's futures that have ended; None while no item is sent
-        self._no_workers: RuntimeError | None = None
-        self._workers = _Workers()
+        self._absent: dict[Any, int] = {}  # checks in which a job that has started had no worker
 
     @property
     def n_workers(self) -> int | None:
         """Number of simulations that run at once on the present workers."""
-        if self.resources:
-            return self.pool.run_on_scheduler(_places, self.resources) or None
         return sum(self.pool.nthreads().values()) or None
 
     def map(self, function: Callable[[Any], Outcome], items: Iterable[Any]) -> list[Outcome]:
@@ -105,7 +93,7 @@ class DaskExecutor(PoolExecutor):
 
     def submit_all(self, function: Callable[[Any], Outcome], items: Sequence[Any]) -> list[Future]:
         """As `PoolExecutor.submit_all`."""
-        sent = self._by_value(function)
+        sent = partial(_run, self._by_value(function))
         futures = [_Item(sent, item) for item in items]
         if not futures:
             return futures
@@ -114,14 +102,11 @@ class DaskExecutor(PoolExecutor):
             logger.warning(text, len(items))
         with self._lock:
             starts = self._ended is None
-            if starts:
-                self._start_lost_workers()
-                self._ended, self._no_workers = SimpleQueue(), None
+            self._ended = SimpleQueue() if starts else self._ended
             self._send(futures)
-            if starts:
-                # not in dask's threads, which Python joins at exit: it would wait for ever if the scheduler is lost
-                for target in (self._receive, self._watch):
-                    threading.Thread(target=target, args=(self._ended,), name="dask", daemon=True).start()
+        if starts:
+            # not in dask's threads, which Python joins at exit: it would wait for ever if the scheduler is lost
+            threading.Thread(target=self._receive, args=(self._ended,), name="dask", daemon=True).start()
         return futures
 
     def give_up(self, futures: Sequence[Future], running: bool = True) -> None:
@@ -129,8 +114,7 @@ class DaskExecutor(PoolExecutor):
         wanted = set(futures)
         with self._lock:
             at_work = set() if running else {key for keys in self.pool.processing().values() for key in keys}
-            inner = [each for each, item in self._sent.items() if item in wanted]
-            inner = [each for each in inner if getattr(each, "key", None) not in at_work]
+            inner = [each for each, item in self._sent.items() if item in wanted and each.key not in at_work]
             for each in inner:
                 del self._sent[each]
             wanted -= set(self._sent.values())
@@ -144,21 +128,16 @@ class DaskExecutor(PoolExecutor):
 
     def _send(self, items: list[_Item]) -> None:
         """Send items with the same function. The lock is held."""
-        options = {"resources": self.resources} if self.resources else {}
-        run = partial(_run, items[0].function)
-        inner = self.pool.map(run, [each.item for each in items], pure=False, **options)
+        inner = self.pool.map(items[0].function, [each.item for each in items], pure=False)
         self._sent |= zip(inner, items, strict=True)
         for each in inner:
             each.add_done_callback(self._ended.put)
 
-    def _start_lost_workers(self) -> None:
-        with contextlib.suppress(Exception):  # there is no cluster object, or it is closing
-            self._workers.start_lost(self.pool.cluster)
-
-    # in separate threads ------------------------------------------------------------------------------------------
+    # in a thread --------------------------------------------------------------------------------------------------
 
     def _receive(self, ended: SimpleQueue) -> None:
-        """Receive results, several at once if possible, until no item is left."""
+        """Receive results, several at once if possible, and check the workers from time to time, until nothing runs."""
+        error, check, last_seen = None, 0.0, time.monotonic()
         while True:
             with self._lock:
                 if not self._sent and self._lost:
@@ -166,8 +145,18 @@ class DaskExecutor(PoolExecutor):
                 if not self._sent:
                     self._ended = None
                     return
-            inner = [ended.get()]
+            if time.monotonic() >= check:
+                with contextlib.suppress(Exception):  # the cluster is closing, or there is no cluster object
+                    last_seen = time.monotonic() if self.pool.nthreads() else last_seen
+                    self._start_lost_workers(self.pool.cluster)
+                if error is None and time.monotonic() - last_seen > self._longest_wait:
+                    error = RuntimeError(_NO_WORKERS.format(self._longest_wait))
+                    with contextlib.suppress(Exception):
+                        self.pool.cancel(list(self._sent), force=True)
+                check = time.monotonic() + SECONDS_BETWEEN_CHECKS
+            inner = []
             with contextlib.suppress(Empty):
+                inner.append(ended.get(timeout=max(0.0, check - time.monotonic())))
                 while True:
                     inner.append(ended.get_nowait())
             finished = [each for each in inner if each is not None and each.status == "finished"]
@@ -178,9 +167,9 @@ class DaskExecutor(PoolExecutor):
                 with self._lock:
                     item = self._sent.pop(each, None)
                 if item is not None:  # else it was given up meanwhile
-                    self._receive_one(each, item, results)
+                    self._receive_one(each, item, results, error)
 
-    def _receive_one(self, inner: Any, item: _Item, results: dict[Any, Any]) -> None:
+    def _receive_one(self, inner: Any, item: _Item, results: dict[Any, Any], no_workers: RuntimeError | None) -> None:
         """Pass on an item's result or error."""
         try:
             resolve(item, results[inner] if inner in results else inner.result())
@@ -190,71 +179,28 @@ class DaskExecutor(PoolExecutor):
             elif type(error).__name__ == "KilledWorker":
                 item.was_lost = True
                 self._lost.append(item)
-            elif self._no_workers or not isinstance(error, Exception) or type(error).__name__ == "FutureCancelledError":
+            elif no_workers or not isinstance(error, Exception) or type(error).__name__ == "FutureCancelledError":
                 text = f"dask has cancelled a simulation ({error}); run again with a new client"
-                resolve(item, error=self._no_workers or RuntimeError(text))
+                resolve(item, error=no_workers or RuntimeError(text))
             else:
                 resolve(item, error=error)
 
-    def _watch(self, ended: SimpleQueue) -> None:
-        """Until all items have ended: request lost workers again; cancel all items after too long without workers."""
-        last_seen = time.monotonic()
-        while True:
-            time.sleep(SECONDS_BETWEEN_CHECKS)
-            if ended is not self._ended:
-                return
-            self._start_lost_workers()
-            with contextlib.suppress(Exception):
-                last_seen = time.monotonic() if self.pool.nthreads() else last_seen
-            longest = LONGEST_WITHOUT_WORKER if self._longest_wait is None else self._longest_wait
-            if time.monotonic() - last_seen > longest and ended is self._ended:
-                self._no_workers = RuntimeError(_NO_WORKERS.format(longest))
-                with contextlib.suppress(Exception):
-                    self.pool.cancel(list(self._sent), force=True)
-                return
+    def _start_lost_workers(self, cluster: Any) -> None:
+        """Start workers and jobs again that the cluster has lost.
 
-
-class _Workers:
-    """Starts workers of a cluster again that were present, and are absent although the cluster wants them.
-
-    If a worker is absent 15 s after it was lost (``distributed.deploy.lost-worker-timeout``), dask closes its nanny and
-    never starts the worker again, although on a busy machine the new process may need longer, or a simulation may have
-    killed it once more. A dask-jobqueue cluster never notices that a job with several workers has ended, for example at
-    its walltime, so such a job is submitted again. Queued jobs are left alone.
-    """
-
-    def __init__(self) -> None:
-        self._seen: dict[Any, float] = {}  # when workers and jobs that have started were last present, or are due
-
-    def start_lost(self, cluster: Any) -> None:
-        """Note which workers and jobs are present, and start those again that the cluster has lost."""
-        wanted, known = dict(getattr(cluster, "worker_spec", {})), set(getattr(cluster, "workers", ()))
+        If a worker is absent 15 s after it was lost (``distributed.deploy.lost-worker-timeout``), dask closes its nanny
+        and never starts the worker again, until it is scaled. A dask-jobqueue cluster never notices that a job with
+        several workers has ended, for example at its walltime. Queued jobs are left alone.
+        """
+        wanted = dict(cluster.worker_spec)
+        here = {worker["name"] for worker in cluster.scheduler_info["workers"].values()}
         jobs = {name: spec["group"] for name, spec in wanted.items() if "group" in spec}
-        names = {worker["name"] for worker in cluster.scheduler_info["workers"].values()} if jobs else set()
-        here = {n for n in known if n not in jobs or any(f"{n}{suffix}" in names for suffix in jobs[n])}
-        now = time.monotonic()
-        self._seen = {name: now if name in here else seen for name, seen in self._seen.items() if name in wanted}
-        self._seen |= {name: now for name in here & wanted.keys()}
-        absent = self._seen.keys() - here
-        ended = {n for n in absent & jobs.keys() & known if now - self._seen[n] > SECONDS_TO_RETURN}
-        lost = ended | {n for n in absent - jobs.keys() if now >= self._seen[n]}
-        if lost:
-            what = f"{len(lost)} of its {len(wanted)} {'jobs' if ended else 'workers'}"
-            logger.warning("The dask cluster has given up %s: starting them again", what)
-            for name in lost & jobs.keys():
-                del self._seen[name]  # the new job may be in the queue for long
-            self._seen |= {name: now + SECONDS_TO_RETURN for name in lost - jobs.keys()}
-            if ended:
-                cluster.sync(cluster.scale_down, ended)
-            cluster.scale(sum(len(spec.get("group", " ")) for spec in wanted.values()))
-
-
-def _places(resources: dict[str, float], dask_scheduler: Any) -> int:
-    """Number of simulations that fit on the workers; called in the scheduler."""
-    return sum(
-        min(worker.nthreads, *(int(worker.resources.get(name, 0.0) // amount) for name, amount in resources.items()))
-        for worker in dask_scheduler.workers.values()
-    )
+        running = {name for name, group in jobs.items() if any(f"{name}{suffix}" in here for suffix in group)}
+        started = (self._absent.keys() | running) & jobs.keys()
+        self._absent = {name: 0 if name in running else self._absent[name] + 1 for name in started}
+        if ended := {name for name, checks in self._absent.items() if checks == CHECKS_UNTIL_LOST}:
+            cluster.sync(cluster.scale_down, ended)
+        cluster.scale(sum(len(spec.get("group", " ")) for spec in wanted.values()))
 
 
 def _run(function: Callable, item: Any) -> Any:

@@ -2,15 +2,12 @@
 
 import os
 import signal
-import threading
 import time
 from pathlib import Path
 
 import numpy as np
 
 from tests.faults.treacherous import Treacherous, line
-
-_lock, _running, most = threading.Lock(), 0, 0
 
 
 class EndsItsJob(Treacherous):
@@ -26,18 +23,6 @@ class EndsItsJob(Treacherous):
             return line(theta)
         os.kill(os.getppid(), signal.SIGKILL)  # of both workers, which end with it
         time.sleep(3600)
-
-
-def counted(item: int) -> tuple[int, str]:
-    """An outcome; notes in `most` how many calls run at once in the threads of a process."""
-    global _running, most
-    with _lock:
-        _running += 1
-        most = max(most, _running)
-    time.sleep(0.1)
-    with _lock:
-        _running -= 1
-    return item, ""
 
 
 class Gate:

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from fe_likelihoods.models.function import FunctionModel
-from fe_likelihoods.simulation import dask_executor
 from fe_likelihoods.simulation.executors import LocalPool
 from fe_likelihoods.simulation.model import simulate_batch
 from samplers import SMCSampler
@@ -134,12 +133,11 @@ def _interrupts(item):
 @pytest.mark.slow
 @needs("dask")
 @needs("distributed")
-def test_dask_gives_up_every_worker_that_dies(tmp_path, monkeypatch):
+def test_dask_gives_up_every_worker_that_dies(tmp_path):
     """A cluster that does not wait for the next process of a worker, as a busy machine is too slow for it."""
     import dask
     from dask.distributed import Client, LocalCluster
 
-    monkeypatch.setattr(dask_executor, "LONGEST_WITHOUT_WORKER", 300.0)
     x = np.column_stack([np.concatenate([theta(bad.FINE, 2), theta(bad.KILLED)]), np.full(3, 0.5)])
     with (
         dask.config.set({"distributed.scheduler.allowed-failures": 2, "distributed.deploy.lost-worker-timeout": "0s"}),
@@ -155,11 +153,9 @@ def test_dask_gives_up_every_worker_that_dies(tmp_path, monkeypatch):
 @pytest.mark.slow
 @needs("dask")
 @needs("distributed")
-def test_dask_retries_and_gives_up_on_the_item_that_kills_its_worker_only(tmp_path, monkeypatch):
+def test_dask_retries_and_gives_up_on_the_item_that_kills_its_worker_only(tmp_path):
     import dask
     from dask.distributed import Client, LocalCluster
-
-    monkeypatch.setattr(dask_executor, "LONGEST_WITHOUT_WORKER", 300.0)
 
     thetas = np.concatenate([theta(bad.FINE, 3), theta(bad.KILLED), theta(bad.FINE, 3)])
     x = np.column_stack([thetas, np.full(7, 0.5)])
