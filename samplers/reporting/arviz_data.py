@@ -54,7 +54,8 @@ def to_arviz(
     prediction : fe_likelihoods.prediction.prediction.Prediction, optional
         The result of `fe_likelihoods.propagate`; adds the group ``predictions``.
     parameter_names : sequence of str, optional
-        One name per parameter; by default the names of the posterior, or else theta_0, theta_1, ...
+        One name per parameter; by default the names of the posterior, or those given to the sampler (of a group
+        ``name`` with several, name_0, name_1, ...), or else theta_0, theta_1, ...
     discard : int
         Burn-in of each run, in steps. Chains of SMC and TMCMC have none.
     draws : int
@@ -93,7 +94,7 @@ def to_arviz(
         _check_posterior(posterior, runs[0])
         known = posterior
     if parameter_names is None:
-        parameter_names = getattr(known, "parameter_names", None)
+        parameter_names = getattr(known, "parameter_names", None) or _names_in_emcee(runs[0])
     names = names_of_parameters(parameter_names, runs[0].ndim)
     if not all(hasattr(run, "get_chain") and run.ndim == len(names) for run in runs):
         raise ValueError(f"expected samplers of {len(names)} parameters; got {[type(run).__name__ for run in runs]}")
@@ -103,7 +104,10 @@ def to_arviz(
     groups = {
         "posterior": _parameter_group(chains, names, described, notes),
         "sample_stats": xarray.Dataset(
-            {name: (("chain", "draw"), values) for name, values in stats.items()},
+            {
+                name: (("chain", "draw", *(f"{name}_dim_{i}" for i in range(values.ndim - 2))), values)
+                for name, values in stats.items()
+            },
             _coordinates(*chains.shape[:2]),
             _statistics_of_runs(runs),
         ),
@@ -150,13 +154,15 @@ def _check_posterior(posterior: Any, run: Any) -> None:
 
 
 def _ordered(runs: Sequence[Any], discard: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Chains (n_runs, n_draws, ndim) in the order of founder, walker and step, and statistics (n_runs, n_draws)."""
+    """Chains (n_runs, n_draws, ndim) in the order of founder, walker and step, and statistics of draws."""
     shapes = [run.get_chain(discard=discard).shape for run in runs]
     if len(set(shapes)) > 1 or 0 in shapes[0]:
         raise ValueError(f"all runs must have chains of the same shape, with one step or more; got {shapes}")
     n_steps, n_walkers, _ = shapes[0]
     chains, stats = [], {"lp": [], "step": [], "walker": [], "founder": []}
-    for run in runs:
+    blobs = [_blobs(run, discard) for run in runs]
+    stats |= {name: [] for name in blobs[0] if all(name in each for each in blobs)}
+    for run, own in zip(runs, blobs, strict=True):
         founders = run.founders if is_tempered(run) else np.arange(n_walkers)
         order = np.argsort(founders, kind="stable")
         chains.append(run.get_chain(discard=discard)[:, order].swapaxes(0, 1).reshape(-1, run.ndim))
@@ -164,7 +170,31 @@ def _ordered(runs: Sequence[Any], discard: int) -> tuple[np.ndarray, dict[str, n
         stats["step"].append(np.tile(discard + np.arange(n_steps), n_walkers))
         stats["walker"].append(np.repeat(order, n_steps))
         stats["founder"].append(np.repeat(founders[order], n_steps))
+        for name in stats.keys() & own.keys():
+            values = own[name][:, order].swapaxes(0, 1)
+            stats[name].append(values.reshape(-1, *values.shape[2:]))
     return np.stack(chains), {name: np.stack(values) for name, values in stats.items()}
+
+
+def _names_in_emcee(run: Any) -> list[str] | None:
+    """Names given to an emcee sampler, one per parameter; None without them."""
+    if not getattr(run, "params_are_named", False):
+        return None
+    names = {}
+    for name, places in run.parameter_names.items():
+        places = np.atleast_1d(places)
+        names |= {int(k): name if len(places) == 1 else f"{name}_{i}" for i, k in enumerate(places)}
+    return [names.get(k, f"theta_{k}") for k in range(run.ndim)]
+
+
+def _blobs(run: Any, discard: int) -> dict[str, np.ndarray]:
+    """Blobs (n_steps, n_walkers, ...) by their names, or as ``blobs``; objects are left out."""
+    found = run.get_blobs(discard=discard)
+    if found is None:
+        return {}
+    named = {name: found[name] for name in found.dtype.names} if found.dtype.names else {"blobs": found}
+    ours = ("lp", "step", "walker", "founder", "chain", "draw")
+    return {f"blob_{k}" if k in ours else k: each for k, each in named.items() if each.dtype.kind in "fiubcUSmM"}
 
 
 def _coordinates(n_chains: int, draws: int | np.ndarray) -> dict[str, np.ndarray]:

@@ -136,6 +136,39 @@ def test_chain_of_emcee_in_the_order_of_its_walkers():
     assert "observed_data" not in data if GENERATION else not hasattr(data, "observed_data")
 
 
+def gaussian_with_blobs(x):
+    return -0.5 * float(x @ x), 2.0 * x[0], x[:2] + 1.0
+
+
+@pytest.mark.parametrize("kind", [emcee.EnsembleSampler, SMCSampler])
+@pytest.mark.parametrize("dtype", [None, [("twice", float), ("lp", float, 2)]])
+def test_blobs_and_names_given_to_the_sampler(kind, dtype, tmp_path):
+    names = {"k": 0, "damping": [1, 2]}
+
+    def target(theta):
+        x = np.array([theta["k"], *theta["damping"]])
+        value, twice, more = gaussian_with_blobs(x)
+        return (value, twice, more) if dtype else (value, twice)
+
+    options = {"blobs_dtype": dtype, "parameter_names": names}
+    if kind is SMCSampler:
+        options |= {"log_prior_fn": lambda theta: stats.norm.logpdf([theta["k"], *theta["damping"]]).sum(), "seed": 1}
+    sampler = kind(40, 3, target, **options)
+    start = np.random.default_rng(0).normal(size=(40, 3))
+    if kind is SMCSampler:
+        sampler.run_mcmc(start, 2)
+    else:
+        sampler.run_mcmc(start, 12)
+    data = to_arviz(sampler, discard=0)
+    data.to_netcdf(str(tmp_path / "run.nc"))
+    again = arviz.from_netcdf(str(tmp_path / "run.nc"))
+    assert set(again["posterior"].data_vars) == {"k", "damping_0", "damping_1"}
+    blob = again["sample_stats"]["twice" if dtype else "blobs"]
+    assert np.array_equal(blob.values, 2.0 * again["posterior"]["k"].values)
+    if dtype:
+        assert np.array_equal(again["sample_stats"]["blob_lp"][..., 1], again["posterior"]["damping_0"] + 1.0)
+
+
 def test_groups_have_units_and_are_read_back(tmp_path, data, linear, runs):
     data.to_netcdf(str(tmp_path / "run.nc"))
     again = arviz.from_netcdf(str(tmp_path / "run.nc"))
