@@ -15,7 +15,7 @@ Communications 181, 259-270, doi:10.1016/j.cpc.2009.09.018.
 """
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -26,6 +26,9 @@ from ..priors.distributions import Distribution
 from ..priors.priors import Prior
 from ..simulation.model import Model, most_responses, simulate_batch
 from ..text_tables import number, text_table
+
+if TYPE_CHECKING:
+    import pandas
 
 __all__ = ["Sensitivity", "sensitivity"]
 
@@ -75,6 +78,16 @@ class Sensitivity(NamedTuple):
         return "\n".join(lines)
 
     __repr__ = __str__
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """The indices as a `pandas.DataFrame`, with a row for each quantity and parameter."""
+        import pandas
+
+        index = pandas.MultiIndex.from_product(
+            [range(len(self.mean)), self.parameter_names], names=["quantity", "parameter"]
+        )
+        names = ("first", "first_error", "total", "total_error")
+        return pandas.DataFrame({name: np.ravel(getattr(self, name)) for name in names}, index=index)
 
 
 def sensitivity(

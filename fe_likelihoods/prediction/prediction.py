@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,6 +15,9 @@ from ..text_tables import number, text_table
 from ..units import find_unit
 from .quantities import measured_quantity
 from .score_tables import HistoryScores, QuantityScores, envelope, score_histories, score_values
+
+if TYPE_CHECKING:
+    import xarray
 
 __all__ = ["Prediction"]
 
@@ -212,6 +216,44 @@ class Prediction:
         units = [c.unit for c in self.channels] if known else ["SI"] * observed.size
         values = self.values.reshape(len(self.values), -1)
         return score_values(names, units, values, observed.ravel(), level, self.effective_sample_size)
+
+    def to_xarray(self) -> "xarray.Dataset":
+        """Mean, standard deviation and quantiles with their coordinates, and `values` where they are kept.
+
+        Returns
+        -------
+        xarray.Dataset
+            Of a history ``<channel>_mean`` and ``<channel>_sd`` over ``time`` [s], ``<channel>_quantiles`` over
+            ``probability`` and ``time``; else ``mean``, ``sd``, ``quantiles`` and ``values``. In SI units; the group
+            ``predictions`` of `samplers.to_arviz`.
+
+        Examples
+        --------
+        >>> predicted = propagate(posterior, samples[:40], progress=False).to_xarray()
+        >>> predicted["displacement_mean"].dims, predicted["time"].attrs["units"]
+        (('time',), 's')
+        """
+        import xarray
+
+        attributes = {name: getattr(self, name) for name in ("n_samples", "n_failed", "from_state")}
+        attributes["noise"] = int(self.noise)
+        columns: dict[str, Any] = {"probability": np.array(self.probabilities)}
+        if self.dt is not None:
+            columns["time"] = ("time", self.time, {"units": "s", "long_name": "time [s]"})
+            variables: dict[str, Any] = {}
+            for row, channel in enumerate(self.channels):
+                name, unit = channel.name, channel.si_unit
+                about = {"units": unit, "long_name": f"{name} [{unit}]", "quantity": channel.quantity}
+                variables[f"{name}_mean"] = ("time", self.mean[row], about)
+                variables[f"{name}_sd"] = ("time", self.sd[row], about)
+                variables[f"{name}_quantiles"] = (("probability", "time"), self.quantiles[:, row], about)
+            return xarray.Dataset(variables, columns, attributes)
+        dims = tuple(f"quantity_dim_{i}" for i in range(np.ndim(self.mean)))
+        variables = {"mean": (dims, self.mean), "sd": (dims, self.sd)}
+        variables["quantiles"] = (("probability", *dims), self.quantiles)
+        if self.values is not None:
+            variables["values"] = (("sample", *dims), self.values)
+        return xarray.Dataset(variables, columns, attributes)
 
     def _near_quantile(self, probability: float) -> np.ndarray:
         """The quantile for a probability that is known up to round-off."""

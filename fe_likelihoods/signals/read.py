@@ -56,6 +56,7 @@ def read_record(
     time: int | str | None = None,
     time_unit: str | None = None,
     skip: int | None = None,
+    inventory: str | Path | None = None,
 ) -> Record:
     """Read a ground motion from a file in any supported format, which is recognised by the first lines.
 
@@ -106,6 +107,9 @@ def read_record(
         times, unless `time` is another one.
     skip : int, optional
         Number of lines above the table, if they are not found. What they state is ignored.
+    inventory : str or path, optional
+        StationXML file of the recorder, with which counts in a miniSEED file become m/s2 (obspy's
+        ``remove_response``). The lowest frequencies of a seismometer for velocities are not restored.
 
     Returns
     -------
@@ -130,6 +134,8 @@ def read_record(
     if channel is not None and column is not None:
         raise ValueError(f"{path}: give channel= or column=, not both; they name the same")
     channel = column if channel is None else channel
+    if inventory is not None and recognise_format(path) != "obspy":
+        raise ValueError(f"{path}: inventory= is for miniSEED, SAC and GSE2 files; leave it out")
     form, file, name = recognise_format(path), str(path), Path(path).stem
     table = {"time": time, "time_unit": time_unit, "skip": skip, "missing": missing}
     if form is None:
@@ -147,7 +153,7 @@ def read_record(
         block = _v2_channel(path, channel, member)
         series, file = strong_motion.parse_v2(block), block.file
     elif form == "obspy":
-        series = strong_motion.parse_obspy(path, channel)
+        series = strong_motion.parse_obspy(path, channel, inventory)
     elif form == "geonet":
         series = _geonet_component(path, channel)
     else:

@@ -683,8 +683,8 @@ _OBSPY = {"miniSEED": "MSEED", "SAC": "SAC", "GSE2": "GSE2"}  # names in `recogn
 _NO_ACCELERATION = {6: "displacement", 7: "velocity"}  # IDEP in a SAC header
 
 
-def parse_obspy(path: str | Path, channel: str | None) -> Series:
-    """Return the samples of one trace in a miniSEED, SAC or GSE2 file."""
+def parse_obspy(path: str | Path, channel: str | None, inventory: str | Path | None = None) -> Series:
+    """Return the samples of one trace in a miniSEED, SAC or GSE2 file, in m/s2 with the `inventory` of its recorder."""
     try:
         import obspy
     except ImportError as error:
@@ -712,10 +712,20 @@ def parse_obspy(path: str | Path, channel: str | None) -> Series:
             f"{path}: {trace.id} lacks {np.ma.count_masked(trace.data)} samples; an excitation needs all samples: cut "
             "the record, or fill the gaps in obspy"
         )
-    if not np.issubdtype(trace.data.dtype, np.floating):
+    if inventory is not None:
+        try:
+            # neither taper nor mean are removed: the record of an event may begin and end with motion
+            stations = obspy.read_inventory(io.BytesIO(read_bytes(inventory)), format="STATIONXML")
+            trace.remove_response(stations, output="ACC", water_level=60.0, zero_mean=False, taper=False)
+        except Exception as error:  # no response of this channel at this time, or anything else
+            raise ValueError(
+                f"{path}: obspy cannot apply the inventory {inventory} to {trace.id} ({error}); give the StationXML "
+                "file with the response of this channel at the time of the record"
+            ) from error
+    elif not np.issubdtype(trace.data.dtype, np.floating):
         raise ValueError(
-            f"{path}: the samples of {trace.id} are whole numbers, counts of a recorder; remove the response of the "
-            "instrument in obspy, stream.remove_response(inventory, output='ACC'), and write the file again"
+            f"{path}: the samples of {trace.id} are whole numbers, counts of a recorder; give the StationXML file "
+            "of the station, inventory="
         )
     quantity = _NO_ACCELERATION.get(trace.stats.get("sac", {}).get("idep"))
     if quantity is not None:
@@ -724,4 +734,5 @@ def parse_obspy(path: str | Path, channel: str | None) -> Series:
         )
     rate = round(1.0 / trace.stats.delta)  # SAC has the step in single precision
     dt = 1.0 / rate if rate and abs(rate * trace.stats.delta - 1.0) < 1e-6 else trace.stats.delta
-    return Series(f"{trace.id}", float(dt), None, np.asarray(trace.data, dtype=np.float64))
+    unit = None if inventory is None else "m/s2"
+    return Series(f"{trace.id}", float(dt), unit, np.asarray(trace.data, dtype=np.float64))

@@ -119,7 +119,7 @@ def to_arviz(
     if posterior is not None:
         groups |= _predictive_groups(posterior, chains, groups["observed_data"], draws, block, seed)
     if prediction is not None:
-        groups["predictions"] = _prediction_group(prediction)
+        groups["predictions"] = prediction.to_xarray()
     groups = {group: _without_slashes(dataset) for group, dataset in groups.items()}
     if arviz.__version__.startswith("0."):
         return arviz.InferenceData(**groups)
@@ -309,27 +309,3 @@ def _predictive_groups(
     about = {"note": "\n".join([blocks.note, *found.notes]), "block_seconds": blocks.seconds}
     groups["log_likelihood"] = xarray.Dataset(values, coordinates, about)
     return groups
-
-
-def _prediction_group(prediction: Any) -> "xarray.Dataset":
-    """Mean, standard deviation and quantiles of a prediction; also the values of each sample if it keeps them."""
-    import xarray
-
-    attributes = {name: getattr(prediction, name) for name in ("n_samples", "n_failed", "from_state")}
-    attributes["noise"] = int(prediction.noise)
-    columns: dict[str, Any] = {"probability": np.array(prediction.probabilities)}
-    variables: dict[str, Any] = {}
-    if prediction.dt is not None:
-        columns["time"] = ("time", prediction.time, {"units": "s", "long_name": "time [s]"})
-        for row, channel in enumerate(prediction.channels):
-            about = _about(channel, channel.name)
-            variables[f"{channel.name}_mean"] = ("time", prediction.mean[row], about)
-            variables[f"{channel.name}_sd"] = ("time", prediction.sd[row], about)
-            variables[f"{channel.name}_quantiles"] = (("probability", "time"), prediction.quantiles[:, row], about)
-        return xarray.Dataset(variables, columns, attributes)
-    dims = tuple(f"quantity_dim_{i}" for i in range(np.ndim(prediction.mean)))
-    variables |= {"mean": (dims, prediction.mean), "sd": (dims, prediction.sd)}
-    variables["quantiles"] = (("probability", *dims), prediction.quantiles)
-    if prediction.values is not None:
-        variables["values"] = (("sample", *dims), prediction.values)
-    return xarray.Dataset(variables, columns, attributes)
