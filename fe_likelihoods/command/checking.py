@@ -54,7 +54,7 @@ def check_job(file: Path, picture: Path, say: Callable[[str], None], progress: b
         say(f"Event {event.name}: {event.record.name}, {steps}, {compared}")
     if is_emcee(job):
         simulations = sampler.nwalkers * (job.sampler.steps + 1)
-        say(f"emcee makes {simulations} simulations: {sampler.nwalkers} walkers, {job.sampler['steps']} steps")
+        say(f"emcee makes {simulations} simulations: {sampler.nwalkers} walkers, {job.sampler.steps} steps")
     else:
         _say_cost(make_problem(job).posterior, job, sampler, checked, say)
     pictures = _draw(problem, checked.seconds, picture)

@@ -41,8 +41,8 @@ class Event(NamedTuple):
 def _histories_of(problem: Problem) -> tuple[FELikelihood, dict[str, str]]:
     """The likelihood of the measured histories, and its name for `propagate` if there are other data sets."""
     likelihood = problem.posterior.likelihood
-    parts = getattr(likelihood, "likelihoods", None)
-    return (likelihood, {}) if parts is None else (parts["measurements"], {"part": "measurements"})
+    parts = likelihood.likelihoods
+    return (likelihood, {}) if "" in parts else (parts["measurements"], {"part": "measurements"})
 
 
 def read_events(job: Job, problem: Problem) -> tuple[Event, ...]:

@@ -2,6 +2,7 @@
 
 import csv
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +19,10 @@ from ..signals.error_measures import rrmse
 __all__ = ["names_of", "write_csv", "write_samples", "write_tables"]
 
 
-def write_tables(folder: Path, run: FinishedRun, judgement: Judgement) -> tuple[str, ...]:
+def write_tables(folder: Path, run: FinishedRun, judgement: Judgement, agreement: str = "") -> tuple[str, ...]:
     """Write judgement, moments of the parameters, stages and errors of the fit; returns the names of the files.
 
-    A run without tempering has no ``stages.txt``.
+    `agreement` says how independent runs agree. A run without tempering has no ``stages.txt``.
     """
     from samplers import ladder_table, summary
 
@@ -41,6 +42,7 @@ def write_tables(folder: Path, run: FinishedRun, judgement: Judgement) -> tuple[
         str(moments),
         "",
         *_of_the_sampler(run),
+        *filter(None, [agreement]),
         *_model_runs(next(iter(posterior.likelihood.parts()))[0], simulations),
         "",
     ]
@@ -139,16 +141,35 @@ def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
 
 
 def write_samples(
-    folder: Path, run: FinishedRun, prediction: Prediction | None, draws: int, judgement: Judgement
-) -> str:
+    folder: Path,
+    run: FinishedRun,
+    samplers: Sequence[Any],
+    prediction: Prediction | None,
+    draws: int,
+    judgement: Judgement,
+) -> tuple[str, str]:
     """Write the samples in netCDF, with the responses of `draws` of them and the judgement as an attribute.
 
-    Returns the name of the file.
+    Independent runs are chains. Returns the name of the file, and how the runs agree, empty for one.
     """
     from samplers import to_arviz
 
-    options = {"draws": draws} if draws else {}
-    data = to_arviz(run.sampler, run.posterior if draws else None, prediction, discard=run.discard, **options)
+    options = {"draws": max(draws, len(samplers))} if draws else {}
+    data = to_arviz(samplers, run.posterior if draws else None, prediction, discard=run.discard, **options)
     data.posterior.attrs["judgement"] = str(judgement)
     data.to_netcdf(str(folder / "posterior.nc"))
-    return "posterior.nc"
+    return "posterior.nc", _agreement(data, samplers) if len(samplers) > 1 else ""
+
+
+def _agreement(data: Any, samplers: Sequence[Any]) -> str:
+    """The largest r_hat of independent runs, and their evidences, as a sentence."""
+    import arviz
+
+    found = arviz.rhat(data)
+    found = found["posterior"] if "posterior" in getattr(found, "children", {}) else found
+    name, worst = max(((name, float(each)) for name, each in found.data_vars.items()), key=lambda each: each[1])
+    text = f"{len(samplers)} independent runs: r_hat at most {worst:.3f} ({name}; above 1.01 they differ)"
+    if not hasattr(samplers[0], "log_evidence"):
+        return text
+    evidences = (f"{each.log_evidence:.2f} +- {each.log_evidence_error:.2g}" for each in samplers)
+    return f"{text}, log-evidences {', '.join(evidences)}"

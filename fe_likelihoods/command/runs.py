@@ -76,9 +76,10 @@ def run_job(
     problem = make_problem(job, SimulationCache(folder / CACHE) if job.budget.cache else None)
     if runs_code_of_user(job) and not (folder / CHAIN).exists():
         refuse_chance(problem.posterior)
-    sampler = _stored_sampler(job, problem, folder)
-    run_sampler(job, problem, sampler, progress)
-    return Outcome(folder, sampler, problem, *_write(folder, job, job.file, sampler, problem, events, progress))
+    samplers = _stored_samplers(job, problem, folder)
+    for chain, sampler in enumerate(samplers):
+        run_sampler(job, problem, sampler, progress, chain)
+    return Outcome(folder, samplers[0], problem, *_write(folder, job, job.file, samplers, problem, events, progress))
 
 
 def report_run(path: Path, runs_code: bool = False) -> Outcome:
@@ -102,20 +103,21 @@ def report_run(path: Path, runs_code: bool = False) -> Outcome:
         )
     cache = SimulationCache(folder / CACHE) if (folder / CACHE).is_file() else None
     problem = make_problem(job, cache)
-    sampler = _stored_sampler(job, problem, folder)
-    if sampler.iteration <= discarded(job):
+    samplers = _stored_samplers(job, problem, folder)
+    if min(sampler.iteration for sampler in samplers) <= discarded(job):
         raise ValueError(
             f"the run in {folder} has no samples yet; continue it with: fe-likelihoods run {origin['file']} --out "
             f"{folder}"
         )
     steps = job.sampler.steps or STEPS
-    if not is_emcee(job) and sampler.iteration >= steps:
-        # the annealing is made again without an evaluation; the chain alone has lost which walkers are copies
-        with _without_messages("samplers.tempered"):
-            sampler.run_mcmc(None, 0, progress=False)
+    for sampler in [] if is_emcee(job) else samplers:
+        if sampler.iteration >= steps:
+            # the annealing is made again without an evaluation; the chain alone has lost which walkers are copies
+            with _without_messages("samplers.tempered"):
+                sampler.run_mcmc(None, 0, progress=False)
     file = Path(origin["file"])
     events = read_events(job, problem)
-    return Outcome(folder, sampler, problem, *_write(folder, job, file, sampler, problem, events, False))
+    return Outcome(folder, samplers[0], problem, *_write(folder, job, file, samplers, problem, events, False))
 
 
 def _command(file: Path, folder: Path) -> str:
@@ -142,11 +144,16 @@ def _origin(folder: Path) -> dict[str, Any]:
     return found
 
 
-def _stored_sampler(job: Job, problem: Problem, folder: Path) -> Any:
-    """The sampler with the chain of a folder; ValueError if a chain of emcee is damaged."""
+def _stored_samplers(job: Job, problem: Problem, folder: Path) -> list[Any]:
+    """A sampler for each independent run of a folder, whose chains are in run.h5, run-2.h5, ..."""
+    names = [CHAIN, *(f"run-{k}.h5" for k in range(2, job.sampler.chains + 1))]
+    return [_stored_sampler(job, problem, folder / name, chain) for chain, name in enumerate(names)]
+
+
+def _stored_sampler(job: Job, problem: Problem, path: Path, chain: int) -> Any:
+    """The sampler with a stored chain; ValueError if a chain of emcee is damaged."""
     import emcee
 
-    path = folder / CHAIN
     backend = emcee.backends.HDFBackend(str(path))
     if is_emcee(job) and path.is_file() and path.stat().st_size:
         try:
@@ -156,7 +163,7 @@ def _stored_sampler(job: Job, problem: Problem, folder: Path) -> Any:
                 backend.get_chain(), backend.get_log_prob()
         except (*DAMAGE, ValueError) as error:
             raise _damaged(path, error) from error
-    return make_sampler(job, problem, backend)
+    return make_sampler(job, problem, backend, chain)
 
 
 @contextlib.contextmanager
@@ -172,7 +179,7 @@ def _without_messages(name: str) -> Iterator[None]:
 
 
 def _write(
-    folder: Path, job: Job, file: Path, sampler: Any, problem: Problem, events: tuple[Event, ...], progress: bool
+    folder: Path, job: Job, file: Path, samplers: list[Any], problem: Problem, events: tuple[Event, ...], progress: bool
 ) -> tuple[tuple[str, ...], tuple[str, ...], bool]:
     """Write tables, predictions, samples and report; return the last members of the `Outcome`.
 
@@ -180,6 +187,7 @@ def _write(
     """
     from ..reporting.report import write_page
 
+    sampler = samplers[0]
     run = read_run(sampler, problem.posterior, truth=problem.truth, discard=discarded(job))
     drawn = _drawn(job, problem, sampler)
     prediction = _predict(job, problem, drawn, progress)
@@ -189,10 +197,10 @@ def _write(
     measured = {event.name: event.measured for event in events if event.name in predicted and event.measured}
     judged = judge_run(run)
     judgement = judged.judgement
-    samples = write_samples(folder, run, prediction, job.prediction.draws, judgement)
+    samples, agreement = write_samples(folder, run, samplers, prediction, job.prediction.draws, judgement)
     page = folder / "report.html"
     write_page(page, run, prediction, judged, events=predicted, measured=measured, repeat=_command(file, folder))
-    tables = write_tables(folder, run, judgement)  # last: they say how many simulations there are
+    tables = write_tables(folder, run, judgement, agreement)  # last: they say how many simulations there are
     sources = {"": judgement.findings, "prediction: ": () if prediction is None else prediction.findings}
     sources |= {f"event {each.name}: ": each.findings for each in described}
     said = tuple(f"{title}{each}" for title, found in sources.items() for each in found if each.severity != NOTE)

@@ -29,8 +29,11 @@ def discarded(job: Job) -> int:
     return 0 if not is_emcee(job) else given.steps // 2 if given.discard is None else given.discard
 
 
-def make_sampler(job: Job, problem: Problem, backend: Any = None) -> Any:
-    """Make the sampler of a TOML file, in memory without a backend; ValueError for a setting names its section."""
+def make_sampler(job: Job, problem: Problem, backend: Any = None, chain: int = 0) -> Any:
+    """Make the sampler of a TOML file, in memory without a backend; ValueError for a setting names its section.
+
+    `chain` is the number of the independent run.
+    """
     import samplers
 
     if is_emcee(job):
@@ -47,7 +50,7 @@ def make_sampler(job: Job, problem: Problem, backend: Any = None) -> Any:
             posterior,
             backend=backend,
             vectorize=True,
-            seed=given.seed,
+            seed=given.seed + chain,
             guide=posterior.guide() if given.guide else None,
             max_simulations=job.budget.max_simulations,
             **settings,
@@ -61,7 +64,7 @@ def _make_emcee(job: Job, problem: Problem, backend: Any) -> Any:
     import emcee
 
     where, given, posterior = job.where("sampler"), job.sampler, problem.posterior
-    own = ("kind", "walkers", "steps", "seed", "discard")
+    own = ("kind", "walkers", "steps", "seed", "chains", "discard")
     for key, value in given.given().items():
         if key not in own and value is not False:
             raise ValueError(f"{where} {key}: emcee has no such setting; it has {', '.join(own)}: leave it out")
@@ -85,22 +88,22 @@ def _make_emcee(job: Job, problem: Problem, backend: Any) -> Any:
     return emcee.EnsembleSampler(walkers, posterior.ndim, posterior, vectorize=True, backend=backend)
 
 
-def run_sampler(job: Job, problem: Problem, sampler: Any, progress: bool) -> None:
+def run_sampler(job: Job, problem: Problem, sampler: Any, progress: bool, chain: int = 0) -> None:
     """Run a sampler, or continue its run, until it has made the steps that the file asks for."""
     if not is_emcee(job):  # the annealing of a stored run is made again from its record, also where no step is missing
         sampler.run_mcmc(None, max((job.sampler.steps or STEPS) - sampler.iteration, 0), progress=progress)
         return
     left = job.sampler.steps - sampler.iteration
     if left > 0:
-        start = sampler.get_last_sample() if sampler.iteration else _start(job, problem, sampler)
+        start = sampler.get_last_sample() if sampler.iteration else _start(job, problem, sampler, chain)
         sampler.run_mcmc(start, left, progress=progress)
 
 
-def _start(job: Job, problem: Problem, sampler: Any) -> Any:
+def _start(job: Job, problem: Problem, sampler: Any, chain: int) -> Any:
     """Draws of the prior with a finite posterior density, and the state of the random numbers."""
     import emcee
 
-    posterior, random = problem.posterior, np.random.RandomState(job.sampler.seed)
+    posterior, random = problem.posterior, np.random.RandomState(job.sampler.seed + chain)
     found = np.empty((0, posterior.ndim))
     for _ in range(_ROUNDS):
         points = posterior.sample_prior(sampler.nwalkers, random)

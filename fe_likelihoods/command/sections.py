@@ -239,6 +239,9 @@ class Sampler(Section):
     steps: Count = key("Sweeps at beta = 1, each of which stores all walkers (4); emcee: iterations")
     discard: Size = key("Emcee: iterations that are left out as burn-in (half of steps)")
     seed: Size = key("Seed", 1)
+    chains: Count = key(
+        "Independent runs with successive seeds, which r_hat compares; tables and report are of the first", 1
+    )
     guide: Switch = key("Find the posterior from the responses, with hundreds of simulations", False)
     preset: Annotated[Any, "one of ramancha2022, ramancha2022-constant, ching-chen-2007"] = key("Settings of papers")
     recycle: Switch = key("Reuse every evaluated point; by default with 150 walkers or more")

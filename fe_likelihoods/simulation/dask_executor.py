@@ -80,6 +80,7 @@ class DaskExecutor(PoolExecutor):
         self._sent: dict[Any, _Item] = {}  # by dask's future
         self._lost: deque[_Item] = deque()
         self._ended: SimpleQueue | None = None  # dask's futures that have ended; None while no item is sent
+        self._no_workers: RuntimeError | None = None
         self._absent: dict[Any, int] = {}  # checks in which a job that has started had no worker
 
     @property
@@ -104,9 +105,11 @@ class DaskExecutor(PoolExecutor):
             starts = self._ended is None
             self._ended = SimpleQueue() if starts else self._ended
             self._send(futures)
-        if starts:
-            # not in dask's threads, which Python joins at exit: it would wait for ever if the scheduler is lost
-            threading.Thread(target=self._receive, args=(self._ended,), name="dask", daemon=True).start()
+            if starts:
+                self._no_workers = None
+                # not in dask's threads, which Python joins at exit: it would wait for ever if the scheduler is lost
+                for target in (self._receive, self._watch):
+                    threading.Thread(target=target, args=(self._ended,), name="dask", daemon=True).start()
         return futures
 
     def give_up(self, futures: Sequence[Future], running: bool = True) -> None:
@@ -133,11 +136,10 @@ class DaskExecutor(PoolExecutor):
         for each in inner:
             each.add_done_callback(self._ended.put)
 
-    # in a thread --------------------------------------------------------------------------------------------------
+    # in separate threads ------------------------------------------------------------------------------------------
 
     def _receive(self, ended: SimpleQueue) -> None:
-        """Receive results, several at once if possible, and check the workers from time to time, until nothing runs."""
-        error, check, last_seen = None, 0.0, time.monotonic()
+        """Receive results, several at once if possible, until no item is left."""
         while True:
             with self._lock:
                 if not self._sent and self._lost:
@@ -145,18 +147,8 @@ class DaskExecutor(PoolExecutor):
                 if not self._sent:
                     self._ended = None
                     return
-            if time.monotonic() >= check:
-                with contextlib.suppress(Exception):  # the cluster is closing, or there is no cluster object
-                    last_seen = time.monotonic() if self.pool.nthreads() else last_seen
-                    self._start_lost_workers(self.pool.cluster)
-                if error is None and time.monotonic() - last_seen > self._longest_wait:
-                    error = RuntimeError(_NO_WORKERS.format(self._longest_wait))
-                    with contextlib.suppress(Exception):
-                        self.pool.cancel(list(self._sent), force=True)
-                check = time.monotonic() + SECONDS_BETWEEN_CHECKS
-            inner = []
+            inner = [ended.get()]
             with contextlib.suppress(Empty):
-                inner.append(ended.get(timeout=max(0.0, check - time.monotonic())))
                 while True:
                     inner.append(ended.get_nowait())
             finished = [each for each in inner if each is not None and each.status == "finished"]
@@ -167,9 +159,9 @@ class DaskExecutor(PoolExecutor):
                 with self._lock:
                     item = self._sent.pop(each, None)
                 if item is not None:  # else it was given up meanwhile
-                    self._receive_one(each, item, results, error)
+                    self._receive_one(each, item, results)
 
-    def _receive_one(self, inner: Any, item: _Item, results: dict[Any, Any], no_workers: RuntimeError | None) -> None:
+    def _receive_one(self, inner: Any, item: _Item, results: dict[Any, Any]) -> None:
         """Pass on an item's result or error."""
         try:
             resolve(item, results[inner] if inner in results else inner.result())
@@ -179,11 +171,28 @@ class DaskExecutor(PoolExecutor):
             elif type(error).__name__ == "KilledWorker":
                 item.was_lost = True
                 self._lost.append(item)
-            elif no_workers or not isinstance(error, Exception) or type(error).__name__ == "FutureCancelledError":
+            elif self._no_workers or not isinstance(error, Exception) or type(error).__name__ == "FutureCancelledError":
                 text = f"dask has cancelled a simulation ({error}); run again with a new client"
-                resolve(item, error=no_workers or RuntimeError(text))
+                resolve(item, error=self._no_workers or RuntimeError(text))
             else:
                 resolve(item, error=error)
+
+    def _watch(self, ended: SimpleQueue) -> None:
+        """Until all items have ended: start lost workers again; cancel all items after too long without workers.
+
+        Apart from `_receive`, which waits for workers where results were lost.
+        """
+        last_seen = time.monotonic()
+        while ended is self._ended:
+            with contextlib.suppress(Exception):  # the cluster is closing, or there is no cluster object
+                last_seen = time.monotonic() if self.pool.nthreads() else last_seen
+                self._start_lost_workers(self.pool.cluster)
+            if time.monotonic() - last_seen > self._longest_wait:
+                self._no_workers = RuntimeError(_NO_WORKERS.format(self._longest_wait))
+                with contextlib.suppress(Exception):
+                    self.pool.cancel(list(self._sent), force=True)
+                return
+            time.sleep(SECONDS_BETWEEN_CHECKS)
 
     def _start_lost_workers(self, cluster: Any) -> None:
         """Start workers and jobs again that the cluster has lost.

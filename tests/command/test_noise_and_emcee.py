@@ -7,9 +7,12 @@ import shutil
 import emcee
 import numpy as np
 import pytest
+import xarray
+from click.testing import CliRunner
 
 from fe_likelihoods import AutoregressiveNoise, GaussianNoise
 from fe_likelihoods.command.job import read_job
+from fe_likelihoods.command.main import NOT_USABLE, main
 from fe_likelihoods.command.models import make_problem
 from tests.command.test_command import OSCILLATOR, ROOT, call, folder, write_oscillator  # noqa: F401
 from tests.reporting.report_page import read_page
@@ -81,6 +84,28 @@ def test_a_noise_without_a_guide_is_told_before_the_run(folder):  # noqa: F811
     (folder / "oscillator.toml").write_text(f'{PLAIN}[noise]\nlevel = "response"\nwindow = "1 s"\n{SENSOR}')
     output = call("run", "oscillator.toml", "--quiet", code=1)
     assert "[sampler]" in output and "guide" in output and not (folder / "results-oscillator").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "sampler", ['kind = "smc"\nwalkers = 40\nsteps = 2', 'kind = "emcee"\nwalkers = 16\nsteps = 60']
+)
+def test_independent_runs_are_chains(folder, sampler):  # noqa: F811
+    chains = {}
+    for name, keys in {"both": "chains = 2", "second": "seed = 2"}.items():
+        changed = OSCILLATOR.replace("walkers = 20\nsteps = 2\nguide = true", f"{sampler}\n{keys}")
+        (folder / "oscillator.toml").write_text(changed)
+        result = CliRunner().invoke(main, ["run", "oscillator.toml", "--quiet", "--out", name])
+        assert result.exit_code in (0, NOT_USABLE), result.output
+        with xarray.open_dataset(f"{name}/posterior.nc", group="posterior") as stored:
+            chains[name] = stored["stiffness"].values
+    assert chains["both"].shape[0] == 2 and chains["second"].shape[0] == 1
+    np.testing.assert_array_equal(chains["both"][1], chains["second"][0])
+    assert not np.array_equal(*chains["both"])
+    summary = (folder / "both" / "summary.txt").read_text()
+    assert "2 independent runs: r_hat at most" in summary and ("log-evidences" in summary) == ("smc" in sampler)
+    CliRunner().invoke(main, ["report", "both"])
+    assert (folder / "both" / "summary.txt").read_text() == summary
 
 
 @pytest.mark.slow
