@@ -24,7 +24,7 @@ import sys
 import threading
 import types
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from hashlib import blake2b
 from typing import Any, NamedTuple
 
@@ -276,7 +276,7 @@ class _Pickler(cloudpickle.Pickler):
         reduced = self._dynamic_function_reduce(function)
         imported = _resolved(names_in(function.__code__).imported, module.__dict__.get("__package__") or "")
         reduced[2][1]["_cloudpickle_submodules"].extend(filter(None, map(self._module, imported)))
-        return reduced
+        return *reduced[:-1], functools.partial(_fill_function, reduced[-1])
 
 
 class _Names(NamedTuple):
@@ -314,16 +314,17 @@ def _resolved(imported: frozenset[str], package: str) -> set[str]:
 
 
 class _Namespace(NamedTuple):
-    """The globals of a module; a receiving process uses those of its copy of the module, this one a copy of them."""
+    """The globals of a module; the receiving process uses the globals of its own copy of the module."""
 
     module: types.ModuleType
 
     def __reduce__(self) -> tuple:
-        return _globals_of, (self.module,)
+        return vars, (self.module,)
 
 
-def _globals_of(module: types.ModuleType) -> dict[str, Any]:
-    return vars(module).copy() if _arriving is None else vars(module)
+def _fill_function(fill: Callable, function: types.FunctionType, state: tuple) -> None:
+    """As cloudpickle does; at home, the module keeps its values."""
+    fill(function, state if _arriving is not None else (state[0], state[1] | {"__globals__": {}}))
 
 
 def _new_module(name: str) -> types.ModuleType:
