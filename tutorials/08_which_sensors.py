@@ -88,12 +88,12 @@ figure.savefig("column.png")
 left_of_motion, information = {}, {}
 for name, motion in motions.items():
     known = rank_sensors(column.with_record(motion), prior, six, **decision, **settings)
-    left_of_motion[name] = dict(zip(known.parameter_names, known.left[-1].tolist(), strict=True))
+    left_of_motion[name] = {parameter: float(shares[-1]) for parameter, shares in known.left.items()}
     information[name] = known.information[-1]
     left_of_motion[name]["peak displacement"] = float(np.sqrt(known.target_left[-1]))
     print(
         f"{name} ({np.abs(motion.acceleration).max():.1f} m/s²): {known.information[-1]:.1f} ± "
-        f"{known.information_errors[-1]:.1f} nat"
+        f"{known.errors['information'][-1]:.1f} nat"
     )
 
 figure, axes = plt.subplots(figsize=(8, 3.8), layout="constrained")

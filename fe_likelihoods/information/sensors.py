@@ -50,83 +50,72 @@ class Slopes(NamedTuple):
 
 
 class SensorRanking(NamedTuple):
-    """Expected information of sensors; ``str`` is a table, `plot` a figure.
-
-    Errors are standard errors over the draws.
+    """Expected information of sensors, averaged over draws; ``str`` is a table, `plot_ranking` a figure.
 
     Attributes
     ----------
-    candidates : tuple of str
-        The n candidates.
-    noise : (n,) float
-        Standard deviation of their noise [SI].
-    alone, alone_error : (n,) float
-        Expected information of each candidate, without the other candidates [nat].
     chosen : tuple of str
         The k sensors of the greedy choice, the best first.
-    gains, gain_errors : (k,) float
-        Information that each chosen sensor adds to those before it [nat].
-    information, information_errors : (k,) float
-        Information of the first sensors together [nat].
-    lead, lead_errors : (k,) float
+    alone : (n,) float
+        Expected information of each of the n `candidates`, without the other candidates [nat].
+    information : (k,) float
+        Information of the first sensors together [nat]; its steps are `gains`.
+    lead : (k,) float
         What the next best candidate would have been worse by: information [nat], or share of the target's variance; NaN
         where no candidate was left. A lead of less than two errors does not decide.
-    parameter_names : tuple of str
-        Names of the d parameters.
-    left : (k, d) float
+    left : dict of str to (k,) float
         Share of each parameter's standard deviation that is left with the first sensors [-], as a root mean square.
-    target_variance : float
-        Variance of the target before any candidate measures [SI²]; NaN without a target.
-    target_left, target_left_errors : (k,) float
-        Share of this variance that is left with the first sensors [-]; NaN without a target.
-    draws, failed, simulations : int
-        Draws that were used and draws that were left out because a simulation failed; simulations made.
+    target_left : (k,) float
+        Share of the target's variance that is left with the first sensors [-]; NaN without a target.
+    errors : dict of str to ndarray
+        Standard errors over the draws of "alone", "gains", "information", "lead" and "target_left".
     precisions : dict of str to (d, d) float
         What each candidate tells of the standard normal coordinates of the prior: J^T W J, averaged over the draws.
         Precisions of several sensors add.
+    counts : dict of str to int
+        "draws" that were used, "failed" draws that were left out because a simulation failed, and "simulations".
     """
 
-    candidates: tuple[str, ...]
-    noise: np.ndarray
-    alone: np.ndarray
-    alone_error: np.ndarray
     chosen: tuple[str, ...]
-    gains: np.ndarray
-    gain_errors: np.ndarray
+    alone: np.ndarray
     information: np.ndarray
-    information_errors: np.ndarray
     lead: np.ndarray
-    lead_errors: np.ndarray
-    parameter_names: tuple[str, ...]
-    left: np.ndarray
-    target_variance: float
+    left: dict[str, np.ndarray]
     target_left: np.ndarray
-    target_left_errors: np.ndarray
-    draws: int
-    failed: int
-    simulations: int
+    errors: dict[str, np.ndarray]
     precisions: dict[str, np.ndarray]
+    counts: dict[str, int]
+
+    @property
+    def candidates(self) -> tuple[str, ...]:
+        """Names of all candidates."""
+        return tuple(self.precisions)
+
+    @property
+    def gains(self) -> np.ndarray:
+        """Information (k,) that each chosen sensor adds to those before it [nat]."""
+        return np.diff(self.information, prepend=0.0)
 
     def __str__(self) -> str:
-        with_target = bool(np.isfinite(self.target_variance))
-        head = ["sensor", "alone [nat]", "gain [nat]", "together [nat]"]
-        head += ["variance left [%]", "lead [%]"] if with_target else ["lead [nat]"]
-        rows, scale = [head], 100.0 if with_target else 1.0
+        with_target = bool(np.isfinite(self.target_left).all())
+        scale = 100.0 if with_target else 1.0  # of a lead
+        columns = {"gain [nat]": ("gains", 1.0), "together [nat]": ("information", 1.0)}
+        columns |= {"variance left [%]": ("target_left", 100.0)} if with_target else {}
+        columns |= {"lead [%]" if with_target else "lead [nat]": ("lead", scale)}
+        rows = [["sensor", "alone [nat]", *columns]]
         for k, name in enumerate(self.chosen):
             i = self.candidates.index(name)
-            row = [name, _with_error(self.alone[i], self.alone_error[i])]
-            row += [_with_error(self.gains[k], self.gain_errors[k])]
-            row += [_with_error(self.information[k], self.information_errors[k])]
-            left = scale * self.target_left[k], scale * self.target_left_errors[k]
-            row += [_with_error(*left)] if with_target else []
-            rows.append([*row, _with_error(scale * self.lead[k], scale * self.lead_errors[k])])
-        left = ", ".join(
-            f"{name} {100.0 * share:.2g} %" for name, share in zip(self.parameter_names, self.left[-1], strict=True)
-        )
-        failed = f"; {self.failed} more were left out, because their simulation failed" if self.failed else ""
+            row = [name, _with_error(self.alone[i], self.errors["alone"][i])]
+            for what, factor in columns.values():
+                row.append(_with_error(factor * getattr(self, what)[k], factor * self.errors[what][k]))
+            rows.append(row)
+        left = ", ".join(f"{name} {100.0 * shares[-1]:.2g} %" for name, shares in self.left.items())
+        failed, counts = "", self.counts
+        if counts["failed"]:
+            failed = f"; {counts['failed']} more were left out, because their simulation failed"
         lines = [
-            f"{len(self.chosen)} of {len(self.candidates)} sensors, from derivatives at {self.draws} draws "
-            f"({self.simulations} simulations{failed})",
+            f"{len(self.chosen)} of {len(self.candidates)} sensors, from derivatives at {counts['draws']} draws "
+            f"({counts['simulations']} simulations{failed})",
             text_table(rows),
             f"Standard deviations left with all of them: {left}",
         ]
@@ -349,16 +338,13 @@ def rank_sensors(
     products = slopes.products[good] * weights[:, None, None]
     start = precision + products[:, [names.index(name) for name in installed]].sum(axis=1)
     places = [names.index(name) for name in candidates]
-    chosen = _choose(products[:, places], start, gradients[good], n_sensors, target is not None)
-    return chosen._replace(
-        candidates=tuple(candidates),
-        chosen=tuple(candidates[i] for i in chosen.chosen),
-        noise=levels[places],
-        parameter_names=known.names,
-        left=chosen.left / sd,
-        failed=int(draws - good.sum()),
-        simulations=simulations,
+    counts = {"draws": int(good.sum()), "failed": int(draws - good.sum()), "simulations": simulations}
+    ranking, left = _choose(products[:, places], start, gradients[good], n_sensors, target is not None)
+    return ranking._replace(
+        chosen=tuple(candidates[i] for i in ranking.chosen),
+        left=dict(zip(known.names, (left / sd).T, strict=True)),
         precisions=dict(zip(candidates, products[:, places].mean(axis=0), strict=True)),
+        counts=counts,
     )
 
 
@@ -417,17 +403,17 @@ def _ratio_and_error(values: np.ndarray, whole: np.ndarray) -> tuple[np.ndarray,
 
 def _choose(
     products: np.ndarray, start: np.ndarray, gradients: np.ndarray, n_sensors: int, by_target: bool
-) -> SensorRanking:
+) -> tuple[SensorRanking, np.ndarray]:
     """Greedy choice from weighted products (m, n, d, d), a precision (m, d, d) and gradients (m, d) of the target.
 
-    `chosen` of the result are numbers of candidates, and its `left` are standard deviations of the coordinates.
+    `chosen` of the result are numbers of candidates; standard deviations (k, d) of the coordinates follow it.
     """
     n, before = products.shape[1], variance_of(start, gradients)
     if by_target and not before.mean() > 0.0:
         raise ValueError("expected a target that depends on the parameters; it does not change at any draw")
-    precision, rest, chosen = start, list(range(n)), []
+    precision, rest, chosen, left = start, list(range(n)), [], []
     alone = np.zeros(n), np.zeros(n)
-    gains, together, leads, left_of_target, left = [], [], [], [], []
+    steps: dict[str, list] = {"gains": [], "information": [], "lead": [], "target_left": []}
     for _ in range(n_sensors):
         added = information_of(precision[:, None], products[:, rest])
         variances = variance_of(precision[:, None] + products[:, rest], gradients[:, None])
@@ -436,35 +422,19 @@ def _choose(
         order = np.argsort(-value.mean(axis=0), kind="stable")
         best = int(order[0])
         pair = value[:, best] - value[:, order[1]] if len(order) > 1 else np.full(len(value), np.nan)
-        leads.append(_mean_and_error(pair))
-        gains.append(_mean_and_error(added[:, best]))
-        left_of_target.append(_ratio_and_error(variances[:, best], before) if by_target else (np.nan, np.nan))
+        steps["lead"].append(_mean_and_error(pair))
+        steps["gains"].append(_mean_and_error(added[:, best]))
+        share = _ratio_and_error(variances[:, best], before) if by_target else (np.nan, np.nan)
+        steps["target_left"].append(share)
         precision = precision + products[:, rest[best]]
         chosen.append(rest.pop(best))
-        together.append(_mean_and_error(information_of(start, precision - start)))
+        steps["information"].append(_mean_and_error(information_of(start, precision - start)))
         left.append(np.sqrt(np.diagonal(np.linalg.inv(precision), axis1=1, axis2=2).mean(axis=0)))
-    (gain, gain_error), (total, total_error), (lead, lead_error), (share, share_error) = (
-        np.transpose(each) for each in (gains, together, leads, left_of_target)
+    means, errors = {}, {"alone": alone[1]}
+    for name, found in steps.items():
+        means[name], errors[name] = np.transpose(found)
+    means.pop("gains")
+    ranking = SensorRanking(
+        chosen=tuple(chosen), alone=alone[0], left={}, errors=errors, precisions={}, counts={}, **means
     )
-    return SensorRanking(
-        candidates=(),
-        noise=np.zeros(0),
-        alone=alone[0],
-        alone_error=alone[1],
-        chosen=tuple(chosen),
-        gains=gain,
-        gain_errors=gain_error,
-        information=total,
-        information_errors=total_error,
-        lead=lead,
-        lead_errors=lead_error,
-        parameter_names=(),
-        left=np.array(left),
-        target_variance=float(before.mean()) if by_target else np.nan,
-        target_left=share,
-        target_left_errors=share_error,
-        draws=len(products),
-        failed=0,
-        simulations=0,
-        precisions={},
-    )
+    return ranking, np.array(left)

@@ -37,20 +37,20 @@ def plot_ranking(ranking: SensorRanking) -> Figure:
     """
     import matplotlib.pyplot as plt
 
-    with_target = bool(np.isfinite(ranking.target_variance))
+    with_target = bool(np.isfinite(ranking.target_left).all())
     size = (10.0 if with_target else 6.5, 1.4 + 0.45 * len(ranking.chosen))
     figure, axes = plt.subplots(1, 1 + with_target, sharey=True, squeeze=False, figsize=size, layout="constrained")
     rows, places = np.arange(len(ranking.chosen)), [ranking.candidates.index(name) for name in ranking.chosen]
     first = axes[0, 0]
-    alone = ranking.alone[places], ranking.alone_error[places]
+    alone = ranking.alone[places], ranking.errors["alone"][places]
     first.barh(rows, alone[0], 0.8, xerr=alone[1], color=GREY, alpha=0.5, label="alone")
-    first.barh(rows, ranking.gains, 0.45, xerr=ranking.gain_errors, color=BLUE, label="added to those above")
+    first.barh(rows, ranking.gains, 0.45, xerr=ranking.errors["gains"], color=BLUE, label="added to those above")
     first.set_yticks(rows, ranking.chosen)
     first.invert_yaxis()
     first.set_xlabel("expected information [nat]")
     figure.legend(loc="outside upper center", ncols=2, frameon=False, fontsize="small")
     if with_target:
-        share, error = 100.0 * ranking.target_left, 100.0 * ranking.target_left_errors
+        share, error = 100.0 * ranking.target_left, 100.0 * ranking.errors["target_left"]
         axes[0, 1].errorbar(share, rows, xerr=error, color=ORANGE, marker="o", capsize=3.0)
         axes[0, 1].set_xlabel("variance of the target that is left [%]")
         axes[0, 1].set_xlim(0.0, None)
