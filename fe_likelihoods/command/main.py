@@ -113,21 +113,17 @@ def _show(outcome: Any) -> None:
     for part, _ in outcome.problem.posterior.likelihood.parts():
         if "CAUTION" in part.measurements.description:
             click.echo(f"Measurements: {part.measurements.description}")
-    _say_assumed(outcome.problem)
+    problem = outcome.problem
+    for parameter in (each for each in problem.posterior.parameters if each.name in problem.assumed):
+        prior = problem.assumed[parameter.name]
+        mean, sd = (parameter.shown(value) for value in prior.moments)
+        click.echo(
+            f"Assumed, since the file does not give it: prior of {parameter.label}: {type(prior).__name__}, mean "
+            f"{mean:.3g}, standard deviation {sd:.3g}"
+        )
     for finding in outcome.findings:
         click.echo(f"CAUTION: {finding}")
     click.echo(f"Written to {outcome.folder}/: {', '.join(outcome.files)}")
-
-
-def _say_assumed(problem: Any) -> None:
-    for parameter in problem.posterior.parameters:
-        if parameter.name in problem.assumed:
-            prior = problem.assumed[parameter.name]
-            mean, sd = (parameter.shown(value) for value in prior.moments)
-            click.echo(
-                f"Assumed, since the file does not give it: prior of {parameter.label}: {type(prior).__name__}, mean "
-                f"{mean:.3g}, standard deviation {sd:.3g}"
-            )
 
 
 @main.command()

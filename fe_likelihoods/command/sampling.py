@@ -10,11 +10,6 @@ from .models import Problem
 __all__ = ["STEPS", "discarded", "is_emcee", "make_sampler", "run_sampler"]
 
 STEPS = 4  # of the chain of SMC and TMCMC
-PRESETS = {
-    "ramancha2022": "RAMANCHA_2022_LITERAL",
-    "ramancha2022-constant": "RAMANCHA_2022_CONSTANT",
-    "ching-chen-2007": "CHING_CHEN_2007",
-}
 _ROUNDS = 20  # of draws of the prior, for walkers that start where the simulation does not fail
 
 
@@ -41,8 +36,7 @@ def make_sampler(job: Job, problem: Problem, backend: Any = None, chain: int = 0
     given, where, posterior = job.sampler, job.where("sampler"), problem.posterior
     if given.discard is not None:
         raise ValueError(f'{where} discard: {given.kind} has no burn-in; this key is for kind = "emcee": leave it out')
-    settings = {} if given.preset is None else dict(getattr(samplers.presets, PRESETS[given.preset]))
-    settings |= given.given("recycle", "ess_ratio", "min_moves", "max_moves", "max_failure_share")
+    settings = given.given("recycle", "ess_ratio", "min_moves", "max_moves", "max_failure_share")
     try:
         return {"smc": samplers.SMCSampler, "tmcmc": samplers.TMCMCSampler}[given.kind](
             given.walkers or 500,

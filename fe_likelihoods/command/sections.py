@@ -243,7 +243,6 @@ class Sampler(Section):
         "Independent runs with successive seeds, which r_hat compares; tables and report are of the first", 1
     )
     guide: Switch = key("Find the posterior from the responses, with hundreds of simulations", False)
-    preset: Annotated[Any, "one of ramancha2022, ramancha2022-constant, ching-chen-2007"] = key("Settings of papers")
     recycle: Switch = key("Reuse every evaluated point; by default with 150 walkers or more")
     ess_ratio: Number = key("Share of effective walkers wanted at each stage, without recycling")
     min_moves: Whole = key("Fewest sweeps per stage")

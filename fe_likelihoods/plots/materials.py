@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from ..units import find_unit, from_si
+from ..units import from_si
 from .style import BLUE, GREY, ORANGE, new_axes
 
 if TYPE_CHECKING:
@@ -18,12 +18,7 @@ __all__ = ["plot_material", "plot_moment_curvature"]
 _COLOURS = (BLUE, ORANGE, GREY, "#4c8c4a", "#8c4a6e")
 
 
-def plot_material(
-    *curves: MaterialCurve,
-    axes: Axes | None = None,
-    strain_unit: str = "%",
-    stress_unit: str = "MPa",
-) -> Axes:
+def plot_material(*curves: MaterialCurve, axes: Axes | None = None, stress_unit: str = "MPa") -> Axes:
     """Plot stress against strain of one or more materials.
 
     Parameters
@@ -32,8 +27,8 @@ def plot_material(
         The curves, such as the results of `fe_likelihoods.material_curves`.
     axes : matplotlib Axes, optional
         Where to draw. Default: a new figure.
-    strain_unit, stress_unit : str
-        Units of the axes.
+    stress_unit : str
+        Unit of the stress; strains are in per cent.
 
     Returns
     -------
@@ -54,22 +49,15 @@ def plot_material(
         raise ValueError("expected one or more curves; got none; give the results of material_curves(column, theta)")
     axes = _with_origin(new_axes(axes, (5.4, 4.0)))
     for curve, colour in zip(curves, _cycle(len(curves)), strict=True):
-        strain = from_si(curve.strain, strain_unit, "strain")
-        axes.plot(strain, from_si(curve.stress, stress_unit, "stress"), color=colour, linewidth=1.1, label=curve.name)
-    label = "strain" if strain_unit == "1" else f"strain [{strain_unit}]"
-    axes.set(xlabel=label, ylabel=f"stress [{stress_unit}]")
+        stress = from_si(curve.stress, stress_unit, "stress")
+        axes.plot(100.0 * curve.strain, stress, color=colour, linewidth=1.1, label=curve.name)
+    axes.set(xlabel="strain [%]", ylabel=f"stress [{stress_unit}]")
     axes.legend(frameon=False, fontsize="small")
     return axes
 
 
-def plot_moment_curvature(
-    curves: MomentCurvature | Mapping[str, MomentCurvature],
-    axes: Axes | None = None,
-    *,
-    curvature_unit: str = "1/m",
-    moment_unit: str = "kN m",
-) -> Axes:
-    """Plot moment against curvature of one or more sections.
+def plot_moment_curvature(curves: MomentCurvature | Mapping[str, MomentCurvature], axes: Axes | None = None) -> Axes:
+    """Plot moment [kN m] against curvature [1/m] of one or more sections.
 
     Parameters
     ----------
@@ -77,8 +65,6 @@ def plot_moment_curvature(
         The curves, such as the result of `fe_likelihoods.moment_curvature`.
     axes : matplotlib Axes, optional
         Where to draw. Default: a new figure.
-    curvature_unit, moment_unit : str
-        Units of the axes.
 
     Returns
     -------
@@ -91,13 +77,11 @@ def plot_moment_curvature(
     """
     many = dict(curves) if isinstance(curves, Mapping) else {"": curves}
     axes = _with_origin(new_axes(axes, (5.4, 4.0)))
-    force_unit = find_unit(moment_unit, "moment").name.split()[0]
     for (name, curve), colour in zip(many.items(), _cycle(len(many)), strict=True):
-        force = f"axial force {from_si(curve.axial_force, force_unit):.5g} {force_unit}"
-        x = from_si(curve.curvature, curvature_unit, "curvature")
-        y = from_si(curve.moment, moment_unit, "moment")
-        axes.plot(x, y, color=colour, linewidth=1.3, label=f"{name}, {force}" if name else force)
-    axes.set(xlabel=f"curvature [{curvature_unit}]", ylabel=f"moment [{moment_unit}]")
+        force = f"axial force {1e-3 * curve.axial_force:.5g} kN"
+        label = f"{name}, {force}" if name else force
+        axes.plot(curve.curvature, 1e-3 * curve.moment, color=colour, linewidth=1.3, label=label)
+    axes.set(xlabel="curvature [1/m]", ylabel="moment [kN m]")
     axes.legend(frameon=False, fontsize="small", loc="best")
     return axes
 

@@ -79,9 +79,7 @@ def plot_bands(
     return figure
 
 
-def plot_fragility(
-    fragility: Fragility, label: str = "peak ground acceleration", unit: str | None = "g", si_unit: str = "m/s2"
-) -> Figure:
+def plot_fragility(fragility: Fragility, label: str = "peak ground acceleration", unit: str | None = "g") -> Figure:
     """Plot the probability of exceedance against intensity: one point with its interval per record, and the curve.
 
     Parameters
@@ -92,9 +90,7 @@ def plot_fragility(
         Name of the intensity measure.
     unit : str or None
         Unit of the intensity in the figure, a name in `fe_likelihoods.units.UNITS`. None: values are drawn as they
-        are, in `si_unit`.
-    si_unit : str
-        Unit of the intensity values, for the label if `unit` is None.
+        are, and the label says all.
 
     Returns
     -------
@@ -130,7 +126,7 @@ def plot_fragility(
         x = np.geomspace(0.7 * fragility.intensity.min(), 1.2 * fragility.intensity.max(), 200)
         text = f"median {shown(curve.median):.3g}, dispersion {curve.dispersion:.2g}"
         axes.plot(shown(x), curve.probability(x), color=GREY, label=text)
-    axes.set_xlabel(f"{label} [{si_unit if unit is None else unit}]")
+    axes.set_xlabel(label if unit is None else f"{label} [{unit}]")
     axes.set_ylabel("probability of exceedance [-]")
     axes.set_ylim(-0.02, 1.02)
     axes.grid(alpha=0.25)
