@@ -91,18 +91,13 @@ def test_likelihood_of_one_parameter_is_the_closed_form(one):
     assert np.abs(error).max() < 0.5  # the fits of four tests have errors of about 0.1 each
     assert np.abs(error[points[:, 1] >= 0.3]).max() < 0.1
     assert one.log_likelihood(points[4]) == pytest.approx(one.log_likelihood(points)[4])
-
-
-def test_control_the_likelihood_without_the_prior_density_is_wrong(one, monkeypatch):
-    points = np.array([[0.7, 0.4], [1.2, 0.4]])
-    expected = np.diff([exact(DATA[:, 0], m, 0.04 + s**2) for m, s in points])
-    assert np.diff(one.log_likelihood(points)) == pytest.approx(expected, abs=0.05)
+    # control: priors that are narrower than the data, and their density forgotten
+    two, change = [[0.7, 0.4], [1.2, 0.4]], np.diff([exact(DATA[:, 0], m, 0.04 + 0.16) for m in (0.7, 1.2)])
     narrow = HierarchicalPosterior(several(DATA[:, :1], ERRORS[:1, :1], 400, 0.5), {"a": LINEAR})
-    assert np.diff(narrow.log_likelihood(points)) == pytest.approx(expected, abs=0.3)
+    assert np.diff(narrow.log_likelihood(two)) == pytest.approx(change, abs=0.3)
     flat = Prior({"a": Uniform(-50.0, 50.0)})
-    forgotten = {k: each._replace(prior=flat) for k, each in narrow.described.items()}
-    monkeypatch.setattr(narrow, "described", forgotten)
-    assert abs(np.diff(narrow.log_likelihood(points)) - expected) > 0.6
+    narrow.described = {k: each._replace(prior=flat) for k, each in narrow.described.items()}
+    assert abs(np.diff(narrow.log_likelihood(two)) - change) > 0.6
 
 
 def test_likelihood_of_two_parameters_is_the_closed_form(two):
@@ -334,21 +329,15 @@ def test_unknown_tests_and_numbers_are_refused(result):
         result.new_test(0)
 
 
-def test_the_spread_is_said_beside_the_error_of_one_test(rng):
-    prior = Prior({"frequency": LogNormal(5.0, 0.5), "damping": LogNormal(0.1, 1.0)})
-    samples = [[5.0, 0.1] * np.exp([0.01, 0.2] * rng.standard_normal((500, 2))) for _ in range(4)]
-    tests = {f"E{k}": StoredPosterior(each, prior) for k, each in enumerate(samples)}
-    varying = {name: Varying(prior.distributions[name], HalfNormal(0.3)) for name in prior.names}
+@pytest.mark.parametrize("spread", (0.1, None))
+def test_the_spread_is_said_beside_the_error_of_one_test(spread, rng):
+    """Tests with an error of 1 % that differ by 10 %, and draws of the spread from its prior."""
+    prior = Prior({"frequency": LogNormal(5.0, 0.5)})
+    tests = {f"E{k}": StoredPosterior(5.0 * np.exp(0.01 * rng.standard_normal((500, 1))), prior) for k in range(4)}
+    own = 0.1 * np.exp(0.1 * rng.standard_normal(400)) if spread else np.abs(0.3 * rng.standard_normal(400))
+    varying = {"frequency": Varying(LogNormal(5.0, 0.5), HalfNormal(0.3))}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        known = [5.0, 0.1, 0.1, 0.05] * np.exp([0.01, 0.1, 0.1, 1.0] * rng.standard_normal((400, 4)))
-        result = Hierarchy(HierarchicalPosterior(tests, varying), known)
-    low, high = (f"{100.0 * each:.2g}" for each in np.quantile(known[:, 1], [0.05, 0.95]))
-    assert f"The tests differ in frequency by 10 % ({low} to {high} %), 10 times the error of one test" in result.spread
-    assert "damping by no more than the error of one test shows (" in result.spread
-    assert "must carry this spread" in result.spread and "white noise are too narrow" in result.spread
-    assert "mostly by its prior" not in result.spread and result.spread in str(result)
-    known[:, 1] = np.abs(0.3 * rng.standard_normal(400))  # the draws of the prior
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        assert "mostly by its prior" in Hierarchy(result.posterior, known).spread
+        found = Hierarchy(HierarchicalPosterior(tests, varying), np.column_stack([5.0 + 0.01 * own, own])).spread
+    assert ("frequency by 10 % (" in found) == ("10 times the error of one test" in found) == bool(spread)
+    assert ("mostly by its prior" in found) == (spread is None)
