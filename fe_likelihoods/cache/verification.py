@@ -89,8 +89,8 @@ class VerifiedCache:
 
     def __init__(self, cache: SimulationCache, pool: Any, label: ModelLabel, model: Model) -> None:
         # user code may depend on what no label contains: there, each model object is verified
-        file = cache.path, cache.file.identity
-        key = secrets.token_hex(16) if label.observes else f"{file} {label.code} {model.fingerprint}"
+        same = cache.path, cache.file.identity, cache.verify, label.code, model.fingerprint
+        key = secrets.token_hex(16) if label.observes else repr(same)
         is_local = pool is None or isinstance(pool, LocalPool)
         self._set_up(cache, trust_of(label, is_local, f"{key} {is_local}"))
 
