@@ -319,7 +319,7 @@ class Simulator:
         stored, new = self._checked.rows, (~request.done).nonzero()[0]
         if stored is not None and len(new):
             rows = stored.look_up(self._key, request.thetas[new], request.run)
-            known, reasons = np.flatnonzero(rows.known), rows.reasons
+            known, reasons = rows.known.nonzero()[0], rows.reasons
             if len(known):
                 self._enter(request, new[known].tolist(), rows.values[known], [reasons[place] for place in known])
                 request.on_disk[new[known]] = True

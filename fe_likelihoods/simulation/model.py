@@ -421,7 +421,7 @@ def _checked_batch(model: Model, batch: tuple, shape: tuple[int, ...]) -> tuple[
         raise ValueError(
             f"expected values of shape {shape} and {shape[0]} reasons, got {values.shape} and {len(reasons)}"
         )
-    for row in np.flatnonzero(~np.isfinite(values).all(axis=tuple(range(1, values.ndim)))):
+    for row in (~np.isfinite(values).all(axis=tuple(range(1, values.ndim)))).nonzero()[0]:
         reasons[row] = reasons[row] or not_finite(model, values[row])
     values[[bool(reason) for reason in reasons]] = np.nan
     return values, reasons
