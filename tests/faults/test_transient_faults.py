@@ -272,7 +272,7 @@ def test_the_first_fault_is_logged(caplog):
     likelihood = likelihood_of(Faulty(FAULTS["no space"]))
     with caplog.at_level(logging.WARNING):
         likelihood.misfit(THETAS)
-    assert "is -inf in this run, and a later run simulates the point again" in caplog.text
+    assert "a later run simulates the point again" in caplog.text
 
 
 # records ------------------------------------------------------------------------------------------------------------
