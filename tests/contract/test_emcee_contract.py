@@ -273,19 +273,6 @@ def test_arviz_from_emcee(Sampler):
     assert dict(data["posterior"]["x1"].sizes) == {"chain": N, "draw": STEPS}  # arviz 1 has draws first
 
 
-def test_our_moves_are_emcees():
-    """A plain EnsembleSampler does not calibrate moves; they fit themselves to the first ensemble."""
-    from samplers.moves.fast_parameters import WithFastSweeps
-    from samplers.moves.population_moves import MixtureMove, RandomWalkMove
-
-    posterior = Gaussian()
-    followed = [WithFastSweeps(move, (2,)) for move in (MixtureMove(), emcee.moves.StretchMove())]
-    for move in (RandomWalkMove(), MixtureMove(), *followed):
-        sampler = emcee.EnsembleSampler(N, 3, posterior, moves=move)
-        sampler.run_mcmc(posterior.mean + posterior.sd * start(posterior), 20, tune=True)
-        assert sampler.acceptance_fraction.mean() > 0.1
-
-
 @every
 def test_progress_bar(Sampler, capfd):
     pytest.importorskip("tqdm")
