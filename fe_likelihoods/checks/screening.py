@@ -31,7 +31,7 @@ __all__ = [
 LARGEST_PEAKS = {"motion": (3.0, "g"), "acceleration": (20.0, "g"), "displacement": (10.0, "m")}
 SHORT_STEP = 1e-3  # [s]: accelerations below the top are then right to about 4 %
 MOST_PLACES = 3  # that a finding lists; the line for the TOML file has all
-REAL_PHASES = 10.0  # [deg]: the modal assurance of a complex shape and its real part is the squared cosine, 0.97
+REAL_PHASES = 10.0  # [deg]; 0 of 7200 right shapes (errors to 0.1); those named: real parts with a MAC of 0.96 to 0.997
 
 
 def check_data(measurements: Measurements, record: Record | Sequence[Record] | None = None) -> tuple[Finding, ...]:
