@@ -310,7 +310,7 @@ def test_a_failed_simulation_is_minus_infinity_with_its_reason(threads, caplog):
     assert report["seconds"] > 0.0
     assert len(caplog.records) == 1  # only the first failure is logged
     assert "(no convergence at step 3) at offset = 1, slope = 0.1" in caplog.text
-    assert "see posterior.report()" in caplog.text
+
     assert posterior(x[0]) == -np.inf
     assert type(posterior.log_likelihood(x[0])) is float
     assert len(caplog.records) == 1

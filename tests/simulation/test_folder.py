@@ -121,7 +121,7 @@ def test_a_file_that_others_write_meanwhile_is_read_from_one_simulation_of_the_f
     def reads_twice(theta):
         first = Path("shared.txt").read_text()
         if not Path("seen", "done").exists():
-            subprocess.run(["/bin/sh", "-c", f"echo 2 > {seen}/shared.txt; touch {seen}/seen/done"], check=True)
+            subprocess.run(["/bin/sh", "-c", f"echo 2 > '{seen}/shared.txt'; touch '{seen}/seen/done'"], check=True)
         return [[float(first), float(Path("shared.txt").read_text())]]
 
     seen = str(start)
@@ -360,7 +360,7 @@ def in_a_database(path, theta):
 
 def by_a_program(path, theta):
     """Noticed when Python code reads it, the second time."""
-    subprocess.run(["/bin/sh", "-c", f'sleep .01; echo "$0" "$1" > {path}', *map(repr, theta.tolist())], check=True)
+    subprocess.run(["/bin/sh", "-c", f'sleep .01; echo "$0" "$1" > "{path}"', *map(repr, theta.tolist())], check=True)
     return [[float(word) for word in Path(path).read_text().split()]]
 
 
