@@ -91,6 +91,8 @@ class ModeSearch(NamedTuple):
         False if `max_simulations` ended the search.
     grown : bool
         Whether it began with the first part of the record, where most starts are given up, in right runs as well.
+    low : int
+        Tops of no weight at which starts ended.
     """
 
     modes: tuple[Mode, ...]
@@ -98,6 +100,7 @@ class ModeSearch(NamedTuple):
     simulations: float
     finished: bool
     grown: bool = False
+    low: int = 0
 
 
 def laplace(target: ResponseTarget, end: Ascent, starts: tuple[int, ...] = ()) -> Mode:
@@ -273,9 +276,10 @@ def _enough(search: ModeSearch, first: int) -> int:
     """Number of starts that shall lead to the modes found: `first` to one mode, and more to several ones.
 
     If as many starts lead to another mode as to each of k modes found, n starts miss it with the probability
-    (k / (k + 1))^n, which shall be 1 / 2^first.
+    (k / (k + 1))^n, which shall be 1 / 2^first. Tops of no weight say that there may be two modes where one was found;
+    on a growing record, most starts are given up before they reach one.
     """
-    k = max(len(search.modes), 1)
+    k = max(len(search.modes), 2 if search.low and not search.grown else 1)
     return int(np.ceil(first * np.log(2.0) / np.log((k + 1.0) / k) - 1e-9))
 
 
@@ -356,12 +360,13 @@ def _modes_of(parts: list[_Part], standing_for: list[int], spent: float, finishe
     """The modes at the ends on the whole record, and which of them each start led to."""
     part = parts[-1]
     modes = sorted((laplace(part.target, end, (k,)) for k, end in part.ends.items()), key=lambda m: -m.log_evidence)
-    modes = [mode for mode in modes if mode.log_evidence > modes[0].log_evidence - _NEGLIGIBLE]
+    low = [mode for mode in modes if mode.log_evidence <= modes[0].log_evidence - _NEGLIGIBLE]
+    modes = modes[: len(modes) - len(low)]
     number_of = {mode.starts[0]: number for number, mode in enumerate(modes)}
     ends = tuple(number_of.get(_end_of(k, standing_for, part.ends), -1) for k in range(len(standing_for)))
     led = [tuple(k for k, end in enumerate(ends) if end == number) for number in range(len(modes))]
     modes = [mode._replace(starts=starts) for mode, starts in zip(modes, led, strict=True)]
-    return ModeSearch(tuple(modes), ends, spent, finished, len(parts) > 1)
+    return ModeSearch(tuple(modes), ends, spent, finished, len(parts) > 1, sum(mode.converged for mode in low))
 
 
 def _end_of(k: int, standing_for: Sequence[int], ends: Container[int]) -> int:
