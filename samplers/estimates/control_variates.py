@@ -110,12 +110,12 @@ class SignedSample(NamedTuple):
     def standard_deviation(self) -> Expectation:
         """Standard deviations (ndim,) of the parameters.
 
-        Both numbers are NaN where the variance, a sum with weights of both signs, is not positive: the draws do not
-        determine it, as with a tail of the posterior that the known density does not have.
+        Both numbers are NaN where the variance, a sum with weights of both signs, is not above its own standard error:
+        the draws do not determine it, as with a tail of the posterior that the known density does not have.
         """
         mean = self.weights @ self.coords
         variance, error = self.expectation(lambda coords: np.square(coords - mean))
-        value = np.sqrt(np.where(variance > 0.0, variance, np.nan))
+        value = np.sqrt(np.where(variance > error, variance, np.nan))
         return Expectation(value, 0.5 * error / value)
 
     def quantile(self, probability: float) -> Expectation:

@@ -348,7 +348,8 @@ def _of_signed_sample(result: AnnealingResult) -> list[Finding]:
         return []
     text = (
         f"The standard deviation of parameter {', '.join(map(str, unknown + 1))} is not determined: its variance by "
-        "the signed sample is negative, as with a tail of the posterior in which the guide makes few draws."
+        "the signed sample is below its own standard error, as with a tail of the posterior in which the guide makes "
+        "few draws."
     )
     action = "Use more walkers, a prior without this tail, or no guide."
     return [Finding("A standard deviation is not determined", CARE, text, action)]
