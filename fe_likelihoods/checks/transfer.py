@@ -2,9 +2,19 @@
 
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+
+from ..signals.channels import Channel
+from ..units import DIMENSIONS, to_si
 from .finding import CARE, Finding
 
-__all__ = ["check_bandwidth", "check_failed_samples", "check_final_values", "check_peaks"]
+__all__ = [
+    "check_bandwidth",
+    "check_failed_samples",
+    "check_final_values",
+    "check_peaks",
+    "check_unit_of_threshold",
+]
 
 # of a predicted peak to the calibrated ones: named in 1 of 100 right runs, and in 96 of 100 at three times the strength
 PEAK_RATIO = 2.0
@@ -83,3 +93,16 @@ def check_failed_samples(reasons: Mapping[str, int], nothing: str = "") -> list[
     known = "; ".join(f"{count}: {reason}" for reason, count in reasons.items())
     text = f"{sum(reasons.values())} samples failed and are left out ({known})."
     return [Finding("Samples failed", CARE, text)] if reasons else []
+
+
+def check_unit_of_threshold(limits: np.ndarray, values: np.ndarray, channel: Channel) -> list[Finding]:
+    """Thresholds that are beside all values [SI], and among them in the unit of the channel."""
+    shown, values = np.asarray(to_si(limits, channel.unit, channel.dimension)), np.abs(values)
+    inside = (shown >= values.min()) & (shown <= values.max())
+    if not np.all(inside & ((limits < values.min()) | (limits > values.max()))):
+        return []
+    text = (
+        f"The threshold {limits.flat[0]:g} is in SI units, {DIMENSIONS[channel.dimension]}, and beside all predicted "
+        f"values (up to {values.max():.3g}): is it in {channel.unit}?"
+    )
+    return [Finding("A threshold may have another unit", CARE, text, f'Then pass unit="{channel.unit}".')]

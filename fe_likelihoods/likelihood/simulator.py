@@ -316,25 +316,39 @@ class Simulator:
 
     def _fill(self, request: _Request, full: bool) -> None:
         """Fill in what caches contain, also in their responses; rows of the disk may be simulated to verify them."""
-        stored, new = self._checked.rows, (~request.done).nonzero()[0]
-        if stored is not None and len(new):
+        if full:
+            self._set_done(request, ~request.finite)
+            self._fill_from_responses(request)
+            self._set_done(request, request.done)
+        if (stored := self._checked.rows) is not None and len(new := (~(request.done | request.known)).nonzero()[0]):
+            done = request.done.copy()
             rows = stored.look_up(self._key, request.thetas[new], request.run)
             known, reasons = rows.known.nonzero()[0], rows.reasons
             if len(known):
                 self._enter(request, new[known].tolist(), rows.values[known], [reasons[place] for place in known])
                 request.on_disk[new[known]] = True
-        if full:  # a failure needs no response
-            request.done = ~np.isfinite(request.statistics).all(axis=1) & request.known
-            for row in np.flatnonzero(request.done):
-                reason = request.reasons[row] or self.memory_cache.reason(request.keys[row])
-                request.reasons[row] = reason or "the simulation failed before"
-        if stored is not None or len(self.response_memory):
-            left, size = (~request.done).nonzero()[0].tolist(), most_responses(self.model)
-            for start in range(0, len(left), size):
-                self._fill_from_responses(request, left[start : start + size])
+            if full:
+                self._set_done(request, done)
+        if not full:
+            self._fill_from_responses(request)
 
-    def _fill_from_responses(self, request: _Request, rows: list[int]) -> None:
+    def _set_done(self, request: _Request, done: np.ndarray) -> None:
+        """Let those rows be done (n,) whose responses are known, and known failures, which need no response."""
+        failed = ~np.isfinite(request.statistics).all(axis=1) & request.known
+        request.done = done | failed
+        for row in failed.nonzero()[0]:
+            reason = request.reasons[row] or self.memory_cache.reason(request.keys[row])
+            request.reasons[row] = reason or "the simulation failed before"
+
+    def _fill_from_responses(self, request: _Request) -> None:
         """Fill in rows whose responses are cached, and their statistics where these are not known."""
+        if self._checked.rows is None and not len(self.response_memory):
+            return
+        left, size = (~request.done).nonzero()[0].tolist(), most_responses(self.model)
+        for start in range(0, len(left), size):
+            self._fill_rows_from_responses(request, left[start : start + size])
+
+    def _fill_rows_from_responses(self, request: _Request, rows: list[int]) -> None:
         stored, run, full = self._checked.rows, request.run, request.responses is not None
         in_memory = self.response_memory.look_up(run.fingerprint, [request.keys[row] for row in rows])
         outcomes = {row: outcome for row, outcome in zip(rows, in_memory, strict=True) if outcome is not None}

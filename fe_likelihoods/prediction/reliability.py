@@ -25,6 +25,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
+from ..checks.finding import warn
+from ..checks.transfer import check_unit_of_threshold
 from ..events.ratios import EventRatios
 from ..signals.channels import Channel
 from ..text_tables import number, text_table
@@ -194,6 +196,8 @@ def exceedance(
             f"{limits.shape}"
         )
     check_level(level)
+    if unit is None and len({channel.unit for channel in channels}) == 1 and limits.size:
+        warn(check_unit_of_threshold(limits, values, channels[0]), stacklevel=2)
     if prediction is not None and prediction.ratios is not None:  # exact, not by the draws
         ratios, values = prediction.ratios, prediction.predicted[None]
     if ratios is not None:
