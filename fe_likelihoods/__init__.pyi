@@ -63,7 +63,6 @@ from .priors.priors import Prior
 from .reporting.report import report
 from .signals.alignment import align
 from .signals.channels import Channel, Measurements
-from .signals.durations import growing_durations
 from .signals.error_measures import rrmse
 from .signals.events import Events
 from .signals.read import read_columns, read_imposed_test, read_record
@@ -138,7 +137,6 @@ __all__ = [
     "fit_mixture",
     "fragility",
     "from_si",
-    "growing_durations",
     "identifiability",
     "interval_score",
     "leave_one_out",

@@ -131,7 +131,8 @@ class Simulator:
     values (n_channels, n_steps), or a `Comparison` where samples are missing. `simulations`, `cache_hits` and
     `disk_hits` count simulations run by this object in this process, cached rows, and rows from the disk; `failures`
     include known ones from the disk. `chunk_size` simulations are run between two writes to the disk, adapted to their
-    duration; `when_simulated` is called with the number that have ended, in this process only.
+    duration; `when_simulated` is called with the number that have ended, in this process only. With `responses_only`
+    nothing was measured: a cache on disk gets the responses alone.
     """
 
     def __init__(
@@ -145,8 +146,10 @@ class Simulator:
         memory_rows: int = 100_000,
         memory_bytes: int = 2**28,
         max_failure_share: float = 1.0,
+        responses_only: bool = False,
     ) -> None:
         self.failures = FailureLog(model.parameter_names, max_failure_share)
+        self._responses_only = responses_only
         self.model, self.measurements, self.statistic = model, measurements, statistic
         self.measured = compare_with(measurements, model.dt, model.n_steps)
         check_statistic(statistic, self.measured)
@@ -320,7 +323,8 @@ class Simulator:
             self._set_done(request, ~request.finite)
             self._fill_from_responses(request)
             self._set_done(request, request.done)
-        if (stored := self._checked.rows) is not None and len(new := (~(request.done | request.known)).nonzero()[0]):
+        stored, new = self._checked.rows, (~(request.done | request.known)).nonzero()[0]
+        if stored is not None and len(new) and not self._responses_only:
             done = request.done.copy()
             rows = stored.look_up(self._key, request.thetas[new], request.run)
             known, reasons = rows.known.nonzero()[0], rows.reasons
@@ -372,7 +376,7 @@ class Simulator:
             batch = SimulationBatch(np.array(responses), failed)
             statistics, reasons = misfit_of_responses(self.model, batch, self.measured, self.statistic)
             self._enter(request, new, statistics, reasons)
-            if stored is not None:
+            if stored is not None and not self._responses_only:
                 stored.store(self._key, request.thetas[new], statistics, reasons, None, 0.0, run)
 
     def _enter(self, request: _Request, rows: list[int], statistics: np.ndarray, reasons: list[str]) -> None:
@@ -566,8 +570,9 @@ class Simulator:
             outcomes = [reason or response for reason, response in zip(why, responses, strict=True)]
             self._latest += zip([run.fingerprint] * len(keys), keys, outcomes, strict=True)
         if self.cache is not None:
+            kept = None if self._responses_only else statistics
             stored = responses if full or self.cache.responses else None
-            self._checked.rows.store(self._key, thetas, statistics, reasons, stored, seconds, run)
+            self._checked.rows.store(self._key, thetas, kept, reasons, stored, seconds, run)
             self.cache.store_remark(self.model)
         for place, row in enumerate(rows):
             request.fill(row, statistics[place], reasons[place], responses[place] if full else None)

@@ -227,15 +227,16 @@ class SumOfParts:
 
     def draw_noise(self, x: Any, rng: RandomState = None) -> dict[str, np.ndarray]:
         """Complete samples (n,) of all parameters from structural ones (n, ndim), see `Posterior.draw_noise`."""
-        points = np.atleast_2d(as_points(x, self.parameter_names))
-        rng = as_generator(rng)
-        named = dict(zip(self.parameter_names, points.T, strict=True))
-        for key, part in self.likelihoods.items():
+        for part in self.likelihoods.values():
             if not isinstance(part.noise, MarginalNoise):
                 raise ValueError(
                     f"the noise parameters {', '.join(part.noise.parameter_names)} are in the samples of this "
                     "posterior; draw_noise is for posteriors from which they are integrated out, see marginal()"
                 )
+        points = np.atleast_2d(as_points(x, self.parameter_names))
+        rng = as_generator(rng)
+        named = dict(zip(self.parameter_names, points.T, strict=True))
+        for key, part in self.likelihoods.items():
             names, own = part.noise.noise.parameter_names, points[:, self._columns[key]]
             uniform = rng.random((len(own), len(names)))
             drawn = part.noise.draw(part.misfit(own), part.n_samples, uniform)

@@ -224,7 +224,9 @@ def propagate(
     stored = None
     if cache is not None:
         nothing = Measurements(model.channels, model.dt, np.zeros((len(model.channels), model.n_steps)))
-        stored = Simulator(model, nothing, pool=source.executor, cache=cache, memory_rows=0, memory_bytes=0)
+        stored = Simulator(
+            model, nothing, pool=source.executor, cache=cache, memory_rows=0, memory_bytes=0, responses_only=True
+        )
     peaks, ends = Peaks(), Ends(wanted.values(), model)
     compared = moved and state == "virgin" and calibration.likelihood is not None
     first: tuple[np.ndarray, np.ndarray] | None = None  # parameters of a sample, and its response to another motion
