@@ -195,9 +195,7 @@ class PredictedModes(NamedTuple):
     assurance: np.ndarray  # (n, m) modal assurance criterion; NaN for modes without a measured shape
     numbers: np.ndarray  # (n, m) numbers of the computed modes, from 1
     shapes: np.ndarray  # (n, m, n_sensors)
-    unknown: (
-        np.ndarray
-    )  # (n,) unknown relative error of a frequency, such as the error of the model; 0 if there is none
+    unknown: np.ndarray  # (n,) unknown relative error of a frequency, as of the model; 0 if there is none
 
     @classmethod
     def of(cls, paired: PairedModes, computed: np.ndarray, unknown: np.ndarray | None = None) -> "PredictedModes":
