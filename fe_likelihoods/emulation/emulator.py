@@ -34,13 +34,10 @@ Journal of the American Statistical Association 103, 570-583, doi:10.1198/016214
 Gaussian processes).
 """
 
-import hashlib
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
-from ..simulation.model import SimulationBatch, SimulationFailed
 from .gaussian_process import GaussianProcess, fit_process, left_out_errors, predict
 from .target import ResponseTarget
 
@@ -50,11 +47,9 @@ _MAX_COMPONENTS = 60
 _NEGLIGIBLE_VARIANCE = 1e-3  # of the left-out components together, per run, in units of the noise variance
 _SMALLEST_SHARE = 1e-10  # of the leading component
 _REACH = 2.5  # squared distance up to which the emulator is used, as a multiple of the training points' largest one
-_SMALLEST_SLOPE = 1e-6  # of a parameter by its coordinate, in units of its spread in the prior
 _TINY = 1e-300
 _WIDEST = 9.0  # factor by which variances are widened at most
 _SMALLEST_GAIN = 0.02  # in log-likelihood, for which a step is tried
-_ROWS = 4096  # points evaluated at once
 
 
 class TrainingSet(NamedTuple):
@@ -62,28 +57,6 @@ class TrainingSet(NamedTuple):
 
     coords: np.ndarray  # structural coordinates (m, d)
     numbers: np.ndarray  # (m,) of the runs in the archive of the target
-
-
-class Whitening(NamedTuple):
-    """Linear map of scaled parameters (`ResponseTarget.scaled_parameters`) to inputs of about unit variance."""
-
-    centre: np.ndarray  # (d,) maps to zero
-    matrix: np.ndarray  # (d, d): inputs are (scaled parameters - centre) @ matrix
-
-
-def fit_whitening(target: ResponseTarget, centre: np.ndarray, covariance: np.ndarray) -> Whitening:
-    """Whitening for a mean (d,) and covariance (d, d) of structural coordinates."""
-    sd = np.sqrt(np.diag(covariance))
-    low, at, high = target.scaled_parameters(np.stack([centre - sd, centre, centre + sd]))
-    below, above = target.scaled_parameters(np.array([[-1.0], [1.0]]) * np.ones_like(sd))
-    # d u / d z over two standard deviations; on a bound it can vanish, where any scale will do
-    slope = np.maximum((high - low) / (2.0 * sd), _SMALLEST_SLOPE * (above - below))
-    return Whitening(at, np.linalg.inv(np.linalg.cholesky(covariance)).T / slope[:, None])
-
-
-def whitened(target: ResponseTarget, whitening: Whitening, coords: np.ndarray) -> np.ndarray:
-    """Inputs (n, d) of the Gaussian process at structural coordinates (n, d)."""
-    return (target.scaled_parameters(coords) - whitening.centre) @ whitening.matrix
 
 
 class _Forms(NamedTuple):
@@ -95,31 +68,24 @@ class _Forms(NamedTuple):
 
 
 class ResponseEmulator:
-    """A model that predicts responses instead of simulating them, near the points that it was fitted to.
+    """Predicts statistics of responses near the runs that it was fitted to; made by `fit_emulator`.
 
-    It has the members of `fe_likelihoods.simulation.model.Model`. Make one with `fit_emulator`.
-
-    Attributes
-    ----------
-    reach : float
-        Largest squared distance, see `squared_distance`, at which the emulator is used.
-    process : GaussianProcess
-        Predicts the components' coefficients.
-    left_out : (m, k) float
-        Errors of each training run's coefficients, predicted from the other runs.
+    `reach` is the largest `squared_distance` at which it is used, and `left_out` (m, k) are the errors of each training
+    run's coefficients, predicted from the other runs. Rows of `histories` (1 + k, n) are the mean residual and the
+    components, as weights of runs.
     """
 
     def __init__(
         self,
         target: ResponseTarget,
-        whitening: Whitening,
+        centre: np.ndarray,
+        whitening: np.ndarray,
         process: GaussianProcess,
         histories: np.ndarray,
         coefficients: np.ndarray,
         slopes: np.ndarray,
     ) -> None:
-        self._target, self._whitening, self.process = target, whitening, process
-        self._histories = histories  # the mean residual and the components, as weights of runs
+        self._target, self._centre, self._whitening, self.process = target, centre, whitening, process
         self.reach = _REACH * float(np.square(process.inputs).sum(axis=1).max())
         self.left_out, variances = left_out_errors(process)
         largest = (np.square(self.left_out) / np.maximum(variances, _TINY)).max(axis=0)
@@ -130,62 +96,20 @@ class ResponseEmulator:
         self._gradient = 2.0 * self._forms.linear @ slopes
         self._hessian = 2.0 * self._forms.quadratic @ slopes
 
-    @property
-    def parameter_names(self) -> tuple[str, ...]:
-        """Names of the structural parameters, as in the emulated model."""
-        return tuple(self._target.model.parameter_names)
+    def _inputs(self, scaled: np.ndarray) -> np.ndarray:
+        return (scaled[:, : self._target.n_structural] - self._centre) @ self._whitening
 
-    @property
-    def channels(self) -> tuple:
-        """Channels of the emulated model."""
-        return tuple(self._target.model.channels)
+    def squared_distance(self, scaled: np.ndarray) -> np.ndarray:
+        """Squared distance (n,) of scaled parameters (n, >= n_structural) from the centre, in whitened parameters."""
+        return np.square(self._inputs(scaled)).sum(axis=1)
 
-    @property
-    def dt(self) -> float:
-        """Time step [s]."""
-        return self._target.model.dt
+    def log_likelihood(self, scaled: np.ndarray) -> np.ndarray:
+        """Logarithm (n,) of the expected likelihood, given the emulator's uncertainty, at scaled parameters (n, ndim).
 
-    @property
-    def n_steps(self) -> int:
-        """Number of samples."""
-        return self._target.model.n_steps
-
-    @property
-    def fingerprint(self) -> str:
-        """Digest of the emulated model and of the runs that the emulator was fitted to."""
-        inputs = self.process.inputs.tobytes() + self._coefficients.tobytes()
-        return hashlib.blake2b(self._target.model.fingerprint.encode() + inputs, digest_size=16).hexdigest()
-
-    @cached_property
-    def _combined(self) -> np.ndarray:
-        """The mean residual and the components (1 + k, n_channels, n_steps) [SI]."""
-        return self._target.archive.combined(self._histories)
-
-    def squared_distance(self, coords: np.ndarray) -> np.ndarray:
-        """Squared distance (n,) of structural coordinates (n, d) from the centre, in whitened parameters."""
-        return np.square(self._inputs(coords)).sum(axis=1)
-
-    def _inputs(self, coords: np.ndarray) -> np.ndarray:
-        return whitened(self._target, self._whitening, coords)
-
-    def statistics(self, coords: np.ndarray) -> np.ndarray:
-        """Statistics (n, n_numbers) of the mean residuals at structural coordinates (n, d)."""
-        return self._at(predict(self.process, self._inputs(coords))[0])
-
-    def log_likelihood(self, coords: np.ndarray) -> np.ndarray:
-        """Logarithm (n,) of the expected likelihood, given the emulator's uncertainty.
-
-        Parameters
-        ----------
-        coords : (n, ndim) float
-            Coordinates of all parameters, the structural ones first.
+        The columns are those of `ResponseTarget.scaled`.
         """
-        parts = [self._log_likelihood(coords[k : k + _ROWS]) for k in range(0, len(coords), _ROWS)]
-        return np.concatenate(parts) if parts else np.zeros(0)
-
-    def _log_likelihood(self, coords: np.ndarray) -> np.ndarray:
-        d = self._target.n_structural
-        mean, variance = predict(self.process, self._inputs(coords[:, :d]))
+        noise = scaled[:, self._target.n_structural :]
+        mean, variance = predict(self.process, self._inputs(scaled))
         variance = variance * self._widening
         curvature = np.maximum(-np.diagonal(self._hessian), 0.0)
         gradient = self._gradient + mean @ self._hessian
@@ -193,13 +117,13 @@ class ResponseEmulator:
         cost = (np.square(step) / np.maximum(variance, _TINY)).sum(axis=1)
         bend = cost - ((step @ self._hessian) * step).sum(axis=1)
         best = (gradient * step).sum(axis=1) / np.maximum(bend, _TINY)
-        top = self._target.log_likelihood(self._at(mean), coords[:, d:])
+        top = self._target.log_likelihood(self._at(mean), noise)
         # far from the mode the quadratic may promise too much, but any step gives a lower bound
         rows = np.flatnonzero(0.5 * best * (gradient * step).sum(axis=1) > _SMALLEST_GAIN)
         if len(rows):
             best = best[rows]
             moved = self._at(mean[rows] + best[:, None] * step[rows])
-            moved = self._target.log_likelihood(moved, coords[rows, d:]) - 0.5 * best**2 * cost[rows]
+            moved = self._target.log_likelihood(moved, noise[rows]) - 0.5 * best**2 * cost[rows]
             top[rows] = np.fmax(top[rows], moved)
         return top - 0.5 * np.log1p(curvature * variance).sum(axis=1)
 
@@ -215,30 +139,6 @@ class ResponseEmulator:
     def left_out_statistics(self) -> tuple[np.ndarray, np.ndarray]:
         """Statistics (m, n_numbers) of training runs, predicted from the other runs, and their true statistics."""
         return self._at(self._coefficients - self.left_out), self._at(self._coefficients)
-
-    def simulate(self, theta: np.ndarray) -> np.ndarray:
-        """Predicted response (n_channels, n_steps) [SI]; `SimulationFailed` away from the training points."""
-        batch = self.simulate_batch(np.asarray(theta, dtype=float)[None])
-        if batch.reasons[0]:
-            raise SimulationFailed(batch.reasons[0])
-        return batch.response[0]
-
-    def simulate_batch(self, thetas: np.ndarray) -> SimulationBatch:
-        """Predicted responses of parameters (n, d)."""
-        coords = self._target.structural_coordinates(np.asarray(thetas, dtype=float))
-        inside = self.squared_distance(coords) <= self.reach
-        mean, _ = predict(self.process, np.where(inside[:, None], self._inputs(coords), 0.0))
-        average, components = self._combined[0], self._combined[1:]
-        residuals = average + np.einsum("nk,kct->nct", mean, components, optimize=True)
-        if self._target.with_gaps:
-            raise ValueError(
-                "the emulator was fitted to measurements with missing samples, or with times of their own, and "
-                "predicts the response at their samples only: predict with the posterior or the model"
-            )
-        response = self._target.measured - residuals
-        response[~inside] = np.nan
-        reason = "the parameters are outside the region that the emulator was fitted to"
-        return SimulationBatch(response, ["" if good else reason for good in inside])
 
 
 def fit_emulator(
@@ -270,9 +170,10 @@ def fit_emulator(
     histories[0, training.numbers] = 1.0 / len(training.coords)
     histories[1:, training.numbers] = (vectors[:, :k] / lengths).T @ centred
     coefficients = vectors[:, :k] * lengths
-    whitening = fit_whitening(target, centre, covariance)
-    inputs = whitened(target, whitening, training.coords)
+    centre, covariance = target.region_in_scaled(centre, covariance)
+    whitening = np.linalg.inv(np.linalg.cholesky(covariance)).T
+    inputs = (target.scaled_parameters(training.coords) - centre) @ whitening
     importance = np.minimum(1.0, values[:k] / values[0] * 1e3)
     log_scales = None if earlier is None else earlier.process.log_scales
     process = fit_process(inputs, coefficients, importance, log_scales)
-    return ResponseEmulator(target, whitening, process, histories, coefficients, slopes)
+    return ResponseEmulator(target, centre, whitening, process, histories, coefficients, slopes)

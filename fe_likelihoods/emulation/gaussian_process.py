@@ -24,7 +24,6 @@ __all__ = ["GaussianProcess", "fit_process", "left_out_errors", "predict", "pred
 
 _NUGGETS = 10.0 ** np.array([-9.0, -7.0, -5.0, -3.0, -1.0, 1.0])
 _LOG_SCALES = -2.0, 4.0  # bounds of the logarithms of the length scales, in units of the inputs
-_FIRST_LOG_SCALE = 1.2
 _TINY = 1e-300
 
 
@@ -62,12 +61,36 @@ def _covariance(first: np.ndarray, second: np.ndarray, log_scales: np.ndarray) -
     return np.exp(-0.5 * np.maximum(squared, 0.0))
 
 
-def _restricted(log_scales: np.ndarray, inputs: np.ndarray, contrasts: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """Minus twice the restricted log-likelihood of every nugget and output, (n_nuggets, k), up to a constant."""
-    values, vectors = np.linalg.eigh(contrasts.T @ _covariance(inputs, inputs, log_scales) @ contrasts)
-    rotated = np.square(vectors.T @ targets)
+def _restricted(log_scales: np.ndarray, inputs: np.ndarray, contrasts: np.ndarray, targets: np.ndarray) -> tuple:
+    """Minus twice the restricted log-likelihood of every nugget and output, (n_nuggets, k), up to a constant.
+
+    Also the covariance (m, m) of the inputs, and the decomposition that `_gradient` needs.
+    """
+    covariance = _covariance(inputs, inputs, log_scales)
+    values, vectors = np.linalg.eigh(contrasts.T @ covariance @ contrasts)
+    rotated = vectors.T @ targets
     spread = np.maximum(values, 0.0)[None] + _NUGGETS[:, None]
-    return np.log(spread).sum(axis=1)[:, None] + len(values) * np.log((1.0 / spread) @ rotated / len(values) + _TINY)
+    variances = (1.0 / spread) @ np.square(rotated) / len(values) + _TINY
+    losses = np.log(spread).sum(axis=1)[:, None] + len(values) * np.log(variances)
+    return losses, covariance, contrasts @ vectors, rotated, spread, variances
+
+
+def _gradient(log_scales: np.ndarray, inputs: np.ndarray, share: np.ndarray, fitted: tuple) -> np.ndarray:
+    """Derivatives (d,) by the logarithms of the length scales of the mean loss with shares (k,), each at its nugget.
+
+    With R = N (N'KN + g)^-1 N', the loss of an output y has the derivative tr(R K') - y'R K'R y / s^2.
+    """
+    losses, covariance, basis, rotated, spread, variances = fitted
+    best = losses.argmin(axis=0)
+    trace, solved = np.zeros(basis.shape[1]), np.empty_like(rotated)
+    for g in np.unique(best):
+        members = best == g
+        trace += share[members].sum() / spread[g]
+        solved[:, members] = rotated[:, members] / spread[g][:, None] * np.sqrt(share[members] / variances[g, members])
+    solved = basis @ solved
+    by_covariance = ((basis * trace) @ basis.T - solved @ solved.T) * covariance
+    squares = np.square(inputs).T @ by_covariance.sum(axis=1) - (inputs * (by_covariance @ inputs)).sum(axis=0)
+    return 2.0 * squares * np.exp(-2.0 * log_scales)
 
 
 def fit_process(
@@ -88,18 +111,18 @@ def fit_process(
     targets = contrasts.T @ outputs
     share = importance / importance.sum()
 
-    def loss(parameters: np.ndarray) -> float:
-        return float(_restricted(parameters, inputs, contrasts, targets).min(axis=0) @ share)
+    def loss(parameters: np.ndarray) -> tuple[float, np.ndarray]:
+        fitted = _restricted(parameters, inputs, contrasts, targets)
+        return float(fitted[0].min(axis=0) @ share), _gradient(parameters, inputs, share, fitted)
 
-    start = np.full(d, _FIRST_LOG_SCALE) if log_scales is None else log_scales
     if log_scales is None:  # one common scale first: cheap, and a good start for the others
-        start = min((np.full(d, scale) for scale in np.arange(0.2, 3.4, 0.4)), key=loss)
-    log_scales = np.asarray(start, dtype=float)
+        log_scales = min((np.full(d, scale) for scale in np.arange(0.2, 3.4, 0.4)), key=lambda scales: loss(scales)[0])
+    log_scales = np.asarray(log_scales, dtype=float)
     if iterations > 0:
-        options = {"maxiter": iterations, "eps": 1e-3}
-        log_scales = minimize(loss, log_scales, method="L-BFGS-B", bounds=[_LOG_SCALES] * d, options=options).x
-    nuggets = _NUGGETS[_restricted(log_scales, inputs, contrasts, targets).argmin(axis=0)]
-    covariance = _covariance(inputs, inputs, log_scales)
+        bounds, options = [_LOG_SCALES] * d, {"maxiter": iterations}
+        log_scales = minimize(loss, log_scales, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
+    losses, covariance, *_ = _restricted(log_scales, inputs, contrasts, targets)
+    nuggets = _NUGGETS[losses.argmin(axis=0)]
     linear, weights = np.empty((d + 1, outputs.shape[1])), np.empty_like(outputs)
     variances, levels = np.empty(outputs.shape[1]), []
     for nugget in np.unique(nuggets):

@@ -6,25 +6,22 @@
 
 the emulated posterior q_e (`fe_likelihoods.emulation.density`), a wide t mixture q_t around the modes, and the prior.
 q_t and the prior bound the weights posterior / q where the emulator is wrong or does not reach. Before there are enough
-runs for an emulator, q_e is absent. Every simulation, including the search for modes, trains the emulators. A draw that
-is far more probable than expected, away from the known modes, starts another ascent.
+runs for an emulator, q_e is absent. Every simulation, including the search for modes, trains the emulators.
 
 The equations are on the page ``docs/theory/guided.rst``.
 """
 
 import logging
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
-from scipy.linalg import eigh
 
 from samplers.estimates.importance import KnownDensity
 from samplers.finding import Finding
 from samplers.judgement.guides import (
     check_draws_in_memory,
     check_ends,
-    check_reach,
     check_unseen_modes,
     find_missing_part,
 )
@@ -32,19 +29,14 @@ from samplers.proposals.mixture import Mixture, draw, log_density
 
 from .density import EmulatedPosterior, Region, factor_of, student_mixture
 from .emulator import ResponseEmulator, TrainingSet, fit_emulator
-from .levenberg_marquardt import POINTS_PER_STEP
 from .modes import (
-    Mode,
     ModeSearch,
-    approach,
     check_starts,
     counted,
     draw_starts,
     ended,
-    search_from,
     search_modes,
     unseen_share,
-    with_mode,
 )
 from .target import SCALES, ResponseTarget
 
@@ -65,29 +57,8 @@ _WITHIN = 36.0  # squared Mahalanobis distance per dimension within which runs t
 _DEPTH = 40.0, 8.0  # log-density below the best within which runs train an emulator: constant, per dimension
 _ALWAYS = 5  # best runs per dimension that train in any case
 _IMPLAUSIBLE = 10.0  # emulated log-density above all runs, besides 1 per dimension, at which a fit is refused
-_SURPRISE = 10.0  # a far point starts an ascent if its log-density is above any known mode minus this
-_MOST_ASCENTS = 2  # of these, per refinement
-_NOT_A_MODE = (
-    "draws found a much higher point near a supposed mode, so the search was misled and may have missed other modes: "
-    "use more starts"
-)
 _LARGE = 10.0  # error of an emulated log-likelihood, beyond which its size does not matter
 _CLEARLY = 0.75  # ratio of such errors at which the emulators take a function of the parameters
-_FREE = 0.2  # variance of a standard normal coordinate from which a direction is left to the prior
-_SINGLE = 0.95  # share of one parameter in a direction from which it is not a combination
-_SMOOTH = 0.5  # mean error of the emulated log-likelihood, below which a response is smooth
-_WIDER = 4.0  # variance of the draws over the variance at the mode, from which a direction may be a curved ridge
-_SETTLED = 3  # runs at the ends without growth after which a ridge is not followed further
-_LONGEST = 4  # such directions at whose ends runs are made
-_MOST_EXTENSIONS, _GROWTH = 12, 0.05  # of an emulator along these, while the log-evidence grows by as much
-_MOST_BENT = 10  # parameters of a posterior that is followed beyond its ends
-_MOST_CURVES, _ENDS = 24, 2  # steps along a curved posterior, and its ends from which each step is made
-_OPEN_ENDS = (
-    "the posterior is curved, and it was not followed to all of its ends: fix one of the parameters that the data do "
-    "not tell apart, or use the combination of them that the data determine as the parameter"
-)
-_LATE = 0.1  # growth of the emulated log-evidence after draws were made, from which ridges are followed again
-_NOT_AT_THE_TOP = "the search for modes ended before the top of a mode"
 
 
 class ResponseGuide:
@@ -106,8 +77,6 @@ class ResponseGuide:
     ----------
     search : ModeSearch, optional
         Result of the search for modes; None before it.
-    emulators : tuple of ResponseEmulator
-        Emulators in use, one per mode.
     simulations : float
         Simulations run by the guide itself, parts of a record counted as fractions; a call of the model's ``jacobian``
         counts as one.
@@ -135,16 +104,10 @@ class ResponseGuide:
         self._posterior, self._starts = posterior, starts
         self.search: ModeSearch | None = None
         self.simulations = 0.0
-        self._missing: tuple[str, ...] = ()  # why parts of the posterior may be missing, as the search met them
-        self._reach = 1.0  # of the draws along directions that the data leave to the prior, see `check_reach`
         self._regions: list[Region] = []
-        self._modes: list[Mode] = []
         self._best = -np.inf  # largest log-density of a run, in standard normal coordinates
         self._emulated: EmulatedPosterior | None = None
         self._wide: Mixture | None = None
-        self._beyond = np.empty((0, self._target.n_structural))  # points beyond the ends of a curved posterior
-        self._curves = 0  # times that such points were tried
-        self._extensions = 0  # of the emulator along directions that the data leave to the prior
 
     def check(self, log_prob_fn: Callable) -> None:
         """Raise ValueError if a sampler evaluates another object: every draw would be simulated twice."""
@@ -167,21 +130,31 @@ class ResponseGuide:
     @property
     def findings(self) -> tuple[Finding, ...]:
         """Why parts of the posterior may be missing."""
-        found = [find_missing_part(text) for text in self._missing]
-        if self.search is not None and len(self.search.modes) > 1:
-            found += check_unseen_modes(unseen_share(self.search), ended(self.search), len(self.search.modes))
-        elif self.search is not None:
-            found += check_ends(ended(self.search), len(self.search.ends), self._starts, self.search.grown)
+        search = self.search
+        if search is None:
+            return ()
+        if not search.finished:
+            found = [find_missing_part("the budget ended the search for modes")]
+        elif not search.modes:
+            found = [find_missing_part("no start of the search led to a mode: the simulations of all starts fail")]
+        elif not all(mode.converged for mode in search.modes):
+            found = [find_missing_part("the search for modes ended before the top of a mode")]
+        else:
+            found = []
+        if len(search.modes) > 1:
+            found += check_unseen_modes(unseen_share(search), ended(search), len(search.modes))
+        else:
+            found += check_ends(ended(search), len(search.ends), self._starts, search.grown)
         if self._emulated is not None:
             found += check_draws_in_memory(self._emulated.largest_weight)
-        return (*found, *check_reach(self._reach))
+        return tuple(found)
 
     @property
     def basis(self) -> str:
         """What a verdict without such findings rests on."""
         if self.search is None or not self.search.modes:
             return ""
-        n, modes = ended(self.search), len(self._modes)
+        n, modes = ended(self.search), len(self.search.modes)
         missed = 1.0 - 0.05 ** (1.0 / n)
         return (
             f"{n} starts led to {modes} mode{'s' if modes > 1 else ''}; with 95 % probability, they would have found "
@@ -190,6 +163,7 @@ class ResponseGuide:
 
     @property
     def emulators(self) -> tuple[ResponseEmulator, ...]:
+        """Emulators in use, one per mode."""
         return tuple(region.emulator for region in self._regions if region.emulator is not None)
 
     @property
@@ -205,20 +179,13 @@ class ResponseGuide:
 
     def prepare(self, session: Any) -> Iterator[None]:
         """Search for modes; each item is a batch of simulations."""
-        if session.asynchronous:
-            self._check_memory()
         starts = draw_starts(self._target, self._starts, session.random)
-        search = search_modes(
-            self._target,
-            starts,
-            session.remember,
-            session.fits,
-            session.asynchronous,
-            self._starts,
-            session.remaining,
-        )
-        self.search = yield from self._counted(search)
-        self._add_modes(self.search.modes)
+        search = search_modes(self._target, starts, session.remember, session.fits, self._starts, session.remaining)
+        self.search = yield from counted(search, self._spend)
+        modes = self.search.modes
+        self._regions = [Region(mode.coords, mode.covariance, None, mode.log_evidence) for mode in modes]
+        if modes:
+            self._best, self._wide = max(mode.log_density for mode in modes), self._wide_mixture()
         archive = self._target.archive
         runs = archive.numbers
         if len(runs) > 1 and all(np.array_equal(*map(archive.residuals, (runs[0], other))) for other in runs):
@@ -227,14 +194,7 @@ class ResponseGuide:
                 f"gave the same one. Check where the model reads {', '.join(self._target.model.parameter_names)}, "
                 "and whether an old file of results is read"
             )
-        if not self.search.finished:
-            self._add_missing("the budget ended the search for modes")
-        elif not self.search.modes:
-            self._add_missing("no start of the search led to a mode: the simulations of all starts fail")
-        elif not all(mode.converged for mode in self.search.modes):
-            self._add_missing(_NOT_AT_THE_TOP)
         self._emulate(session.random)
-        yield from self._follow_ridges(session)
 
     def evaluation_queue(self) -> Any:
         """The queue of the posterior, which keeps the responses for `observe`."""
@@ -263,18 +223,13 @@ class ResponseGuide:
         coords = self._target.coordinates(parameters)[:, : self._target.n_structural]
         self._target.run_parameters(structural, coords, session.remember)
 
-    def refine(self, parameters: np.ndarray, log_prob: np.ndarray, session: Any) -> Iterator[None]:
-        """Learn from evaluated points (n, ndim): ascents from surprising ones, and new emulators."""
-        yield from self._ascend_from_surprises(parameters, log_prob, session)
-        earlier = self._emulated
+    def refine(self, parameters: np.ndarray, log_prob: np.ndarray, session: Any) -> None:
+        """Learn from evaluated points (n, ndim): new emulators."""
+        alive = np.isfinite(log_prob)
+        coords = self._target.coordinates(parameters[alive])
+        density = log_prob[alive] - self._posterior.log_prior(parameters[alive]) + self._target.log_prior(coords)
+        self._best = max(self._best, density.max(initial=-np.inf))
         self._emulate(session.random)
-        if earlier is None or self._emulated is None:
-            return
-        # the evidence of an emulator of a rough response changes by about its error from fit to fit
-        if self._emulated.log_evidence > earlier.log_evidence + _LATE + self._left_out_error():
-            yield from self._follow_ridges(session)
-        else:
-            yield from self._follow_curves(session)
 
     # ------------------------------------------------------------------ parts
 
@@ -285,12 +240,16 @@ class ResponseGuide:
         self._fit_emulators()
         ready = [region for region in self._regions if region.emulator is not None]
         if ready and len(ready) == len(self._regions):
-            emulated = EmulatedPosterior(self._target, self._regions, random)
+            try:
+                emulated = EmulatedPosterior(self._target, self._regions, random)
+            except np.linalg.LinAlgError as error:
+                logger.info("no draws of the emulated posterior could be made: %s", error)
+                return
             if emulated.top > self._best + _IMPLAUSIBLE + self._target.ndim:
                 logger.info("the emulators have a top (%.1f) far above all runs (%.1f)", emulated.top, self._best)
                 return
             self._emulated = emulated
-            self._regions = self._emulated.moments()
+            self._regions = emulated.regions
             self._wide = self._wide_mixture()
 
     def _choose_scale(self) -> None:
@@ -312,7 +271,7 @@ class ResponseGuide:
     def _left_out_error(self) -> float:
         """Mean error of the log-likelihood of runs that the emulators were not fitted to, each at most `_LARGE`."""
         errors = []
-        for region, mode in zip(self._regions, self._modes, strict=True):
+        for region, mode in zip(self._regions, self.search.modes, strict=True):
             if region.emulator is not None:
                 predicted, true = (
                     self._target.log_likelihood(
@@ -323,108 +282,8 @@ class ResponseGuide:
                 errors.append(np.minimum(np.abs(predicted - true), _LARGE).mean())
         return float(np.mean(errors)) if errors else np.inf
 
-    def _follow_ridges(self, session: Any) -> Iterator[None]:
-        """Simulate at the ends of directions that the data leave to the prior, while the emulated evidence grows."""
-        largest, settled = -np.inf, 0  # three times, because the first runs at the ends of a stretch may add nothing
-        while self._emulated is not None and self._extensions < _MOST_EXTENSIONS:
-            free, _ = self._free_directions()
-            grown = self._emulated.log_evidence > largest + _GROWTH
-            settled = 0 if grown else settled + 1
-            if settled == _SETTLED or not len(free):
-                break
-            largest = max(largest, self._emulated.log_evidence)
-            points = self._emulated.extremes(free[:_LONGEST])[:, : self._target.n_structural]
-            new = self._target.new_points(points)
-            if not session.fits(new):
-                break
-            self._target.run(points, session.remember)
-            self.simulations += new
-            self._extensions += 1
-            yield
-            self._emulate(session.random)
-        yield from self._follow_curves(session)
-        self._reach = float(min(self._free_directions()[1], default=1.0))
-
-    def _follow_curves(self, session: Any) -> Iterator[None]:
-        """Simulate beyond the ends of a curved posterior until it ends there.
-
-        It is not begun while the emulator is inaccurate: of a rough response, the emulated posterior is rough as well.
-        Nor is it in many dimensions, where nearly all draws of a normal density look like ends.
-        """
-        if self._target.n_structural > _MOST_BENT or (not self._curves and not self._left_out_error() < _SMOOTH):
-            return
-        while self._emulated is not None and self._emulated.curved:
-            points = self._emulated.beyond(_ENDS, np.concatenate([self._plausible(), self._beyond]))
-            if not len(points):
-                break
-            if self._curves == _MOST_CURVES:
-                self._add_missing(_OPEN_ENDS)
-                break
-            self._curves += 1
-            self._beyond = np.concatenate([self._beyond, points])
-            finished = yield from self._counted(approach(self._target, points, session.remember, session.fits))
-            self._emulate(session.random)
-            if not finished:
-                self._add_missing(_OPEN_ENDS)
-                break
-
-    def _plausible(self) -> np.ndarray:
-        """Structural coordinates (n, d) of the runs that are not far less probable than the mode, by their noise."""
-        archive, d = self._target.archive, self._target.n_structural
-        best = max(self._modes, key=lambda mode: mode.log_density)
-        noise = np.repeat(best.coords[None, d:], len(archive), axis=0)
-        density = self._target.log_likelihood(archive.statistics, noise) + self._target.log_prior(archive.coords)
-        return archive.coords[density > density.max() - _IMPLAUSIBLE - d]
-
-    def _free_directions(self) -> tuple[np.ndarray, np.ndarray]:
-        """Combinations (n, ndim) of parameters that the data leave to the prior, and how far the draws reach along.
-
-        The longest are first. The reach (n,) is the variance of the draws as a share of the variance at the mode. Along
-        a curved ridge, the Laplace approximation can be narrow; directions in which the draws are much wider count as
-        well. A single parameter that the data leave to the prior is no ridge: the design at the mode reaches along it.
-        """
-        directions, reached = [np.empty((0, self._target.ndim))], [np.empty(0)]
-        if self._emulated is not None:
-            spread = self._emulated.covariance
-            # the draws themselves as well, because a mode can be too narrow
-            for covariance in (spread, *(mode.covariance for mode in self._modes)):
-                values, vectors = np.linalg.eigh(covariance)
-                free, allowed = vectors[:, values > _FREE].T[::-1], values[values > _FREE][::-1]
-                directions.append(free)
-                reached.append(((free @ spread) * free).sum(axis=1) / allowed)
-            # differences of a rough response make the mode too narrow, which is no curved ridge
-            smooth = self._left_out_error() < _SMOOTH
-            for region, mode in zip(self._regions, self._modes, strict=True) if smooth else ():
-                ratios, vectors = eigh(region.covariance, mode.covariance)
-                wider = vectors[:, ratios > _WIDER].T[::-1]
-                directions.append(wider / np.linalg.norm(wider, axis=1, keepdims=True))
-                reached.append(np.ones(len(wider)))
-        found, reach = np.concatenate(directions), np.concatenate(reached)
-        combined = np.square(found).max(axis=1, initial=0.0) < _SINGLE
-        return found[combined], reach[combined]
-
-    def _check_memory(self) -> None:
-        """Raise ValueError if the likelihood cannot cache the responses that arrive before they are used."""
-        most = self._starts * max(self._target.n_structural, POINTS_PER_STEP)
-        for part, _ in self._posterior.likelihood.parts():
-            needed = 8 * most * len(part.model.channels) * part.model.n_steps
-            if part.simulator.response_memory.most < needed:
-                raise ValueError(
-                    f"an asynchronous run with a guide needs a likelihood with memory_bytes of {needed} or more, which "
-                    "holds the responses that arrive together, so that none is simulated twice; got "
-                    f"{part.simulator.response_memory.most}"
-                )
-
-    def _counted(self, search: Generator[float, None, Any]) -> Generator[float, None, Any]:
-        """Result of a search; simulations are counted batch by batch, as soon as they are made."""
-        return counted(search, self._spend)
-
     def _spend(self, simulations: float) -> None:
         self.simulations += simulations
-
-    def _add_missing(self, text: str) -> None:
-        if text not in self._missing:
-            self._missing = (*self._missing, text)
 
     def _shares(self) -> tuple[float, float]:
         """Shares of the wide mixture and of the prior in the draws."""
@@ -444,32 +303,19 @@ class ResponseGuide:
             total = np.logaddexp(total, np.log(1.0 - wide - prior) + emulated)
         return total
 
-    def _add_modes(self, modes: Any) -> None:
-        for mode in modes:
-            self._modes.append(mode)
-            self._regions.append(self._region_of(mode))
-        if self._regions:
-            self._wide = self._wide_mixture()
-
-    def _region_of(self, mode: Mode) -> Region:
-        """The region of a new mode, which has no emulator yet."""
-        self._best = max(self._best, mode.log_density)
-        return Region(mode.coords, mode.covariance, None, mode.log_evidence)
-
     def _wide_mixture(self) -> Mixture:
         shares = np.array([region.log_evidence for region in self._regions])
         weights = np.exp(shares - shares.max())
         weights = (1.0 - _SMALLEST_WEIGHT) * weights / weights.sum() + _SMALLEST_WEIGHT / len(weights)
         # the modes themselves as well: where an emulator is wrong, so are the moments that it gives
-        centres = [*(region.centre for region in self._regions), *(mode.coords for mode in self._modes)]
-        covariances = [*(region.covariance for region in self._regions), *(mode.covariance for mode in self._modes)]
+        centres = [*(region.centre for region in self._regions), *(mode.coords for mode in self.search.modes)]
+        covariances = [
+            *(region.covariance for region in self._regions),
+            *(mode.covariance for mode in self.search.modes),
+        ]
         factors = [factor_of(_WIDENED * covariance) for covariance in covariances]
         weights = np.concatenate([(1.0 - _SHARE_OF_MODES) * weights, _SHARE_OF_MODES * weights])
         return student_mixture(weights, centres, factors, _WIDE_FREEDOM)
-
-    def _far(self, coords: np.ndarray) -> np.ndarray:
-        """Whether structural coordinates (n, d) are away from all regions."""
-        return self._distances(coords).min(axis=0) > _WITHIN * self._target.n_structural
 
     def _distances(self, coords: np.ndarray) -> np.ndarray:
         """Squared Mahalanobis distances (n_regions, n) of structural coordinates (n, d)."""
@@ -479,42 +325,6 @@ class ResponseGuide:
             inverse = np.linalg.inv(np.linalg.cholesky(region.covariance[:d, :d]))
             rows.append(np.square((coords - region.centre[:d]) @ inverse.T).sum(axis=1))
         return np.array(rows)
-
-    def _ascend_from_surprises(self, parameters: np.ndarray, log_prob: np.ndarray, session: Any) -> Iterator[None]:
-        """Ascents from points away from the known modes that are nearly as probable as these."""
-        alive = np.flatnonzero(np.isfinite(log_prob))
-        if not len(alive):
-            return
-        coords = self._target.coordinates(parameters[alive])
-        density = log_prob[alive] - self._posterior.log_prior(parameters[alive]) + self._target.log_prior(coords)
-        self._best = max(self._best, float(density.max()))
-        structural = coords[:, : self._target.n_structural]
-        if self._modes:
-            best = max(mode.log_density for mode in self._modes)
-            surprising = self._far(structural) & (density > best - _SURPRISE)
-            surprising |= (density >= density.max()) & (density > best + _IMPLAUSIBLE + self._target.ndim)
-        else:
-            surprising = density >= density.max()
-        for row in np.flatnonzero(surprising)[np.argsort(-density[surprising])][:_MOST_ASCENTS]:
-            search = search_from(self._target, structural[row], session.remember, session.fits)
-            found = yield from self._counted(search)
-            if found is None:
-                self._add_missing("the budget ended an ascent to a mode that the search had missed")
-            elif not self._modes or self._far(found.coords[None, : self._target.n_structural])[0]:
-                self._add_modes([found])
-                self.search, self._emulated = with_mode(self.search, found), None
-            elif found.log_density > max(mode.log_density for mode in self._modes) + _IMPLAUSIBLE:
-                self._replace_nearest(found)
-
-    def _replace_nearest(self, mode: Mode) -> None:
-        """Enter a mode instead of the nearest one, whose ascent ended early, such as where simulations fail."""
-        number = int(np.argmin(self._distances(mode.coords[None, : self._target.n_structural])[:, 0]))
-        if self._modes[number].converged:
-            self._add_missing(_NOT_A_MODE)
-        self._modes[number], self._regions[number] = mode, self._region_of(mode)
-        self._emulated, self._wide = None, self._wide_mixture()
-        if all(mode.converged for mode in self._modes):
-            self._missing = tuple(text for text in self._missing if text != _NOT_AT_THE_TOP)
 
     def _fit_emulators(self) -> None:
         archive, d = self._target.archive, self._target.n_structural
@@ -527,7 +337,7 @@ class ResponseGuide:
             rows = np.flatnonzero((nearest == k) & (distances[k] < _WITHIN * d))
             if len(rows) < _FEWEST_RUNS[0] * d + _FEWEST_RUNS[1]:
                 continue
-            noise = self._modes[k].coords[d:]
+            noise = self.search.modes[k].coords[d:]
             density = self._target.log_likelihood(statistics[rows], np.repeat(noise[None], len(rows), axis=0))
             density = density + self._target.log_prior(coords[rows])
             best = rows[np.argmax(density)]
@@ -555,6 +365,6 @@ class ResponseGuide:
 
     def _expected(self, region: Region, coords: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Log-density (n,) at structural coordinates (n, d) by the emulator of a region; -inf beyond its reach."""
-        full = np.column_stack([coords, np.repeat(noise[None], len(coords), axis=0)])
-        density = region.emulator.log_likelihood(full) + self._target.log_prior(coords)
-        return np.where(region.emulator.squared_distance(coords) <= region.emulator.reach, density, -np.inf)
+        scaled = self._target.scaled(np.column_stack([coords, np.repeat(noise[None], len(coords), axis=0)]))
+        density = region.emulator.log_likelihood(scaled) + self._target.log_prior(coords)
+        return np.where(region.emulator.squared_distance(scaled) <= region.emulator.reach, density, -np.inf)

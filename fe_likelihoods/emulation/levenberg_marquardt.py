@@ -21,7 +21,7 @@ K. Levenberg (1944), Quarterly of Applied Mathematics 2, 164-168; D. W. Marquard
 Industrial and Applied Mathematics 11, 431-441; C. G. Broyden (1965), Mathematics of Computation 19, 577-593 (secants).
 """
 
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,19 +29,17 @@ import numpy as np
 from .target import NoiseFit, Remember, ResponseTarget, Runs
 
 __all__ = [
-    "POINTS_PER_STEP",
     "TOLERANCE",
     "Ascent",
-    "Batches",
     "Derivatives",
     "Jacobians",
     "ascend",
     "axes_of",
+    "complete",
     "distinct_ends",
 ]
 
 _DAMPINGS = 10.0 ** np.array([-1.5, 0.0, 1.5])
-POINTS_PER_STEP = len(_DAMPINGS)
 _FIRST_DAMPING = 1e-2
 _DAMPING_LIMITS = 1e-8, 1e8
 _LARGEST_STEP = 2.0  # prior standard deviations
@@ -67,15 +65,15 @@ _SAME_MODE = 4.0  # squared distance per dimension, in units of the Laplace appr
 _EXPLAINED = 0.01, 0.1, 1.0
 _NEAR = 20.0  # largest difference of log-densities at which the line between ends is examined
 _ALONG = np.array([0.207, 0.414, 0.732])  # points of this line, unequal so that equally spaced modes are not all hit
+_DIP = 3.0  # depth of a valley in log-density that separates modes
 _ROUGHNESS = 4.0  # depth of a valley between points of one rough mode, as a multiple of the cost of a step
 _DEEPEST = 9.0  # at most: along wrong axes, steps cost hundreds
 _TOO_SHORT = 0.02  # squared length of a step, in units of the Laplace approximation, with which a design is repeated
 _DESIGNS = 4  # at most, around one end
 _DESIGN_FROM = 0.25  # log-density per dimension still to gain at which the first one is made
-_FREE = 2.0  # curvatures of the Hessian below this are the prior's, which is 1, with little of the data's
 _LONGEST = 4  # such directions along which steps are simulated
 _FAR = 2.0  # standard deviations that are simulated along such directions
-_DIP = 3.0  # depth of a valley in log-density that separates modes
+_FREE = 2.0  # curvatures of the Hessian below this are the prior's, which is 1, with little of the data's
 _SHARPEST = 1e18  # curvature at which a step of a standard deviation, 1e-9 of the prior's, is lost in rounding
 _EXACT = (
     "the model reproduces the measurements exactly at {}, so the likelihood grows without bound as the standard "
@@ -388,9 +386,10 @@ class _Climb:
     def connected(self) -> Generator[np.ndarray, Runs, int | None]:
         """Number of the ascent that a line without a valley leads to from nearly the same height; None if none.
 
-        On a rough or curved likelihood, derivatives at one point do not describe the other points of its mode. The line
-        is straight in logarithms of positive parameters, in which a ridge of equal products is straight. A lower ascent
-        that goes on is no end: from a saddle, lines without a valley lead up to two modes.
+        On a rough or curved likelihood, derivatives at one point do not describe the other points of its mode: without
+        lines, searches on the bridge column find up to three modes where one is, in a third more simulations. The line
+        is straight in scaled parameters, in which a ridge of equal products is straight. A lower ascent that goes on is
+        no end: from a saddle, lines without a valley lead up to two modes.
         """
         here = self.here
         for number, end in list(self._known.items()):
@@ -510,111 +509,46 @@ def _valley(values: np.ndarray) -> float:
     return float((np.minimum(before, after) - values[1:-1]).max())
 
 
-class Batches:
-    """Runs generators of points side by side; `remember` and `fits` as for `search_modes`.
+def complete(
+    target: ResponseTarget,
+    ascents: dict[int, Generator[Request, Any, Any]],
+    finished: Callable[[int, Any], None],
+    remember: Remember,
+    fits: Callable[[float], bool],
+    share: float = 1.0,
+) -> Generator[float, None, bool]:
+    """Run generators of requests, by their numbers, side by side to their ends: all requests together are one batch.
 
-    With `overlap`, each generator goes on as soon as its own points have been simulated; otherwise all requests are
-    simulated as one batch. The order in which requests end is stored with `remember`.
+    Yields the cost of each batch, `share` for each new simulation. Returns False as soon as one does not fit in the
+    budget; `remember` and `fits` are as for `search_modes`.
     """
-
-    def __init__(
-        self, target: ResponseTarget, remember: Remember, fits: Callable[[float], bool], overlap: bool = False
-    ) -> None:
-        self._target, self._remember, self._fits, self._overlap = target, remember, fits, overlap
-
-    def complete(
-        self, ascents: dict[int, Generator[np.ndarray, Runs, Any]], finished: Callable[[int, Any], None]
-    ) -> Iterator[int]:
-        """Advance all generators, by their numbers, to their ends; yields the number of new points in each batch.
-
-        Stops early, with `interrupted` set, when a batch does not fit in what remains of the budget; what runs by then
-        is kept by the target.
-        """
-        self.interrupted = False
+    answers: dict[int, Any] = dict.fromkeys(ascents)
+    while True:
         waiting: dict[int, Request] = {}
-        begun: set[int] = set()
-        running = _RunningRequests(self._target) if self._overlap else None
-
-        def advance(index: int, answer: Runs | np.ndarray | None) -> None:
+        for index, answer in answers.items():
             try:
                 waiting[index] = ascents[index].send(answer)
             except StopIteration as end:
                 finished(index, end.value)
-
-        for index in ascents:
-            advance(index, None)
-        try:
-            while waiting:
-                wanted = self._cost(waiting.values())
-                if not self.interrupted and not self._fits(wanted):
-                    self.interrupted = True
-                    for index in waiting.keys() - begun:
-                        del waiting[index]
-                    continue
-                begun.update(waiting)
-                ended = self._wait(waiting, running)
-                requests = [waiting.pop(index) for index in ended]
-                new = self._cost(requests)
-                answers = self._answers(requests)
-                yield new
-                for index, answer in zip(ended, answers, strict=True):
-                    begun.discard(index)
-                    if not self.interrupted:
-                        advance(index, answer)
-        finally:
-            if running is not None:
-                running.close()
-
-    def _cost(self, requests: Iterable[Request]) -> int:
-        """Simulations that requests need; derivatives at a point count as one."""
-        points = [each for each in requests if not isinstance(each, Derivatives)]
-        derivatives = sum(isinstance(each, Derivatives) for each in requests)
-        return derivatives + (self._target.new_points(np.concatenate(points)) if points else 0)
-
-    def _answers(self, requests: list[Request]) -> list[Any]:
-        """Runs at the points of each request, or the model's derivatives."""
-        wanted = [each.coords for each in requests if isinstance(each, Derivatives)]
-        points = [each for each in requests if not isinstance(each, Derivatives)]
-        slopes = iter(self._target.derivatives(np.array(wanted), self._remember) if wanted else ())
-        runs = self._target.run(np.concatenate(points), self._remember) if points else None
-        ends = iter(np.cumsum([len(each) for each in points]))
-
-        def rows(n: int) -> Runs:
-            end = next(ends)
-            return Runs(*(column[end - n : end] for column in runs))
-
-        return [next(slopes) if isinstance(each, Derivatives) else rows(len(each)) for each in requests]
-
-    def _wait(self, waiting: dict[int, Request], running: "_RunningRequests | None") -> list[int]:
-        """Numbers of the generators whose requests can be answered: in lock-step all of them."""
-        if running is None:
-            return list(waiting)
-        if derivatives := [index for index, each in waiting.items() if isinstance(each, Derivatives)]:
-            return derivatives
-
-        return self._remember("ascents", lambda: [np.array(running.wait(waiting))])[0].tolist()
-
-
-class _RunningRequests:
-    """Requests of generators whose points are evaluated at the same time; `run` finds their responses in the caches."""
-
-    def __init__(self, target: ResponseTarget) -> None:
-        self._target, self._queue = target, target.evaluation_queue()
-        self._left: dict[int, set[int]] = {}  # tickets of points that run, by number of the generator
-        self.close = self._queue.close
-
-    def wait(self, waiting: dict[int, np.ndarray]) -> list[int]:
-        """Numbers of the generators whose points have all been evaluated, at least one of those that are waiting."""
-        for index, coords in waiting.items():
-            if index not in self._left:
-                self._left[index] = set(self._queue.submit(self._target.at_median_noise(coords)))
-        while not (ended := [index for index, left in self._left.items() if not left]):
-            arrived = {ticket for ticket, _ in self._queue.collect()}
-            for left in self._left.values():
-                left -= arrived
-        for index in ended:
-            del self._left[index]
-        return ended
+        if not waiting:
+            return True
+        wanted = [index for index, each in waiting.items() if isinstance(each, Derivatives)]
+        points = [waiting[index] for index in waiting if index not in wanted]
+        coords = np.concatenate(points) if points else np.empty((0, target.n_structural))
+        cost = share * (len(wanted) + target.new_points(coords))  # derivatives at a point count as one simulation
+        if not fits(cost):
+            return False
+        at = np.array([waiting[index].coords for index in wanted])
+        slopes = iter(target.derivatives(at, remember) if wanted else ())
+        runs = target.run(coords, remember) if points else None
+        answers, end = {}, 0
+        for index, each in waiting.items():
+            if isinstance(each, Derivatives):
+                answers[index] = next(slopes)
+            else:
+                answers[index] = Runs(*(column[end : end + len(each)] for column in runs))
+                end += len(each)
+        yield cost
 
 
 def distinct_ends(ends: dict[int, Ascent], apart: float = np.inf) -> dict[int, int]:

@@ -13,23 +13,29 @@ import numpy as np
 
 from samplers.judgement.guides import DOUBTED_SHARE
 
-from .levenberg_marquardt import FIRST_DIFFERENCE, TOLERANCE, Ascent, Batches, Jacobians, ascend, axes_of, distinct_ends
+from .levenberg_marquardt import (
+    FIRST_DIFFERENCE,
+    TOLERANCE,
+    Ascent,
+    Jacobians,
+    ascend,
+    axes_of,
+    complete,
+    distinct_ends,
+)
 from .target import Remember, ResponseTarget, run_at_once
 
 __all__ = [
     "Mode",
     "ModeSearch",
-    "approach",
     "check_starts",
     "counted",
     "draw_starts",
     "ended",
     "find_modes",
     "laplace",
-    "search_from",
     "search_modes",
     "unseen_share",
-    "with_mode",
 ]
 
 _NEGLIGIBLE = 15.0  # a mode whose log-evidence is lower than the largest by more than this is dropped
@@ -162,7 +168,6 @@ def search_modes(
     starts: np.ndarray,
     remember: Remember = run_at_once,
     fits: Callable[[float], bool] = lambda _: True,
-    overlap: bool = False,
     first: int | None = None,
     remaining: Callable[[], float] = lambda: np.inf,
 ) -> Generator[float, None, ModeSearch]:
@@ -175,8 +180,8 @@ def search_modes(
     often.
 
     `remember` stores responses for a resumed run, ``fits(n)`` says whether n more simulations of the whole record fit
-    into the budget, and `remaining` how many are left of it. With `overlap`, ascents begin together, and go on as soon
-    as their own simulations have ended (`Batches`). Yields the cost of each batch, in simulations of the whole record.
+    into the budget, and `remaining` how many are left of it. Yields the cost of each batch, in simulations of the whole
+    record.
     """
     first = len(starts) if first is None else first
     most = min(_MOST_STARTS * first, len(starts))
@@ -196,7 +201,7 @@ def search_modes(
     while True:
         fresh = range(begin, following)
         standing_for.extend(fresh)
-        ascents = _ascend_from(parts, {k: starts[k] for k in fresh}, standing_for, remember, fits, overlap)
+        ascents = _ascend_from(parts, {k: starts[k] for k in fresh}, standing_for, remember, fits)
         finished = yield from counted(ascents, spend)
         search = _modes_of(parts, standing_for, spent, finished)
         few = _enough(search, first) - ended(search) if begin == 0 or not search.grown else 0
@@ -204,7 +209,7 @@ def search_modes(
         if not finished or missing <= 0 or following == most or not remember("starts", affordable)[0]:
             return search
         if begin == 0:
-            heights = yield from counted(_heights(parts[0], starts, remember, fits, overlap), spend)
+            heights = yield from counted(_heights(parts[0], starts, remember, fits), spend)
             if heights is None:
                 return search._replace(simulations=spent, finished=False)
             starts = np.concatenate([starts[:following], starts[_in_order(starts, heights, following)]])
@@ -215,22 +220,20 @@ def search_modes(
 
 
 def _heights(
-    part: _Part, starts: np.ndarray, remember: Remember, fits: Callable[[float], bool], overlap: bool
+    part: _Part, starts: np.ndarray, remember: Remember, fits: Callable[[float], bool]
 ) -> Generator[float, None, np.ndarray | None]:
     """Log-likelihoods (n,) of starts (n, n_structural) on the first part of the record; -inf where one failed.
 
     None if the budget ended it.
     """
 
-    def simulate(start: np.ndarray) -> Generator[np.ndarray, Any, float]:
-        runs = yield start[None]
-        return -np.inf if runs.failed[0] else part.target.fit_noise(runs.statistics[0]).log_density
-
-    heights = np.full(len(starts), -np.inf)
-    batches = Batches(part.target, remember, lambda points: fits(part.share * points), overlap)
-    for points in batches.complete({k: simulate(start) for k, start in enumerate(starts)}, heights.__setitem__):
-        yield part.share * points
-    return None if batches.interrupted else heights
+    cost = part.share * part.target.new_points(starts)
+    if not fits(cost):
+        return None
+    runs = part.target.run(starts, remember)
+    yield cost
+    found = zip(runs.failed, runs.statistics, strict=True)
+    return np.array([-np.inf if failed else part.target.fit_noise(each).log_density for failed, each in found])
 
 
 def counted(steps: Generator[float, None, Any], spend: Callable[[float], None]) -> Generator[float, None, Any]:
@@ -288,22 +291,12 @@ def ended(search: ModeSearch) -> int:
     return sum(end >= 0 for end in search.ends)
 
 
-def with_mode(search: ModeSearch, mode: Mode) -> ModeSearch:
-    """The search with a mode, the last one, to which one further start has led."""
-    modes = (*search.modes, mode)
-    least = max(each.log_evidence for each in modes) - _NEGLIGIBLE
-    ends = (*search.ends, len(modes) - 1)
-    seen = tuple(end if end >= 0 and modes[end].log_evidence > least else -1 for end in ends)
-    return search._replace(modes=modes, ends=seen)
-
-
 def _ascend_from(
     parts: list[_Part],
     starts: dict[int, np.ndarray],
     standing_for: list[int],
     remember: Remember,
     fits: Callable[[float], bool],
-    overlap: bool,
 ) -> Generator[float, None, bool]:
     """Ascents from starts, by their numbers, on all parts of the record; returns False if the budget ended them."""
     target, n = parts[-1].target, len(standing_for)
@@ -314,7 +307,6 @@ def _ascend_from(
         tolerance = TOLERANCE if whole else min(TOLERANCE / part.share, _LOOSEST)
         # many starts are close together, and none may be lost before the part of the record where they differ
         apart = np.inf if whole else min(_APART, _APART_OF_ALL / n)
-        batches = Batches(part.target, remember, lambda points, share=part.share: fits(share * points), overlap)
         ascents = {
             k: ascend(
                 part.target,
@@ -331,11 +323,10 @@ def _ascend_from(
             for k, (start, steps) in fronts.items()
         }
         # the best end of the part before first: others often lead to it, which costs them no derivatives
-        leading = len(ascents) if overlap or part is parts[0] else 1
+        leading = len(ascents) if part is parts[0] else 1
         for wave in (list(ascents)[:leading], list(ascents)[leading:]):
-            for points in batches.complete({k: ascents[k] for k in wave}, standing_for.__setitem__):
-                yield part.share * points
-            if batches.interrupted:
+            some = {k: ascents[k] for k in wave}
+            if not (yield from complete(part.target, some, standing_for.__setitem__, remember, fits, part.share)):
                 return False
         if not part.ends:
             break
@@ -461,29 +452,3 @@ def find_modes(posterior: Any, starts: int = 6, seed: Any = None, max_simulation
             spent += next(search)
         except StopIteration as end:
             return end.value
-
-
-def search_from(
-    target: ResponseTarget, start: np.ndarray, remember: Remember, fits: Callable[[float], bool]
-) -> Generator[float, None, Mode | None]:
-    """One ascent on the whole record from a point (n_structural,); returns the mode, or None if the budget ended it."""
-    known: dict[int, Ascent] = {}
-    ascent = ascend(target, Jacobians(), 0, start, np.zeros(target.n_structural), known)
-    batches = Batches(target, remember, fits)
-    for points in batches.complete({0: ascent}, lambda *_: None):
-        yield float(points)
-    return laplace(target, known[0]) if known and not batches.interrupted else None
-
-
-def approach(
-    target: ResponseTarget, points: np.ndarray, remember: Remember, fits: Callable[[float], bool]
-) -> Generator[float, None, bool]:
-    """Simulate from points (n, n_structural) towards the nearest points that fit the data.
-
-    The prior is centred at the points, so that no step climbs along a ridge. Returns False if the budget ended it.
-    """
-    jacobians, batches = Jacobians(), Batches(target, remember, fits)
-    ascents = {k: ascend(target, jacobians, k, point, point, {}, designed=False) for k, point in enumerate(points)}
-    for new in batches.complete(ascents, lambda *_: None):
-        yield float(new)
-    return not batches.interrupted

@@ -16,6 +16,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.optimize import minimize
 
 from ..signals.durations import growing_durations
 from ..simulation.model import most_responses
@@ -33,16 +34,15 @@ _GRID = np.linspace(-1.0, 1.0, 41)
 _SLOPE_STEP = 1e-4
 SCALES = "parameters", "logarithms", "reciprocals"
 _LARGEST_FACTOR = 30.0  # between the ends of the prior's central 95 %, up to which a parameter is a factor
+_SMALLEST_SLOPE = 1e-6  # of a parameter by its coordinate, in units of its spread in the prior
 _MAP_STEP = 1e-5  # of coordinates, for the derivatives of the parameters
 _SMALL_STEP = 1e-4  # share of a step from which its direction in scaled parameters is found
 _LOG_LIMITS = -690.0, 690.0
 _SMALLEST = 1e-300  # positive parameters are at least this before their logarithm or reciprocal is taken
 _AT_BOUND = 8.5  # from about 8.3, parameters are rounded to a bound that is not zero
-_NEWTON_STEPS = 12
-_NEWTON_GAIN = 1e-4
-_NEWTON_DIFFERENCE = 1e-3
+_NOISE_STEP, _NOISE_SLOPE = 1e-3, 1e-2  # of noise coordinates: difference, and slope of the log-density at the best
+_LARGE = 1e300
 _MANY = 10_000  # runs of a pool whose size is not known
-_DAMPED = 0.0, 1.0, 10.0, 100.0
 
 
 def _finite(coords: np.ndarray) -> np.ndarray:
@@ -253,6 +253,22 @@ class ResponseTarget:
             ratio = (reached - coords) / steps
         return np.where((ratio > 0.3) & (ratio < 3.0), reached, coords + steps)
 
+    def scale_slopes(self, coords: np.ndarray, spread: np.ndarray) -> np.ndarray:
+        """Derivatives (n_structural,) of scaled parameters by their coordinates, over a spread (n_structural,).
+
+        On a bound of the prior they can vanish, where any scale will do.
+        """
+        below, low, high, above = self.scaled_parameters(
+            np.stack([-np.ones_like(coords), coords - spread, coords + spread, np.ones_like(coords)])
+        )
+        return np.maximum((high - low) / (2.0 * spread), _SMALLEST_SLOPE * (above - below))
+
+    def region_in_scaled(self, centre: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Centre (k,) and covariance (k, k) of coordinates, structural ones first, in scaled parameters."""
+        slopes, d = np.ones(len(centre)), self.n_structural
+        slopes[:d] = self.scale_slopes(centre[:d], np.sqrt(np.diag(covariance)[:d]))
+        return self.scaled(centre[None])[0], covariance * np.outer(slopes, slopes)
+
     def scaled(self, coords: np.ndarray) -> np.ndarray:
         """Scaled parameters and noise coordinates (n, ndim) at coordinates (n, ndim): a ridge is straight in them."""
         return np.column_stack([self.scaled_parameters(coords[:, : self.n_structural]), coords[:, self.n_structural :]])
@@ -329,10 +345,6 @@ class ResponseTarget:
         by_coords = np.einsum("nzp,npct->nzct", (ahead - behind) / (2.0 * _MAP_STEP), found.astype(float))
         return self._data.of_residuals(by_coords)
 
-    def evaluation_queue(self) -> Any:
-        """Where points are evaluated while others are waited for; `run` finds their responses in the cache."""
-        return self.posterior.evaluation_queue(responses=True)
-
     # ------------------------------------------------------------------ the noise
 
     def log_likelihood(self, statistics: np.ndarray, coords: np.ndarray) -> np.ndarray:
@@ -359,37 +371,17 @@ class ResponseTarget:
                 trial = np.repeat(coords[None], len(_GRID), axis=0)
                 trial[:, k] += width * _GRID
                 coords = trial[np.argmax(self._noise_density(statistics, trial))]
-        best = NoiseFit(coords, float(self._noise_density(statistics, coords[None])[0]))
-        for _ in range(_NEWTON_STEPS):
-            improved = self._newton_step(statistics, best)
-            if improved.log_density < best.log_density + _NEWTON_GAIN:
-                break
-            best = improved
-        return best
+        offsets = _NOISE_STEP * np.concatenate(
+            [np.zeros((1, self.n_noise)), *np.eye(self.n_noise) * [[[1.0]], [[-1.0]]]]
+        )
 
-    def _newton_step(self, statistics: np.ndarray, at: NoiseFit) -> NoiseFit:
-        """The best of several damped Newton steps of the noise parameters, or the point itself."""
-        k = self.n_noise
-        unit = _NEWTON_DIFFERENCE * np.eye(k)
-        pairs = [(i, j) for i in range(k) for j in range(i)]
-        offsets = [unit, -unit]
-        if pairs:
-            offsets.append(np.array([unit[i] + unit[j] for i, j in pairs]))
-        values = self._noise_density(statistics, at.coords + np.concatenate(offsets))
-        if not np.isfinite(values).all():
-            return at
-        ahead, behind, both = values[:k], values[k : 2 * k], values[2 * k :]
-        gradient = (ahead - behind) / (2.0 * _NEWTON_DIFFERENCE)
-        hessian = np.diag((2.0 * at.log_density - ahead - behind) / _NEWTON_DIFFERENCE**2)
-        for (i, j), value in zip(pairs, both, strict=True):
-            mixed = -(value - ahead[i] - ahead[j] + at.log_density) / _NEWTON_DIFFERENCE**2
-            hessian[i, j] = hessian[j, i] = mixed
-        curvatures, vectors = np.linalg.eigh(hessian)
-        steps = [(vectors / (np.abs(curvatures) * (1.0 + damping) + 0.1)) @ vectors.T @ gradient for damping in _DAMPED]
-        trials = at.coords + np.clip(steps, -1.0, 1.0)
-        reached = self._noise_density(statistics, trials)
-        top = int(np.argmax(np.where(np.isfinite(reached), reached, -np.inf)))
-        return NoiseFit(trials[top], float(reached[top])) if reached[top] > at.log_density else at
+        def loss(at: np.ndarray) -> tuple[float, np.ndarray]:
+            values = np.nan_to_num(-self._noise_density(statistics, at + offsets), nan=_LARGE, posinf=_LARGE)
+            ahead, behind = np.split(values[1:], 2)
+            return float(values[0]), (ahead - behind) / (2.0 * _NOISE_STEP)
+
+        found = minimize(loss, coords, jac=True, method="BFGS", options={"gtol": _NOISE_SLOPE})
+        return NoiseFit(found.x, -float(found.fun))
 
     def slopes(self, statistics: np.ndarray, coords: np.ndarray) -> np.ndarray:
         """Derivatives (n_numbers,) of the log-likelihood by the statistics, at fixed noise parameters."""

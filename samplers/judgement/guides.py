@@ -7,7 +7,6 @@ __all__ = [
     "UNSEEN",
     "check_draws_in_memory",
     "check_ends",
-    "check_reach",
     "check_unseen_modes",
     "find_missing_part",
 ]
@@ -23,7 +22,6 @@ REFUSED_SHARE = 0.3
 # 9 searches that had found one of several modes, and in 6 of 10 that had found the only one.
 GROWN_STARTS = 2
 HEAVY = 0.01  # largest weight of a draw of the emulated posterior; 0.006 in right runs with 30 parameters
-REACHED = 0.05  # variance of the draws along a ridge, as a share of the mode's, below which they are short of it
 
 
 def find_missing_part(text: str, severity: str = CARE) -> Finding:
@@ -63,17 +61,5 @@ def check_draws_in_memory(largest_weight: float) -> list[Finding]:
         "the emulated posterior is curved and its draws in memory cover it badly (one of them has "
         f"{100.0 * largest_weight:.2g} % of their weight): standard deviations and tails may be too small, by much "
         "more than their stated errors. Compare with a run without a guide, or with another seed"
-    )
-    return [find_missing_part(text)]
-
-
-def check_reach(reach: float) -> list[Finding]:
-    """Whether draws reach along a ridge; `reach` is their smallest variance along one, as a share of the mode's."""
-    if reach >= REACHED:
-        return []
-    text = (
-        "the data leave a combination of the parameters to the prior, and the draws reach only a small part of what "
-        "the prior allows: fix one of the parameters that the data do not tell apart, or use their product as the "
-        "parameter"
     )
     return [find_missing_part(text)]

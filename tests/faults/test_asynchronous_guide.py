@@ -103,7 +103,7 @@ def test_a_limit_counts_what_is_running(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["threads", *(pytest.param(k, marks=pytest.mark.slow) for k in ("map only", "none"))])
 def test_pools(kind):
-    """Real threads; pools that take batches only, or no pool, are used without overlap."""
+    """Real threads; pools that take batches only, or no pool."""
     posterior = symmetric()
 
     class MapOnly:
@@ -131,9 +131,3 @@ def test_what_cannot_be_asynchronous_is_refused():
         SMCSampler(N, 2, posterior, vectorize=True, guide=guide, asynchronous=True)
     with pytest.raises(TypeError, match="asynchronous"), ThreadPoolExecutor(1) as pool:
         TMCMCSampler(N, 2, posterior, pool=pool, guide=guide, asynchronous=True)
-    emulated = symmetric()
-    emulated.likelihood.simulator.response_memory.most = 1000
-    sampler = SMCSampler(N, 2, emulated, vectorize=True, guide=emulated.guide(), asynchronous=True)
-    with pytest.raises(ValueError, match="memory_bytes of 57600 or more"):
-        sampler.run_mcmc(None, 0)
-    assert emulated.likelihood.simulations == 0
