@@ -30,6 +30,7 @@ from .checks import find_unreached_part
 from .clusters import Cluster, find_clusters
 from .failures import NearFailures, check_failed_region
 from .guides import UNSEEN
+from .rounds import UNSETTLED
 
 __all__ = [
     "CONVERGED",
@@ -255,7 +256,8 @@ def judge(
             f"weights is {result.start.pareto_shape:.2f}"
         )
         if result.start.shortfall:
-            found.append(find_unreached_part(result.start.shortfall, CARE))
+            unsettled = result.start.shortfall == UNSETTLED
+            found.append(find_unreached_part(result.start.shortfall, WRONG if unsettled else CARE))
         found += _of_signed_sample(result)
     elif result.start is not None:
         text = f"The draws of the guide were not used ({result.start.reason})."

@@ -217,3 +217,29 @@ def test_rounds_that_missed_a_part_of_the_posterior_are_left_out(left_out, monke
         assert abs(error) < 4.0 * sampler.log_evidence_error < 0.2
     else:
         assert error < -4.0 * sampler.log_evidence_error
+
+
+class UncoveringGuide(FixedGuide):
+    """Knows one of ten equal modes, and one more after each round, as along a ridge that the draws follow slowly."""
+
+    def __init__(self, posterior, known=1):
+        parts = [stats.multivariate_normal([centre, 0.0], 0.01) for centre in range(known)]
+
+        def log_density(coords):
+            return np.logaddexp.reduce([part.logpdf(coords) for part in parts]) - np.log(known)
+
+        points = np.concatenate([part.rvs(1000, random_state=np.random.RandomState(3)) for part in parts])
+        super().__init__(posterior, [part.mean for part in parts], [0.012 * np.eye(2)] * known)
+        self.known_density = KnownDensity(log_density, points, np.full(len(points), 1.0 / len(points)), 0.0)
+
+    def refine(self, coords, log_prob, session):
+        self.__init__(self.posterior, min(len(self.parts) + 1, 10))
+
+
+def test_a_density_that_still_grows_when_enough_draws_are_made_is_refused():
+    whole = UncoveringGuide(Box([-4.0, -4.0], [14.0, 4.0], lambda x: 0.0), 10).known_density
+    box = Box([-4.0, -4.0], [14.0, 4.0], lambda x: whole.log_density(np.atleast_2d(x)).reshape(np.shape(x)[:-1]))
+    sampler = SMCSampler(100, 2, box, vectorize=True, seed=4, guide=UncoveringGuide(box))
+    sampler.run_mcmc(None, 1)
+    assert sampler.log_evidence + np.log(144.0) < -4.0 * sampler.log_evidence_error
+    assert sampler.verdict.status == "not usable" and "larger than its draws" in str(sampler.verdict)
