@@ -85,7 +85,8 @@ class EmulatedPosterior:
 
     `log_evidence` is the log of the integral over the emulated density, with an error from the importance sampling in
     memory; `top` is the largest log-density in the pool, `effective_share` its effective sample size divided by its
-    size, and `largest_weight` the largest normalised weight in it; `regions` are those given, with their moments.
+    size, and `largest_weight` the largest normalised weight in it; `of_runs` are log-densities (n,) of the simulations
+    by their responses, and by the emulators; `regions` are those given, with their moments.
     """
 
     def __init__(self, target: ResponseTarget, regions: Sequence[Region], random: np.random.RandomState) -> None:
@@ -216,6 +217,8 @@ class EmulatedPosterior:
         scaled = self._target.scaled(np.column_stack([structural, np.zeros((len(structural), noise.shape[1]))]))
         scaled[:, structural.shape[1] :] = noise[self._nearest(scaled)[0]]
         density = self._log_likelihood(scaled) + self._target.log_prior(structural)
+        simulated = self._target.log_likelihood(self._target.archive.statistics, scaled[:, structural.shape[1] :])
+        self.of_runs = simulated + self._target.log_prior(structural), density
         probable = scaled[density > density.max() - _PLAUSIBLE - ndim]
         if len(probable) < 2 * ndim or not np.all(np.ptp(probable, axis=0) > 0.0):
             return [(mixture, 1.0)]

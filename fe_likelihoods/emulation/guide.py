@@ -22,6 +22,7 @@ from samplers.finding import Finding
 from samplers.judgement.guides import (
     check_draws_in_memory,
     check_ends,
+    check_excluded_runs,
     check_unseen_modes,
     find_missing_part,
 )
@@ -147,6 +148,7 @@ class ResponseGuide:
             found += check_ends(ended(search), len(search.ends), self._starts, search.grown)
         if self._emulated is not None:
             found += check_draws_in_memory(self._emulated.largest_weight)
+            found += check_excluded_runs(*self._emulated.of_runs)
         return tuple(found)
 
     @property

@@ -1,5 +1,7 @@
 """Findings of guides: may a search, and the draws that follow from it, have missed a part of the posterior?"""
 
+import numpy as np
+
 from ..finding import CARE, WRONG, Finding
 
 __all__ = [
@@ -7,6 +9,7 @@ __all__ = [
     "UNSEEN",
     "check_draws_in_memory",
     "check_ends",
+    "check_excluded_runs",
     "check_unseen_modes",
     "find_missing_part",
 ]
@@ -22,6 +25,9 @@ REFUSED_SHARE = 0.3
 # 9 searches that had found one of several modes, and in 6 of 10 that had found the only one.
 GROWN_STARTS = 2
 HEAVY = 0.01  # largest weight of a draw of the emulated posterior; 0.006 in right runs with 30 parameters
+
+# Log-density below the best of a probable simulation, and above the emulated one of a simulation that is excluded.
+PROBABLE, EXCLUDED = 3.0, 4.0
 
 
 def find_missing_part(text: str, severity: str = CARE) -> Finding:
@@ -63,3 +69,17 @@ def check_draws_in_memory(largest_weight: float) -> list[Finding]:
         "more than their stated errors. Compare with a run without a guide, or with another seed"
     )
     return [find_missing_part(text)]
+
+
+def check_excluded_runs(simulated: np.ndarray, emulated: np.ndarray) -> list[Finding]:
+    """Whether an emulated posterior has all probable simulations; log-densities (n,) by responses and by emulators."""
+    probable = simulated > np.max(simulated) - PROBABLE
+    excluded = int(np.sum(probable & ~(emulated > simulated - EXCLUDED)))
+    if excluded == 0:
+        return []
+    text = (
+        f"the emulated posterior excludes {excluded} of {np.sum(probable)} probable simulations, as at the ends of a "
+        "ridge of parameters that the data do not tell apart: evidence and standard deviations may be wrong by far "
+        "more than their errors. Fix one of such parameters, or make their product the parameter"
+    )
+    return [find_missing_part(text, WRONG)]

@@ -291,7 +291,7 @@ def draw_rounds(
             logger.info("%d of %d rounds hardly reached a part of the posterior", len(rounds) - len(reaching), made)
             rounds, outcome, left_out = reaching, None, left_out + 1
         elif len(reaching) < len(rounds) and outcome is not None:
-            outcome = outcome._replace(shortfall=outcome.shortfall or UNSETTLED)
+            outcome = outcome._replace(shortfall=UNSETTLED)
         if outcome is not None:
             return outcome
         if budget.refused:

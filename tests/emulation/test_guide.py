@@ -20,6 +20,7 @@ from fe_likelihoods import (
 )
 from fe_likelihoods.emulation.guide import ResponseGuide
 from samplers import SMCSampler, TMCMCSampler
+from samplers.judgement.guides import check_excluded_runs
 from tests.faults import guided_run
 from tests.statistics.hard_posteriors import CASES
 
@@ -231,3 +232,18 @@ def test_a_banana_is_right_or_has_a_concern(n):
     sd = np.sqrt((weights * x**2).sum() / weights.sum())
     right = abs(sampler.get_chain(flat=True)[:, 0].std() / sd - 1.0) < 0.25  # 3.5 standard errors of 100 draws
     assert right if n == 8 else sampler.verdict.status == "usable"
+
+
+@pytest.mark.parametrize(
+    ("simulated", "emulated", "refused"),
+    [
+        ([0.0, -1.0, -20.0], [0.1, -1.5, -np.inf], False),  # improbable runs need not be emulated
+        ([0.0, -1.0, -2.0], [0.0, -1.0, -np.inf], True),  # beyond the reach of the emulator
+        ([0.0, -1.0, -2.0], [0.0, -1.0, -6.5], True),
+        ([0.0, -1.0, -2.0], [0.0, -1.0, np.nan], True),
+        ([0.0, -1.0, -2.0], [-3.0, -4.0, -5.0], False),  # an uncertain emulator
+    ],
+)
+def test_a_posterior_that_excludes_probable_simulations_is_refused(simulated, emulated, refused):
+    found = check_excluded_runs(np.array(simulated), np.array(emulated))
+    assert [each.severity for each in found] == ["wrong"] * refused
