@@ -27,6 +27,8 @@ GROWN_STARTS = 2
 HEAVY = 0.01  # largest weight of a draw of the emulated posterior; 0.006 in right runs with 30 parameters
 
 # Log-density below the best of a probable simulation, and above the emulated one of a simulation that is excluded.
+# On ridges E h^3 with uniform priors, 20 runs: 4 of 7 wrong runs, among them the 2 that change little from round to
+# round, and none of 12 right ones; none of 40 right runs with other priors and on four problems.
 PROBABLE, EXCLUDED = 3.0, 4.0
 
 

@@ -18,7 +18,11 @@ class Target:
 
     def __init__(self, arc, runs=40):
         angles = np.linspace(-arc, arc, runs)
-        self.archive = SimpleNamespace(coords=RADIUS * np.column_stack([np.cos(angles), np.sin(angles)]))
+        coords = RADIUS * np.column_stack([np.cos(angles), np.sin(angles)])
+        self.archive = SimpleNamespace(coords=coords, statistics=np.hypot(*coords.T)[:, None])
+
+    def log_likelihood(self, statistics, noise):
+        return -0.5 * np.square((statistics[:, 0] - RADIUS) / THICKNESS)
 
     def log_prior(self, coords):
         return -0.5 * np.square(coords).sum(axis=1) - np.log(2.0 * np.pi)

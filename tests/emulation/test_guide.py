@@ -223,7 +223,7 @@ def test_a_banana_is_right_or_has_a_concern(n):
     sampler = SMCSampler(100, n + 1, posterior, vectorize=True, seed=1, guide=posterior.guide(), max_simulations=1500)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
-        sampler.run_mcmc(None, 0)
+        sampler.run_mcmc(None, 1)
     # x1 and the noise apart, the first value is normal with the mean -9 x0^2
     x, sigma = np.meshgrid(np.linspace(-5.0, 5.0, 1001), np.exp(np.linspace(-1.2, 1.2, 201)), indexing="ij")
     density = norm.logpdf(values[0, 0], -9.0 * x**2, np.hypot(15.0, sigma)) + norm.logpdf(x)
