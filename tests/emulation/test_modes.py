@@ -53,7 +53,7 @@ def test_the_mode_is_the_one_of_a_general_optimiser(noise):
     posterior = vibration(noise)
     search = find_modes(posterior, starts=3, seed=1)
     mode = search.modes[0]
-    assert mode.converged and search.finished and search.ends[0] == 0
+    assert mode.converged and search.finished and 0 in list(search.ends)
     assert mode.log_density == pytest.approx(_log_density(posterior, mode.coords), abs=1e-3)
     scale = np.sqrt(np.diag(mode.covariance))
     found = minimize(
