@@ -6,6 +6,7 @@ from math import comb
 from typing import Any
 
 import numpy as np
+from scipy.stats import chi2
 
 from ..likelihood.parameters import Parameter
 from ..likelihood.posterior import Posterior
@@ -31,6 +32,7 @@ __all__ = [
     "check_parameters",
     "check_residuals",
     "check_responses",
+    "check_stated_errors",
     "check_supports",
     "describe_residuals",
     "limits_of_model",
@@ -313,7 +315,9 @@ def check_parameters(rows: Sequence[ParameterRow], limits: Container[str] = ()) 
     The bounds of the names in `limits` are limits of the model as well, and end a posterior rightly.
     """
     found = []
-    flat = [row for row in rows if row.sd > SAME_AS_PRIOR * row.prior_sd]
+    far = {row.label: (row.mean - row.prior_mean) / row.prior_sd for row in rows}
+    far = {name: distance for name, distance in far.items() if abs(distance) > SURE}
+    flat = [row for row in rows if row.sd > SAME_AS_PRIOR * row.prior_sd and row.label not in far]
     at = [f"{label} at {bound:.4g}" for name, (label, bound, _) in edges(rows).items() if name not in limits]
     if at:
         text = f"The posterior reaches the edge of its prior: {listed(at)}. The bound, not the data, ends it there."
@@ -324,8 +328,6 @@ def check_parameters(rows: Sequence[ParameterRow], limits: Container[str] = ()) 
         text = f"The posterior of {names} is nearly as wide as its prior: these data say little about it."
         action = "Do not report it as identified. A stronger excitation or another sensor may inform it."
         found.append(Finding("Not informed by the data", NOTE, text, action))
-    far = {row.label: (row.mean - row.prior_mean) / row.prior_sd for row in rows}
-    far = {name: distance for name, distance in far.items() if abs(distance) > SURE}
     if far:
         text = (
             f"The posterior mean of {listed(list(far))} is more than {SURE:.2g} standard deviations of the "
@@ -394,6 +396,30 @@ def check_residuals(fits: Fits) -> list[Finding]:
         "effective_samples=, and look at the residuals for an effect that the model lacks."
     )
     return [Finding(CORRELATED, NOTE, text, action, {"factor": factor})]
+
+
+def check_stated_errors(fits: Fits) -> list[Finding]:
+    """Whether data without time differ from the model by more than the standard deviations of their errors."""
+    found = []
+    for fit in fits.fits:
+        if fit.deviations is None or fit.residuals is None:
+            continue
+        errors = fit.residuals / fit.deviations
+        square, n = float(np.nansum(np.square(errors))), int(np.isfinite(errors).sum())
+        if not chi2.sf(square, n) < SMALL_PROBABILITY:
+            continue
+        factor = float(np.sqrt(square / n))
+        text = (
+            f"The {n} values{f' of {fit.title}' if fit.title else ''} differ from the model by {factor:.2g} times the "
+            "standard deviations of their errors (root mean square). The model differs from the structure, a load case "
+            "or a sensor is another one, or the stated errors are too small: intervals of the parameters are too "
+            "narrow."
+        )
+        action = (
+            "Look at the values one by one. Leave out known errors, which then are parameters, or state larger ones."
+        )
+        found.append(Finding("Values differ more than their stated errors", CARE, text, action, {"factor": factor}))
+    return found
 
 
 def _is_coloured(each: ChannelFit) -> bool:

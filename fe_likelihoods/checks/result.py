@@ -19,6 +19,7 @@ from .fit import (
     check_parameters,
     check_residuals,
     check_responses,
+    check_stated_errors,
     check_supports,
     limits_of_model,
 )
@@ -116,7 +117,7 @@ def check_run(
         found += check_data(likelihood.measurements, motions_to_replace(likelihood.model))
         found += check_gaps(likelihood.noise) + _check_range(likelihood)
     if not run.is_inconclusive and all(each.severity != WRONG for each in found):  # a fault explains the residuals
-        found += check_residuals(fits)
+        found += check_residuals(fits) + check_stated_errors(fits)
         found += check_other_events([row for row in rows if row.name in _of_one_event(run)])
     unique = dict.fromkeys(found)  # data sets may share a description or a motion
     return judge(unique, (*_tests(run, fits, failed), *model.tests.items()))

@@ -194,12 +194,12 @@ def _check_size(name: str, kind: str, peak: float) -> list[Finding]:
 
 
 def _check_silence(measurements: Measurements) -> list[Finding]:
-    """Channels whose samples are all equal."""
-    silent = [
-        channel.name
-        for channel, values in zip(measurements.channels, measurements.values, strict=True)
-        if np.isfinite(values).any() and np.nanmax(values) == np.nanmin(values)
-    ]
+    """Channels whose samples are all equal; of data without time, whose samples are all zero."""
+    silent = []
+    for channel, values in zip(measurements.channels, measurements.values, strict=True):
+        known = values[np.isfinite(values)]
+        equal = len(known) > 1 and np.ptp(known) == 0.0
+        silent += [channel.name] if equal and (measurements.is_history or known[0] == 0.0) else []
     if not silent:
         return []
     text = f"All samples of {', '.join(silent)} are equal."

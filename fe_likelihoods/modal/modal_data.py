@@ -84,6 +84,12 @@ class ModalData:
         whole = all(isinstance(number, int | np.integer) and number > 0 for number in numbers)
         if len(numbers) != m or len(set(numbers)) != m or not whole:
             raise ValueError(f"ModalData: mode_numbers must be {m} different whole numbers from 1 on; got {numbers}")
+        damping = None if self.damping is None else _numbers("damping", self.damping, (1, 2), (n_sets, m))
+        if damping is not None and not ((damping >= 0.0) & (damping < 1.0) | np.isnan(damping)).all():
+            raise ValueError(
+                f"ModalData: damping ratios must be from 0 to below 1, such as 0.015 for 1.5 %, or NaN; got "
+                f"{damping.tolist()}: in a file, state the unit, damping_%"
+            )
         sensors = (self.sensors,) if isinstance(self.sensors, str) else tuple(self.sensors)
         if len(set(sensors)) != len(sensors) or not all(isinstance(name, str) and name for name in sensors):
             raise ValueError(f"ModalData: the names of the sensors must differ and not be empty; got {sensors}")
@@ -91,7 +97,7 @@ class ModalData:
             "frequencies": frequencies,
             "shapes": _checked_shapes(self.shapes, n_sets, m, sensors, known),
             "sensors": sensors,
-            "damping": None if self.damping is None else _numbers("damping", self.damping, (1, 2), (n_sets, m)),
+            "damping": damping,
             "frequency_cv": _share("frequency_cv", self.frequency_cv, m, "0.005 for 0.5 %"),
             "covariance": self._checked_covariance(frequencies),
             "shape_error": _share("shape_error", self.shape_error, m, "0.02, for shapes with a norm of 1"),

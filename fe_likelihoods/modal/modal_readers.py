@@ -147,7 +147,9 @@ def _of_table(table: Table, sensors: Sequence[str], unit: str | None, options: d
     sensors = tuple(sensors) or tuple(others)
     values = {what: None if place is None else table.columns[place].values for what, place in found.items()}
     frequencies = _frequencies(table, found, unit)
-    shapes = np.array([table.columns[names.index(name)].values for name in sensors]).reshape(len(sensors), -1).T
+    _refuse_complex(table, sensors)
+    shapes = np.array([table.columns[names.index(name)].values for name in sensors])
+    shapes = shapes.reshape(len(sensors), len(frequencies)).T
     sets = np.zeros(len(frequencies)) if values["set"] is None else values["set"]
     modes = values["mode"]
     if modes is None:  # the place among the lines of its identification
@@ -176,6 +178,17 @@ def _of_table(table: Table, sensors: Sequence[str], unit: str | None, options: d
         named = stated_unit(table, found["damping"], "dimensionless")
         placed["damping"][rows] = to_si(values["damping"], named or "1", "dimensionless")
     return ModalData(sensors=sensors, mode_numbers=numbers.astype(int).tolist(), **placed, **options)
+
+
+def _refuse_complex(table: Table, sensors: Sequence[str]) -> None:
+    """Raise ValueError for columns that are real and imaginary parts, or magnitudes and phases, of a shape."""
+    words = [(re.sub(r"[^a-z]+(re|im|real|imag|mag|abs|phase)$", "", name.lower()), name) for name in sensors]
+    ends = [name for stem, name in words if stem != name.lower()]
+    if len(ends) > 1 and len({stem for stem, _ in words}) < len(words):
+        raise ValueError(
+            f"{table.file}: the columns {', '.join(ends)} are parts of complex shapes; make real ones of them, "
+            "real_shapes(parts) of fe_likelihoods.modal.modal_data, and give these to ModalData"
+        )
 
 
 def _frequencies(table: Table, found: Mapping[str, int | None], unit: str | None) -> np.ndarray:

@@ -96,6 +96,8 @@ def test_bad_data_are_refused_with_what_to_do(arguments, text):
         ({"mode_numbers": [1, 1]}, "different whole numbers"),
         ({"mode_numbers": [0, 1]}, "from 1 on"),
         ({"damping": [0.01]}, "damping must be real numbers"),
+        ({"damping": [-0.02, 0.01]}, "from 0 to below 1"),
+        ({"damping": [1.5, 0.01]}, "from 0 to below 1"),
     ],
 )
 def test_bad_options_are_refused(options, text):

@@ -21,6 +21,7 @@ from fe_likelihoods import (
     ShearFrame,
     SimulationCache,
     Uniform,
+    check_data,
 )
 from fe_likelihoods.modal.load_cases import LoadTest
 from fe_likelihoods.modal.mode_models import StructureModes
@@ -237,6 +238,7 @@ def test_frequencies_alone_are_paired_by_number():
     assert likelihood.parameter_names == ("f",)
     assert likelihood([2.02]) == pytest.approx(2 * norm.logpdf(0.01, 0.0, 0.01))
     assert np.isnan(likelihood.predict_modes([[2.0]]).assurance).all()
+    assert not check_data(likelihood.measurements)
 
 
 @pytest.mark.parametrize(

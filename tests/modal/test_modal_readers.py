@@ -60,6 +60,15 @@ def test_other_layouts_of_a_table(tmp_path):
             read_modal_data(written(tmp_path, head, "1.0,1"))
 
 
+def test_frequencies_alone_and_parts_of_complex_shapes(tmp_path):
+    data = read_modal_data(written(tmp_path, "mode,frequency_Hz,damping_%", "1,2.0,1.5", "2,5.0,2"))
+    assert data.sensors == () and data.damping.tolist() == [[0.015, 0.02]]
+    for head in ("f_Hz,a_re,a_im", "f_Hz,a mag,a phase", "f_Hz,a real,a imag"):
+        with pytest.raises(ValueError, match="parts of complex shapes; make real ones"):
+            read_modal_data(written(tmp_path, head, "2.0,1.0,0.1"))
+    assert read_modal_data(written(tmp_path, "f_Hz,roof_re,base_re", "2.0,1.0,0.1")).sensors == ("roof_re", "base_re")
+
+
 def test_units_are_stated_or_given(tmp_path):
     lines = ("6.283185307179586,1,2", "12.566370614359172,1,-1")
     for head, options in (("frequency [rad/s],a,b", {}), ("frequency,a,b", {"unit": "rad/s"})):
