@@ -105,37 +105,6 @@ def frames_of(sampler: type) -> list[str]:
     return found
 
 
-def frames_to_kernels() -> str:
-    """Deepest stack from ``posterior(theta)`` to a compiled function that Python calls, of the bridge column."""
-    from numba.core.dispatcher import Dispatcher
-
-    posterior = import_module("fe_likelihoods").problems.bridge_column()
-    thetas = posterior.sample_prior(2, np.random.default_rng(1))
-    posterior(thetas[0])  # compiles: numba reads the names that are replaced below
-    stacks = []
-
-    def watched(kernel):
-        def call(*args):
-            stacks.append(stack_to("__call__"))
-            return kernel(*args)
-
-        return call
-
-    replaced = []
-    for name, module in list(sys.modules.items()):
-        if name.startswith("fe_likelihoods.") and not name.startswith("fe_likelihoods.kernels"):
-            for key, value in list(vars(module).items()):
-                if isinstance(value, Dispatcher):
-                    replaced.append((module, key, value))
-                    setattr(module, key, watched(value))
-    try:
-        posterior(thetas[1])
-    finally:
-        for module, key, value in replaced:
-            setattr(module, key, value)
-    return describe(stacks) if any(stacks) else "not seen: the kernel runs in a thread or is no global"
-
-
 def rows():
     """Pairs of label and value, in the order of the table."""
     for folder, budget in BUDGETS.items():
@@ -148,7 +117,6 @@ def rows():
     for name in ("SMCSampler", "TMCMCSampler"):
         annealing, final = frames_of(getattr(import_module("samplers"), name))
         yield f"{name}: run_mcmc to the function, annealing, at beta = 1", f"{annealing}; {final}"
-    yield "posterior(theta) to a kernel of the bridge column", frames_to_kernels()
 
 
 if __name__ == "__main__":

@@ -47,14 +47,6 @@ ORDER = {
         ("blobs", "emcee_internals", "finding", "interrupts", "resampling"),
     ),
 }
-# a thing and its figure, section of the command, report or other package
-SAME_NAME = {"comparison", "damage", "events", "finding", "guide", "inputs", "isolated_bridge", "priors", "results"} | {
-    "interrupts",
-    "sampling",
-    "scores",
-    "sensors",
-    "starting",
-}
 
 TREES = {path: ast.parse(path.read_text()) for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))}
 
@@ -122,22 +114,6 @@ def test_samplers_import_nothing_of_fe_likelihoods():
         for path, names in IMPORTS.items()
         if name(path).startswith("samplers/") and any(n.startswith("fe_likelihoods") for n in names)
     ]
-
-
-def test_private_names_of_emcee_are_used_in_one_module():
-    private = {"_random", "_moves", "_weights", "_previous_state", "_FunctionWrapper"}
-    users = {
-        name(path)
-        for path, tree in TREES.items()
-        if name(path).startswith("samplers/")
-        and private & {node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
-    }
-    assert len(users) == 1, users
-
-
-def test_files_of_the_same_name_hold_the_same_thing():
-    stems = [path.stem for path in TREES if path.stem not in ("__init__", "__main__")]
-    assert {stem for stem in stems if stems.count(stem) > 1} <= SAME_NAME
 
 
 def test_sources_cite_only_what_a_reader_has():

@@ -65,23 +65,6 @@ def test_the_stub_lists_what_it_imports(package, most):
     assert len(declared) <= most
 
 
-@pytest.mark.parametrize("package", [fe_likelihoods, samplers])
-def test_unknown_name_is_an_attribute_error(package):
-    assert not hasattr(package, "absent")
-    with pytest.raises(AttributeError, match=f"No {package.__name__} attribute .*absent"):
-        package.absent  # noqa: B018
-
-
-@pytest.mark.parametrize("name", ["SMCSampler", "TMCMCSampler"])
-def test_what_a_module_misses_itself_is_named(name):
-    """Not hidden behind an AttributeError: the message says that emcee is not there."""
-    code = (
-        "import sys; sys.modules['emcee'] = None; import samplers\n"
-        f"try:\n    samplers.{name}\nexcept ModuleNotFoundError as error:\n    print(error.name)"
-    )
-    assert fresh(code).strip() == "emcee"
-
-
 def test_no_folder_or_module_has_the_name_of_a_public_function():
     """Such a name would be the function or the module, whichever was imported last."""
     for package in (fe_likelihoods, samplers):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fe_likelihoods.units import DIMENSIONS, G0, UNITS, find_unit, from_si, to_si
+from fe_likelihoods.units import UNITS, find_unit, from_si, to_si
 
 
 @pytest.mark.parametrize(
@@ -46,10 +46,6 @@ def test_from_si_is_the_inverse_of_to_si(unit, rng):
     values = rng.normal(size=(3, 4))
     there_and_back = from_si(to_si(values, unit), unit, UNITS[unit].dimension)
     np.testing.assert_allclose(there_and_back, values, rtol=4e-16)
-
-
-def test_every_dimension_has_an_si_unit_of_factor_one():
-    assert all(find_unit(unit, name) == (unit, 1, name) for name, unit in DIMENSIONS.items())
 
 
 def test_a_share_is_a_strain_only_where_no_other_dimension_is_stated():
@@ -100,7 +96,3 @@ def test_wrong_dimension_is_refused():
         to_si(1.0, "in", "acceleration")
     with pytest.raises(ValueError, match="unknown dimension 'length'; known dimensions: acceleration"):
         from_si(1.0, "in", "length")
-
-
-def test_gravity_is_the_standard_one():
-    assert G0 == 9.80665

@@ -16,10 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fe_likelihoods.simulation import dask_executor
 from samplers.record import Record
-from tests.clusters import noted
-from tests.faults.treacherous import Treacherous, posterior_of
 
 ROOT = Path(__file__).parents[2]
 SCRIPTS = ROOT / "docs" / "clusters"
@@ -102,35 +99,6 @@ def check_result(place, interruptions):
     return repeated
 
 
-@needs("dask_jobqueue")
-@pytest.mark.slow
-def test_scripts_of_jobs_limit_threads_and_leave_before_their_walltime(place):
-    code = "import dask_jobs; print(dask_jobs.make_cluster(dask_jobs.parse_arguments()).job_script())"
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    options = ["--partition", "compute", "--memory", "1GB", "--cores", "8", "--threads", "4"]
-    scripts = {}
-    for system in ("slurm", "pbs"):
-        command = [sys.executable, "-c", code, *options, "--system", system]
-        done = subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True, check=True)
-        scripts[system] = done.stdout
-    assert "OMP_NUM_THREADS=4" in scripts["slurm"]
-    assert re.search(r"--nworkers 2.*--nthreads 1 --lifetime 7h", scripts["slurm"]), scripts["slurm"]
-    assert "#PBS -l select=1:ncpus=8:mem=" in scripts["pbs"] and "#PBS -l walltime=08:00:00" in scripts["pbs"]
-
-
-@needs("mpi4py")
-@pytest.mark.slow
-def test_mpi(place):
-    mpiexec = Path(sys.executable).with_name("mpiexec")
-    command = [mpiexec if mpiexec.exists() else "mpiexec", "--oversubscribe", "-n", "3"]
-    command += [sys.executable, "-m", "mpi4py.futures", "mpi.py"]
-    environment = os.environ | {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
-    environment |= {"PYTHONPATH": str(ROOT), "SECONDS_PER_SIMULATION": "0.002"}
-    with open(place / "output.txt", "wb") as output:
-        subprocess.run(command, cwd=place, env=environment, stdout=output, stderr=output, timeout=300, check=True)
-    assert check_result(place, 0) == 0
-
-
 @pytest.mark.slow
 def test_one_machine_stopped_by_a_signal_goes_on(place, monkeypatch):
     monkeypatch.setenv("SECONDS_PER_SIMULATION", "0.01")
@@ -144,48 +112,3 @@ def test_one_machine_stopped_by_a_signal_goes_on(place, monkeypatch):
 
 
 # jobs on one machine -------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def jobs(tmp_path, monkeypatch):
-    """A client of dask-jobqueue with one job of two workers, which is a process of this machine; the jobs' names."""
-    from dask.distributed import Client
-    from dask_jobqueue.local import LocalCluster, LocalJob
-
-    names = []
-
-    class Job(LocalJob):
-        async def start(self):
-            names.append(self.name)
-            await super().start()
-
-        @classmethod
-        async def _close_job(cls, job_id, cancel_command):
-            with contextlib.suppress(ProcessLookupError):  # it has ended, which scancel does not mind
-                await super()._close_job(job_id, cancel_command)
-
-    class Cluster(LocalCluster):
-        job_cls = Job
-
-    monkeypatch.setattr(dask_executor, "SECONDS_BETWEEN_CHECKS", 0.2)
-    options = ["--nthreads", "1", "--no-dashboard"]
-    with (
-        Cluster(
-            cores=2, processes=2, memory="1GB", worker_extra_args=options, local_directory=str(tmp_path)
-        ) as cluster,
-        Client(cluster) as client,
-    ):
-        cluster.scale(jobs=1)
-        yield client, names
-
-
-@pytest.mark.slow
-@needs("dask_jobqueue")
-def test_a_job_with_several_workers_that_has_ended_is_submitted_again(jobs, tmp_path):
-    client, names = jobs
-    posterior = posterior_of(noted.EndsItsJob(tmp_path), pool=client)
-    points = posterior.sample_prior(20, 1)
-    values = posterior(points)
-    assert len(names) == 2
-    np.testing.assert_array_equal(values, posterior_of(Treacherous())(points))
-    assert posterior.report()["failure_count"] == 0

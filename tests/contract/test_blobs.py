@@ -121,20 +121,6 @@ def test_a_refused_run_goes_on_with_a_wider_type(tmp_path):
     assert np.array_equal(sampler.get_blobs(), whole.get_blobs())
 
 
-def test_a_chain_of_one_type_goes_on_with_a_wider_type(tmp_path):
-    """The stored steps are converted, and a step is stored exactly."""
-    path = tmp_path / "run.h5"
-    run(Changing(ints, ints, FIRST), path, 2)
-    sampler = make(Changing(ints, ints, FIRST), path, blobs_dtype=float)
-    sampler.run_mcmc(None, 1)
-    assert sampler.get_blobs().dtype == float and sampler.get_blobs().shape == (3, N) and exact(sampler)
-    again = make(Changing(ints, ints, FIRST), path, blobs_dtype=float)
-    again.run_mcmc(None, 0)
-    assert again.iteration == 3 and not path.with_name("run.h5.damaged").exists()
-    with pytest.raises(ValueError, match="cannot hold"):
-        make(Changing(ints, ints, FIRST), path, blobs_dtype=bool).run_mcmc(None, 1)
-
-
 @pytest.mark.parametrize(
     ("pair", "dtype"),
     [
@@ -154,13 +140,6 @@ def test_a_value_that_a_declared_type_cannot_hold_is_refused(pair, dtype, place,
     for path in (None, tmp_path / "run.h5"):
         with pytest.raises(ValueError, match="blobs_dtype|the blobs of each point"):
             run(Changing(*pair, place), path, blobs_dtype=dtype)
-
-
-def test_a_declared_type_may_have_fewer_digits(tmp_path):
-    sampler = run(Changing(floats, floats, FIRST), tmp_path / "run.h5", blobs_dtype=np.float32)
-    assert exact(sampler, lambda value: np.float32(value).item())
-    text = run(Changing(lambda x: "a", lambda x: repr(x[0]), LATER), tmp_path / "text.h5", blobs_dtype="S30")
-    assert exact(text, lambda value: value.encode())
 
 
 @pytest.mark.parametrize("first", [True, False])

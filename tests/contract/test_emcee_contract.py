@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from samplers import SamplingWarning, SMCSampler, TemperedSampler, TMCMCSampler
-from tests.contract.targets import Gaussian, WithBlobs
+from tests.contract.targets import Gaussian
 from tests.covering import covering
 
 N, STEPS = 24, 8
@@ -67,23 +67,6 @@ def test_signatures_are_emcees(Sampler):
         ], name
 
 
-def test_only_what_must_be_is_overridden():
-    shared = {n for n in vars(TemperedSampler) if n in vars(emcee.EnsembleSampler)}
-    own = {"__module__", "__doc__", "__init__", "__getstate__", "__firstlineno__", "__static_attributes__"}
-    assert shared - own == {"sample", "run_mcmc", "reset", "compute_log_prob"}
-
-
-def test_emcees_private_names_exist():
-    """The private attributes that `samplers.emcee_internals` uses; if emcee renames one, this says so."""
-    sampler = emcee.EnsembleSampler(8, 2, Gaussian(2))
-    for name in ("_random", "_moves", "_weights"):
-        assert hasattr(sampler, name), name
-    sampler.run_mcmc(start(Gaussian(2))[:8], 1)
-    assert isinstance(sampler._previous_state, emcee.State)
-    assert isinstance(sampler._random, np.random.RandomState)
-    assert sampler.log_prob_fn.f.ndim == 2
-
-
 @stored
 def test_what_is_stored(Sampler, make_backend):
     sampler = run(Sampler, make_backend())
@@ -116,41 +99,6 @@ def test_thin_by_and_store(Sampler, make_backend):
         unstored.get_chain()
 
 
-@every
-@pytest.mark.parametrize("vectorize", [False, True])
-def test_blobs(Sampler, vectorize):
-    sampler = run(Sampler, None, WithBlobs(), vectorize=vectorize)
-    chain, blobs = sampler.get_chain(), sampler.get_blobs()
-    assert blobs.shape == (STEPS, N, 2)
-    assert np.allclose(blobs[..., 0], np.sum(chain**2, axis=-1), rtol=1e-13)
-    assert np.array_equal(blobs[..., 1], chain[..., 0])
-    assert sampler.get_blobs(flat=True).shape == (STEPS * N, 2)
-
-
-def labelled(x, posterior):
-    return posterior(x), float(x[0]), f"x0={x[0]:.17g}"
-
-
-def single(x, posterior):
-    return posterior(x), float(x[1])
-
-
-@stored
-def test_named_text_and_single_blobs(Sampler, make_backend):
-    posterior = Gaussian()
-    extra = {} if Sampler is emcee.EnsembleSampler else {"log_prior_fn": posterior.log_prior}
-    dtype = [("first", float), ("text", object)]
-    sampler = Sampler(N, 3, labelled, args=[posterior], blobs_dtype=dtype, **extra)
-    sampler.run_mcmc(start(posterior), STEPS)
-    chain, blobs = sampler.get_chain(), sampler.get_blobs()
-    assert np.array_equal(blobs["first"], chain[..., 0])
-    assert blobs["text"][-1, 3] == f"x0={chain[-1, 3, 0]:.17g}"
-
-    sampler = Sampler(N, 3, single, backend=make_backend(), kwargs={"posterior": posterior}, **extra)
-    sampler.run_mcmc(start(posterior), STEPS)
-    assert np.array_equal(sampler.get_blobs(), sampler.get_chain()[..., 1])
-
-
 class Fragile(Gaussian):
     """Raises an exception in a small part of the prior."""
 
@@ -165,22 +113,6 @@ class Broken(Gaussian):
 
     def __call__(self, x):
         raise TypeError("no such argument")
-
-
-def shifted(x, posterior, shift, scale=1.0):
-    return posterior((x - shift) / scale)
-
-
-@every
-def test_args_and_kwargs(Sampler):
-    posterior = Gaussian()
-    extra = {} if Sampler is emcee.EnsembleSampler else {"log_prior_fn": posterior.log_prior}
-    sampler = Sampler(N, 3, shifted, args=[posterior, 0.0], kwargs={"scale": 1.0}, **extra)
-    sampler.run_mcmc(start(posterior), STEPS)
-    chain = sampler.get_chain(flat=True)
-    assert np.allclose(sampler.get_log_prob(flat=True), posterior(chain))
-    assert sampler.log_prob_fn.args == [posterior, 0.0]
-    assert not hasattr(sampler, "args")  # arviz would take it for data
 
 
 def of_names(x, density=Gaussian(3)):
@@ -251,17 +183,6 @@ def test_pickle(Sampler, make_backend):
         assert np.array_equal(first.coords, second.coords)
         if Sampler is not emcee.EnsembleSampler:
             assert copy.ladder == sampler.ladder
-
-
-@stored
-def test_sample_is_a_generator_that_stores_as_it_goes(Sampler, make_backend):
-    posterior = Gaussian()
-    sampler = Sampler(N, 3, posterior, backend=make_backend())
-    for count, state in enumerate(sampler.sample(start(posterior), iterations=4), start=1):
-        assert sampler.iteration == count
-        assert np.array_equal(sampler.get_chain()[-1], state.coords)
-    unending = Sampler(N, 3, posterior).sample(start(posterior), iterations=None, store=False)
-    assert len({float(next(unending).coords[0, 0]) for _ in range(20)}) > 1
 
 
 @every

@@ -1,6 +1,5 @@
 """Every move of emcee, alone and mixed, with both samplers: the right evidence, means and variances."""
 
-import emcee
 import numpy as np
 import pytest
 from emcee import moves
@@ -43,13 +42,6 @@ def is_right(samplers):
     )
 
 
-def test_all_moves_of_emcee_are_here():
-    exported = {getattr(moves, name) for name in moves.__all__}
-    abstract = {moves.Move, moves.RedBlueMove}
-    used = {type(move) for move in MOVES.values() if not isinstance(move, list)}
-    assert exported - abstract - {moves.DESnookerMove} == used  # which is refused
-
-
 @pytest.mark.parametrize(
     ("name", "Sampler"),
     [
@@ -77,25 +69,6 @@ def test_a_wrong_move_is_caught(seed):
 
 
 # ---------------------------------------------------------------- the snooker move
-
-
-def variances(move, ndim, start, nsteps=600):
-    """Variances of a standard normal target, by a plain sampler of emcee."""
-    np.random.seed(4)  # noqa: NPY002
-    sampler = emcee.EnsembleSampler(
-        len(start), ndim, lambda x: -0.5 * np.sum(x**2, axis=-1), vectorize=True, moves=move
-    )
-    sampler.run_mcmc(start, nsteps, skip_initial_state_check=True)
-    return sampler.get_chain(discard=nsteps // 5, flat=True).var(axis=0)
-
-
-def test_why_the_snooker_move_of_emcee_is_refused(rng):
-    """Fails with a version of emcee that has corrected it; then it need not be refused."""
-    start = rng.standard_normal((80, 3))
-    assert np.all(variances(moves.DESnookerMove(), 3, start) < 0.9)
-    start[40:] = start[:40]
-    with np.errstate(all="ignore"), pytest.raises(ValueError, match="infinite|NaN"):
-        variances(moves.DESnookerMove(), 3, start)
 
 
 @pytest.mark.parametrize("Sampler", [SMCSampler, TMCMCSampler])

@@ -7,10 +7,10 @@ import emcee
 import numpy as np
 import pytest
 
-from samplers import SamplingWarning, SMCSampler, TemperedSampler, TMCMCSampler
+from samplers import SamplingWarning, SMCSampler, TMCMCSampler
 from samplers.moves.population_moves import RandomWalkMove
 from samplers.presets import CHING_CHEN_2007, RAMANCHA_2022_CONSTANT, RAMANCHA_2022_LITERAL
-from samplers.reporting.summary import ladder_table, summary
+from samplers.reporting.summary import summary
 from samplers.reports import AnnealingResult
 from tests.contract.targets import Box, Gaussian
 
@@ -314,16 +314,6 @@ def test_moves_too_short_are_reported():
 # ---------------------------------------------------------------- reporting
 
 
-def test_the_table_of_the_stages():
-    sampler = annealed()
-    table = ladder_table(sampler).splitlines()
-    assert len(table) == len(sampler.ladder) + 4
-    assert f"{sampler.log_evidence:.3f}" in table[-3]
-    assert f"{sampler.log_evidence_ladder:.3f}" in table[-2]
-    assert f"{sampler.log_evidence_check.log_evidence:.3f}" in table[-2]
-    assert table[-1] == sampler.verdict.summary
-
-
 def test_summary_with_errors_of_mean_and_standard_deviation():
     sampler = annealed()
     result = summary(sampler.get_chain(flat=True), None, sampler.mean_error(), sampler.sd_error())
@@ -340,10 +330,3 @@ def test_summary_with_errors_of_mean_and_standard_deviation():
     for name in ("mean_error", "sd_error"):
         with pytest.raises(ValueError, match=f"{name} must be 3"):
             summary(sampler.get_chain(flat=True), **{name: [0.1, 0.1]})
-
-
-def test_the_base_class_samples():
-    posterior = Gaussian()
-    sampler = TemperedSampler(N, 3, posterior, vectorize=True, seed=1)
-    sampler.run_mcmc(None, 2)
-    assert sampler.ladder[-1].beta == 1

@@ -117,19 +117,6 @@ def test_steps_are_added_after_the_last_stored_one(kind, tmp_path, whole_run):
     assert len(posterior.evaluated) <= 4 * N  # those of the added steps only
 
 
-@pytest.mark.parametrize("kind", MARKED)
-def test_a_loop_over_sample_adds_steps(kind, tmp_path, whole_run):
-    begin(make(kind, tmp_path / "run.h5", Counted()), 2)
-    reopened = make(kind, tmp_path / "run.h5", Counted())
-    seen = []
-    for state in reopened.sample(reopened.get_last_sample(), iterations=10):
-        seen.append(state.coords.copy())
-        if reopened.iteration == 5:
-            break
-    assert np.array_equal(reopened.get_chain()[2:], seen)
-    assert np.array_equal(reopened.get_chain(), whole_run(kind, 2, 3).get_chain())
-
-
 def interrupted(kind, path):
     """A run on a file that Ctrl-C has ended in its annealing."""
     sampler = make(kind, path, Counted(interrupt_at=N + 5))
@@ -295,21 +282,6 @@ def test_a_run_that_was_cut_short_refuses_other_draws(kind, tmp_path, whole_run)
     assert same(again, whole_run(kind, 2))
 
 
-@pytest.mark.parametrize("kind", ONE)
-def test_a_second_annealing_of_a_reopened_run(kind, tmp_path):
-    """Other draws begin a new annealing after the steps of the first one; a third sampler goes on with the second."""
-    begin(make(kind, tmp_path / "run.h5", Counted()), 2)
-    reopened = make(kind, tmp_path / "run.h5", Counted())
-    reopened.run_mcmc(None, 1)
-    reopened.run_mcmc(np.random.default_rng(2).standard_normal((N, NDIM)), 2)
-    assert reopened.iteration == 5
-    posterior = Counted()
-    third = make(kind, tmp_path / "run.h5", posterior)
-    assert third.ladder == reopened.ladder and third.log_evidence == reopened.log_evidence
-    third.run_mcmc(None, 0)
-    assert not posterior.evaluated and np.array_equal(third.get_chain(), reopened.get_chain())
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -359,17 +331,6 @@ def test_a_negative_number_of_steps_is_refused(kind, tmp_path):
         with pytest.raises(ValueError, match="nsteps must be 0 or more; got -2 "):
             each.run_mcmc(None, -2)
         assert each.iteration == 3
-
-
-def test_other_blobs_are_noticed(tmp_path):
-    class Doubled(Counted):
-        def __call__(self, x):
-            log_prob, *blobs = super().__call__(x)
-            return (log_prob, *(2.0 * np.asarray(blob) for blob in blobs))
-
-    begin(make("SMCSampler", tmp_path / "run.h5", Counted(None)), 2)
-    with pytest.raises(ValueError, match="blobs of log_prob_fn were"):
-        make("SMCSampler", tmp_path / "run.h5", Doubled(None)).run_mcmc(None, 1)
 
 
 @pytest.mark.parametrize(("kind", "steps"), covering(OURS, [0, 2], strength=1))

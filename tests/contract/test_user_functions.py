@@ -127,26 +127,6 @@ def test_attributes_of_a_log_likelihood_count():
         SMCSampler(N, 2, None, log_likelihood_fn=Likelihood())
 
 
-def test_a_run_of_a_likelihood_is_continued_as_such(tmp_path):
-    posterior = Gaussian()
-
-    def fail_late(x):
-        if len(calls) > 8:
-            raise KeyboardInterrupt
-        calls.append(1)
-        return posterior.log_likelihood(x)
-
-    calls, path = [], str(tmp_path / "run.h5")
-    prior = {"log_prior_fn": posterior.log_prior, "vectorize": True}
-    with pytest.raises(KeyboardInterrupt):
-        run(SMCSampler, None, log_likelihood_fn=fail_late, backend=emcee.backends.HDFBackend(path), **prior)
-    with pytest.raises(ValueError, match="log_likelihood_fn was used, is None"):
-        run(SMCSampler, lambda x: posterior(x), backend=emcee.backends.HDFBackend(path), **prior)
-    likelihood = {"log_likelihood_fn": lambda x: posterior.log_likelihood(x), **prior}
-    resumed = run(SMCSampler, None, backend=emcee.backends.HDFBackend(path), **likelihood)
-    assert np.array_equal(resumed.get_chain(), run(SMCSampler, None, **likelihood).get_chain())
-
-
 @every
 def test_exactly_one_function_is_given(Sampler):
     posterior = Gaussian()

@@ -1,27 +1,17 @@
 """Damaged input files: every reader returns, or raises ValueError, within a few seconds.
 
-``python -m tests.faults.fuzz_readers --files 20000`` prints what came of them, by reader. Files are made from small
-valid ones by flipping, deleting, repeating and inserting bytes. Each hundred is read in a forked process, so that a
-crash of a library is counted as well.
+Files are made from small valid ones by flipping, deleting, repeating and inserting bytes.
 
 Styles of logger files are also changed in the marks between their digits and in the order of their rows: they must be
 refused, or read with the same samples (`altered`).
 """
 
-import argparse
-import faulthandler
 import io
-import json
-import logging
-import os
 import random
-import tempfile
 import time
-import warnings
 import zipfile
 from collections import Counter
 from collections.abc import Callable
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -205,67 +195,16 @@ def read_damaged(case, data, path):
     return "slow" if time.perf_counter() - start > SLOW else found
 
 
-def fuzz(number, seed, folder, forked=True, show=None):
+def fuzz(number, seed, folder):
     """Read damaged files; a Counter of (reader, what came of it), and the bad ones as (reader, what, bytes)."""
     folder.mkdir(exist_ok=True)
     all_cases, counts, bad = cases(folder), Counter(), []
-    for batch in range(0, number, 100):
-
-        def read_batch(batch=batch):
-            results = []
-            for index in range(batch, min(batch + 100, number)):
-                choose = random.Random(1_000_003 * seed + index)
-                case = all_cases[index % len(all_cases)]
-                data = damage(choose.choice(case.files), choose)
-                found = read_damaged(case, data, folder / f"damaged.{case.name}")
-                results.append((case.name, found, index))
-            return results
-
-        for name, found, index in _forked(read_batch) if forked else read_batch():
-            counts[name, found] += 1
-            if found not in ("read", "ValueError"):
-                bad.append((name, found, index))
-                if show is not None:
-                    show(f"{name}: {found}, file {index}")
+    for index in range(number):
+        choose = random.Random(1_000_003 * seed + index)
+        case = all_cases[index % len(all_cases)]
+        data = damage(choose.choice(case.files), choose)
+        found = read_damaged(case, data, folder / f"damaged.{case.name}")
+        counts[case.name, found] += 1
+        if found not in ("read", "ValueError"):
+            bad.append((case.name, found, index))
     return counts, bad
-
-
-def _forked(function):
-    """The result of a function in a process of its own; a crash is a result."""
-    read, write = os.pipe()
-    pid = os.fork()
-    if pid == 0:
-        os.close(read)
-        faulthandler.dump_traceback_later(15, exit=True)  # HDF5 itself loops on some damaged files
-        warnings.simplefilter("ignore")
-        logging.disable(logging.CRITICAL)
-        with os.fdopen(write, "w") as stream:
-            json.dump(function(), stream)
-        os._exit(0)
-    os.close(write)
-    with os.fdopen(read) as stream:
-        text = stream.read()
-    status = os.waitpid(pid, 0)[1]
-    return json.loads(text) if status == 0 else [("all", f"process died ({status})", -1)]
-
-
-def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--files", type=int, default=20_000)
-    parser.add_argument("--seed", type=int, default=1)
-    args = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        start = time.perf_counter()
-        counts, bad = fuzz(args.files, args.seed, Path(folder), show=print)
-        wrong = wrong_in_silence(args.files // 4, args.seed, Path(folder) / "altered.csv")
-    for style, text in wrong[:20]:
-        print(f"WRONG IN SILENCE: {style}\n{text}")
-    for (name, found), count in sorted(counts.items()):
-        print(f"{name:14s}{found:24s}{count:7d}")
-    print(f"{sum(counts.values())} files in {time.perf_counter() - start:.0f} s, {len(bad)} bad")
-    print(f"{args.files // 4} altered files, {len(wrong)} wrong in silence")
-    return 1 if bad or wrong else 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

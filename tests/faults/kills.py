@@ -1,9 +1,9 @@
 """Kills by signal 9, after which the same script is started again until it ends: ``python -m tests.faults.kills``.
 
-Most kills come at a chosen event of a forked process: before, within or after a write to the record or to the HDF5 file
-(whose writes go through a Python file), or in an evaluation. Pools and threads are killed at random times, with their
-workers. Chain, log-probabilities, blobs, counts, failures, ladder, evidence and verdict must be those of a run that was
-not killed, and no evaluation may be made again but those that were running.
+Kills come at a chosen event of a forked process: before, within or after a write to the record or to the HDF5 file
+(whose writes go through a Python file), or in an evaluation. Chain, log-probabilities, blobs, counts, failures, ladder,
+evidence and verdict must be those of a run that was not killed, and no evaluation may be made again but those that were
+running.
 """
 
 import argparse
@@ -26,11 +26,8 @@ import h5py
 
 import samplers.evaluation.evaluator
 import samplers.record
-from tests.faults.resumable_run import BURN_IN, SAMPLERS, STEPS, WAYS, N, calls, go_on, make, outcome
+from tests.faults.resumable_run import BURN_IN, KINDS, STEPS, N, calls, go_on, make, outcome
 
-AT_RANDOM_TIMES = ("pool", "threads")
-WORKERS = 2
-KINDS = (*SAMPLERS, *WAYS)
 COMPARED = 2  # points by which a new sampler compares its function with the record
 
 
@@ -110,17 +107,11 @@ def fork(function):
     return pid, read
 
 
-def end(pid, read, after=None):
-    """Status and output of a forked process, which is killed with its group after some seconds."""
-    if after is not None:
-        time.sleep(after)
-        with contextlib.suppress(ProcessLookupError, PermissionError):
-            os.killpg(pid, signal.SIGKILL)
+def end(pid, read):
+    """Status and output of a forked process."""
     with os.fdopen(read, "rb") as stream:
         said = stream.read()
     status = os.waitpid(pid, 0)[1]
-    with contextlib.suppress(ProcessLookupError, PermissionError):  # workers of a process that was killed
-        os.killpg(pid, signal.SIGKILL)
     return status, said
 
 
@@ -129,16 +120,12 @@ def script(kind, path, events=None, limit=None):
     samplers.evaluation.evaluator.SECONDS_BETWEEN_NOTES = 0.0  # so that no time of the machine decides
     log = path.with_name("log")
     changes = {} if kind != "limit" else {"max_simulations": limit}
-    if kind == "threads":
-        changes["seconds"] = 0.001  # or both threads evaluate more points than the sampler can enter
     sampler = go_on(make(path, kind, log=log, event=events, **changes), kind)
-    if kind in AT_RANDOM_TIMES:
-        sampler.pool.shutdown()
     return pickle.dumps((outcome(sampler), sampler.iteration))
 
 
 def whole_outcomes(kind, folder):
-    """Outcomes of runs that are not killed, number of events, and seconds."""
+    """Outcomes of runs that are not killed, and the number of events."""
     events = Events()
 
     def counted():
@@ -146,11 +133,9 @@ def whole_outcomes(kind, folder):
         return pickle.dumps((script(kind, folder / "run.h5", events), events.count))
 
     folder.mkdir()
-    start = time.perf_counter()
-    status, said = end(*fork(counted if kind not in AT_RANDOM_TIMES else lambda: script(kind, folder / "run.h5")))
-    seconds = time.perf_counter() - start
+    status, said = end(*fork(counted))
     assert status == 0, said.decode()
-    first, count = pickle.loads(said) if kind not in AT_RANDOM_TIMES else (said, 0)
+    first, count = pickle.loads(said)
     found = [pickle.loads(first)[0]]
     if kind == "reset":
         # a kill in the burn-in is taken for one after the reset, and one directly after the reset repeats the burn-in
@@ -165,7 +150,7 @@ def whole_outcomes(kind, folder):
                 return pickle.dumps(outcome(sampler))
 
             found.append(pickle.loads(end(*fork(longer))[1]))
-    return found, count, seconds
+    return found, count
 
 
 def evaluated_again(log, kind):
@@ -178,13 +163,13 @@ def evaluated_again(log, kind):
         points = {point for call in made for point in call}
         lost += max(len((points & seen) - running) - COMPARED, 0)
         # all points of a submission, or those that have ended while the sampler computed proposals
-        last = {"asynchronous": 4 * N, "threads": N, "map": 4 * WORKERS}.get(kind, 1)
+        last = {"asynchronous": 4 * N, "map": 8}.get(kind, 1)
         running |= {point for call in made[-last:] for point in call}
         seen |= points
     return lost
 
 
-def trial(kind, folder, whole, count, seconds, choose, number):
+def trial(kind, folder, whole, count, choose, number):
     """One run with its kills: how many there were, and what went wrong."""
     folder.mkdir()
     path, kills = folder / "run.h5", 0
@@ -193,13 +178,10 @@ def trial(kind, folder, whole, count, seconds, choose, number):
         events = Events(choose.randint(1, max(count, 1)), choose.choice(("before", "within", "after")))
 
         def child(events=events, attempt=attempt):
-            if kind not in AT_RANDOM_TIMES:
-                events.install()
-            hook = None if kind in AT_RANDOM_TIMES else events
-            return script(kind, path, hook, sorted(limits)[attempt])
+            events.install()
+            return script(kind, path, events, sorted(limits)[attempt])
 
-        after = choose.uniform(0.0, seconds) if kind in AT_RANDOM_TIMES else None
-        status, said = end(*fork(child), after)
+        status, said = end(*fork(child))
         if os.WIFSIGNALED(status):
             kills += 1
         elif status != 0:
@@ -208,12 +190,8 @@ def trial(kind, folder, whole, count, seconds, choose, number):
     if status != 0:
         return kills, f"stuck: {said.decode()}"
     found, steps = pickle.loads(said)
-    lost = 0 if kind == "pool" else evaluated_again(folder / "log", kind)  # its workers write the log
-    if lost > 0:
+    if lost := evaluated_again(folder / "log", kind):
         return kills, f"lost: {lost} evaluations were made again"
-    if kind == "threads":  # another order of arrival is another run: it is compared with its repetition
-        path.unlink()
-        whole = [pickle.loads(end(*fork(lambda: script("threads", path)))[1])[0]]
     if kind == "reset":  # evaluations of a burn-in that was given up count, and so in the verdict
         found, whole = found[:5], [each[:5] for each in whole]
     if found not in whole:
@@ -234,10 +212,10 @@ def kill(number, kinds=KINDS, seed=1, show=print):
     folder = Path(tempfile.mkdtemp(dir="/dev/shm" if os.access("/dev/shm", os.W_OK) else None))
     try:
         for kind in kinds:
-            whole, count, seconds = whole_outcomes(kind, folder / f"whole {kind}")
+            whole, count = whole_outcomes(kind, folder / f"whole {kind}")
             while counts[kind, "kills"] < number:
                 where = folder / "trial"
-                kills, wrong = trial(kind, where, whole, count, seconds, choose, choose.randint(1, 3))
+                kills, wrong = trial(kind, where, whole, count, choose, choose.randint(1, 3))
                 counts[kind, "kills"] += kills
                 counts[kind, "runs"] += 1
                 if wrong:

@@ -2,14 +2,13 @@
 
 import os
 import time
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import Executor, Future
 from pathlib import Path
 
 import emcee
 import numpy as np
 
 from samplers import SMCSampler, TMCMCSampler
-from samplers.presets import RAMANCHA_2022_LITERAL
 from tests.contract.targets import WithBlobs
 from tests.tempering.guides import SearchingGuide
 
@@ -25,29 +24,18 @@ class InOrder(Executor):
         return future
 
 
-SAMPLERS = {
+KINDS = {
     "smc": (SMCSampler, {"recycle": True}),
     "moves": (SMCSampler, {"recycle": False}),
     "tmcmc": (TMCMCSampler, {}),
-    "leaders": (TMCMCSampler, {"chains": "leaders", "burn_in": 1}),
-    "literal": (SMCSampler, {**RAMANCHA_2022_LITERAL, "ess_floor": 10.0}),  # the floor of the preset is above N
     "guided": (SMCSampler, {"guide": SearchingGuide}),
-    "guided, TMCMC": (TMCMCSampler, {"guide": SearchingGuide}),
-    "stretch": (SMCSampler, {"moves": emcee.moves.StretchMove(), "max_moves": 5}),
-}
-# further ways to run
-WAYS = {
     "map": (SMCSampler, {"recycle": True}),
-    "pool": (SMCSampler, {"recycle": True, "pool": ProcessPoolExecutor}),
     "asynchronous": (SMCSampler, {"recycle": True, "asynchronous": True, "pool": InOrder}),
     "asynchronous, guided": (SMCSampler, {"guide": SearchingGuide, "asynchronous": True}),
-    "threads": (SMCSampler, {"recycle": True, "asynchronous": True, "pool": ThreadPoolExecutor}),
     "limit": (SMCSampler, {"recycle": True}),
     "reset": (SMCSampler, {"recycle": False}),
     "thin": (SMCSampler, {"recycle": False}),
-    "without blobs": (SMCSampler, {"recycle": True}),
 }
-IN_ARRAYS = {*SAMPLERS, "asynchronous, guided", "limit", "reset", "thin", "without blobs"}
 
 
 class Queue:
@@ -99,13 +87,6 @@ class Watched(WithBlobs):
         return Queue(self)
 
 
-class WatchedWithoutBlobs(Watched):
-    """The same without blobs."""
-
-    def __call__(self, x):
-        return super().__call__(x)[..., 0]
-
-
 def calls(log) -> list[tuple[int, list[bytes]]]:
     """Calls in a log: process and points of each."""
     rows = np.frombuffer(Path(log).read_bytes()).reshape(-1, NDIM) if Path(log).exists() else np.empty((0, NDIM))
@@ -124,15 +105,15 @@ def points_of(log) -> list[bytes]:
 
 def make(path, kind, seconds=0.0, sd=0.01, log=None, event=None, **changes):
     """The sampler with a file, or in memory without a path."""
-    Sampler, settings = {**SAMPLERS, **WAYS}[kind]
-    posterior = (WatchedWithoutBlobs if kind == "without blobs" else Watched)(log, seconds, event, ndim=NDIM, sd=sd)
+    Sampler, settings = KINDS[kind]
+    posterior = Watched(log, seconds, event, ndim=NDIM, sd=sd)
     backend = None if path is None else emcee.backends.HDFBackend(str(path))
     settings = {"seed": 5, **settings, **changes}
     if "guide" in settings:
         settings["guide"] = settings["guide"](posterior)
-    if isinstance(settings.get("pool"), type):
-        settings["pool"] = settings["pool"]() if settings["pool"] is InOrder else settings["pool"](2)
-    return Sampler(N, NDIM, posterior, vectorize=kind in IN_ARRAYS, backend=backend, **settings)
+    if "pool" in settings:
+        settings["pool"] = settings["pool"]()
+    return Sampler(N, NDIM, posterior, vectorize=kind not in ("map", "asynchronous"), backend=backend, **settings)
 
 
 def go_on(sampler, kind="smc", steps=STEPS):

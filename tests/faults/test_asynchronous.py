@@ -1,11 +1,6 @@
 """Asynchronous runs: killed anywhere, they go on; the record repeats them to the last bit without an evaluation."""
 
-import importlib.util
-import multiprocessing
-import os
-import signal
-import time
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 
 import emcee
 import numpy as np
@@ -13,7 +8,7 @@ import pytest
 
 from samplers import SMCSampler
 from tests.contract.targets import Gaussian, WithBlobs
-from tests.faults.records import blocks, cut, record_of
+from tests.faults.records import blocks, cut
 from tests.simulated_cluster import SimulatedCluster
 
 N, NDIM, STEPS = 40, 2, 2
@@ -84,79 +79,10 @@ def test_killed_anywhere_a_run_goes_on_and_its_record_repeats_it(every, tmp_path
     assert state_of(repeated(tmp_path / "whole.h5", tmp_path, order=98)[0]) == state_of(whole)
 
 
-def test_one_worker_goes_on_as_if_it_had_not_been_killed(tmp_path):
-    """Points of one worker arrive in the order of their submission, so that the run can be compared to the last bit."""
-    whole, _ = finished(tmp_path / "whole.h5", workers=1)
-    for _, place in blocks(tmp_path / "whole.h5")[::40]:
-        path = tmp_path / "killed.h5"
-        cut(tmp_path / "whole.h5", place, path)
-        assert state_of(finished(path, workers=1)[0]) == state_of(whole)
-
-
-class Waits(Gaussian):
-    """Takes longer where the first parameter is large: the order of arrival depends on the parameters."""
-
-    def __call__(self, x):
-        time.sleep(0.002 * np.exp(float(np.clip(x[0], -2.0, 2.0))))
-        return super().__call__(x)
-
-
-def run_with_threads(path):
-    with ThreadPoolExecutor(3) as pool:
-        backend = emcee.backends.HDFBackend(str(path))
-        posterior = Waits(NDIM, sd=0.05)
-        settings = {"seed": 5, "recycle": True, "asynchronous": True}
-        sampler = SMCSampler(N, NDIM, posterior, pool=pool, backend=backend, **settings)
-        sampler.run_mcmc(None, STEPS - sampler.iteration)
-        sampler._record.close()
-    return sampler
-
-
-@pytest.mark.slow
-def test_killed_by_signal_9(tmp_path, rng):
-    """A real process with threads; whatever the place, the run goes on and every stored evaluation is used."""
-    path = tmp_path / "killed.h5"
-    context, sizes = multiprocessing.get_context("spawn"), [3_000, 12_000]
-    for size in sizes:
-        process = context.Process(target=run_with_threads, args=(path,))
-        process.start()
-        while not record_of(path).exists() or record_of(path).stat().st_size < size:
-            assert process.is_alive()
-            time.sleep(0.002)
-        process.kill()
-        process.join()
-    known = record_of(path).stat().st_size
-    sampler = run_with_threads(path)
-    assert sampler.iteration == STEPS and record_of(path).stat().st_size > known
-    assert abs(sampler.log_evidence - Gaussian(NDIM, sd=0.05).log_evidence) < 4 * sampler.log_evidence_error
-
-
-def open_loky():
-    import loky
-
-    return loky.ProcessPoolExecutor(2)
-
-
-needs_loky = pytest.mark.skipif(
-    importlib.util.find_spec("loky") is None, reason="NO LOKY: install it to test this pool"
-)
-
-
-@pytest.mark.parametrize(
-    "kind",
-    [
-        "threads",
-        pytest.param("processes", marks=pytest.mark.slow),
-        pytest.param("loky", marks=[needs_loky, pytest.mark.slow]),
-    ],
-)
-def test_pools_that_take_single_points(kind):
-    """Each point goes to the pool by itself; the result is that of the posterior."""
-    opened = {"threads": lambda: ThreadPoolExecutor(2)}
-    opened["processes"] = lambda: ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn"))
-    opened["loky"] = open_loky
+def test_threads_take_single_points():
+    """The result is that of the posterior."""
     posterior = Gaussian(NDIM, sd=0.05)
-    with opened[kind]() as pool:
+    with ThreadPoolExecutor(2) as pool:
         sampler = SMCSampler(N, NDIM, posterior, pool=pool, seed=3, recycle=True, asynchronous=True)
         sampler.run_mcmc(None, 1)
     assert abs(sampler.log_evidence - posterior.log_evidence) < 4 * sampler.log_evidence_error
@@ -182,45 +108,3 @@ def test_what_cannot_be_asynchronous_is_refused():
         SMCSampler(N, NDIM, posterior, pool=pool, recycle=False, asynchronous=True)
     with pytest.raises(ValueError, match="True or False"):
         SMCSampler(300, NDIM, posterior, vectorize=True, asynchronous=1)
-
-
-class Killed(Gaussian):
-    """Ends its process at the evaluation of a point, once, after a number of points."""
-
-    fingerprint = "of this target"
-
-    def __init__(self, folder, after=60):
-        super().__init__(NDIM, sd=0.05)
-        self.folder, self.after = folder, after
-
-    def __call__(self, x):
-        (self.folder / f"{x[0]!r}").touch()
-        if len(list(self.folder.iterdir())) > self.after and not (self.folder / "killed").exists():
-            (self.folder / "killed").touch()
-            os.kill(os.getpid(), signal.SIGKILL)
-        return super().__call__(x)
-
-
-def killed_run(folder, pool, asynchronous=True):
-    posterior, backend = Killed(folder / "points"), emcee.backends.HDFBackend(str(folder / "run.h5"))
-    settings = {"seed": 5, "recycle": True, "asynchronous": asynchronous}
-    sampler = SMCSampler(N, NDIM, posterior, pool=pool, backend=backend, **settings)
-    sampler.run_mcmc(None, 1)
-    return sampler
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["executor", pytest.param("loky", marks=needs_loky)])
-def test_a_process_of_a_pool_that_is_killed_ends_the_run_with_advice(kind, tmp_path):
-    """The pool gives up; the run goes on afterwards with a new one."""
-    (tmp_path / "points").mkdir()
-    context = multiprocessing.get_context("spawn")
-    opened = {"executor": lambda: ProcessPoolExecutor(2, mp_context=context), "loky": open_loky}
-    message = {"executor": "BrokenProcessPool", "loky": "TerminatedWorkerError"}[kind]
-    with opened[kind]() as pool, pytest.raises(RuntimeError, match=f"(?s){message}.*start the same script again"):
-        killed_run(tmp_path, pool)
-    known = len(list((tmp_path / "points").iterdir()))
-    with opened[kind]() as pool:
-        sampler = killed_run(tmp_path, pool)
-    assert sampler.iteration == 1 and known > 60
-    assert sampler.report()["new_evaluations"] < sampler.evaluations - 50

@@ -1,15 +1,12 @@
 """Asynchronous runs with a guide: killed anywhere they go on, and the record repeats them without a simulation."""
 
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 
 import emcee
 import numpy as np
 import pytest
 
-from fe_likelihoods.simulation.executors import as_executor
 from samplers import SMCSampler, TMCMCSampler
-from samplers.tempering.early_stop import NothingToReport
 from tests.contract.targets import Gaussian
 from tests.emulation.problems import symmetric
 from tests.faults.records import blocks, cut
@@ -81,47 +78,9 @@ def test_killed_anywhere_a_run_goes_on_and_its_record_repeats_it(whole, tmp_path
     assert state_of(again) == state_of(resumed) and nothing.simulations == 0.0
 
 
-@pytest.mark.slow
-def test_a_run_that_limits_have_ended_goes_on(tmp_path):
-    """The search, then the rounds; what was simulated is not simulated again."""
-    with suppress(NothingToReport):  # a draw or none
-        finished(tmp_path / "run.h5", max_simulations=20)
-    limited, first = finished(tmp_path / "run.h5", order=1, max_simulations=80)
-    assert 79.0 < limited.simulations <= 80.0 and first.simulations < 80.0 - 10.0
-    sampler, rest = finished(tmp_path / "run.h5", order=2, max_simulations=5000)
-    assert sampler.verdict.status != "not usable"
-    assert rest.simulations < sampler.simulations - 80.0 + N
-    again, nothing = repeated(tmp_path / "run.h5", tmp_path, order=3)
-    assert state_of(again)[:3] == state_of(sampler)[:3] and nothing.simulations == 0.0
-
-
 def test_a_limit_counts_what_is_running(tmp_path):
     sampler, pool = finished(tmp_path / "run.h5", order=1, max_simulations=75)
     assert 74.0 < sampler.simulations <= 75.0 and pool.simulations == pytest.approx(sampler.simulations)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["threads", *(pytest.param(k, marks=pytest.mark.slow) for k in ("map only", "none"))])
-def test_pools(kind):
-    """Real threads; pools that take batches only, or no pool."""
-    posterior = symmetric()
-
-    class MapOnly:
-        map = staticmethod(map)
-
-    with ThreadPoolExecutor(3) as threads:
-        posterior.likelihood.simulator.pool = as_executor(
-            {"threads": threads, "map only": MapOnly(), "none": None}[kind]
-        )
-        sampler = SMCSampler(
-            N, 2, posterior, vectorize=True, seed=5, guide=posterior.guide(4), asynchronous=True, max_simulations=1000
-        )
-        sampler.run_mcmc(None, 0)
-    reference = symmetric()
-    barriers = SMCSampler(N, 2, reference, vectorize=True, seed=6, guide=reference.guide(4))
-    barriers.run_mcmc(None, 0)
-    joint = np.hypot(sampler.log_evidence_error, barriers.log_evidence_error)
-    assert abs(sampler.log_evidence - barriers.log_evidence) < 4.0 * joint < 0.8
 
 
 def test_what_cannot_be_asynchronous_is_refused():

@@ -1,6 +1,5 @@
 """Ctrl-C in asynchronous runs with a file: what has been evaluated is in the record, and the same script goes on."""
 
-import sys
 from concurrent.futures import ThreadPoolExecutor, wait
 
 import emcee
@@ -8,11 +7,8 @@ import numpy as np
 import pytest
 
 from samplers import SMCSampler
-from samplers.evaluation import asynchronous
 from tests.contract.targets import Gaussian
 from tests.faults.records import points_of
-from tests.faults.test_ctrl_c import is_deferred
-from tests.faults.treacherous import Treacherous, posterior_of
 
 N, NDIM, WORKERS = 40, 2, 3
 
@@ -82,79 +78,6 @@ def test_points_of_a_pool_that_have_ended_are_kept(before, tmp_path, monkeypatch
     new = posterior.evaluated[len(known) :]
     assert not set(new) & set(known)
     assert abs(again.log_evidence - posterior.log_evidence) < 4 * again.log_evidence_error
-
-
-def test_points_of_a_posterior_that_have_ended_are_kept(tmp_path, monkeypatch):
-    """The pool is that of the likelihood, which has no cache on disk."""
-    path = tmp_path / "run.h5"
-    with Threads() as pool:
-        posterior = posterior_of(Treacherous(), pool=pool)
-        sampler = make(path, posterior, vectorize=True)
-        interrupted_when_all_has_ended(sampler, pool, monkeypatch, 2 * N, "wait")
-        sampler._record.close()
-        known = points_of(path)
-    # on a busy machine some are run again, since the model counts its runs
-    assert len(known) == len(set(known)) >= len(pool.futures) - posterior.report()["verifications"]
-
-
-class Interrupt:
-    """Raises KeyboardInterrupt at a line of the two modules that receive points, counted from the start.
-
-    Lines of ``submit`` do not count: points that begin have not ended.
-    """
-
-    files = {asynchronous.__file__}
-    left_out = {"submit", "__init__", "reset", "close"}  # with what they call
-
-    def __init__(self, line, evaluated):
-        self.line, self.count, self.evaluated, self.known = line, 0, evaluated, None
-
-    def __enter__(self):
-        sys.settrace(self._enter)
-        return self
-
-    def __exit__(self, *error):
-        sys.settrace(None)
-
-    def _enter(self, frame, event, value):
-        if frame.f_code.co_filename not in self.files:
-            return None
-        caller = frame
-        while caller is not None:
-            if caller.f_code.co_filename in self.files and caller.f_code.co_name in self.left_out:
-                return None
-            caller = caller.f_back
-        return self._trace
-
-    def _trace(self, frame, event, value):
-        if event == "line" and not is_deferred():
-            self.count += 1
-            if self.count == self.line:
-                sys.settrace(None)
-                self.known = list(self.evaluated)
-                raise KeyboardInterrupt
-        return self._trace
-
-
-@pytest.mark.parametrize("every", [8, pytest.param(1, marks=pytest.mark.slow)])
-def test_ctrl_c_at_any_line_keeps_what_has_ended(every, tmp_path):
-    """Each thread may just have ended a point and not have said so."""
-    lines = 0
-    for line in [*range(1, 90), *range(90, 2000, 61)][::every]:
-        path, posterior = tmp_path / f"{line}.h5", Noted()
-        with ThreadPoolExecutor(WORKERS) as pool:
-            sampler, interrupt = make(path, posterior, pool), Interrupt(line, posterior.evaluated)
-            try:
-                with interrupt:
-                    sampler.run_mcmc(None, 0)
-            except KeyboardInterrupt:
-                lines += 1
-        sampler._record.close()
-        if interrupt.known is not None:
-            known = points_of(path)
-            assert len(known) == len(set(known))
-            assert len(set(interrupt.known) - set(known)) <= WORKERS, (line, len(interrupt.known), len(known))
-    assert lines > 100 // every
 
 
 @pytest.mark.parametrize("kind", [KeyboardInterrupt, SystemExit, RuntimeError])

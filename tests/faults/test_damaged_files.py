@@ -1,4 +1,4 @@
-"""Damaged and hostile input files: ValueError, in a short time. `tests.faults.fuzz_readers` makes many more of them."""
+"""Damaged and hostile input files: ValueError, in a short time."""
 
 import time
 
@@ -26,7 +26,7 @@ def refused(read, path, content, match):
 
 
 def test_fuzz(tmp_path):
-    counts, bad = fuzz(420, 1, tmp_path, forked=False)
+    counts, bad = fuzz(420, 1, tmp_path)
     assert not bad and sum(counts.values()) == 420
 
 

@@ -6,7 +6,6 @@ import os
 import subprocess
 import sys
 import time
-from concurrent.futures import as_completed
 from pathlib import Path
 
 import emcee
@@ -25,7 +24,6 @@ from tests.faults.treacherous import (
     N_STEPS,
     DiesLoading,
     DiesOnce,
-    LoadsOnce,
     Treacherous,
     descendants,
     gone,
@@ -102,21 +100,6 @@ def test_workers_end_with_the_likelihood_and_after_an_interrupt():
         pool.map(_interrupts, range(4))
 
 
-@needs_proc
-def test_a_pool_that_is_closed_while_a_process_loads_ends_that_process(tmp_path):
-    function = LoadsOnce(tmp_path)  # only the first process can load it
-    others, pool = workers_now(), LocalPool(2)
-    futures = pool.submit_all(function, [1, 2, 3])
-    done = [future.result() for _, future in zip(range(2), as_completed(futures), strict=False)]
-    assert len(done) == 2
-    workers = list(workers_now() - others)
-    assert len(workers) == 2
-    pool.close()
-    assert not any(worker in descendants(os.getpid()) for worker in workers)
-    assert [future.done() for future in futures] == [True] * 3
-    pool.close()
-
-
 class _Interrupt(Exception):
     def __reduce__(self):
         return _interrupt, ()
@@ -128,26 +111,6 @@ def _interrupt():
 
 def _interrupts(item):
     return _Interrupt()
-
-
-@pytest.mark.slow
-@needs("dask")
-@needs("distributed")
-def test_dask_gives_up_every_worker_that_dies(tmp_path):
-    """A cluster that does not wait for the next process of a worker, as a busy machine is too slow for it."""
-    import dask
-    from dask.distributed import Client, LocalCluster
-
-    x = np.column_stack([np.concatenate([theta(bad.FINE, 2), theta(bad.KILLED)]), np.full(3, 0.5)])
-    with (
-        dask.config.set({"distributed.scheduler.allowed-failures": 2, "distributed.deploy.lost-worker-timeout": "0s"}),
-        LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster,
-        Client(cluster) as client,
-    ):
-        posterior = posterior_of(DiesOnce(tmp_path), top=20.0, pool=client)
-        assert np.isfinite(posterior(x)).all()
-        values = posterior_of(Treacherous(), top=20.0, pool=client)(x)
-        assert np.isfinite(values[:2]).all() and np.isneginf(values[2])
 
 
 @pytest.mark.slow

@@ -180,29 +180,6 @@ def test_a_chain_that_something_else_has_changed_is_made_again(whole, damage, tm
     sampler._record.close()
 
 
-def test_a_run_that_another_processor_cannot_repeat_goes_on_from_its_last_step(whole, tmp_path):
-    """Other random numbers in place of other bits: nothing is evaluated but a comparison, and all results stay."""
-    kind, path, expected = whole
-    path = copied(path, tmp_path)
-    sampler = make(path, kind, log=tmp_path / "log")
-    other = np.random.RandomState(9).get_state()
-    sampler._record.start = sampler._record.start._replace(random_state=other)
-    with pytest.warns(SamplingWarning, match="computes other bits"):
-        go_on(sampler)
-    assert outcome(sampler) == expected and len(points_of(tmp_path / "log")) <= 1
-    sampler.run_mcmc(None, 2)
-    assert sampler.iteration == STEPS + 2 and len(points_of(tmp_path / "log")) <= 2 * N + 1
-
-
-def test_a_damaged_chain_without_a_record_is_refused(whole, tmp_path):
-    kind, path, _ = whole
-    path = copied(path, tmp_path)
-    record_of(path).unlink()
-    os.truncate(path, 2000)
-    with pytest.raises(ValueError, match="is damaged, and has no record"):
-        make(path, kind)
-
-
 def test_a_lost_record_leaves_the_chain(whole, tmp_path):
     """The chain goes on as with emcee, where its last step is that of the same posterior."""
     kind, path, _ = whole
@@ -239,24 +216,6 @@ def test_the_chain_of_another_run_begins_a_new_record(whole, tmp_path, caplog):
     assert Path(f"{record_of(path)}.before_reset").read_bytes() == earlier
     sampler.run_mcmc(None, 1)
     assert np.array_equal(sampler.get_chain()[:1], other.get_chain())
-
-
-def test_groups_of_one_file_are_runs_of_their_own(tmp_path):
-    def sampler(name, seed):
-        backend = emcee.backends.HDFBackend(str(tmp_path / "run.h5"), name=name)
-        posterior = Gaussian(NDIM, sd=0.05)
-        return SMCSampler(N, NDIM, posterior, vectorize=True, seed=seed, backend=backend)
-
-    first, second = sampler("one", 1), sampler("a/b", 2)
-    first.run_mcmc(None, 2)
-    second.run_mcmc(None, 2)
-    with h5py.File(tmp_path / "run.h5", "a") as file:
-        file["one/accepted"][0] += 1.0
-    again, other = sampler("one", 1), sampler("a/b", 2)
-    again.run_mcmc(None, 2)
-    assert np.array_equal(again.get_chain(), first.get_chain())
-    other.run_mcmc(None, 1)
-    assert other.iteration == 3
 
 
 def run_in_a_group(path, number, together):
@@ -367,23 +326,6 @@ def test_a_run_does_not_begin_with_a_file_that_another_process_writes(whole_smc,
         make(path, "smc")
 
 
-def test_two_processes_and_two_samplers_on_one_file(tmp_path):
-    path = tmp_path / "run.h5"
-    first = make(path, "smc")
-    first.run_mcmc(None, 1)
-
-    code = (
-        "import sys; from tests.faults.resumable_run import make\n"
-        "try: make(sys.argv[1], 'smc').run_mcmc(None, 1)\n"
-        "except ValueError as error: print(error)"
-    )
-    said = subprocess.run([sys.executable, "-W", "ignore", "-c", code, str(path)], capture_output=True, text=True)
-    assert "another run is writing" in said.stdout, said.stderr
-    second = make(path, "smc")  # of the same process: the last sampler owns the file
-    second.run_mcmc(None, 1)
-    assert make(path, "smc").iteration == 2
-
-
 def test_a_sampler_that_does_not_know_the_chain_of_another_one_leaves_it_alone(tmp_path):
     """Made before the other one ran, or before the other one went on: it is refused, and nothing is changed."""
     path = tmp_path / "run.h5"
@@ -434,23 +376,6 @@ def test_a_full_disk(size, ballast, tmp_path):
     assert status == 0, said.decode()
     assert pickle.loads(said) == expected
     assert evaluated_again(log, "smc") == 0
-
-
-def test_blobs_that_cannot_be_stored_are_refused_after_the_first_batch(tmp_path):
-    posterior = Gaussian(NDIM)
-    for blob in ({"any": "thing"}, "text"):
-        path = tmp_path / f"{type(blob).__name__}.h5"
-        sampler = SMCSampler(
-            N,
-            NDIM,
-            lambda x, blob=blob: (posterior(x), blob),
-            log_prior_fn=posterior.log_prior,
-            backend=emcee.backends.HDFBackend(str(path)),
-        )
-        posterior.calls = 0
-        with pytest.raises(ValueError, match="blobs"):
-            sampler.run_mcmc(posterior.sample_prior(N, np.random.default_rng(0)), 1)
-        assert posterior.calls <= N + 2
 
 
 # ---------------------------------------------------------------------- half-opened records, names, earlier steps
@@ -565,28 +490,6 @@ def test_a_half_made_file_of_emcee_is_made_again(made, whole_smc, tmp_path):
         for name in ("accepted", "chain", "log_prob")[max(made - len(ATTRIBUTES), 0) :]:
             del file["mcmc"][name]
     assert outcome(go_on(make(path, "smc"))) == whole_smc
-
-
-def test_a_record_that_could_not_be_opened_is_opened_again(tmp_path):
-    """A full disk at the first bytes, then the same call in the same process."""
-    expected = outcome(go_on(make(tmp_path / "whole.h5", "smc")))
-
-    def run():
-        sampler = make(tmp_path / "run.h5", "smc")
-        limit_files(10)
-        try:
-            sampler.run_mcmc(None, 1)
-        except OSError:
-            limit_files(None)
-            go_on(sampler)
-            sampler._record.close()
-            return pickle.dumps(outcome(sampler))
-        return None
-
-    status, said = end(*fork(run))
-    assert status == 0, said.decode()
-    assert pickle.loads(said) == expected
-    assert record_of(tmp_path / "run.h5").read_bytes().startswith(MAGIC)
 
 
 def test_damaged_files_are_kept_under_different_names(whole, tmp_path):

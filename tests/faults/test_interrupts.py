@@ -2,7 +2,6 @@
 
 import os
 import signal
-import subprocess
 import sys
 import threading
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
@@ -92,12 +91,6 @@ def test_a_handler_that_returns_has_dealt_with_ctrl_c():
     assert noted
 
 
-def test_an_ignored_sigint_stays_ignored():
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    assert np.isfinite(likelihood_of(press_ctrl_c).misfit(THETAS)).all()
-    assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-
-
 def test_a_handler_that_a_model_sets_stays():
     likelihood_of(lambda: signal.signal(signal.SIGINT, leaves)).misfit(THETAS)
     assert signal.getsignal(signal.SIGINT) is leaves
@@ -118,21 +111,6 @@ def test_deferred_ctrl_c_is_a_keyboard_interrupt_at_the_end():
     with pytest.raises(KeyboardInterrupt):
         sampler.run_mcmc(Gaussian(2).sample_prior(20, np.random.RandomState(1)), 1)
     assert done == [1] and signal.getsignal(signal.SIGINT) is leaves
-
-
-@pytest.mark.slow
-def test_dask_jobqueue_sets_sys_exit_and_ctrl_c_still_ends_the_run(tmp_path):
-    pytest.importorskip("dask_jobqueue", reason="NO DASK_JOBQUEUE: install it to test its handler of SIGINT")
-    code = (
-        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "import dask_jobqueue, pytest; theirs = signal.getsignal(signal.SIGINT)\n"
-        "from tests.faults.test_interrupts import *\n"
-        "with pytest.raises(KeyboardInterrupt): likelihood_of(press_ctrl_c, 'cache.db').misfit(THETAS)\n"
-        "assert signal.getsignal(signal.SIGINT) is theirs is not signal.default_int_handler\n"
-        "check_nothing_is_stored('cache.db')\n"
-    )
-    environment = os.environ | {"PYTHONPATH": os.getcwd()}
-    subprocess.run([sys.executable, "-c", code], check=True, cwd=tmp_path, env=environment)
 
 
 # pools ---------------------------------------------------------------------------------------------------------------
@@ -257,14 +235,10 @@ class Fails(Gaussian):
         return super().__call__(x)
 
 
-@pytest.mark.parametrize("asynchronous", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_interrupts_in_pools_of_a_sampler(pool, asynchronous):
+def test_interrupts_in_pools_of_a_sampler(pool):
     name, pool = pool
-    if asynchronous and not hasattr(pool, "submit"):
-        pytest.skip("this pool takes no single points")
     for act, kind in ((leave, SystemExit), (interrupt, KeyboardInterrupt)):
-        settings = {"recycle": True, "asynchronous": True} if asynchronous else {}
-        sampler = SMCSampler(40, 2, Fails(act), seed=3, pool=pool, **settings)
+        sampler = SMCSampler(40, 2, Fails(act), seed=3, pool=pool)
         if kind is SystemExit and name in IN_PROCESSES:
             sampler.run_mcmc(None, 1)
             assert {each["reason"] for each in sampler.failures} == {"SystemExit: bye"}

@@ -120,24 +120,6 @@ class DiesLoading:
             os.kill(os.getpid(), signal.SIGKILL)
 
 
-class LoadsOnce:
-    """A function that is loaded by its first process, and by others not before a folder has the file ``go``."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-
-    def __setstate__(self, state: dict) -> None:
-        self.__dict__.update(state)
-        try:
-            (self.folder / "first").touch(exist_ok=False)
-        except FileExistsError:
-            while not (self.folder / "go").exists():
-                time.sleep(0.005)
-
-    def __call__(self, item: int) -> int:
-        return item
-
-
 class Large(Treacherous):
     """A model of 1 MB that counts how often it was unpickled in this process."""
 

@@ -6,25 +6,18 @@ from scipy.stats import multivariate_normal, norm
 
 from fe_likelihoods import (
     Channel,
-    FELikelihood,
     FunctionModel,
-    GaussianNoise,
     LinearOscillator,
     LogNormal,
-    Measurements,
-    Posterior,
     Prior,
     RCColumn,
     SimulationFailed,
     TruncatedNormal,
     peak,
-    plot_ranking,
     problems,
-    propagate,
     rank_sensors,
 )
-from fe_likelihoods.information.sensors import slopes_at, variance_of
-from samplers import SMCSampler
+from fe_likelihoods.information.sensors import slopes_at
 
 TIME = np.linspace(0.0, 1.0, 40)
 SHAPES = np.stack([np.sin(5.0 * TIME), np.cos(3.0 * TIME), np.ones(40)])
@@ -145,60 +138,6 @@ def test_derivatives_of_the_model_replace_differences():
     np.testing.assert_allclose(exact.target_left, rough.target_left, rtol=0.03)
 
 
-def test_failed_draws_of_a_model_with_derivatives_are_left_out():
-    def respond(theta):
-        if theta[0] > 2.5:
-            raise SimulationFailed("too large")
-        return np.stack([theta[0] * SHAPES[0], theta[0] ** 2 * SHAPES[1]])
-
-    def slopes(theta):
-        return np.stack([SHAPES[0], 2.0 * theta[0] * SHAPES[1]])[None]
-
-    models = [FunctionModel(respond, ("x",), CHANNELS[:2], 0.02, 40, jacobian=each) for each in (slopes, None)]
-    own, rough = (rank_sensors(each, {"x": norm(1.0, 1.0)}, noise={"a": 0.1, "b": 0.1}, draws=100) for each in models)
-    assert 0 < own.counts["failed"] and own.counts["simulations"] == 200
-    np.testing.assert_allclose(own.alone, rough.alone, rtol=0.05)
-    wrong = FunctionModel(respond, ("x",), CHANNELS[:2], 0.02, 40, jacobian=lambda theta: slopes(theta)[0])
-    with pytest.raises(ValueError, match="jacobian to return finite derivatives"):
-        rank_sensors(wrong, {"x": norm(1.0, 1.0)}, draws=3)
-
-
-@pytest.mark.slow
-def test_the_variance_left_of_a_drift_is_what_guided_runs_obtain():
-    """Of the peak under a stronger motion, after five synthetic tests of an oscillator."""
-    motion = problems.table_motion().trim(0.0, 6.0).resample(0.02)
-    model = LinearOscillator(motion, 0.5)
-    design = model.with_record(motion.scale(2.0).trim(0.5, 5.0))
-    prior = Prior({"stiffness": TruncatedNormal(1.0, 0.2), "damping": TruncatedNormal(1.0, 0.3)})
-    sd = 0.2 * model.simulate(np.ones(2)).std(axis=1)
-    noise = dict(zip(("acceleration", "displacement"), sd, strict=True))
-    coords = np.random.default_rng(3).standard_normal((5, 2))
-    target = peak("displacement")
-
-    def largest(response):
-        return np.abs(response[1]).max()
-
-    steps = np.full((5, 2), -0.05)
-    slopes = slopes_at(model, prior, coords, steps)
-    gradients = slopes_at(design, prior, coords, steps, largest).gradients
-    precision = np.eye(2) + np.einsum("mcij,c->mij", slopes.products, 1.0 / sd**2)
-    predicted, obtained = variance_of(precision, gradients), []
-    for k, theta in enumerate(prior.from_normal(coords)):
-        errors = sd[:, None] * np.random.default_rng(k).standard_normal((2, model.n_steps))
-        measured = Measurements(model.channels, model.dt, model.simulate(theta) + errors)
-        known = {f"sigma_{name}": LogNormal(value, 1e-3) for name, value in noise.items()}
-        likelihood = FELikelihood(model, measured, GaussianNoise(model.channels))
-        posterior = Posterior(likelihood, prior.distributions | known)
-        sampler = SMCSampler(200, 4, posterior, vectorize=True, seed=k, guide=posterior.guide())
-        sampler.run_mcmc(None, 2)
-        samples = sampler.get_chain(flat=True)[:, :2]
-        obtained.append(propagate(design, samples, quantity=target, progress=False).sd ** 2)
-    ratio = np.array(obtained) / predicted
-    assert np.abs(np.log(ratio)).max() < np.log(1.4), ratio
-    ranking = rank_sensors(model, prior, noise=noise, target=target, target_model=design, draws=40)
-    assert ranking.target_left[-1] < 0.2
-
-
 def test_strains_of_the_column_near_the_base_are_ranked_before_mid_height():
     record = problems.bridge_column_data("short").record.trim(3.0, 5.0)
     bar = RCColumn.lhpost(record).bar_circle_radius
@@ -208,16 +147,6 @@ def test_strains_of_the_column_near_the_base_are_ranked_before_mid_height():
     ranking = rank_sensors(column, prior, noise={"strain": 5e-5}, effective_samples=50.0, draws=3)
     assert ranking.chosen[0].startswith("strain@0.2:") and (np.diff(ranking.alone) < 0.0).all()
     assert ranking.lead[0] > 2.0 * ranking.errors["lead"][0]
-
-
-def test_the_figure_has_the_chosen_sensors():
-    import matplotlib.pyplot as plt
-
-    ranking = rank_sensors(LINEAR, PRIOR, noise=NOISE, draws=2, target=lambda response: response[1].mean())
-    figure = plot_ranking(ranking)
-    assert [text.get_text() for text in figure.axes[0].get_yticklabels()] == list(ranking.chosen)
-    assert figure.axes[1].get_xlabel() == "variance of the target that is left [%]"
-    plt.close(figure)
 
 
 @pytest.mark.parametrize(
@@ -249,12 +178,3 @@ def test_levels_and_numbers_of_samples_are_checked_before_a_simulation(arguments
     model = FunctionModel(response, LINEAR.parameter_names, LINEAR.channels, LINEAR.dt, LINEAR.n_steps)
     with pytest.raises(ValueError, match=next(iter(arguments))):
         rank_sensors(model, PRIOR, **{"noise": NOISE} | arguments)
-
-
-def test_all_draws_fail():
-    def fail(theta):
-        raise SimulationFailed("no")
-
-    model = FunctionModel(fail, ("x",), CHANNELS[:1], 0.02, 40)
-    with pytest.raises(ValueError, match="got 0 of 2: narrow the prior"):
-        rank_sensors(model, {"x": norm(0.0, 1.0)}, draws=2)

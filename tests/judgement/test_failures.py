@@ -1,6 +1,5 @@
 """Failures among the final points end the posterior, not the data: the verdict says so, and only then."""
 
-import emcee
 import numpy as np
 import pytest
 from scipy import stats
@@ -126,28 +125,6 @@ def test_an_answer_that_cannot_be_used_rules_nothing_out(answer, caplog):
     assert found == expected and found.failed > 50 and "takes all points as possible" in caplog.text
 
 
-@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
-def test_a_run_that_goes_on_from_its_file_says_the_same(tmp_path):
-    verdicts = []
-    for name, interrupted in (("whole", False), ("parts", True)):
-        path = str(tmp_path / f"{name}.h5")
-
-        def make(path=path):
-            posterior = Cut(0.7, "nan")
-            backend = emcee.backends.HDFBackend(path)
-            return SMCSampler(60, 2, posterior, vectorize=True, seed=3, backend=backend)
-
-        sampler = make()
-        if interrupted:
-            for count, _ in enumerate(sampler.sample(None, iterations=4)):
-                if count == 1:
-                    break
-            sampler = make()
-        sampler.run_mcmc(None, 4 - sampler.iteration)
-        verdicts.append((sampler.verdict, sampler.verdict.near_failures))
-    assert verdicts[0] == verdicts[1] and verdicts[0][1].borders
-
-
 def test_the_region_is_that_of_the_samples_in_any_units(rng):
     samples = rng.standard_normal((400, 2))
     failed, succeeded = rng.uniform(-4.0, 4.0, size=(100, 2)), rng.uniform(-4.0, 4.0, size=(300, 2))
@@ -219,21 +196,6 @@ def test_the_place_of_the_failures(log_likelihood, fails, place, status, seed):
     assert (sampler.verdict.near_failures.place, sampler.verdict.status) == (place, status)
     words = {"scattered": "scattered among successful ones", "edge": "at an edge", "border": "end the posterior there"}
     assert [each for each in words if words[each] in str(sampler.verdict)] == [place] * (place in words)
-
-
-def test_scattered_failures_are_told_from_those_that_fill_a_hole(rng):
-    samples, points = rng.standard_normal((300, 2)), rng.standard_normal((1500, 2))
-    for fails, is_scattered in ((rng.random(1500) < 0.08, True), (np.linalg.norm(points, axis=1) < 0.4, False)):
-        found = failures_near(samples, points[fails], points[~fails])
-        assert found.scattered == is_scattered and found.borders != is_scattered and found.adjoining > 40
-
-
-@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
-def test_a_long_chain_says_the_same():
-    """Its many evaluated points are all closer to a sample than the next sample is."""
-    posterior = Plane(gaussian, lambda x: x[..., 0] > 1.6)
-    sampler = run(posterior, nwalkers=200, steps=90, seed=102)
-    assert (sampler.verdict.near_failures.place, sampler.verdict.status) == ("border", "not usable")
 
 
 def test_walkers_in_one_place_have_no_region(rng):

@@ -1,6 +1,5 @@
 """``sampler.verdict``: modes with shares, agreement of the estimates, effective sample size, what is not known."""
 
-import emcee
 import numpy as np
 import pytest
 
@@ -53,17 +52,6 @@ def test_sentence_and_what_it_is_made_of(sampler):
     assert found.summary in str(compare_models({"a": sampler, "b": (-3.0, 0.1)}))
 
 
-def test_without_check_and_from_a_file(two_modes, tmp_path):
-    backend = emcee.backends.HDFBackend(str(tmp_path / "a.h5"))
-    made = run(two_modes, 300, check_draws=0, backend=backend)
-    sampler = SMCSampler(300, 4, two_modes, vectorize=True, backend=backend)
-    found = sampler.verdict
-    assert "check" not in found.summary
-    assert found.pareto_shape is None
-    np.testing.assert_array_equal(sampler.founders, made.founders)  # the file says which walkers are copies
-    assert len(found.unknown) == 2
-
-
 def test_modes_need_a_chain(two_modes):
     sampler = SMCSampler(300, 4, two_modes, vectorize=True)
     with pytest.raises(ValueError, match="call run_mcmc first"):
@@ -72,14 +60,6 @@ def test_modes_need_a_chain(two_modes):
     assert len(sampler.verdict.unknown) == 1
     with pytest.raises(ValueError, match="one step or more"):
         sampler.verdict.modes  # noqa: B018
-
-
-def test_worst_direction_of_independent_draws_and_of_copies(rng):
-    draws = rng.standard_normal((1, 400, 8))
-    assert worst_effective_sample_size(draws, np.arange(400)) == pytest.approx(400.0, rel=0.01)
-    copies = np.repeat(draws, 4, axis=1)
-    assert worst_effective_sample_size(copies, np.repeat(np.arange(400), 4)) == pytest.approx(400.0, rel=0.01)
-    assert worst_effective_sample_size(draws, np.zeros(400, dtype=int)) == 0.0
 
 
 def test_worst_direction_is_a_combination_of_parameters(rng):

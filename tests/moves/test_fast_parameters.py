@@ -1,14 +1,12 @@
 """Sweeps over fast parameters: correct posterior, other parameters unchanged, no additional simulations."""
 
-from multiprocessing.pool import ThreadPool
-
 import emcee
 import numpy as np
 import pytest
 from emcee.model import Model
 from scipy import stats
 
-from samplers import MixtureMove, RandomWalkMove, SMCSampler, TemperedSampler, TMCMCSampler
+from samplers import RandomWalkMove, SMCSampler, TMCMCSampler
 from samplers.emcee_internals import get_moves
 from samplers.moves.fast_parameters import WithFastSweeps
 from tests.contract.targets import Gaussian, WithBlobs
@@ -149,25 +147,6 @@ def test_fast_parameters_move_when_the_expensive_move_does_not(seed):
 
 
 # ---------------------------------------------------------------- when it is off
-
-
-def kinds(posterior, Sampler=SMCSampler, **kwargs):
-    sampler = Sampler(50, 3, posterior, log_prior_fn=Gaussian().log_prior, **kwargs)
-    return {type(move) for move in get_moves(sampler)[0]}
-
-
-def test_only_if_some_parameters_are_fast():
-    assert kinds(Noisy()) == kinds(Noisy(), TMCMCSampler) == kinds(Noisy(), TemperedSampler) == {WithFastSweeps}
-    assert kinds(Noisy(), moves=[(emcee.moves.DEMove(), 0.8), (RandomWalkMove(), 0.2)]) == {WithFastSweeps}
-    assert kinds(Noisy(), fast_sweeps=0) == kinds(Gaussian()) == kinds(Noisy().__call__) == {MixtureMove}
-    everything = Noisy()
-    everything.fast_parameters = (0, 1, 2)
-    nothing = Noisy()
-    nothing.fast_parameters = ()
-    assert kinds(everything) == kinds(nothing) == {MixtureMove}
-    with ThreadPool(1) as pool:  # workers have no cache of the simulations
-        assert kinds(Noisy(), pool=pool) == {MixtureMove}
-        assert kinds(Noisy(), pool=pool, vectorize=True) == {WithFastSweeps}
 
 
 @pytest.mark.parametrize("fast", [(3,), (-1,), (0, 7), (0.5,), ("sigma",)])

@@ -7,9 +7,7 @@ from emcee.model import Model
 from scipy.stats import norm
 
 from samplers.estimates.weights import normalised_weights
-from samplers.moves import population_moves
 from samplers.moves.population_moves import MixtureMove
-from samplers.proposals.mixture import fit_mixture, leave_out, log_density
 from samplers.resampling import systematic
 
 NDIM, N, RUNS = 30, 400, 4
@@ -42,37 +40,3 @@ def test_independent_draws_keep_the_spread_of_many_parameters(parts, low, high):
     """Four runs have a standard error of 0.005. Negative control: one fit to all points makes them too wide."""
     changes = [change_of_variance(seed, parts) for seed in range(RUNS)]
     assert low < np.mean(changes) < high
-
-
-def test_a_point_has_no_part_in_the_fit_that_moves_it(rng):
-    """A point that is far away changes every mixture except the one of its own part."""
-    points = rng.standard_normal((200, 6))
-    weights, parts = np.full(200, 1.0 / 200), np.arange(200) % 10
-    mixture = fit_mixture(points, weights)
-    here = leave_out(mixture, points, weights, parts)
-    moved = points.copy()
-    moved[3] += 0.5  # of part 3
-    there = leave_out(mixture, moved, weights, parts)
-    differ = [
-        not np.allclose(log_density(a, points[:5]), log_density(b, points[:5]))
-        for a, b in zip(here, there, strict=True)
-    ]
-    assert differ == [part != 3 for part in range(10)]
-
-
-def test_one_step_without_a_part_stays_near_the_fit(rng):
-    points = rng.standard_normal((500, 3)) + 8.0 * (np.arange(500) % 2)[:, None]
-    weights = np.full(500, 1.0 / 500)
-    mixture = fit_mixture(points, weights)
-    for each in leave_out(mixture, points, weights, np.arange(500) % 10):
-        assert len(each.weights) == 2
-        assert np.allclose(each.means, mixture.means, atol=0.1) and np.allclose(
-            each.covariances, mixture.covariances, atol=0.2
-        )
-
-
-@pytest.mark.parametrize(("ndim", "fitted"), [(14, 0), (15, population_moves.PARTS)])
-def test_few_parameters_need_no_parts(ndim, fitted, rng):
-    move = MixtureMove()
-    move.calibrate(rng.standard_normal((100, ndim)), np.full(100, 0.01))
-    assert len(move._mixtures) == fitted

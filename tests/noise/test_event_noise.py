@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import (
-    AutoregressiveNoise,
     Channel,
     Events,
     FELikelihood,
@@ -93,16 +92,6 @@ def test_data_of_an_event_are_the_same_after_another_event_and_alone(model, even
     assert FELikelihood(model, whole).data_fingerprint != FELikelihood(model, cut).data_fingerprint
 
 
-def test_events_on_the_supports_of_a_structure(events):
-    structure = LinearStructure(ShearFrame({"low": 1, "top": 2}, (1.0, 1.0), (900.0, 900.0)), events)
-    theta = np.array([1.0, 1.0, 0.05, 0.05])
-    parts = events.split(structure.simulate(theta))
-    measured = {name: Measurements(structure.channels, 0.02, part) for name, part in parts.items()}
-    likelihood = FELikelihood(structure, measured, noise=GaussianNoise(structure.channels, groups="event"))
-    assert likelihood.parameter_names[4:] == ("sigma_low_EQ1", "sigma_top_EQ1", "sigma_low_EQ2", "sigma_top_EQ2")
-    assert np.nanmax(np.abs(likelihood.residuals(theta))) == 0.0
-
-
 def test_an_event_without_measurement_changes_the_state_only(model, events, measured):
     only = FELikelihood(model, {"EQ2": measured["EQ2"]})
     errors = residuals(model, events, measured, [1.0, 1.0])["EQ2"]
@@ -131,21 +120,6 @@ def test_a_level_per_event(model, events, measured):
     assert FELikelihood(model, measured, sensor)(point) == pytest.approx(likelihood([1.1, 0.9, *total]), rel=1e-12)
 
 
-def test_only_measured_channels_have_levels(model, measured):
-    partial = {"EQ1": measured["EQ1"].select(["displacement"]), "EQ2": measured["EQ2"]}
-    likelihood = FELikelihood(model, partial, noise=GaussianNoise(model.channels, groups="event"))
-    assert "sigma_acceleration_EQ1" not in likelihood.parameter_names and likelihood.ndim == 2 + 3
-    assert np.isfinite(likelihood([1.0, 1.0, 0.01, 1.0, 0.01]))
-
-
-def test_other_noises_work_with_events(model, events, measured):
-    joined = events.join(measured).select(["acceleration", "displacement"])
-    for noise in (GaussianNoise(joined.channels, groups="all"), AutoregressiveNoise(model.channels)):
-        likelihood = FELikelihood(model, measured, noise)
-        values = [1.0, 1.0, *(0.3 if "rho" not in name else 0.2 for name in noise.parameter_names)]
-        assert np.isfinite(likelihood(values))
-
-
 def test_first_part_cache_and_guide(model, measured, tmp_path):
     cache = SimulationCache(tmp_path / "cache.db")
     likelihood = FELikelihood(model, measured, noise=GaussianNoise(model.channels, groups="event"), cache=cache)
@@ -162,26 +136,6 @@ def test_first_part_cache_and_guide(model, measured, tmp_path):
     posterior = Posterior(likelihood, prior)
     assert Posterior(again, prior).fingerprint == posterior.fingerprint
     assert posterior.guide() is not None
-
-
-def test_steps_of_the_measurements_may_be_longer(events, model):
-    assert [window.first for window in events.windows] == [0, 110]
-    channel = (Channel("displacement", "relative displacement", "cm"),)
-    first, second = (Measurements(channel, 0.04, values) for values in (np.ones((1, 30)), np.zeros((1, 5))))
-    joined = events.join({"EQ1": first, "EQ2": second})
-    assert joined.dt == 0.04 and joined.n_steps == 80
-    assert np.flatnonzero(joined.values[0] == 0.0).tolist() == [55, 56, 57, 58, 59]
-    model = LinearOscillator(events, period=0.5)
-    noise = GaussianNoise(channel, groups="event").under(model).with_measurements(joined)
-    assert noise.layout.counts == ((30,), (5,)) and noise.statistic.windows == ((0, 30), (55, 80))
-    assert noise.parameter_names == ("sigma_displacement_EQ1", "sigma_displacement_EQ2")
-    only_first = noise.under(model).with_measurements(events.join({"EQ1": first}))
-    assert only_first.parameter_names == noise.parameter_names, "the parameters stay for a part of the measurements"
-    fewer = GaussianNoise(channel, groups="event").under(model).with_measurements(events.join({"EQ1": first}))
-    with pytest.raises(ValueError, match="no level for displacement in an event in which they are measured"):
-        fewer.with_measurements(joined)
-    late = events.join({"EQ2": Measurements(channel, 0.02, np.zeros((1, 5)), start=0.1)})
-    assert np.flatnonzero(~np.isnan(late.values[0])).tolist() == [115, 116, 117, 118, 119]
 
 
 def test_bad_input_is_refused_before_anything_is_simulated(model, events, measured):

@@ -15,7 +15,6 @@ from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.noise.marginal import MarginalNoise
 from fe_likelihoods.prediction.propagation import propagate
 from fe_likelihoods.priors.distributions import HalfNormal, LogNormal, TruncatedNormal, Uniform
-from fe_likelihoods.problems import isolated_bridge
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record
 
@@ -70,15 +69,6 @@ def test_equals_an_adaptive_quadrature(prior):
         np.testing.assert_allclose(got, expected, atol=tolerance, rtol=1e-13)
 
 
-def test_equals_the_closed_form_of_a_flat_prior():
-    """The integral of sigma^-n exp(-J / (2 sigma^2)) over all sigma is 1/2 (J / 2)^(-(n-1)/2) Gamma((n-1)/2)."""
-    n, squares = 60, np.array([[2.0], [0.5]])
-    got = MarginalNoise(GaussianNoise([TOP]), {"sigma_top": Uniform(0.0, 100.0)}).log_likelihood(squares, n)
-    half = 0.5 * (n - 1)
-    expected = -0.5 * n * math.log(2.0 * math.pi) - math.log(200.0) - half * np.log(squares / 2) + special.gammaln(half)
-    np.testing.assert_allclose(got, expected[:, 0], rtol=1e-13)
-
-
 def test_channels_are_a_sum_and_a_shared_sigma_is_one_integral(rng):
     priors = {"sigma_drift": HalfNormal(0.5), "sigma_top": LogNormal(1.0, 0.5)}  # in any order
     misfit = rng.uniform(20.0, 90.0, size=(5, 2))
@@ -107,13 +97,6 @@ def test_impossible_values_and_exact_fits():
     assert values[:2].tolist() == [-np.inf] * 2 and values[2] == np.inf and np.isfinite(values[[3, 5]]).all()
     assert values[4] < -1e100
     assert perfect[0] == pytest.approx(by_quadrature(0.0, 50, Uniform(0.1, 1.0)), rel=1e-9)
-
-
-def test_a_row_does_not_depend_on_the_others_but_for_round_off(rng):
-    noise = MarginalNoise(GaussianNoise([TOP]), {"sigma_top": HalfNormal(1.0)})
-    misfit = rng.uniform(0.1, 1e4, size=(40, 1))
-    apart = [noise.log_likelihood(row[None], 500)[0] for row in misfit]
-    np.testing.assert_allclose(noise.log_likelihood(misfit, 500), apart, rtol=1e-13)
 
 
 def test_draws_have_the_conditional_distribution(rng):
@@ -202,19 +185,3 @@ def test_the_noise_is_drawn_afterwards_without_a_simulation(full, rng):
         propagate(marginal, samples, noise=True, progress=False)
     with pytest.raises(ValueError, match="are in the samples of this posterior"):
         full.draw_noise(samples)
-
-
-def test_cache_and_failure_limit_are_kept(full, tmp_path):
-    model, measurements = full.likelihood.model, full.likelihood.measurements
-    likelihood = FELikelihood(model, measurements, cache=tmp_path / "sums.sqlite", max_failure_share=0.5, memory_rows=7)
-    posterior = Posterior(likelihood, full.prior)
-    posterior.log_prob([1.0, 1.0, 0.5, 0.01])
-    marginal = posterior.marginal()
-    marginal.log_prob([1.0, 1.0])
-    assert (marginal.likelihood.simulations, marginal.likelihood.simulator.disk_hits) == (0, 1)
-    assert marginal.likelihood.simulator.failures.max_share == 0.5
-
-
-def test_problems_with_the_noise_integrated_out():
-    marginal = isolated_bridge(noise="marginal", step=1e-3)
-    assert marginal.ndim == 10 and marginal.likelihood.noise.noise.parameter_names == ("sigma",)

@@ -29,9 +29,8 @@ from fe_likelihoods import (
 )
 from fe_likelihoods.emulation.modes import find_modes
 from fe_likelihoods.noise.marginal import MarginalNoise
-from fe_likelihoods.noise.residuals import autocorrelation, innovations, lag_one_sums
-from fe_likelihoods.noise.sample_counts import SampleCounts, count_samples
-from fe_likelihoods.simulation.model import SimulationBatch
+from fe_likelihoods.noise.residuals import autocorrelation, innovations
+from fe_likelihoods.noise.sample_counts import count_samples
 from tests.emulation.problems import CHANNELS as MODES_CHANNELS
 from tests.emulation.problems import DT, N_STEPS, free_vibration
 
@@ -128,56 +127,14 @@ def test_marginal_noise_counts_the_samples_that_are_there(rng):
     np.testing.assert_allclose(draws.mean(axis=0), known, rtol=0.1)
 
 
-def test_equals_the_density_with_all_samples_in_one_pattern(rng):
-    """The form with gaps, where there are none, is the form without."""
-    residuals = rng.normal(size=(2, 60))
-    squares, steps = np.square(residuals).sum(axis=1), np.square(np.diff(residuals, axis=1)).sum(axis=1)
-    later, earlier = np.square(residuals[:, 1:]).sum(axis=1), np.square(residuals[:, :-1]).sum(axis=1)
-    sums = np.concatenate([squares, residuals[:, 0] ** 2, later, earlier, steps])[None]
-    counts = SampleCounts(np.array([60, 60]), np.array([1]), np.array([[59, 59]]))
-    noise, parameters = AutoregressiveNoise(CHANNELS), np.array([[0.8, 1.3, 0.6, -0.2]])
-    expected = noise.log_likelihood(lag_one_sums(residuals)[None], 60, parameters)
-    np.testing.assert_allclose(noise.log_likelihood(sums, counts, parameters), expected, rtol=1e-13)
-
-
-@pytest.mark.parametrize("parameters", [[0.0, 1.0, 0.1, 0.1], [-1.0, 1.0, 0.1, 0.1], [1.0, 1.0, 1.0, 0.1]])
-def test_impossible_parameters_have_no_likelihood(rng, parameters):
-    residuals = np.where(with_gaps(rng), rng.normal(size=(2, 60)), np.nan)
-    noise = AutoregressiveNoise(CHANNELS)
-    statistics = statistics_of(noise, residuals)
-    assert noise.log_likelihood(statistics, count_samples(residuals), np.array([parameters])) == -np.inf
-    possible = np.array([[1.0, 1.0, 0.1, 0.1]])
-    assert noise.log_likelihood(np.full_like(statistics, np.nan), count_samples(residuals), possible) == -np.inf
-
-
 # the likelihood -------------------------------------------------------------------------------------------------------
 
 
-class Batch:
-    """The model with batch methods of its own; that of the misfit knows no gaps."""
-
-    parameter_names, channels, dt, n_steps, fingerprint = ("size", "speed"), CHANNELS, 0.02, 60, "wave in batches"
-
-    def __init__(self):
-        self.runs = 0
-
-    def simulate(self, theta):
-        self.runs += 1
-        return wave(theta)
-
-    def simulate_batch(self, thetas):
-        self.runs += len(thetas)
-        good = [theta[1] <= 3.0 for theta in thetas]
-        rows = [wave(theta) if ok else np.full((2, 60), np.nan) for theta, ok in zip(thetas, good, strict=True)]
-        return SimulationBatch(np.array(rows), ["" if ok else "too fast" for ok in good])
-
-
 @pytest.mark.parametrize("noise", [GaussianNoise, AutoregressiveNoise])
-@pytest.mark.parametrize("own", [False, True])
-def test_likelihood_with_gaps(rng, tmp_path, noise, own):
+def test_likelihood_with_gaps(rng, tmp_path, noise):
     there = with_gaps(rng)
     data = measured(rng, there)
-    model = Batch() if own else FunctionModel(wave, ["size", "speed"], CHANNELS, 0.02, 60)
+    model = FunctionModel(wave, ["size", "speed"], CHANNELS, 0.02, 60)
     cache = SimulationCache(tmp_path / "cache.db")
     likelihood = FELikelihood(model, data.select(["drift", "top"]), noise(CHANNELS), cache=cache)
     x = np.column_stack([rng.uniform(0.5, 1.5, (9, 2)), rng.uniform(0.05, 0.3, (9, 2)), rng.uniform(-0.9, 0.9, (9, 2))])
@@ -200,30 +157,6 @@ def test_likelihood_with_gaps(rng, tmp_path, noise, own):
     assert shifted.fingerprint != likelihood.fingerprint
 
 
-@pytest.mark.parametrize("noise", [GaussianNoise, AutoregressiveNoise])
-@pytest.mark.parametrize(("jitter", "stale"), [(1e-13, False), (1e-3, True)])
-def test_cached_rows_are_compared_with_gaps(rng, tmp_path, noise, jitter, stale):
-    """Simulations that differ in their last digits agree with the stored rows, others do not."""
-    data, runs = measured(rng, with_gaps(rng)), []
-
-    def unsteady(theta):
-        runs.append(theta)
-        return wave(theta) * (1.0 + jitter * len(runs))
-
-    model = FunctionModel(unsteady, ["size", "speed"], CHANNELS, 0.02, 60, version="1")
-    thetas = rng.uniform(0.5, 1.5, (4, 2))
-    first = FELikelihood(
-        model, data, noise(CHANNELS), cache=SimulationCache(tmp_path / "cache.db")
-    ).simulator.statistics(thetas)
-    again = FELikelihood(model, data, noise(CHANNELS), cache=SimulationCache(tmp_path / "cache.db"))
-    if stale:
-        # the counter is part of the label, so that a new generation begins
-        assert not np.any(again.simulator.statistics(thetas)[:, 0] == first[:, 0])
-    else:
-        again.simulator.statistics(thetas)
-        assert again.simulator.disk_hits == 4 and again.simulator.verifications > 0
-
-
 class Unaware:
     """A noise whose statistic knows no gaps."""
 
@@ -242,21 +175,6 @@ def test_a_statistic_without_a_rule_for_gaps_is_refused(rng):
     FELikelihood(model, measured(rng, np.ones((2, 60), dtype=bool)), Unaware())
     with pytest.raises(ValueError, match="samples are missing, and the statistic"):
         FELikelihood(model, measured(rng, with_gaps(rng)), Unaware())
-
-
-def test_a_response_that_is_not_finite_fails_also_where_no_sample_is(rng):
-    def broken(theta):
-        response = wave(theta)
-        response[0, 0] = np.nan
-        return response
-
-    there = with_gaps(rng)
-    assert not there[0, 0]
-    model = FunctionModel(broken, ["size", "speed"], CHANNELS, 0.02, 60)
-    for noise in (GaussianNoise(CHANNELS), AutoregressiveNoise(CHANNELS)):
-        likelihood = FELikelihood(model, measured(rng, there), noise)
-        assert likelihood.log_likelihood([1.0, 1.0, *([0.1] * (likelihood.ndim - 2))]) == -np.inf
-        assert "not finite" in likelihood.simulator.failures.records[0]["reason"]
 
 
 # guides ---------------------------------------------------------------------------------------------------------------

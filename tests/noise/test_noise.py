@@ -25,36 +25,12 @@ def noise():
     return GaussianNoise(CHANNELS)
 
 
-def test_names_follow_the_channels(noise):
-    assert noise.parameter_names == ("sigma_top", "sigma_drift")
-    assert GaussianNoise(list(CHANNELS)) == noise
-    with pytest.raises(ValueError, match="at least one channel"):
-        GaussianNoise([])
-
-
 def test_equals_the_sum_of_normal_densities(noise, rng):
     sigma = rng.uniform(0.1, 3.0, (6, 2)) * [1.0, 0.01]
     residuals = rng.normal(size=(6, 2, 300)) * [[1.0], [0.02]]
     expected = stats.norm.logpdf(residuals, scale=sigma[:, :, None]).sum(axis=(1, 2))
     got = noise.log_likelihood((residuals**2).sum(axis=-1), 300, sigma)
     np.testing.assert_allclose(got, expected, rtol=1e-12)
-
-
-def test_largest_where_sigma_is_the_root_mean_square(noise):
-    misfit, n_steps = np.array([[8.0, 2e-4]]), 50
-    best = np.sqrt(misfit / n_steps)
-    at_best = noise.log_likelihood(misfit, n_steps, best)[0]
-    for factor in ([0.99, 1.0], [1.01, 1.0], [1.0, 0.99], [1.0, 1.01]):
-        assert noise.log_likelihood(misfit, n_steps, best * factor)[0] < at_best
-
-
-def test_another_unit_shifts_the_density_by_its_jacobian(noise):
-    misfit, sigma, n_steps = np.array([[3.0, 2e-4]]), np.array([[0.2, 0.003]]), 40
-    factor = np.array([9.80665, 0.0254])
-    shift = noise.log_likelihood(misfit / factor**2, n_steps, sigma / factor) - noise.log_likelihood(
-        misfit, n_steps, sigma
-    )
-    assert shift[0] == pytest.approx(n_steps * np.log(factor).sum(), rel=1e-12)
 
 
 def test_impossible_values_are_minus_infinity_without_a_warning(noise):
@@ -72,13 +48,6 @@ def test_impossible_values_are_minus_infinity_without_a_warning(noise):
     assert noise.log_likelihood(np.empty((0, 2)), 10, np.empty((0, 2))).shape == (0,)
 
 
-def test_a_row_does_not_depend_on_the_others(noise, rng):
-    misfit, sigma = rng.uniform(0.1, 5.0, (64, 2)), rng.uniform(0.1, 2.0, (64, 2))
-    together = noise.log_likelihood(misfit, 100, sigma)
-    apart = [noise.log_likelihood(misfit[k : k + 1], 100, sigma[k : k + 1])[0] for k in range(64)]
-    assert together.tolist() == apart
-
-
 def test_a_shared_sigma_is_in_units_of_the_scale_of_each_channel(noise, rng):
     shared = GaussianNoise(CHANNELS, groups="all", scales=[2.0, 0.03])
     assert shared.parameter_names == ("sigma",)
@@ -90,13 +59,6 @@ def test_a_shared_sigma_is_in_units_of_the_scale_of_each_channel(noise, rng):
         shared.log_likelihood(misfit, 40, sigma), noise.log_likelihood(misfit, 40, noise.standard_deviations(each))
     )
     assert np.isneginf(shared.log_likelihood(misfit, 40, -sigma)).all()
-
-
-def test_scales_of_a_shared_sigma_are_the_root_mean_squares(rng):
-    values = rng.normal(size=(2, 50)) * [[3.0], [0.01]]
-    shared = GaussianNoise(CHANNELS, groups="all").with_measurements(Measurements(CHANNELS, 0.1, values))
-    np.testing.assert_allclose(shared.scales, np.sqrt(np.mean(values**2, axis=1)))
-    assert repr(shared) != repr(GaussianNoise(CHANNELS, groups="all", scales=[1.0, 1.0]))
 
 
 @pytest.mark.parametrize(

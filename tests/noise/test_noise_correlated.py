@@ -8,14 +8,11 @@ import pytest
 from scipy import linalg, stats
 
 from fe_likelihoods import AutoregressiveNoise, GaussianNoise
-from fe_likelihoods.cache.simulation_cache import SimulationCache
 from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.likelihood.posterior import Posterior
-from fe_likelihoods.noise.draws import SampleNoise
 from fe_likelihoods.noise.residuals import lag_one_sums
 from fe_likelihoods.prediction.propagation import propagate
-from fe_likelihoods.priors.distributions import HalfNormal, TruncatedNormal, Uniform
-from fe_likelihoods.problems import bridge_column, bridge_column_prior, isolated_bridge
+from fe_likelihoods.priors.distributions import Uniform
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.simulation.model import SimulationFailed
 from tests import lines
@@ -47,30 +44,6 @@ def test_equals_the_normal_density_with_the_toeplitz_covariance(rng, rho, n_step
     )
     got = noise.log_likelihood(lag_one_sums(residuals)[None], n_steps, np.concatenate([sigma, rhos])[None])
     assert got[0] == pytest.approx(expected, rel=1e-9)
-
-
-def test_is_white_noise_without_correlation(rng):
-    residuals = rng.normal(size=(5, 2, 40))
-    statistics = np.array([lag_one_sums(r) for r in residuals])
-    sigma = rng.uniform(0.5, 2.0, size=(5, 2))
-    np.testing.assert_allclose(
-        AutoregressiveNoise(CHANNELS).log_likelihood(statistics, 40, np.hstack([sigma, np.zeros((5, 2))])),
-        GaussianNoise(CHANNELS).log_likelihood(statistics[:, :2], 40, sigma),
-        rtol=1e-13,
-    )
-
-
-def test_residuals_smoother_than_round_off_do_not_cancel():
-    """With products of neighbours instead of differences, Q would cancel completely at this correlation."""
-    residuals = 1.0 + 1e-9 * np.sin(np.arange(50.0))[None]
-    rho, sigma = 1.0 - 1e-12, 1.3
-    new = (residuals[0, 1:] - residuals[0, :-1]) + (1.0 - rho) * residuals[0, :-1]
-    spread = (1.0 - rho) * (1.0 + rho)
-    expected = stats.norm.logpdf(residuals[0, 0], scale=sigma)
-    expected += stats.norm.logpdf(new, scale=sigma * math.sqrt(spread)).sum()
-    noise = AutoregressiveNoise(CHANNELS[:1])
-    got = noise.log_likelihood(lag_one_sums(residuals)[None], 50, np.array([[sigma, rho]]))[0]
-    assert got == pytest.approx(expected, rel=1e-6)
 
 
 def test_impossible_values_are_minus_infinity_without_a_warning():
@@ -175,32 +148,6 @@ def test_impossible_noise_parameters_are_not_simulated(rng):
     assert np.isneginf(likelihood.log_likelihood(x)).all() and model.runs == 0
 
 
-@pytest.mark.parametrize("responses", [False, True])
-def test_the_cache_separates_statistics(tmp_path, rng, responses):
-    """Rows stored for white noise are not used for another noise, in either order; responses serve every noise."""
-    measurements, thetas = measured_by(Line(), rng), rng.uniform(-1.0, 1.0, size=(6, 2))
-    cache = SimulationCache(tmp_path / "lines.sqlite", responses=responses)
-    expected = {}
-    for round_ in range(2):
-        for noise in (
-            GaussianNoise(CHANNELS),
-            AutoregressiveNoise(CHANNELS),
-            GaussianNoise(CHANNELS, groups="all", scales=[1, 1]),
-        ):
-            model = Line()
-            likelihood = FELikelihood(model, measurements, noise, cache=cache)
-            statistics = likelihood.simulator.statistics(thetas)
-            white = not isinstance(noise, AutoregressiveNoise)
-            assert statistics.shape == (6, 2 if white else 6)
-            assert np.array_equal(expected.setdefault(white, statistics), statistics)
-            known = round_ or noise.parameter_names == ("sigma",) or (responses and not white)
-            assert (model.runs - likelihood.simulator.verifications, likelihood.simulator.disk_hits) == (
-                (0, 6) if known else (6, 0)
-            )
-    np.testing.assert_array_equal(expected[True], expected[False][:, :2])
-    assert cache.damaged == 0
-
-
 def test_a_noise_of_other_channels_is_refused(rng):
     with pytest.raises(ValueError, match="noise's channels are drift, top, the model's are top, drift"):
         FELikelihood(Line(), measured_by(Line(), rng), GaussianNoise(CHANNELS[::-1]))
@@ -218,16 +165,6 @@ def test_residuals_of_a_likelihood(rng):
 
 
 # predictions ----------------------------------------------------------------------------------------------------------
-
-
-def test_drawn_errors_have_the_covariance_that_the_likelihood_assumes(rng):
-    noise = SampleNoise(np.array([[0.5, 2.0]]), np.array([[0.9, -0.4]]))
-    errors = np.array([noise.draw(0, 6, rng) for _ in range(20_000)])
-    for k in range(2):
-        expected = noise.deviations[0, k] ** 2 * linalg.toeplitz(noise.lag_one[0, k] ** np.arange(6))
-        got = errors[:, k].T @ errors[:, k] / len(errors)
-        error = np.sqrt((np.outer(np.diag(expected), np.diag(expected)) + expected**2) / len(errors))
-        assert np.all(np.abs(got - expected) < 4.5 * error)
 
 
 def test_predictions_draw_correlated_errors(rng):
@@ -250,29 +187,3 @@ def test_predictions_draw_correlated_errors(rng):
 
 
 # problems -------------------------------------------------------------------------------------------------------------
-
-
-def test_problems_take_another_noise():
-    posterior = isolated_bridge(channels=("acc_p1", "Ub_2"), noise="autoregressive", step=1e-3)
-    assert posterior.parameter_names[-4:] == ["sigma_acc_p1", "sigma_Ub_2", "rho_acc_p1", "rho_Ub_2"]
-    assert posterior.prior.distributions["rho_Ub_2"] == Uniform(-1.0, 1.0)
-    measurements = posterior.likelihood.measurements
-    noise = GaussianNoise(measurements.channels, groups="all", effective_samples={"Ub_2": 50.0})
-    given = isolated_bridge(channels=("acc_p1", "Ub_2"), noise=noise, step=1e-3)
-    assert given.likelihood.noise == noise.with_measurements(measurements) and given.ndim == 11
-    assert given.fingerprint != isolated_bridge(channels=("acc_p1", "Ub_2"), step=1e-3).fingerprint
-    with pytest.raises(ValueError, match='"channel", "all", "autoregressive" or "marginal"'):
-        isolated_bridge(noise="pink")
-    column = bridge_column(noise="autoregressive", duration=1.0, mesh=20)
-    assert column.fast_parameters == (5, 6, 7, 8)
-    x = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 0.2, 2e-3, 0.0, 0.0])
-    white = bridge_column(duration=1.0, mesh=20)
-    assert column.log_likelihood(x) == pytest.approx(white.log_likelihood(x[:7]), rel=1e-12)
-    assert bridge_column(noise="marginal", duration=1.0, mesh=20).parameter_names == white.parameter_names[:5]
-    names = AutoregressiveNoise((CHANNELS[0],)).parameter_names
-    with pytest.raises(ValueError, match="no default prior for nu_top"):
-        bridge_column_prior((*names[1:], "nu_top"))
-    prior = bridge_column_prior(("sigma_acceleration", "rho_acceleration"))
-    assert prior.names[-2:] == ("sigma_acceleration", "rho_acceleration")
-    assert bridge_column_prior(("sigma",)).distributions["sigma"] == HalfNormal(0.3)
-    assert prior.distributions["Ec"] == TruncatedNormal(1.0, 0.3)

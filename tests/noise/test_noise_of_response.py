@@ -7,7 +7,6 @@ import warnings
 import numpy as np
 import pytest
 from scipy import stats
-from scipy.fft import dct
 
 from fe_likelihoods import (
     Channel,
@@ -26,7 +25,6 @@ from fe_likelihoods import (
     propagate,
     residual_checks,
 )
-from fe_likelihoods.cache.comparison import largest_difference
 from fe_likelihoods.checks.screening import check_gaps
 from fe_likelihoods.emulation.modes import find_modes
 from fe_likelihoods.emulation.target import ResponseTarget
@@ -147,23 +145,6 @@ def test_shares_scale_with_the_motion_and_levels_in_si_units_do_not(kind):
     np.testing.assert_array_equal(*levels)
 
 
-def test_levels_in_bands_are_those_of_the_errors_whatever_the_time_step():
-    """The variance of the samples is the sum of the squared levels, apart from the ends, and of the sensor."""
-    noise, parameters = NOISES["levels in bands"], PARAMETERS["levels in bands"]
-    total = np.hypot(np.sqrt(np.square(parameters[:3]).sum()), SENSOR[0])
-    assert noise.standard_deviations(parameters[None])[0, 0] == pytest.approx(total)
-    for n, dt in ((2000, 0.02), (4000, 0.01), (500, 0.02)):
-        found = noise.response_deviations(parameters, np.zeros((2, n)), dt)
-        assert np.sqrt(np.mean(found[0] ** 2)) == pytest.approx(total, rel=1e-12)
-        np.testing.assert_allclose(found[0, n // 4 : 3 * n // 4], total, rtol=0.03)
-    one = GaussianNoise(CHANNELS, groups=EDGES, sensor=SENSOR)
-    errors = one.response_errors(
-        parameters * [1, 0, 0, 1, 0, 0], np.zeros((2, 4000)), np.random.default_rng(1).standard_normal((2, 4000)), DT
-    )
-    spectrum = np.square(dct(errors[0], norm="ortho"))
-    assert spectrum[:320].sum() > 30.0 * spectrum[320:].sum()  # below 2 Hz
-
-
 def draw(noise, parameters, simulated, rng):
     normal = rng.standard_normal(simulated.shape)
     if noise.n_bands > 1:
@@ -234,37 +215,6 @@ def test_blocks_of_time_add_up_and_are_those_of_the_whole_response(kind, rng):
         assert blocks.values[0, 1] == pytest.approx(expected, rel=1e-10)
 
 
-@pytest.mark.parametrize("kind", ["shares in bands", "levels in bands"])
-def test_a_block_of_band_noise_is_nearly_conditional_on_the_others(kind, rng):
-    """Against the exact density of a block given all other samples of the channel; white noise is the control."""
-    simulated, parameters, inside = response([1.0]), PARAMETERS[kind], np.arange(N) // 60 == 1
-    noise = NOISES[kind].with_measurements(measured(simulated))
-    matrix = covariance(kind, simulated[0], parameters, 0)
-    gain = matrix[np.ix_(inside, ~inside)] @ np.linalg.inv(matrix[np.ix_(~inside, ~inside)])
-    left = matrix[np.ix_(inside, inside)] - gain @ matrix[np.ix_(~inside, inside)]
-    found, exact_ones, white = np.empty((3, 200))
-    for k in range(200):
-        errors = draw(noise, parameters, simulated, rng)
-        found[k] = noise.log_densities(errors, simulated, parameters)[0, inside].sum()
-        exact_ones[k] = stats.multivariate_normal(gain @ errors[0, ~inside], left).logpdf(errors[0, inside])
-        white[k] = stats.norm.logpdf(errors[0, inside], 0.0, np.sqrt(np.diag(matrix)[inside])).sum()
-    assert abs(np.mean(found - exact_ones)) < 0.2 * abs(np.mean(white - exact_ones))
-
-
-@EVERY
-def test_whitened_residuals_pass_the_checks_that_residuals_fail(kind):
-    rng, n = np.random.default_rng(5), 3000
-    simulated = np.tile(response([1.0], 300), 10)
-    noise = NOISES[kind].with_measurements(measured(simulated))
-    errors = draw(noise, PARAMETERS[kind], simulated, rng)
-    found = residual_checks(errors, CHANNELS)
-    white = noise.whitened(errors, simulated, PARAMETERS[kind])
-    checks = residual_checks(white, CHANNELS)
-    assert (checks.white > 0.01).all() and (checks.normal > 0.01).all()
-    np.testing.assert_allclose(checks.standard_deviation, 1.0, atol=5.0 / np.sqrt(2.0 * n))
-    assert (found.normal < 1e-6).all() if kind == "modulated" else (found.white < 1e-6).all()
-
-
 @EVERY
 def test_caches_pools_pickles_and_joint_likelihoods(kind, rng, tmp_path):
     values = response([1.0]) + rng.standard_normal((2, N)) * [[0.1], [0.001]]
@@ -283,20 +233,6 @@ def test_caches_pools_pickles_and_joint_likelihoods(kind, rng, tmp_path):
     assert joint(point) == pytest.approx(2.0 * likelihood([1.1, *parameters]), rel=1e-12)
 
 
-def test_a_response_that_changes_by_round_off_is_the_same_simulation(rng):
-    """Sums of squares of the response are larger than those of the residuals, and may change more."""
-    simulated = 100.0 * response([1.0])
-    values = simulated + 1e-6 * rng.standard_normal((2, N))
-    statistic = likelihood_of("modulated", values).noise.statistic
-    changed = simulated * (1.0 + 1e-10)
-    stored, new = (statistic(each - values, each) for each in (simulated, changed))
-    norm = np.linalg.norm(simulated, axis=1)
-    assert largest_difference(stored, new, norm, 1e-9, True) is None
-    assert largest_difference(stored, new, norm, 1e-9) is not None  # control: the bound of residuals
-    far = simulated * (1.0 + 1e-7)
-    assert largest_difference(stored, statistic(far - values, far), norm, 1e-9, True) is not None
-
-
 def test_guides_take_levels_in_si_units_and_refuse_shares(rng):
     values = response([1.0]) + rng.standard_normal((2, N)) * [[0.1], [0.001]]
     priors = {"factor": TruncatedNormal(1.0, 0.3)}
@@ -310,13 +246,6 @@ def test_guides_take_levels_in_si_units_and_refuse_shares(rng):
     for kind in ("modulated", "shares in bands"):
         with pytest.raises(ValueError, match="depends on the response.*without a guide"):
             ResponseTarget(posterior_of(kind))
-
-
-def test_units_and_names_of_the_parameters():
-    labels = [each.label for each in likelihood_of("levels in bands", response([1.0])).parameters]
-    assert labels[1:5] == [f"sigma_top_band{k} [m/s2]" for k in (1, 2, 3)] + ["sigma_base_band1 [mm]"]
-    for kind in ("modulated", "shares in bands"):
-        assert {each.unit for each in likelihood_of(kind, response([1.0])).parameters[1:]} == {"-"}
 
 
 def test_measurements_that_do_not_fit_are_refused():

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from fe_likelihoods.likelihood.block_likelihood import block_log_likelihood
 from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.likelihood.posterior import Posterior
 from fe_likelihoods.models.function import FunctionModel
@@ -11,7 +10,6 @@ from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.noise.gaussian import GaussianNoise
 from fe_likelihoods.noise.response_level import local_level
 from fe_likelihoods.prediction.propagation import propagate
-from fe_likelihoods.prediction.quantities import rms
 from fe_likelihoods.priors.distributions import HalfNormal, TruncatedNormal
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record
@@ -55,20 +53,6 @@ def test_the_likelihood_is_that_of_white_noise_with_the_scaled_deviations(rng):
     )
 
 
-def test_level_of_a_response():
-    time = 0.01 * np.arange(2000)
-    history = np.where(time < 10.0, 3.0, 0.1) * np.sin(2.0 * np.pi * 5.0 * time)
-    both = np.stack([history, np.ones(2000)])
-    np.testing.assert_allclose(local_level(both, None)[:, 0], np.sqrt(np.mean(both**2, axis=1)))
-    level = local_level(both, 101.0)
-    np.testing.assert_allclose(level[0, 100:900], 3.0 / np.sqrt(2.0), rtol=0.01)
-    np.testing.assert_allclose(level[0, 1100:1900], 0.1 / np.sqrt(2.0), rtol=0.01)
-    np.testing.assert_allclose(level[1], 1.0, rtol=1e-12)
-    np.testing.assert_allclose(local_level(both, 1.0), np.abs(both), rtol=1e-6, atol=1e-6)
-    # a mean square is kept, so that the share of the whole motion is that of its parts
-    assert np.mean(level[0] ** 2) == pytest.approx(np.mean(history**2), rel=0.02)
-
-
 @pytest.mark.parametrize("window", (None, 1.0))
 def test_a_prediction_of_a_weaker_motion_has_the_noise_of_the_weaker_response(record, window):
     model = LinearOscillator(record)
@@ -95,22 +79,6 @@ def test_a_prediction_of_a_weaker_motion_has_the_noise_of_the_weaker_response(re
     )
     fixed = propagate(absolute, np.tile([1.0, 1.0, 0.3, 0.2], (300, 1)), record=record.scale(0.1), **options)
     np.testing.assert_allclose(fixed.sd[0], 0.3, rtol=1e-9)
-
-
-def test_draws_have_the_stated_standard_deviations_whatever_the_batch_and_the_channels(record):
-    model = LinearOscillator(record)
-    measured = Measurements(model.channels, model.dt, model.simulate([1.0, 1.0]))
-    posterior = posterior_of(model, measured, window=2.0)
-    samples = np.tile([1.0, 1.0, 0.3, 0.2], (400, 1)) * np.linspace(0.99, 1.01, 400)[:, None]
-    options = {"noise": True, "seed": 3, "progress": False}
-    whole = propagate(posterior, samples, **options)
-    one = propagate(posterior, samples, quantity="displacement", **options)
-    np.testing.assert_allclose(one.quantiles[:, 0], whole.quantiles[:, 1], rtol=1e-9)
-    np.testing.assert_allclose(one.variance[0], whole.variance[1], rtol=1e-9)
-    spread = (whole.quantile(0.95) - whole.quantile(0.05)) / (2.0 * 1.6449 * whole.sd)
-    assert np.abs(np.mean(spread[:, 100:-100], axis=1) - 1.0).max() < 0.02
-    energy = propagate(posterior, samples, quantity=rms("acceleration"), **options)
-    assert energy.mean == pytest.approx(measured.values[0].std() / np.sqrt(1.0 - 0.3**2), rel=0.02)
 
 
 @pytest.mark.parametrize("own_times", (False, True))
@@ -148,17 +116,3 @@ def test_what_has_no_level_is_refused():
         propagate(posterior, [[1.0, -0.1]], noise=True, progress=False)
     with pytest.raises(ValueError, match="positive standard deviation"):
         propagate(posterior, [[1.0, 1.0]], noise=True, progress=False)
-
-
-def test_blocks_of_time_count_a_sample_as_in_the_whole_measurements(rng):
-    measured = Measurements((TOP,), 0.1, rng.standard_normal((1, 200)))
-    residuals = 0.3 * rng.standard_normal((3, 1, 200))
-    stops = np.array([5.0, 12.0, np.inf])
-    noise = GaussianNoise(measured.channels, level="measured", effective_samples=(50,)).with_measurements(measured)
-    white = GaussianNoise((TOP,), effective_samples=(50,))
-    shares = np.full((3, 1), 0.3)
-    terms, expected = (
-        block_log_likelihood(each, measured, measured.values, residuals, parameters, stops)
-        for each, parameters in ((noise, shares), (white, shares * noise.scales[0]))
-    )
-    np.testing.assert_allclose(terms, expected, rtol=1e-12)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from fe_likelihoods import FELikelihood, FunctionModel, Measurements, plot_residuals
+from fe_likelihoods import plot_residuals
 from fe_likelihoods.checks.fit import describe_residuals
 from fe_likelihoods.noise.residuals import (
     autocorrelation,
@@ -16,7 +16,6 @@ from fe_likelihoods.noise.residuals import (
     residual_checks,
 )
 from fe_likelihoods.signals.channels import Channel
-from fe_likelihoods.simulation.local_pool import LocalPool
 
 N = 4000
 
@@ -50,13 +49,6 @@ def test_effective_samples_of_autoregressive_errors(rng, rho):
     assert found == pytest.approx(N * (1.0 - rho**2) / (1.0 + rho**2), rel=0.06)
 
 
-def test_effective_samples_give_the_variance_of_the_mean_square(rng):
-    """The mean square of correlated errors has the variance of that of n_eff independent errors."""
-    errors = autoregressive(rng, 0.8, n=1000, n_channels=2000)
-    spread = np.square(errors).mean(axis=1).var()
-    assert 2.0 / spread == pytest.approx(effective_samples(errors).mean(), rel=0.15)
-
-
 def test_oscillating_errors_are_worth_fewer_samples(rng):
     """The correlation time of a mean would give more than n samples."""
     z = rng.standard_normal((1, N))
@@ -67,11 +59,6 @@ def test_oscillating_errors_are_worth_fewer_samples(rng):
         pulse.sum() ** 2 / np.square(pulse).sum() < 1.0
     )  # that time is the spectrum at zero frequency over the variance
     assert effective_samples(errors)[0] < 0.1 * N
-
-
-def test_an_offset_is_worth_few_samples(rng):
-    assert effective_samples(1.0 + 0.01 * rng.standard_normal((1, 500)))[0] < 5.0
-    assert effective_samples(rng.standard_normal((1, 2)))[0] >= 1.0
 
 
 def test_innovations_of_autoregressive_errors_are_white(rng):
@@ -124,35 +111,6 @@ def test_what_checks_say_of_residuals(rng):
     assert residual_checks(gappy[None]).n_samples == [600]
     title = plot_residuals(slow[None], [Channel("top", "displacement", "mm")], 0.01).axes[0].get_title(loc="left")
     assert " ".join(title.split()) == second
-
-
-def test_innovations_show_whether_an_autoregressive_noise_explains_the_errors(rng):
-    """Errors smoother than AR(1): their innovations are correlated."""
-    smooth = signal.lfilter([1.0], [1.0, -0.85], autoregressive(rng, 0.85, n=1500), axis=1)
-    residual = residual_checks(smooth)
-    assert residual_checks(innovations(smooth, residual.lag_one)).lag_one[0] > 0.3
-    assert residual_checks(innovations(autoregressive(rng, 0.9), [0.9])).white[0] > 0.01
-
-
-def response_of(theta):
-    return np.stack([theta[0] * np.sin(0.1 * np.arange(400)), np.cos(0.1 * np.arange(400))])
-
-
-def test_checks_are_a_table_with_names_and_units(rng):
-    """Of a model of the user's own that runs in a pool."""
-    channels = Channel("top", "displacement", "mm"), Channel("base", "acceleration", "g")
-    noise = np.stack([0.001 * rng.standard_normal(400), autoregressive(rng, 0.9, n=400)[0]])
-    model = FunctionModel(response_of, ["a"], channels, 0.01, 400)
-    with LocalPool(2) as pool:
-        likelihood = FELikelihood(model, Measurements(channels, 0.01, response_of([1.0]) + noise), pool=pool)
-        checks = residual_checks(likelihood.residuals([1.0]), channels)
-    lines = str(checks).splitlines()
-    assert [line.split()[0] for line in lines] == ["channel", "top", "base"]
-    cells = dict(zip(lines[0].split()[1:4], lines[1].split()[1:4], strict=True))
-    assert cells["unit"] == "mm" and float(cells["sd"]) == pytest.approx(1000.0 * noise[0].std(), rel=0.01)
-    assert str(residual_checks(noise)).splitlines()[2].split()[:3] == ["channel", "1", "SI"]
-    with pytest.raises(ValueError, match="one channel per row"):
-        residual_checks(noise, channels[:1])
 
 
 def test_few_samples_and_zeros_are_named():

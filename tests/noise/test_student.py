@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fe_likelihoods import Channel, FELikelihood, LogNormal, Posterior, Uniform
+from fe_likelihoods import Channel, FELikelihood, Posterior, Uniform
 from fe_likelihoods.modal.load_cases import LoadTest
 from fe_likelihoods.noise.student import StudentNoise
 
@@ -67,13 +67,6 @@ def test_a_guide_finds_the_posterior_of_student_errors(rng):
     samples = sampler.get_chain(flat=True)[:, 0]
     assert samples.mean() == pytest.approx(found["student"][0], abs=0.3 * found["student"][1])
     assert samples.std() == pytest.approx(found["student"][1], rel=0.3)
-
-
-def test_unknown_scales_have_priors(rng):
-    posterior = Posterior(
-        likelihood(UNIT), {"x": LogNormal(1.0, 0.1)} | dict.fromkeys(("sigma_a", "sigma_b"), LogNormal(1, 1))
-    )
-    assert [each.label for each in posterior.parameters] == ["x", "sigma_a [mm]", "sigma_b [1]"]
 
 
 @pytest.mark.parametrize("degrees", [2.0, -1.0, "four", True])

@@ -1,14 +1,11 @@
 """Priors of several correlated parameters: normalised densities, draws and maps; mixtures fitted to samples."""
 
-import pickle
-
 import numpy as np
 import pytest
 from scipy import stats
 
 from fe_likelihoods import (
     HalfNormal,
-    LogNormal,
     MultivariateNormal,
     Posterior,
     Prior,
@@ -60,19 +57,6 @@ def test_draws_and_maps_of_correlated_parameters(rng):
     np.testing.assert_array_equal(prior.transform(stats.norm.cdf(z))[4], prior.transform(stats.norm.cdf(z[4])))
 
 
-def test_scipy_distributions_are_accepted():
-    frozen = stats.multivariate_normal(MEAN, COVARIANCE)
-    prior = Prior({"k": stats.lognorm(0.3), ("a", "b"): frozen})
-    x = prior.rvs(2000, 5)
-    own = Prior({"k": LogNormal(1.0, 0.3)})
-    np.testing.assert_allclose(prior.subset(["k"]).logpdf(x[:, :1]), own.logpdf(x[:, :1]), rtol=1e-10)
-    np.testing.assert_allclose(prior.subset(["k"]).transform([[0.3]]), own.transform([[0.3]]), rtol=1e-10)
-    np.testing.assert_allclose(prior.subset(["a", "b"]).logpdf(x[:, 1:3]), frozen.logpdf(x[:, 1:3]))
-    assert "lognorm(0.3)" in repr(prior) and "0x" not in repr(prior)
-    copy = pickle.loads(pickle.dumps(prior))
-    assert repr(copy) == repr(prior) and copy.logpdf(x[0]) == prior.logpdf(x[0])
-
-
 @pytest.fixture(scope="module")
 def bent():
     """Samples with a bound and a bent ridge, and their density up to a constant."""
@@ -117,23 +101,6 @@ def test_a_mixture_gets_its_parameters_by_name(bent):
     assert swapped.reorder(["k", "c"]).subset(["k", "c"]).logpdf(samples[0, :2]) == mixture.logpdf(samples[0, :2])
     with pytest.raises(ValueError, match="the names k, m differ from those of the distribution, k, c"):
         Prior({("k", "m"): mixture})
-
-
-def test_round_off_of_a_covariance_is_no_asymmetry():
-    computed = np.array([[1e-6, 1e-18], [3e-18, 4.0]])
-    np.testing.assert_array_equal(MultivariateNormal(MEAN, computed).covariance, [[1e-6, 2e-18], [2e-18, 4.0]])
-    with pytest.raises(ValueError, match="expects a symmetric covariance"):
-        MultivariateNormal(MEAN, [[1e-6, 1e-9], [0.0, 4.0]])
-
-
-def test_mixture_of_some_parameters(bent):
-    prior, samples, _ = bent
-    mixture = fit_mixture(dict(zip(prior.names, samples.T, strict=True)), prior, ["c", "k"])
-    assert mixture.names == ("c", "k")
-    draws = mixture.rvs(4000, 1)
-    np.testing.assert_allclose(draws.mean(axis=0), samples[:, [1, 0]].mean(axis=0), atol=0.05)
-    assert np.isneginf(mixture.logpdf(np.array([[-1.0, 0.5], [1.0, np.nan]]))).all()
-    assert repr(pickle.loads(pickle.dumps(mixture))) == repr(mixture)
 
 
 def test_two_steps_give_the_joint_posterior_and_evidence(rng):

@@ -1,7 +1,6 @@
 """Data of arviz: groups, units, Monte Carlo errors, and leave-one-out cross-validation of blocks of time."""
 
 import json
-import warnings
 from importlib.metadata import version
 
 import emcee
@@ -72,25 +71,6 @@ def test_loo_of_blocks_is_that_of_the_closed_form(linear, data):
     assert data["log_likelihood"]["measurements"].sizes["block"] == 6
     assert elpd == pytest.approx(exact, abs=0.25)
     assert abs(within - exact) > 1.0  # control: the density with the block in the data is another number
-
-
-def test_the_same_run_is_not_two_chains(runs):
-    with pytest.raises(ValueError, match="a sampler is given twice"):
-        to_arviz([runs[0], runs[0]])
-
-
-def test_compare_prefers_the_right_model(linear, data, runs):
-    wrong = Posterior(
-        likelihood_of(("a",), np.random.default_rng(4), 60, SIGMA),
-        {"a": TruncatedNormal(MEAN, SD, -np.inf, np.inf)},
-    )
-    likelihood = type(wrong.likelihood)(wrong.likelihood.model, linear.likelihood.measurements, linear.likelihood.noise)
-    wrong = Posterior(likelihood, wrong.prior)
-    other = to_arviz(run(wrong), wrong, block=1.0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of Pareto shapes of the wrong model
-        table = arviz.compare({"right": data, "wrong": other})
-    assert list(table.index) == ["right", "wrong"]
 
 
 def values(dataset):

@@ -6,7 +6,7 @@ import matplotlib
 import numpy as np
 import pytest
 
-from fe_likelihoods import HalfNormal, MultivariateNormal, Prior, TruncatedNormal, problems
+from fe_likelihoods import HalfNormal, Prior, TruncatedNormal
 from samplers import plot_corner
 from samplers.reporting.figures import plot_marginals
 
@@ -65,11 +65,6 @@ def lines(axes, colour: str) -> list[float]:
     return [line.get_xdata()[0] for line in marks if line.get_xdata()[0] == line.get_xdata()[1]]
 
 
-def outside(axes) -> list[str]:
-    """Values that are written at an edge of the axes, with their arrows."""
-    return [text.get_text() for text in axes.texts]
-
-
 def legend(figure) -> list[str]:
     return [text.get_text() for text in figure.legends[0].get_texts()]
 
@@ -105,22 +100,6 @@ def test_corner_shows_units_prior_truth_and_nominal_values(updated):
             assert axes[i, j].get_xlim() == axes[j, j].get_xlim() and axes[i, j].get_ylim() == axes[i, i].get_xlim()
 
 
-def test_arrows_point_to_values_outside_of_the_panels(updated):
-    axes = grid(plot_corner(updated, Posterior(), truths=[9.0, 0.9, 0.5]))
-    assert outside(axes[0, 0]) == ["9 →"]
-    assert outside(axes[2, 2]) == ["500 →"], "in millimetres"
-    assert outside(axes[1, 1]) == [] and lines(axes[1, 1], RED) == [0.9]
-    assert axes[0, 0].get_xlim()[1] < 2.0, "the panels stay those of the samples"
-    highest = max(polygon.get_xy()[:, 1].max() for polygon in axes[0, 0].patches)
-    assert highest < 0.8 * axes[0, 0].get_ylim()[1], "the arrows are above the histogram"
-
-
-def test_true_values_near_the_samples_widen_the_panels(updated):
-    axes = grid(plot_corner(updated, Posterior(), truths=[1.7, np.nan, np.nan]))
-    assert lines(axes[0, 0], RED) == [1.7] and axes[0, 0].get_xlim()[1] > 1.7
-    assert lines(axes[1, 1], RED) == []
-
-
 def test_several_samplers_have_common_axes_and_a_legend(updated, rng):
     figure = plot_corner({"SMC": updated, "TMCMC": updated + 0.01, "emcee": updated}, truths={"x1": 1.0})
     axes = grid(figure)
@@ -131,42 +110,6 @@ def test_several_samplers_have_common_axes_and_a_legend(updated, rng):
     assert len(set(colours)) == 3
     with pytest.raises(ValueError, match="columns are {'a': 3, 'b': 2}"):
         plot_corner({"a": updated, "b": updated[:, :2]})
-
-
-def test_too_many_parameters_are_left_out_aloud(rng):
-    many = rng.normal(size=(300, 15))
-    figure = plot_corner(many)
-    assert grid(figure).shape == (12, 12)
-    assert "the first 12 of 15 parameters; names= chooses others" in figure.legends[0].get_title().get_text()
-    axes = grid(plot_corner(many, names=["x14", "x2"]))
-    assert [each.get_xlabel() for each in axes[-1]] == ["x14", "x2"]
-    np.testing.assert_allclose(np.mean(axes[0, 0].get_xlim()), np.median(many[:, 14]), atol=1.0)
-    with pytest.raises(ValueError, match="names must be some of the parameters x0, .*unknown: x99"):
-        plot_corner(many, names=["x99"])
-
-
-def test_parameters_that_do_not_vary_are_told_and_few_samples_are_points(rng):
-    flat = np.column_stack([rng.normal(size=400), np.full(400, 2.0)])
-    figure = plot_corner(flat)
-    axes = grid(figure)
-    assert axes[1, 1].get_title() == "2, does not vary"
-    copies = np.repeat(rng.normal(size=(40, 2)), 20, axis=0)
-    assert not grid(plot_corner(copies))[1, 0].collections, "800 rows of which 40 are distinct"
-    figure = plot_corner([[0.0], [1.0]])
-    assert len(figure.axes) == 1
-
-
-def test_correlated_priors_are_drawn_from_their_draws(updated):
-    class Correlated(Posterior):
-        prior = Prior(
-            {("k", "c"): MultivariateNormal([1.0, 1.0], [[0.09, 0.1], [0.1, 0.25]]), "sigma": HalfNormal(0.01)}
-        )
-
-    line = next(each for each in grid(plot_corner(updated, Correlated()))[0, 0].lines if each.get_linestyle() == ":")
-    x = line.get_xdata()
-    np.testing.assert_allclose(
-        line.get_ydata(), np.exp(-0.5 * ((x - 1) / 0.3) ** 2) / (0.3 * np.sqrt(2 * np.pi)), atol=0.1
-    )
 
 
 @pytest.mark.parametrize(
@@ -189,19 +132,6 @@ def test_correlated_priors_are_drawn_from_their_draws(updated):
 def test_wrong_arguments_are_refused(change, arguments, message, updated):
     with pytest.raises(ValueError, match=message):
         plot_corner(change(updated), **arguments)
-
-
-def test_labels_of_the_library_fit_their_panels(rng):
-    """Of neighbours below the panels, no label covers another."""
-    posterior = problems.bridge_column(every=16, duration=10.0)
-    means = np.array([0.6, 0.96, 0.3, 4.7, 2.4, 0.05, 5e-4])
-    figure = plot_corner(means * (1.0 + 0.02 * rng.standard_normal((300, 7))), posterior)
-    figure.canvas.draw()
-    below = [axes.xaxis.label.get_window_extent() for axes in grid(figure)[-1]]
-    assert all(left.x1 < right.x0 for left, right in zip(below, below[1:], strict=False))
-    beside = [axes.yaxis.label.get_window_extent() for axes in grid(figure)[1:, 0]]
-    assert all(lower.y1 < upper.y0 for upper, lower in zip(beside, beside[1:], strict=False))
-    assert all(0 <= box.x0 and box.y1 < figure.bbox.y1 for box in (*below, *beside))
 
 
 def test_marginals_show_what_the_data_changed(updated):

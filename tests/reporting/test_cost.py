@@ -34,14 +34,6 @@ def test_the_run_begins_with_the_timed_points():
     assert posterior.report()["simulations"] == 128
 
 
-def test_cached_points_are_told(tmp_path):
-    """A second estimate with the same seed."""
-    posterior = posterior_of(oscillating())
-    assert estimate_cost(posterior, 20, seed=4).cached == 0
-    again = estimate_cost(posterior, 20, seed=4)
-    assert again.cached == again.evaluated == 4 and "4 points were cached" in str(again)
-
-
 def test_the_table():
     estimate = estimate_cost(posterior_of(oscillating()), 250, workers=16, seed=4)
     first, *rows = str(estimate).splitlines()
@@ -52,20 +44,6 @@ def test_the_table():
     assert as_duration(shortest, longest) in str(estimate)
     recycled, moved = (estimate_cost(Gaussian(), 250, seed=1, recycle=choice).fewest for choice in (True, False))
     assert recycled != moved
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"),
-    [
-        ((2.1 * 3600, 3.4 * 3600), "about 2.1 to 3.4 h"),
-        ((5.0,), "about 5 s"),
-        ((30.0, 150.0), "about 0.5 to 2.5 min"),
-        ((40 * 3600, 300 * 3600), "about 1.7 to 12 d"),
-        ((0.0, 100.0), "about 0 to 100 s"),
-    ],
-)
-def test_durations_as_text(seconds, text):
-    assert as_duration(*seconds) == text
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,6 @@ from scipy import stats
 from scipy.special import softmax
 
 from samplers import SMCSampler, compare_models
-from tests.contract.targets import Gaussian
 
 
 class Regression:
@@ -78,15 +77,6 @@ def test_the_interval_is_right_for_large_errors(rng):
     assert np.all((found.lower >= 0.0) & (found.upper <= 1.0))
 
 
-def test_table():
-    table = str(compare_models({"worse": (-12.0, 0.1), "better": (-10.0, 0.05)}))
-    head, first, second = table.splitlines()
-    assert (
-        first.startswith("better") and second.startswith("worse") and len({len(r) for r in (head, first, second)}) == 1
-    )
-    assert "-10.000 +- 0.050" in first and "-2.000 +- 0.112" in second and "0.8808" in first
-
-
 def test_a_model_excluded_by_its_prior():
     found = compare_models({"a": (0.0, 0.1), "b": (3.0, 0.1)}, prior={"a": 1.0, "b": 0.0})
     assert found.probability.tolist() == [1.0, 0.0]
@@ -112,13 +102,6 @@ def test_a_model_excluded_by_its_prior():
 def test_refused(models, prior, message):
     with pytest.raises(ValueError, match=message):
         compare_models(models, prior)
-
-
-def test_a_sampler_that_has_not_run_is_refused():
-    posterior = Gaussian(2)
-    sampler = SMCSampler(20, 2, posterior, vectorize=True)
-    with pytest.raises(ValueError, match="run_mcmc"):
-        compare_models({"a": sampler, "b": (0.0, 0.1)})
 
 
 def finished(data_fingerprint=None):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fe_likelihoods import Measurements, SimulationFailed, peak, propagate, report
+from fe_likelihoods import Measurements, peak, propagate, report
 from fe_likelihoods.checks.finding import CARE, Finding
 from fe_likelihoods.reporting.other_events import describe_event
 from tests.reporting.report_page import read_page
@@ -74,22 +74,6 @@ def test_what_speaks_against_an_event_is_said(vibrating, tmp_path):
     assert "A band without noise is that of the response" in silent.sentence
     other = describe_event("other", few, Measurements(posterior.likelihood.measurements.channels, 0.02, [[0.0] * 9]))
     assert "No scores: " in other.sentence
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:the residuals")
-def test_what_is_not_known_of_an_event_is_said_in_words(vibrating, tmp_path, monkeypatch):
-    sampler, posterior = vibrating
-    found = predicted(vibrating, noise=True)
-    scores = found["histories"].score(posterior.likelihood.measurements)
-    monkeypatch.setattr(
-        type(found["histories"]), "score", lambda *_: scores._replace(coverage_strong=np.array([np.nan]))
-    )
-    told = describe_event("silent", {"": found["histories"]}, posterior.likelihood.measurements)
-    assert "nan" not in told.sentence and "In the strong part, no sample of top can be compared." in told.sentence
-    failed = SimulationFailed("nothing to predict from, all 3 samples failed (3: unstable)")
-    page = read_page(report(sampler, posterior, out=tmp_path / "report.html", events={"strong": failed}))
-    assert "strong: It could not be predicted." in page.text and "3: unstable" in page.notes["strong: No prediction"]
 
 
 def test_what_are_no_predictions_of_events_is_refused(vibrating, tmp_path):

@@ -10,20 +10,16 @@ import sys
 import termios
 
 import numpy as np
-import pytest
 
 from fe_likelihoods import (
     Channel,
     FELikelihood,
     FunctionModel,
     HalfNormal,
-    JointLikelihood,
     Measurements,
     Posterior,
     TruncatedNormal,
 )
-from samplers import SMCSampler
-from samplers.reporting import progress
 
 RUN = [sys.executable, "-m", "tests.reporting.progress_run"]
 
@@ -77,44 +73,6 @@ def test_a_pipe_gets_lines():
     check_last_states(lines, json.loads(done.stdout))
 
 
-class Bar:
-    """A bar that keeps what it is told."""
-
-    def __init__(self):
-        self.total, self.n, self.shown = None, 0, []
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *exception):
-        pass
-
-    def set_description_str(self, text, refresh):
-        pass
-
-    def set_postfix(self, figures, refresh):
-        self.figures = figures
-
-    def update(self, n):
-        self.n += n
-        self.shown.append((self.n, self.total, self.figures))
-
-
-@pytest.fixture
-def bars(monkeypatch):
-    """All bars; every point is shown, however fast it is evaluated."""
-    made = []
-
-    def make(display, total, **kwargs):
-        made.append(Bar())
-        return made[-1]
-
-    monkeypatch.setattr("samplers.tempered.get_progress_bar", make)
-    monkeypatch.setattr(progress, "get_progress_bar", make)
-    monkeypatch.setattr(progress, "SECONDS_BETWEEN_FIGURES", -1.0)
-    return made
-
-
 def oscillating(names=("a", "b")):
     """A likelihood of a cheap model, whose simulations fail where `a` is above 1.6."""
     channels = (Channel("top", "displacement", "mm"),)
@@ -134,31 +92,3 @@ def posterior_of(likelihood):
     return Posterior(
         likelihood, {name: TruncatedNormal(1.0, 0.3) for name in names} | {name: HalfNormal(0.002) for name in sigmas}
     )
-
-
-def test_figures_of_a_bar_are_those_since_it_began(bars):
-    """Simulations and failures of the annealing, and of the sweeps of each call."""
-    posterior = posterior_of(oscillating())
-    sampler = SMCSampler(32, posterior.ndim, posterior, vectorize=True, seed=1, recycle=True)
-    counts = [(0, 0)]
-    for steps in (0, 3, 3):
-        sampler.run_mcmc(None, steps, progress=True)
-        report = posterior.report()
-        counts.append((report["simulations"], report["failure_count"]))
-    shown = [[int(bar.figures.get(name, 0)) for name in ("simulations", "failures")] for bar in bars]
-    shown = [figures for figures in shown if any(figures)]
-    assert shown == np.diff(counts, axis=0).tolist()
-    assert shown[0][1] > 0 and all(simulations > 0 for simulations, _ in shown[1:])
-
-
-def test_parts_of_a_joint_likelihood_are_parts_of_a_point():
-    posterior = posterior_of(JointLikelihood({"one": oscillating(), "two": oscillating(("a", "c"))}))
-    points, heard = posterior.sample_prior(5, np.random.RandomState(1)), []
-    points[:, 0] = np.minimum(points[:, 0], 1.5)
-    posterior.when_simulated(heard.append)
-    silent = posterior_of(JointLikelihood({"one": oscillating(), "two": oscillating(("a", "c"))}))
-    assert np.array_equal(posterior(points), silent(points))
-    assert sum(heard) == pytest.approx(5.0) and len(heard) > 2
-    posterior.when_simulated(None)
-    posterior(points + 0.01)
-    assert sum(heard) == pytest.approx(5.0)

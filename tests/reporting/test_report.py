@@ -1,11 +1,5 @@
 """The report of a run: well-formed, complete, self-contained, and right in what it says."""
 
-import html
-import json
-import re
-import shutil
-import subprocess
-import warnings
 from dataclasses import replace
 from types import MappingProxyType, SimpleNamespace
 
@@ -13,7 +7,6 @@ import emcee
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from PIL import Image
 
 from fe_likelihoods import (
     Channel,
@@ -29,7 +22,6 @@ from fe_likelihoods import (
     SimulationFailed,
     TruncatedNormal,
     Uniform,
-    identifiability,
     peak,
     propagate,
     report,
@@ -38,10 +30,9 @@ from fe_likelihoods.checks.compared import fit_data_sets
 from fe_likelihoods.checks.failed_simulations import Failures
 from fe_likelihoods.checks.finding import Finding, judge
 from fe_likelihoods.checks.result import check_result, check_run
-from fe_likelihoods.checks.run import _errors, read_run
+from fe_likelihoods.checks.run import read_run
 from fe_likelihoods.checks.table import moments_of, parameter_rows
 from fe_likelihoods.reporting.contents import evidence, residual_sentences
-from fe_likelihoods.reporting.report import _like
 from samplers import SamplingWarning, SMCSampler, TMCMCSampler, ladder_table, plot_run
 from samplers.estimates.control_variates import SignedSample
 from tests.contract.targets import Gaussian
@@ -109,12 +100,6 @@ def test_the_page_needs_nothing_from_elsewhere(page):
     assert sum(alt.startswith("Histogram of the probability integral") for _, alt in page.images) == 1  # not of peaks
 
 
-def test_the_page_says_what_the_data_determine(page, vibrating):
-    sampler, posterior = vibrating
-    assert str(identifiability(posterior, sampler.get_chain(flat=True))) in page.text
-    assert "These data determine" in page.text
-
-
 def test_texts_of_users_are_escaped_and_shown(page):
     assert ODD in page.text and "too much <damping>" in page.text and "<script>alert(1)</script>" in page.text
 
@@ -132,11 +117,6 @@ def test_the_table_has_every_parameter_in_the_units_of_a_reader(page, vibrating)
     assert float(cv.removesuffix(" %")) == pytest.approx(100 * samples[:, 2].std() / samples[:, 2].mean(), rel=1e-2)
     assert float(interval.split(" to ")[1]) == pytest.approx(1e3 * np.quantile(samples[:, 2], 0.95), rel=1e-3)
     assert rows["damping"][1] == "normal, mean 1, sd 0.4, above 0"
-
-
-def test_digits_follow_the_standard_deviation():
-    template = [_like(value, sd) for value, sd in ((1.09976, 0.000545), (1.1, 0.3), (-1234.5, 20.0), (2.0, 0.0))]
-    assert template == ["1.09976", "1.100", "−1234", "2"] and _like(np.nan, 1.0) == "–"
 
 
 def test_a_run_that_the_limit_ended_shows_the_exponent_that_it_reached():
@@ -305,67 +285,6 @@ def test_what_does_not_fit_is_refused_before_anything_is_written(vibrating, tmp_
     with pytest.raises(ValueError, match="result of propagate"):
         report(sampler, posterior, "bands", out)
     assert not out.exists()
-
-
-BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
-MEASURE = """<!DOCTYPE html><iframe id="page" src="{page}" width="{width}" height="4000" onload="
-const d = this.contentDocument, images = [...d.images];
-document.title = JSON.stringify({{width: d.documentElement.scrollWidth, images: images.length,
-broken: images.filter(i => !i.naturalWidth).length,
-font: parseFloat(getComputedStyle(d.body).fontSize)}});"></iframe>"""
-
-
-def browse(address, folder, *options) -> subprocess.CompletedProcess:
-    """Open a page without a window; the console of the page is in stderr."""
-    common = ["--headless=new", "--no-sandbox", "--disable-gpu", "--allow-file-access-from-files"]
-    common += [f"--user-data-dir={folder / 'browser'}", "--enable-logging=stderr", "--virtual-time-budget=10000"]
-    return subprocess.run([BROWSER, *common, *options, address], capture_output=True, text=True, timeout=120)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(BROWSER is None, reason="NO BROWSER: install chromium to look at the report as a reader does")
-def test_a_browser_shows_the_report_on_a_telephone_a_desk_and_paper(page, tmp_path):
-    path = page.path
-    for width in (400, 1200):
-        wrapper = tmp_path / f"{width}.html"
-        wrapper.write_text(MEASURE.format(page=path.as_uri(), width=width))
-        seen = browse(wrapper.as_uri(), tmp_path, "--dump-dom")
-        found = json.loads(html.unescape(re.search("<title>(.*?)</title>", seen.stdout)[1]))
-        assert found["width"] <= width and found["broken"] == 0 and found["images"] == len(page.images)
-        assert found["font"] >= 14.0
-        assert "CONSOLE" not in seen.stderr
-        shot = tmp_path / f"{width}.png"
-        seen = browse(path.as_uri(), tmp_path, f"--window-size={width},1500", f"--screenshot={shot}")
-        assert "CONSOLE" not in seen.stderr
-        pixels = np.asarray(Image.open(shot).convert("L"))
-        assert pixels[0, 0] == 255 and 0.01 < np.mean(pixels < 128) < 0.5  # dark text on a light background
-    paper = tmp_path / "page.pdf"
-    browse(path.as_uri(), tmp_path, "--no-pdf-header-footer", f"--print-to-pdf={paper}")
-    assert paper.read_bytes().startswith(b"%PDF") and len(re.findall(rb"/Type\s*/Page\b", paper.read_bytes())) >= 2
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(BROWSER is None, reason="NO BROWSER: install chromium to look at the report as a reader does")
-def test_control_the_browser_tells_of_errors(tmp_path):
-    bad = tmp_path / "bad.html"
-    bad.write_text("<!DOCTYPE html><script>undefined_function()</script>")
-    assert "CONSOLE" in browse(bad.as_uri(), tmp_path, "--dump-dom").stderr
-
-
-def test_identical_samples_have_an_effective_sample_size_without_a_warning():
-    """A chain that never moved has neither spread nor error in a parameter."""
-
-    class Stuck:
-        def mean_error(self, discard, thin):
-            return np.array([0.0, 0.5])
-
-        sd_error = mean_error
-
-    samples = np.column_stack([np.ones(100), np.arange(100.0)])
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        *_, size = _errors(Stuck(), samples, True, np.nan, 0, 1)
-    assert size == pytest.approx((samples[:, 1].std() / 0.5) ** 2) or size == 100.0
 
 
 def test_the_most_severe_finding_decides_and_is_the_first_sentence(page, vibrating):

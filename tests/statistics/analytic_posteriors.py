@@ -134,19 +134,6 @@ def narrow_mode(seed: int) -> Posterior:
     return _mixture(np.array([0.5, 0.5]), middle + np.stack([half, -half]), roots, "normal")
 
 
-def four_modes(seed: int) -> Posterior:
-    """Four modes of masses 0.4, 0.3, 0.2, 0.1 and different shapes in 8-D, with sds of 0.15 to 0.4, in a box."""
-    random = np.random.RandomState(seed)
-    means = np.clip(random.normal(0.0, 1.0, (4, 8)), -2.0, 2.0)
-    roots = []
-    for _ in range(4):
-        axes = random.standard_normal((8, 8))
-        covariance = axes @ axes.T + 8.0 * np.eye(8)
-        scale = np.exp(random.uniform(np.log(0.15), np.log(0.4), 8)) / np.sqrt(np.diag(covariance))
-        roots.append(np.linalg.cholesky(covariance * np.outer(scale, scale)))
-    return _mixture(np.array([0.4, 0.3, 0.2, 0.1]), means, np.array(roots), "box")
-
-
 def three_shapes(seed: int) -> Posterior:
     """Three modes of masses 0.5, 0.3, 0.2 and different shapes in 8-D: axes of 0.01 to 0.04 in random directions."""
     random = np.random.RandomState(seed)

@@ -1,20 +1,10 @@
 """Asynchronous recycling, and rounds of a guide, where the time of an evaluation depends on what is to be found."""
 
-from concurrent.futures import ThreadPoolExecutor
-
-import emcee
 import numpy as np
 import pytest
-from scipy import stats
 
-from fe_likelihoods import FELikelihood, JointLikelihood, Posterior
-from fe_likelihoods.simulation.local_pool import LocalPool
 from samplers import SMCSampler
-from samplers.tempering.guided import Batch
-from samplers.tempering.pending_points import PendingPoints
 from tests.contract.targets import Gaussian
-from tests.faults.records import points_of
-from tests.likelihood.linear_gaussian import KnownNoise, exact_log_evidence, likelihood_of
 from tests.simulated_cluster import SimulatedCluster
 from tests.statistics import analytic_posteriors as analytic
 from tests.tempering.guides import LearningGuide
@@ -66,32 +56,6 @@ def test_a_run_of_failures_is_stopped():
         sampler.run_mcmc(None, 0)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["one pool", "two pools"])
-def test_a_joint_likelihood_has_its_evidence(kind, rng, tmp_path):
-    """Two tests that share a parameter; the parts have one pool of processes, or one of threads beside it."""
-    names = ["a", "b", "c"]
-    with LocalPool(2) as processes, ThreadPoolExecutor(2) as threads:
-        pools = {"component": processes, "system": processes if kind == "one pool" else threads}
-        parts = {}
-        for name, parameters in (("component", ("a", "b")), ("system", ("b", "c"))):
-            part = likelihood_of(parameters, rng, sigma=0.2)
-            parts[name] = FELikelihood(part.model, part.measurements, KnownNoise(0.2), pool=pools[name])
-        posterior = Posterior(JointLikelihood(parts), {name: stats.norm(1.0, 0.7) for name in names})
-        backend = emcee.backends.HDFBackend(str(tmp_path / "run.h5"))
-        sampler = SMCSampler(
-            100, 3, posterior, vectorize=True, seed=1, recycle=True, asynchronous=True, backend=backend
-        )
-        sampler.run_mcmc(None, 1)
-        exact = exact_log_evidence(parts.values(), names, 1.0, 0.7)
-        assert abs(sampler.log_evidence - exact) < 4.0 * sampler.log_evidence_error < 0.4
-        report, evaluated = posterior.report(), np.array([np.frombuffer(row) for row in points_of(tmp_path / "run.h5")])
-        assert report["failure_count"] == 0 and len(evaluated) == sampler.evaluations
-        # a sweep may move one parameter only, and then a part that does not have it needs no simulation
-        for part, columns in (("component", [0, 1]), ("system", [1, 2])):
-            assert report["likelihoods"][part]["simulations"] == len(np.unique(evaluated[:, columns], axis=0))
-
-
 def deviations_with_a_guide(seeds=30):
     """Deviations (3,) of log-evidence, mean and variance of a parameter, in standard errors of the mean over the seeds.
 
@@ -121,21 +85,3 @@ def test_rounds_of_a_guide_do_not_prefer_short_runs(monkeypatch, parts):
     """Also where the guide learns from the first arrivals, none of which is from the long half."""
     monkeypatch.setattr(LearningGuide, "learns_from_parts", parts, raising=False)
     assert np.all(np.abs(deviations_with_a_guide()) < 3.0)
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
-def test_control_rounds_of_early_arrivals_prefer_short_runs(monkeypatch):
-    """Negative control: rounds are judged when 60 % of their draws have arrived, and consist of these."""
-    monkeypatch.setattr(PendingPoints, "complete", property(lambda points: np.mean(points.arrived) > 0.6))
-    monkeypatch.setattr(
-        PendingPoints, "arrived_part", lambda points: (points.coords[points.arrived], records_of(points))
-    )
-    running = Batch.running.fget
-    monkeypatch.setattr(Batch, "running", property(lambda batch: 0 if batch.pending.complete else running(batch)))
-    evidence, mean, _ = deviations_with_a_guide()
-    assert evidence < -3.0 and mean < -6.0
-
-
-def records_of(points):
-    return points.base[:0] if points._records is None else points._records[points.arrived]

@@ -100,17 +100,6 @@ def test_a_guide_that_does_not_say_how_it_searched_is_at_best_usable():
     assert np.all(statuses == "usable")
 
 
-@pytest.mark.slow
-def test_a_share_of_the_prior_finds_a_missing_mode_or_shows_that_something_is_missing():
-    """With 30 % of the draws from the prior and a mode that holds 13 % of it, some draws reach the mode."""
-    posterior, guide = two_modes(1, LearningGuide, width=0.08, prior_share=0.3)
-    posterior.log_evidence = np.log(2.0 * 2.0 * np.pi * 0.08**2)
-    deviations, statuses = outcomes(posterior, guide, 1000, runs=20)
-    wrong = np.abs(deviations[:, 0]) > 4.0
-    assert not np.any(wrong & (statuses == "converged"))
-    assert np.mean(~wrong & (statuses != "not usable")) > 0.5
-
-
 class Student:
     """Student t in a wide normal prior; a large number of degrees of freedom gives a Gaussian."""
 

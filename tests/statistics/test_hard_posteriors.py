@@ -2,13 +2,11 @@
 
 import numpy as np
 import pytest
-from scipy.special import logsumexp
 
 from tests.statistics.guided_runs import compare, run
 
-from .brute_force import Reference, log_prob_function, reference
-from .hard_posteriors import CASES, hash_uniform
-from .late_posteriors import LATE_CASES
+from .brute_force import Reference, log_prob_function
+from .hard_posteriors import CASES
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -21,16 +19,6 @@ def test_the_vectorised_density_is_that_of_the_posterior(name):
         np.testing.assert_allclose(log_prior(x) + log_likelihood(x), expected, rtol=1e-9)
     if name.startswith("failing"):
         assert 0.03 < np.mean(~np.isfinite(expected)) < 0.3
-
-
-@pytest.mark.parametrize("name", LATE_CASES)
-def test_a_shortened_model_gives_the_first_samples(name):
-    posterior = CASES[name].posterior(1)
-    model = posterior.likelihood.model
-    theta = posterior.sample_prior(1, 1)[0, : len(model.parameter_names)]
-    part = model.first(100 * model.dt)
-    assert part.n_steps == 101 and part.fingerprint != model.fingerprint
-    np.testing.assert_array_equal(part.simulate(theta), model.simulate(theta)[:, :101])
 
 
 KNOWN = {  # reference(CASES[name], 1)
@@ -69,50 +57,3 @@ def test_a_posterior_that_is_decided_late_is_right_or_refused(name):
     errors = compare(outcome, KNOWN[name], case.labels)
     print(errors, outcome.status, outcome.reasons)
     assert errors.judgement in ("right", "refused")
-
-
-def test_hashes_are_uniform_and_repeatable(rng):
-    x = rng.standard_normal((20_000, 3))
-    u = hash_uniform(x)
-    assert np.array_equal(u, hash_uniform(x.copy()))
-    assert abs(u.mean() - 0.5) < 0.01 and abs(u.std() - 1 / np.sqrt(12)) < 0.01
-    assert abs(np.corrcoef(u, hash_uniform(x, 1))[0, 1]) < 0.03
-    near = hash_uniform(np.nextafter(x, np.inf))
-    assert abs(np.corrcoef(u, near)[0, 1]) < 0.03
-
-
-def quadrature(name: str, seed: int) -> tuple[float, np.ndarray]:
-    """Evidence and mode shares of a case with three parameters, from the normal equations of its features."""
-    case = CASES[name]
-    posterior = case.posterior(seed)
-    measured = posterior.likelihood.measurements.values.ravel()
-    shapes = case.shapes.reshape(len(case.target), -1)
-    gram, along, square = shapes @ shapes.T, shapes @ measured, measured @ measured
-    # the likelihood depends on the sum of squares alone: a table of it makes a point cost nothing
-    sums = np.geomspace(0.5, 50.0, 4000) * case.noise**2 * case.n_steps
-    table = posterior.likelihood.noise.log_likelihood(sums[:, None], case.n_steps)
-    step = 2e-5
-    a = np.arange(0.0, 3.0, step) + 0.5 * step
-    b, c = np.linspace(0.97, 1.03, 61), np.linspace(0.97, 1.03, 61)
-    grid = np.stack(np.meshgrid(b, c, indexing="ij"), axis=-1).reshape(-1, 2)
-    possible = np.abs(case.features(np.column_stack([a, np.ones_like(a), np.ones_like(a)]))[:, 0] - 0.8) < 0.05
-    logs, labels = [], []
-    for value in a[possible]:
-        x = np.column_stack([np.full(len(grid), value), grid])
-        f = case.features(x)
-        misfit = square - 2.0 * f @ along + np.einsum("ni,ij,nj->n", f, gram, f)
-        logs.append(logsumexp(np.interp(misfit, sums, table) + posterior.log_prior(x)))
-        labels.append(case.labels(x[:1])[0])
-    logs = np.array(logs) + np.log(step * (b[1] - b[0]) * (c[1] - c[0]))
-    total = logsumexp(logs)
-    shares = [np.exp(logsumexp(logs[np.array(labels) == mode]) - total) for mode in range(case.n_modes)]
-    return total, np.array(shares)
-
-
-@pytest.mark.slow
-def test_brute_force_agrees_with_quadrature():
-    found = reference(CASES["far"], 1, draws=40_000)
-    total, shares = quadrature("far", 1)
-    print(found.log_evidence - total, found.log_evidence_error, found.shares - shares, found.shares_error)
-    assert abs(found.log_evidence - total) < 4.0 * found.log_evidence_error
-    assert np.all(np.abs(found.shares - shares) < 4.0 * found.shares_error)

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from samplers import SMCSampler, TMCMCSampler
+from samplers import TMCMCSampler
 from samplers.moves.population_moves import RandomWalkMove
 from tests.contract.targets import Box, Gaussian
-from tests.statistics.test_mean_error import TwoModes, scores
+from tests.statistics.test_mean_error import TwoModes
 from tests.statistics.test_posteriors import deviations, evidence_deviation, runs, within
 
 
@@ -43,16 +43,6 @@ def test_burn_in_removes_the_bias_of_chains_from_leaders(settings, biased, seed)
 
 
 @pytest.mark.slow
-def test_stated_errors_of_two_modes_cover(seed):
-    """Two stated errors cover the truth in nearly 95 % of 40 runs, and are not too wide."""
-    posterior = TwoModes()
-    samplers = runs(posterior, seed, count=40, nwalkers=250, nsteps=1, Sampler=TMCMCSampler)
-    covered, ratio = scores(posterior, samplers, np.array([s.mean_error() for s in samplers]))
-    assert np.all(covered >= stats.binom(40, 0.93).ppf(1e-3))
-    assert np.all((0.5 < ratio) & (ratio < 1.6))
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(("burn_in", "right"), [(4, True), (0, False)])
 def test_few_walkers_for_many_parameters(burn_in, right, seed):
     """Chains alone leave copies, of which the next fit sees too few distinct points; the control makes no sweeps."""
@@ -60,12 +50,3 @@ def test_few_walkers_for_many_parameters(burn_in, right, seed):
     samplers = runs(posterior, seed, count=3, nwalkers=100, nsteps=1, Sampler=TMCMCSampler, burn_in=burn_in)
     off = np.array([(s.get_chain(flat=True).mean(axis=0) - posterior.mean) / posterior.sd for s in samplers])
     assert (np.sqrt(np.mean(off**2)) < 0.25) == right
-
-
-@pytest.mark.parametrize("nwalkers", [60, 150, 400])
-def test_smc_and_tmcmc_are_different_runs(nwalkers):
-    smc, tmcmc = (Sampler(nwalkers, 3, Gaussian(3), vectorize=True, seed=1) for Sampler in (SMCSampler, TMCMCSampler))
-    for sampler in (smc, tmcmc):
-        sampler.run_mcmc(None, 1)
-    assert not np.isin(smc.get_chain(flat=True), tmcmc.get_chain(flat=True)).any()
-    assert [stage.beta for stage in smc.ladder] != [stage.beta for stage in tmcmc.ladder]

@@ -9,9 +9,7 @@ from scipy.stats import multivariate_normal
 
 from samplers import SMCSampler, TMCMCSampler
 from samplers.judgement import rounds as judged
-from samplers.moves.population_moves import MixtureMove
 from samplers.tempering import recycling
-from tests.statistics import analytic_posteriors as analytic
 from tests.statistics import analytic_runs
 
 NDIM = 10
@@ -99,14 +97,6 @@ def test_moves_keep_the_narrow_mode():
     assert share == pytest.approx(0.5, abs=0.15)
 
 
-def test_moves_without_components_for_basins_lose_it(monkeypatch):
-    """Negative control."""
-    monkeypatch.setattr(MixtureMove, "cover_basins", lambda self, coords, log_target: None)
-    posterior = TwoModes(2)
-    _, share = finish(TMCMCSampler(500, NDIM, posterior, vectorize=True, seed=2), posterior)
-    assert share < 0.05
-
-
 @pytest.mark.parametrize(("rounds", "found"), [(4, True), (0, False)])
 def test_a_mode_that_is_met_at_the_end_is_explored(rounds, found, monkeypatch):
     """One draw of the last round before the check hits the flank of the narrow mode."""
@@ -114,38 +104,3 @@ def test_a_mode_that_is_met_at_the_end_is_explored(rounds, found, monkeypatch):
     monkeypatch.setattr(recycling, "MOST_BASIN_ROUNDS", rounds)
     result = analytic_runs.run(analytic_runs.Cell("two", 100.0, "SMC", 500), 4, 1, {})
     assert (min(result["shares"]) > 0.15) == found
-
-
-def test_search_draws_are_spread_over_the_stages(monkeypatch):
-    posterior = analytic.gaussian(1)
-    runs = []
-    for draws in (0.0, 1500.0):
-        monkeypatch.setattr(recycling, "search_draws", lambda size, draws=draws: draws)
-        sampler = SMCSampler(500, posterior.ndim, posterior, vectorize=True, seed=1)
-        sampler.run_mcmc(None, 0)
-        runs.append((len(sampler.ladder), sampler.evaluations))
-    (stages, evaluations), (more_stages, more_evaluations) = runs
-    assert abs(more_stages - stages) <= 2  # more draws make no larger steps
-    assert 2.0 * 500 < more_evaluations - evaluations <= 3.6 * 500
-
-
-def lost(posterior, seeds, walkers=250):
-    """Number of runs by recycling in which the share of a mode is off by more than 0.15."""
-    count = 0
-    for seed in seeds:
-        sampler = SMCSampler(walkers, posterior(seed).ndim, posterior(seed), vectorize=True, seed=seed)
-        sampler.run_mcmc(None, 1)
-        shares = posterior(seed).responsibilities(sampler.get_chain(flat=True)).mean(axis=0)
-        count += np.max(np.abs(shares - posterior(seed).shares)) > 0.15
-    return count
-
-
-@pytest.mark.parametrize(("walkers", "draws"), [(100, 300.0), (250, 1500.0), (500, 1500.0), (1000, 3000.0)])
-def test_search_draws_have_a_minimum_where_recycling_is_the_default(walkers, draws):
-    assert recycling.search_draws(walkers) == draws
-
-
-@pytest.mark.slow
-def test_four_modes_keep_their_shares():
-    """With a target that does not grow with the components, the second of these runs loses a mode."""
-    assert lost(analytic.four_modes, (0, 1)) == 0

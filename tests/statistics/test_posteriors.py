@@ -202,48 +202,6 @@ def test_units_change_no_draw(mode, unit, seed):
     assert scaled.log_evidence == pytest.approx(plain.log_evidence, abs=1e-8)
 
 
-def test_one_parameter_in_another_unit(seed):
-    class Mixed(Gaussian):
-        def __init__(self, unit):
-            super().__init__(3)
-            self.unit = np.array([1.0, unit, 1.0])
-
-        def log_prior(self, x):
-            z = x / self.unit
-            return -0.5 * np.sum(z**2, axis=-1) - np.sum(np.log(np.sqrt(2 * np.pi) * self.unit))
-
-    for unit in (1e-4, 1e4):
-        plain, scaled = (runs(Mixed(u), seed, count=1)[0] for u in (1.0, unit))
-        assert np.allclose(plain.get_chain() * np.array([1, unit, 1]), scaled.get_chain(), rtol=1e-8)
-
-
-@pytest.mark.parametrize(
-    "mode", ["default", *(pytest.param(mode, marks=pytest.mark.slow) for mode in ("moves", "literal", "tmcmc"))]
-)
-def test_order_of_parameters_changes_no_answer(mode, seed):
-    """Another order gives other draws; mean and evidence agree within the errors over runs."""
-
-    class Turned(Gaussian):
-        def __init__(self, order):
-            super().__init__(3)
-            self.order, self.back = np.array(order), np.argsort(order)
-            self.scale = np.array([0.02, 0.1, 0.5])
-
-        def log_likelihood(self, x):
-            return -0.5 * np.sum(((x[..., self.back] - 0.7) / self.scale) ** 2, axis=-1)
-
-    means, evidences = [], []
-    for k, order in enumerate(([0, 1, 2], [2, 0, 1])):
-        posterior = Turned(order)
-        samplers = runs(posterior, seed + 100 * k, **MODES[mode])
-        means.append([s.get_chain(flat=True).mean(axis=0)[posterior.back] for s in samplers])
-        evidences.append([s.log_evidence for s in samplers])
-    for first, second in (means, evidences):
-        error = np.sqrt((np.var(first, axis=0, ddof=1) + np.var(second, axis=0, ddof=1)) / len(first))
-        deviation = (np.mean(first, axis=0) - np.mean(second, axis=0)) / error
-        assert np.all(np.abs(deviation) < stats.t(2 * len(first) - 2).isf(stats.norm.sf(4.0)))
-
-
 @pytest.mark.parametrize("mode", MODES)
 def test_the_backend_changes_no_draw(mode, seed, tmp_path):
     backend = emcee.backends.HDFBackend(str(tmp_path / "run.h5"))
