@@ -1,13 +1,13 @@
-"""Responses beside the measurements of each data set and event: before and after an update, and draws of the prior.
+"""Measurements of each data set and event beside responses: before and after an update, and at draws of the prior.
 
 Responses are taken from the caches of the likelihood where they are there; the likelihood counts the others.
 """
 
 import logging
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,56 +23,16 @@ from ..signals.error_measures import relative_errors
 from ..signals.events import find_events
 from ..simulation.faults import ChangedModel
 from ..simulation.model import SimulationFailed
+from ..text_tables import listed
 from .run import FinishedRun
 from .slow_motion import FEWEST_DRAWS, SlowMotion, slow_motions
 
-__all__ = ["ChannelFit", "Compared", "Fit", "Fits", "compare", "data_sets_of", "draws_to_compare", "fit_data_sets"]
+__all__ = ["ChannelFit", "Fit", "Fits", "checks_of", "compare", "data_sets_of", "draws_to_compare", "fit_data_sets"]
 
 logger = logging.getLogger(__name__)
 
 MOST_DRAWS = 100  # of the prior
 SECONDS = 10.0  # of simulations of these draws
-
-
-class Window(NamedTuple):
-    """The part of the measurements that belongs to one event."""
-
-    title: str  # name of the data set and of the event; empty if there is one only
-    measurements: Measurements
-    inside: np.ndarray  # (n_channels, n_samples) bool, among the samples of all events
-    rows: np.ndarray  # channels that are kept
-    columns: np.ndarray  # samples that are kept
-
-    def of(self, values: np.ndarray) -> np.ndarray:
-        """The part of values (..., n_channels, n_samples), NaN outside of the event."""
-        return np.where(self.inside, values, np.nan)[..., self.rows[:, None], self.columns]
-
-
-@dataclass(frozen=True, eq=False)
-class Compared:
-    """Measurements of one event, and responses to compare with them: the fit, and draws of the prior."""
-
-    title: str  # name of the data set and of the event; empty if there is one only
-    measurements: Measurements
-    responses: np.ndarray  # (n, n_channels, n_samples) at the times of the samples [SI]
-    fitted: bool  # whether the first response is the fit, not one more draw of the prior
-    supports: int = 1  # whose motions excite the model
-    modal: "ModalFit | None" = None  # modes of the responses, instead of these
-
-    @cached_property
-    def slow(self) -> dict[str, SlowMotion]:
-        """Channels that follow the draws of the prior where no parameter changes the response, see `slow_motions`."""
-        return slow_motions(self.measurements, self.draws) if self.is_history else {}
-
-    @property
-    def draws(self) -> np.ndarray:
-        """The responses that are draws of the prior."""
-        return self.responses[int(self.fitted) :]
-
-    @property
-    def is_history(self) -> bool:
-        """Whether there are samples along time, of which clocks, offsets and slow motions can be judged."""
-        return not self.modal and self.measurements.is_history
 
 
 class ModalFit(NamedTuple):
@@ -91,20 +51,65 @@ class ChannelFit(NamedTuple):
     samples: int  # that are compared
     before: float  # NaN where there is no simulation
     after: float  # NaN where there is no simulation
-    checks: ResidualChecks | None  # of the residuals after the update; None where they cannot be checked
-    assumed: float = np.nan  # independent samples that the noise assumes
+    checks: ResidualChecks | None  # of the whitened residuals; None where they cannot be checked
+    assumed: float  # independent samples that the noise assumes
 
 
-class Fit(NamedTuple):
-    """Measurements and responses of one data set or event; residuals are checked as the noise whitens them."""
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Measurements of one data set or event, and the responses to them [SI], NaN outside of the event."""
 
     title: str  # name of the data set and of the event; empty if there is one only
     measurements: Measurements
-    responses: dict[str, np.ndarray]  # (n_channels, n_samples) [SI], before and after the update
-    residuals: np.ndarray | None  # (n_channels, n_samples) [SI], measured minus simulated
-    channels: tuple[ChannelFit, ...]
-    modal: ModalFit | None = None  # of modal data, instead of responses and residuals
-    deviations: np.ndarray | None = None  # of the errors, of the shape of the residuals [SI]; None if not known
+    draws: np.ndarray  # (n, n_channels, n_samples) at draws of the prior
+    after: np.ndarray | None = None  # (n_channels, n_samples) of the fit
+    before: np.ndarray | None = None  # the same before the update
+    white: np.ndarray | None = None  # residuals of the fit as the noise whitens them; None without time
+    assumed: np.ndarray | None = None  # (n_channels,) independent samples that the noise assumes at most
+    deviations: np.ndarray | None = None  # of the errors (n_channels, 1); None if not known
+    supports: int = 1  # whose motions excite the model
+    modal: ModalFit | None = None  # modes, instead of responses
+
+    @property
+    def is_history(self) -> bool:
+        """Whether there are samples along time, of which clocks, offsets and slow motions can be judged."""
+        return self.modal is None and self.measurements.is_history
+
+    @property
+    def residuals(self) -> np.ndarray | None:
+        """Measured minus simulated (n_channels, n_samples) of the fit."""
+        return None if self.after is None else self.measurements.values - self.after
+
+    @property
+    def responses(self) -> np.ndarray:
+        """The fit, if there is one, and the draws (n, n_channels, n_samples)."""
+        return self.draws if self.after is None else np.concatenate([self.after[None], self.draws])
+
+    @cached_property
+    def slow(self) -> dict[str, SlowMotion]:
+        """Channels that follow the draws of the prior where no parameter changes the response, see `slow_motions`."""
+        return slow_motions(self.measurements, self.draws) if self.is_history else {}
+
+    @cached_property
+    def channels(self) -> tuple[ChannelFit, ...]:
+        """The table of the fit."""
+        measured, none = self.measurements.values, np.full(self.measurements.n_channels, np.nan)
+        counts = np.isfinite(measured).sum(axis=1)
+        assumed = counts if self.assumed is None else np.minimum(counts, self.assumed)
+        checks = none if self.white is None else [checks_of(each) for each in self.white]
+        before, after = (
+            none if each is None else relative_errors(measured - each, measured) for each in (self.before, self.after)
+        )
+        return tuple(
+            ChannelFit(channel, int(n), float(b), float(a), c if isinstance(c, ResidualChecks) else None, float(worth))
+            for channel, n, b, a, c, worth in zip(
+                self.measurements.channels, counts, before, after, checks, assumed, strict=True
+            )
+        )
+
+    def where(self, *names: str) -> str:
+        """Names of channels, and the event that they are of."""
+        return f"{listed(names)}{f' ({self.title})' if self.title else ''}"
 
 
 class Fits(NamedTuple):
@@ -115,40 +120,20 @@ class Fits(NamedTuple):
     after: str
     simulations: int  # run for the fits
     failures: tuple[str, ...]  # simulations that failed, in words
-    compared: tuple[Compared, ...] = ()  # what `check_responses` judges
+
+
+def checks_of(residuals: np.ndarray) -> ResidualChecks | None:
+    """The checks of one channel's residuals (n_samples,); None for too few samples, or an exact fit."""
+    try:
+        return residual_checks(residuals[None])
+    except ValueError:
+        return None
 
 
 def data_sets_of(posterior: Any) -> list[tuple[str, FELikelihood, np.ndarray]]:
     """Name (empty if there is one only), likelihood and columns of the parameters of each data set."""
     likelihood = posterior.likelihood
     return [(key, *part) for key, part in zip(likelihood.likelihoods, likelihood.parts(), strict=True)]
-
-
-def windows_of(likelihood: FELikelihood, key: str = "") -> list[Window]:
-    """The measurements of a likelihood, event by event; `key` is the name of the data set."""
-    measured, events = likelihood.measurements, find_events(likelihood.model)
-    spans = [(key, -np.inf, np.inf)]
-    if events is not None and len(events.windows) > 1:
-        spans = [(f"{key}, {each.name}" if key else each.name, each.start, each.end) for each in events.windows]
-    times = np.stack([measured.times(channel.name) for channel in measured.channels])
-    half, found = 0.5 * np.array(measured.steps)[:, None], []
-    for title, start, end in spans:
-        inside = (times > start - half) & (times < end + half)
-        rows = np.flatnonzero((inside & np.isfinite(measured.values)).any(axis=1))
-        columns = np.flatnonzero(inside[rows].any(axis=0))
-        if not len(rows):
-            continue
-        part = Measurements(
-            tuple(measured.channels[row] for row in rows),
-            tuple(measured.steps[row] for row in rows),
-            np.where(inside, measured.values, np.nan)[np.ix_(rows, columns)],
-            measured.description,
-            tuple(measured.starts[row] + columns[0] * measured.steps[row] for row in rows),
-            measured.axis,
-            () if measured.is_history else np.array(measured.points, dtype=object)[columns],
-        )
-        found.append(Window(title, part, inside, rows, columns))
-    return found
 
 
 def draws_to_compare(posterior: Posterior, seconds: float | None = None) -> np.ndarray:
@@ -171,35 +156,93 @@ def draws_to_compare(posterior: Posterior, seconds: float | None = None) -> np.n
 
 
 def compare(
-    likelihood: FELikelihood, points: np.ndarray, fitted: bool, key: str = "", samples: np.ndarray | None = None
-) -> tuple[Compared, ...]:
-    """Responses at points (n, ndim) beside the measurements of each event.
+    likelihood: FELikelihood,
+    draws: np.ndarray,
+    key: str = "",
+    point: np.ndarray | None = None,
+    start: np.ndarray | None = None,
+    samples: np.ndarray | None = None,
+) -> tuple[list[Fit], dict[str, str]]:
+    """The fits of a data set with the name `key`, and reasons of failures "before" and "after" the update.
 
-    The points are draws of the prior, after the fit if it is `fitted`. Failed simulations are left out; the result is
-    empty if all fail, or the first one fails and is the fit. `key` is the name of the data set. Of modal data, modes at
-    draws and `samples` are compared.
+    Draws of the prior (n, ndim), the fit at a `point`, the `start` before the update (ndim,); of modal data, modes at
+    draws and at as many `samples` of the posterior.
     """
-    n = len(likelihood.model.parameter_names)
+    measured, n = likelihood.measurements, len(likelihood.model.parameter_names)
     if likelihood.is_modal:
-        modal = _modes(likelihood, points[int(fitted) :], samples if fitted else None)
-        no = np.empty((0, *likelihood.measurements.values.shape))
-        return (Compared(key, likelihood.measurements, no, fitted, modal=modal),)
+        return [Fit(key, measured, np.empty((0, *measured.values.shape)), modal=_modes(likelihood, draws, samples))], {}
+    found, failed = {}, {}
+    for name, theta in (("before", start), ("after", point)):
+        batch = None if theta is None else likelihood.simulate(theta[None, :n])
+        if batch is not None and batch.reasons[0]:
+            failed[name] = batch.reasons[0]
+        elif batch is not None:
+            found[name] = measured.values - likelihood.residuals_of(batch.response[0])
+    drawn = np.empty((0, *measured.values.shape))
     try:
-        batch = likelihood.simulate(points[:, :n])
+        batch = likelihood.simulate(draws[:, :n])
+        good = [not reason for reason in batch.reasons]
+        drawn = np.array([measured.values - likelihood.residuals_of(each) for each in batch.response[good]] or drawn)
     except (ChangedModel, StaleCache, TooManyFailures) as error:  # concerns the next sampling, not this result
         logger.warning("the fit is compared with no draws of the prior: %s", error)
-        return ()
-    good = [i for i, reason in enumerate(batch.reasons) if not reason]
-    if not good or (fitted and good[0]):
-        return ()
-    responses = np.stack(
-        [likelihood.measurements.values - likelihood.residuals_of(each) for each in batch.response[good]]
-    )
-    supports = len(getattr(likelihood.model, "supports", ()))
-    return tuple(
-        Compared(each.title, each.measurements, each.of(responses), fitted, supports)
-        for each in windows_of(likelihood, key)
-    )
+    white, deviations = _errors(likelihood, found.get("after"), point)
+    assumed = getattr(sampled_noise(likelihood.noise), "effective_samples", None)
+    assumed = None if assumed is None else np.broadcast_to(assumed, measured.n_channels)
+    supports, fits = len(getattr(likelihood.model, "supports", ())), []
+    for title, part, rows, cut in _events(likelihood, key):
+        of_event = {name: cut(each) for name, each in found.items()}
+        own = None if white is None else cut(white)
+        counts, errors = (None if each is None else each[rows] for each in (assumed, deviations))
+        fits.append(
+            Fit(title, part, cut(drawn), white=own, assumed=counts, deviations=errors, supports=supports, **of_event)
+        )
+    return fits, failed
+
+
+def _errors(
+    likelihood: FELikelihood, response: np.ndarray | None, point: np.ndarray | None
+) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Residuals of a history as the noise whitens them; of data without time, standard deviations of the errors."""
+    if response is None or point is None:
+        return None, None
+    sampled, values = sampled_noise(likelihood.noise), dict(zip(likelihood.parameter_names, point, strict=True))
+    parameters = np.array([values.get(name, np.nan) for name in sampled.parameter_names])
+    if not likelihood.measurements.is_history:
+        known = hasattr(sampled, "standard_deviations") and np.isfinite(parameters).all()
+        return None, sampled.standard_deviations(parameters[None])[0][:, None] if known else None
+    residuals = likelihood.measurements.values - response
+    return sampled.whitened(residuals, response, parameters) if hasattr(sampled, "whitened") else residuals, None
+
+
+def _events(likelihood: FELikelihood, key: str) -> Iterator[tuple[str, Measurements, np.ndarray, Callable]]:
+    """Name, measurements and rows of channels of each event, and what cuts (..., n_channels, n_samples) to it."""
+    measured, events = likelihood.measurements, find_events(likelihood.model)
+    spans = [(key, -np.inf, np.inf)]
+    if events is not None and len(events.windows) > 1:
+        spans = [(f"{key}, {each.name}" if key else each.name, each.start, each.end) for each in events.windows]
+    times = np.stack([measured.times(channel.name) for channel in measured.channels])
+    half = 0.5 * np.array(measured.steps)[:, None]
+    for title, start, end in spans:
+        inside = (times > start - half) & (times < end + half)
+        rows = np.flatnonzero((inside & np.isfinite(measured.values)).any(axis=1))
+        columns = np.flatnonzero(inside[rows].any(axis=0))
+        if not len(rows):
+            continue
+        cut = partial(_cut, inside, rows, columns)
+        part = Measurements(
+            tuple(measured.channels[row] for row in rows),
+            tuple(measured.steps[row] for row in rows),
+            cut(measured.values),
+            measured.description,
+            tuple(measured.starts[row] + columns[0] * measured.steps[row] for row in rows),
+            measured.axis,
+            () if measured.is_history else np.array(measured.points, dtype=object)[columns],
+        )
+        yield title, part, rows, cut
+
+
+def _cut(inside: np.ndarray, rows: np.ndarray, columns: np.ndarray, values: np.ndarray) -> np.ndarray:
+    return np.where(inside, values, np.nan)[..., rows[:, None], columns]
 
 
 def _modes(likelihood: Any, draws: np.ndarray, samples: np.ndarray | None) -> ModalFit:
@@ -225,80 +268,22 @@ def fit_data_sets(run: FinishedRun) -> Fits:
     if run.likelihood is None:
         return Fits((), "", "", 0, ())
     start, start_name = _before(run)
-    names = f"before: {start_name}", f"after: {run.centre_name}"
-    fits, failures, compared, simulations = [], [], [], run.likelihood.simulations
+    names = {"before": f"before: {start_name}", "after": f"after: {run.centre_name}"}
+    fits, failures, before = list[Fit](), list[str](), run.likelihood.simulations
     for key, likelihood, columns in data_sets_of(run):
-        point, n = run.centre[columns], len(likelihood.model.parameter_names)
-        draws = draws_to_compare(run.posterior)[:, columns]
-        compared += compare(likelihood, np.stack([point, *draws]), True, key, run.samples[:, columns])
-        if likelihood.is_modal:
-            fits.append(Fit(key, likelihood.measurements, {}, None, (), compared[-1].modal))
-            continue
-        batch = likelihood.simulate(np.stack([start[columns], point])[:, :n])
-        residuals = {}
-        for name, response, reason in zip(names, batch.response, batch.reasons, strict=True):
-            if reason:
-                failures.append(f"{key}{', ' if key else ''}{name}: the simulation failed ({reason})")
-            else:
-                residuals[name] = likelihood.residuals_of(response)
-        fits += _split(likelihood, key, residuals, names, dict(zip(likelihood.parameter_names, point, strict=True)))
-    made = run.likelihood.simulations - simulations
-    return Fits(tuple(fits), *names, made, tuple(failures), tuple(compared))
+        points = draws_to_compare(run.posterior), run.centre, start, run.samples
+        draws, point, first, samples = (each[..., columns] for each in points)
+        found, failed = compare(likelihood, draws, key, point, first, samples)
+        fits += found
+        failures += [
+            f"{key}{', ' if key else ''}{names[when]}: the simulation failed ({why})" for when, why in failed.items()
+        ]
+    return Fits(tuple(fits), *names.values(), run.likelihood.simulations - before, tuple(failures))
 
 
 def _before(run: FinishedRun) -> tuple[np.ndarray, str]:
     """The point (ndim,) that represents the knowledge before the update, and its name."""
-    fast = set(run.posterior.fast_parameters)
     nominal = np.array([parameter.nominal for parameter in run.parameters])
-    structural = [i for i in range(len(nominal)) if i not in fast]
-    if np.isfinite(nominal[structural]).all():
-        return nominal, "nominal values"
-    try:
-        median, name = run.posterior.prior_transform(np.full(len(nominal), 0.5)), "median of the prior"
-    except ValueError:  # a joint prior without such a map
-        median, name = np.median(run.posterior.sample_prior(1000, 0), axis=0), "median of draws of the prior"
-    known = np.isfinite(nominal)
-    return np.where(known, nominal, median), name if not known.any() else f"nominal values, where known, and {name}"
-
-
-def _split(
-    likelihood: FELikelihood,
-    key: str,
-    residuals: dict[str, np.ndarray],
-    names: tuple[str, str],
-    values: Mapping[str, float],
-) -> list[Fit]:
-    """One fit per event, from residuals (n_channels, n_samples) by name; `values` are the parameters of the fit."""
-    sampled, checked, deviations, fits = sampled_noise(likelihood.noise), residuals.get(names[1]), None, []
-    parameters = np.array([values.get(name, np.nan) for name in sampled.parameter_names])
-    if not likelihood.measurements.is_history:  # samples without an order
-        checked = None
-        if hasattr(sampled, "standard_deviations") and np.isfinite(parameters).all():
-            deviations = sampled.standard_deviations(parameters[None])[0][:, None]
-    elif checked is not None and hasattr(sampled, "whitened"):
-        checked = sampled.whitened(checked, likelihood.measurements.values - checked, parameters)
-    fewer = getattr(sampled, "effective_samples", None)
-    for window in windows_of(likelihood, key):
-        part = window.measurements
-        own = {name: window.of(each) for name, each in residuals.items()}
-        errors = {name: relative_errors(each, part.values) for name, each in own.items()}
-        missing, channels = np.full(part.n_channels, np.nan), []
-        left = None if checked is None else window.of(checked)
-        for row, channel in enumerate(part.channels):
-            checks = None if left is None else _check(left[[row]])
-            samples = int(np.isfinite(part.values[row]).sum())
-            assumed = samples if fewer is None else min(np.broadcast_to(fewer, part.n_channels)[row], samples)
-            before, after = (float(errors.get(name, missing)[row]) for name in names)
-            channels.append(ChannelFit(channel, samples, before, after, checks, float(assumed)))
-        responses = {name: part.values - each for name, each in own.items()}
-        errors_of = None if deviations is None else deviations[window.rows]
-        fits.append(Fit(window.title, part, responses, own.get(names[1]), tuple(channels), deviations=errors_of))
-    return fits
-
-
-def _check(residuals: np.ndarray) -> ResidualChecks | None:
-    """The checks of one channel's residuals (1, n_samples); None for too few samples, or an exact fit."""
-    try:
-        return residual_checks(residuals)
-    except ValueError:
-        return None
+    known, fast = np.isfinite(nominal), np.isin(np.arange(len(nominal)), run.posterior.fast_parameters)
+    names = (["nominal values"] if known.any() else []) + ([] if (known | fast).all() else ["mean of the prior"])
+    return np.where(known, nominal, run.posterior.prior.mean()), " and ".join(names)

@@ -1,15 +1,10 @@
 """Faults of data that a fit shows: wrong units or signs, swapped channels, clocks that differ.
 
-A fault of the data is seldom a fault of the fit: a sampler finds parameters that make up for a part of it, with a
-frequency far from the true one. Each fault is therefore a hypothesis about responses of many parameters, such as draws
-of the prior: with a factor, the other sign, a shift in time or another order of the channels, is one of them much
-closer to the measurements than the best one is without it? For a channel with measurements y and a response r, the
-errors relative to y are, with the correlation rho of y and r about zero, ::
-
-    e = |y - r| / |y|,    e(factor) = sqrt(1 - rho^2),    e(sign) = |y + r| / |y|,    e(lag) = |y(t) - r(t - lag)| / |y|
-
-and a hypothesis is named where it reduces the errors of the channels that it concerns to less than 0.6, in their
-geometric mean, of the errors of the best response. Study ``fit_gate`` of docs/results.rst has chosen this limit.
+A sampler finds parameters that make up for a part of a fault, with a frequency far from the true one. Each fault is
+therefore a hypothesis about responses of many parameters, such as draws of the prior: with a factor, the other sign, a
+shift in time or another order of the channels, is one of them much closer to the measurements than the best one is
+without it? It is named where it reduces the errors (RRMSE) of its channels to less than 0.6, in their geometric mean.
+Study ``fit_gate`` of docs/results.rst has chosen this limit.
 """
 
 import math
@@ -23,7 +18,7 @@ from ..signals.channels import Measurements
 from ..signals.error_measures import relative_errors
 from ..units import DIMENSIONS, UNITS
 
-__all__ = ["BETTER", "EXPLAINED", "FACTOR", "Fault", "describe_unit", "find_faults"]
+__all__ = ["EXPLAINED", "FACTOR", "Fault", "describe_unit", "find_faults"]
 
 BETTER = 0.6  # errors with a fault taken into account, as a share of the errors without
 EXPLAINED = 0.85  # error above which a response explains nothing: a correlation of a half
@@ -46,57 +41,50 @@ class Fault(NamedTuple):
     after: float  # the same error with the fault
 
 
-class _Hypothesis(NamedTuple):
-    """A fault, the channels whose errors change, and what corrects responses for it."""
-
-    kind: str
-    channels: tuple[int, ...]
-    errors: np.ndarray  # (n, n of these channels), logarithms, of each response
-    value: np.ndarray  # (n,) factor or lag that gives these errors
-
-
 def find_faults(measurements: Measurements, responses: np.ndarray) -> tuple[Fault, ...]:
     """Faults that explain measurements better than any of the responses does without them, the strongest first.
 
     Responses (n, n_channels, n_samples) [SI] have any parameters. Each fault is found after those before it are
     corrected.
     """
-    values = np.asarray(measurements.values, dtype=float)
+    values, r = measurements.values, np.asarray(responses, dtype=float)
     there, usable = np.isfinite(values), np.flatnonzero(np.nan_to_num(values).any(axis=1))
-    responses = np.asarray(responses, dtype=float)
-    kept = np.isfinite(responses[:, there]).all(axis=1)
-    if not kept.any() or not len(usable):
+    r = r[np.isfinite(r[:, there]).all(axis=1)]
+    if not len(r) or not len(usable):
         return ()
-    channels = [measurements.channels[row] for row in usable]
-    steps, starts = (np.array(each)[usable] for each in (measurements.steps, measurements.starts))
-    alike = [(channel.dimension, *when) for channel, *when in zip(channels, steps, starts, strict=True)]
-    y = np.where(there, values, 0.0)[usable]
-    r, found = np.where(there[usable], responses[kept][:, usable], 0.0), list[Fault]()
+    channels, steps = [measurements.channels[row] for row in usable], np.array(measurements.steps)[usable]
+    alike = [(each.dimension, steps[k], measurements.starts[usable[k]]) for k, each in enumerate(channels)]
+    y, r, found = np.nan_to_num(values)[usable], np.where(there, r, 0.0)[:, usable], list[Fault]()
     r = r[np.argsort(_log_errors(y, r).sum(axis=1), kind="stable")[: max(8, MOST_VALUES // y.size)]]
     while len(found) < MOST_FAULTS:
-        errors = _log_errors(y, r)
-        best, most, explained = int(np.argmin(errors.sum(axis=1))), 0.0, None
-        for each in _hypotheses(y, r, alike, steps, errors):
-            c = list(each.channels)
-            total = errors.sum(axis=1) + (each.errors - errors[:, c]).sum(axis=1)
+        errors, most, chosen = _log_errors(y, r), 0.0, None
+        best = int(np.argmin(errors.sum(axis=1)))
+        for kind, group, value, of_group in _hypotheses(y, r, alike, steps, measurements.is_history):
+            total = errors.sum(axis=1) + (of_group - errors[:, group]).sum(axis=1)
             row = int(np.argmin(total))
-            gain, before, after = errors[best].sum() - total[row], errors[best, c].mean(), each.errors[row].mean()
-            value = float(each.value[row])
-            is_large = value < 0.0 or _is_factor(value) if each.kind == "factor" else True
-            if each.kind == "lag":  # one step is a convention of files
-                is_large = measurements.is_history and round(abs(value) / steps[c].max()) > 1
-            clear = after < min(math.log(BETTER) + before, math.log(EXPLAINED)) and gain > -math.log(BETTER) * len(c)
+            gain, before, after = errors[best].sum() - total[row], errors[best, group].mean(), of_group[row].mean()
+            if kind == "factor":
+                is_large = value[row] < 0.0 or _is_factor(value[row])
+            else:  # one step is a convention of files
+                is_large = kind == "swap" or round(abs(value[row]) / steps[group].max()) > 1
+            clear = after < min(math.log(BETTER) + before, math.log(EXPLAINED)) and gain > -math.log(BETTER) * len(
+                group
+            )
             if is_large and clear and gain > most:
-                most, explained = gain, (each, value, math.exp(before), math.exp(after))
-        if explained is None:
+                most, chosen = gain, (kind, group, float(value[row]), math.exp(before), math.exp(after))
+        if chosen is None:
             break
-        each, value, *change = explained
-        names = tuple(channels[c].name for c in each.channels)
-        if each.kind == "factor" and value < 0.0:
+        kind, group, value, *change = chosen
+        names = tuple(channels[c].name for c in group)
+        if kind == "factor" and value < 0.0:
             found.append(Fault("sign", names, math.nan, *change))
-        if each.kind != "factor" or _is_factor(abs(value)):
-            found.append(Fault(each.kind, names, abs(value) if each.kind == "factor" else value, *change))
-        r = _corrected(each, value, r, steps)
+        if kind != "factor" or _is_factor(value):
+            found.append(Fault(kind, names, abs(value) if kind == "factor" else value, *change))
+        r = r.copy()
+        if kind == "lag":
+            r[:, group] = np.stack([_later(r[:, c], round(value / steps[c])) for c in group], axis=1)
+        else:
+            r[:, group] = value * r[:, group] if kind == "factor" else r[:, group[::-1]]
     return tuple(found)
 
 
@@ -119,7 +107,7 @@ def describe_unit(factor: float, dimension: str) -> str:
 
 
 def _is_factor(value: float) -> bool:
-    return max(value, 1.0 / value) > FACTOR
+    return max(abs(value), 1.0 / max(abs(value), 1e-300)) > FACTOR
 
 
 def _log_errors(y: np.ndarray, r: np.ndarray) -> np.ndarray:
@@ -127,37 +115,38 @@ def _log_errors(y: np.ndarray, r: np.ndarray) -> np.ndarray:
     return np.log(np.maximum(relative_errors(y - r, y), FLOOR))
 
 
+def _later(values: np.ndarray, k: int) -> np.ndarray:
+    """Histories (..., n_samples) later by k steps, zero where nothing is known."""
+    out, n = np.zeros_like(values), values.shape[-1]
+    out[..., max(k, 0) : n + min(k, 0)] = values[..., max(-k, 0) : n - max(k, 0)]
+    return out
+
+
 def _hypotheses(
-    y: np.ndarray,
-    r: np.ndarray,
-    alike: Sequence[tuple],
-    steps: np.ndarray,
-    errors: np.ndarray,
-) -> Iterator[_Hypothesis]:
-    """Every fault of one round, simple ones first; only channels of one quantity and the same times can be swapped."""
-    every = tuple(range(len(y)))
-    power, own, product = np.square(r).sum(axis=-1), np.square(y).sum(axis=-1), (y * r).sum(axis=-1)
-    single = [(c,) for c in every]
+    y: np.ndarray, r: np.ndarray, alike: Sequence[tuple], steps: np.ndarray, is_history: bool
+) -> Iterator[tuple[str, list[int], np.ndarray, np.ndarray]]:
+    """Kind, channels, factor or lag (n,) and logarithms of errors (n, n of these channels) of every fault of one round.
+
+    Simple ones come first; only channels of one quantity and the same times can be swapped.
+    """
+    every, own = list(range(len(y))), np.square(y).sum(axis=-1)
+    power, product = np.square(r).sum(axis=-1) / own, (y * r).sum(axis=-1) / own
     of_kind = [tuple(c for c in every if alike[c][0] == kind) for kind in dict.fromkeys(each[0] for each in alike)]
-    for group in dict.fromkeys([*single, *of_kind, every]):
-        c = list(group)
-        # least squares of relative errors, so that no channel outweighs the others
-        weight, along = (power[:, c] / own[c]).sum(axis=1), (product[:, c] / own[c]).sum(axis=1)
-        factor = np.where(weight > 0.0, along / np.where(weight > 0.0, weight, 1.0), 0.0)[:, None]
-        squares = 1.0 + (np.square(factor) * power[:, c] - 2.0 * factor * product[:, c]) / own[c]
-        squares = np.where(factor == 0.0, np.inf, np.maximum(squares, FLOOR**2))
-        yield _Hypothesis("factor", group, 0.5 * np.log(squares), factor[:, 0])
-    cross = (power[:, :, None] + own - 2.0 * np.einsum("nit,jt->nij", r, y)) / own  # of response i for channel j
-    cross = 0.5 * np.log(np.maximum(cross, FLOOR**2))
+    for group in map(list, dict.fromkeys([*((c,) for c in every), *of_kind, tuple(every)])):
+        weight = power[:, group].sum(axis=1)  # least squares of relative errors: no channel outweighs the others
+        factor = np.where(weight > 0.0, product[:, group].sum(axis=1) / np.where(weight > 0.0, weight, 1.0), 0.0)
+        squares = 1.0 + np.square(factor)[:, None] * power[:, group] - 2.0 * factor[:, None] * product[:, group]
+        squares = np.where(factor[:, None] == 0.0, np.inf, np.maximum(squares, FLOOR**2))
+        yield "factor", group, factor, 0.5 * np.log(squares)
     for j, i in combinations(every, 2):
-        swapped = np.stack([cross[:, i, j], cross[:, j, i]], axis=1)
-        if alike[i] == alike[j] and (swapped < errors[:, [j, i]]).all(axis=1).any():
-            yield _Hypothesis("swap", (j, i), swapped, np.full(len(r), np.nan))
+        if alike[i] == alike[j]:
+            yield "swap", [j, i], np.full(len(r), np.nan), _log_errors(y[[j, i]], r[:, [i, j]])
     lags, by_lag = _lag_errors(y, r, steps)
-    for group in dict.fromkeys([*single, every]) if len(lags) > 1 else ():
-        chosen = by_lag[:, list(group)]
-        best = np.argmin(chosen.sum(axis=1), axis=1)
-        yield _Hypothesis("lag", group, np.take_along_axis(chosen, best[:, None, None], axis=2)[..., 0], lags[best])
+    for group in (
+        map(list, dict.fromkeys([*((c,) for c in every), tuple(every)])) if is_history and len(lags) > 1 else ()
+    ):
+        best = np.argmin(by_lag[:, group].sum(axis=1), axis=1)
+        yield "lag", group, lags[best], np.take_along_axis(by_lag[:, group], best[:, None, None], axis=2)[..., 0]
 
 
 def _lag_errors(y: np.ndarray, r: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -175,27 +164,11 @@ def _lag_errors(y: np.ndarray, r: np.ndarray, steps: np.ndarray) -> tuple[np.nda
         ends, power, own = n - np.maximum(-k, 0), _sums(r[:, c]), _sums(y[None, c])[0]
         squares = own[ends] + power[:, n - np.maximum(k, 0)] - power[:, np.maximum(-k, 0)] - 2.0 * products
         own = np.where(own[ends] < 0.5 * own[-1], 0.0, own[ends])  # too little is left to compare
-        with np.errstate(divide="ignore"):
-            shares = np.maximum(squares, 0.0) / np.where(own > 0.0, own, 1.0)
-            found[:, c] = 0.5 * np.log(np.where(own > 0.0, shares, np.inf))
-    return lags, np.maximum(found, math.log(FLOOR))
+        shares = np.maximum(squares, 0.0) / np.where(own > 0.0, own, 1.0)
+        found[:, c] = np.where(own > 0.0, 0.5 * np.log(np.maximum(shares, FLOOR**2)), np.inf)
+    return lags, found
 
 
 def _sums(values: np.ndarray) -> np.ndarray:
     """Sums of squares (n, n_samples + 1) of the first 0, 1, ... samples."""
     return np.concatenate([np.zeros((len(values), 1)), np.cumsum(np.square(values), axis=1)], axis=1)
-
-
-def _corrected(fault: _Hypothesis, value: float, given: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Responses (n, n_channels, n_samples) as they would be compared with measurements that have the fault."""
-    out, c = given.copy(), list(fault.channels)
-    if fault.kind == "factor":
-        out[:, c] *= value
-    elif fault.kind == "swap":
-        out[:, c] = given[:, c[::-1]]
-    else:
-        for row in c:
-            k, n = round(value / steps[row]), given.shape[-1]
-            out[:, row] = 0.0
-            out[:, row, max(k, 0) : n + min(k, 0)] = given[:, row, max(-k, 0) : n - max(k, 0)]
-    return out

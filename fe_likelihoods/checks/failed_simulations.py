@@ -58,21 +58,16 @@ def failures(run: FinishedRun) -> Failures:
     """Failed simulations by reason, the most frequent first, with the parameters at which they happened."""
     if run.likelihood is None:
         return _of_function(run)
-    found = [(part, _of_likelihood(run, part, columns)) for part, columns in run.likelihood.parts()]
-    sources = [source for _, source in found]
-    attempts = sum(each.simulations for part, _ in found for each in (part, *part.shortened))
-    unknown = ""
-    if not all(_was_here(run, part, source) for part, source in found):
-        unknown = (
-            "Not known: the simulations of this run were made in another process, or are no longer in memory, and "
-            "failures are counted in the process that simulates."
-        )
-    return _joined(run, sources, attempts, unknown)
+    parts = run.likelihood.parts()
+    sources = [_of_likelihood(*part) for part in parts]
+    attempts = sum(each.simulations for part, _ in parts for each in (part, *part.shortened))
+    here = all(_was_here(run, part, source) for (part, _), source in zip(parts, sources, strict=True))
+    unknown = "Not known: simulations of this run were made in another process, or are no longer in memory."
+    return _joined(run, sources, attempts, "" if here else unknown)
 
 
-def _of_likelihood(run: FinishedRun, likelihood: FELikelihood, columns: np.ndarray) -> _Source:
-    names = likelihood.model.parameter_names
-    logs = [likelihood, *likelihood.shortened]
+def _of_likelihood(likelihood: FELikelihood, columns: np.ndarray) -> _Source:
+    names, logs = likelihood.model.parameter_names, [likelihood, *likelihood.shortened]
     records = [record for each in logs for record in each.simulator.failures.records]
     return _Source(
         np.asarray(columns)[: len(names)],
@@ -89,24 +84,23 @@ def _of_function(run: FinishedRun) -> Failures:
     sampler, ndim = run.sampler, run.samples.shape[1]
     failed = np.array([each["parameters"] for each in sampler.failures], dtype=float).reshape(-1, ndim)
     reasons = [each["reason"] for each in sampler.failures]
-    counts = Counter(reasons)
     draws = np.empty((0, ndim)) if sampler.prior_draws is None else sampler.prior_draws
-    draws = draws[~_are_among(draws, failed)]
-    source = _Source(np.arange(ndim), failed, reasons, np.concatenate([draws, run.samples]), counts)
-    unknown = (
-        "No evaluation raised an exception or returned NaN. Whether a value of -inf stands for a failed simulation is "
-        "not known."
-    )
+    succeeded = np.concatenate([draws[~_are_among(draws, failed)], run.samples])
+    unknown = "No evaluation raised an error or returned NaN; whether -inf stands for a failed simulation is not known."
+    source = _Source(np.arange(ndim), failed, reasons, succeeded, Counter(reasons))
     return _joined(run, [source], sampler.evaluations, unknown, sampler.failure_count)
 
 
 def _joined(
     run: FinishedRun, sources: list[_Source], attempts: int, unknown: str, count: int | None = None
 ) -> Failures:
-    rows = [row for source in sources for row in _by_reason(run, source)]
-    rows.sort(key=lambda row: -row.count)
+    rows = sorted((row for source in sources for row in _by_reason(run, source)), key=lambda row: -row.count)
     count = sum(row.count for row in rows) if count is None else count
-    return Failures(tuple(rows), count, max(attempts, count), unknown, _near_the_samples(run, sources))
+    near = None if run.verdict is None else run.verdict.near_failures  # as judged by the sampler, else as known here
+    if near is None:
+        known = [failures_near(run.samples[:, each.columns], each.failed, each.succeeded) for each in sources]
+        near = max(known, key=lambda each: each.failed)
+    return Failures(tuple(rows), count, max(attempts, count), unknown, near)
 
 
 def _by_reason(run: FinishedRun, source: _Source) -> list[Failure]:
@@ -139,15 +133,6 @@ def _was_here(run: FinishedRun, likelihood: FELikelihood, source: _Source) -> bo
     return likelihood.simulations >= len(distinct) or _are_among(distinct, source.succeeded).mean() >= 0.5
 
 
-def _near_the_samples(run: FinishedRun, sources: list[_Source]) -> NearFailures:
-    """Failures in the region of the samples: as judged by the sampler, else as known here."""
-    judged = None if run.verdict is None else run.verdict.near_failures
-    if judged is not None:
-        return judged
-    found = [failures_near(run.samples[:, each.columns], each.failed, each.succeeded) for each in sources]
-    return max(found, key=lambda each: each.failed)
-
-
 def _where(run: FinishedRun, source: _Source, failed: np.ndarray) -> str:
     """The parameter whose values tell these failures from the successes best, by the Kolmogorov-Smirnov distance."""
     succeeded = np.concatenate([source.succeeded, run.samples[:, source.columns]])
@@ -156,10 +141,7 @@ def _where(run: FinishedRun, source: _Source, failed: np.ndarray) -> str:
     test, name = tests[i], run.names[source.columns[i]]
     if test.pvalue > SMALL_PROBABILITY:
         return "no single parameter tells them from the successful ones"
-    place = test.statistic_location
     low = test.statistic_sign > 0  # the failures have the smaller values
-    shares = [np.mean(values <= place if low else values > place) for values in (failed[:, i], succeeded[:, i])]
-    return (
-        f"at {name} {'up to' if low else 'above'} {place:.4g} ({100.0 * shares[0]:.3g} % of these failures, "
-        f"{100.0 * shares[1]:.3g} % of the successful points)"
-    )
+    inside = [np.mean((values <= test.statistic_location) == low) for values in (failed[:, i], succeeded[:, i])]
+    shares = "{:.3g} % of these failures, {:.3g} % of the successful points".format(*(100.0 * each for each in inside))
+    return f"at {name} {'up to' if low else 'above'} {test.statistic_location:.4g} ({shares})"

@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Container, Iterable, Sequence
-from math import comb
 from typing import Any
 
 import numpy as np
@@ -10,14 +9,14 @@ from scipy.stats import chi2
 
 from ..likelihood.parameters import Parameter
 from ..likelihood.posterior import Posterior
-from ..noise.residuals import ResidualChecks, residual_checks
+from ..noise.residuals import ResidualChecks
 from ..priors.between_events import spread_of
 from ..priors.points import as_points
 from ..signals.error_measures import relative_errors
 from ..simulation.model import simulate_batch
 from ..text_tables import listed
-from .compared import ChannelFit, Compared, Fit, Fits, compare, data_sets_of, draws_to_compare
-from .data_faults import BETTER, EXPLAINED, Fault, describe_unit, find_faults
+from .compared import ChannelFit, Fit, checks_of, compare, data_sets_of, draws_to_compare
+from .data_faults import EXPLAINED, Fault, describe_unit, find_faults
 from .finding import CARE, CORRELATED, HALF, NOTE, SMALL_PROBABILITY, SURE, WRONG, Finding, percent
 from .modal_faults import check_modes
 from .slow_motion import find_slow_faults, support_gains, supports_apart
@@ -47,27 +46,27 @@ FEWEST = 10  # samples that the tests of correlation and distribution need
 FAULTS = {
     "factor": (
         "A {what} may be wrong",
-        "Responses times {value:.3g} fit the {which} of {where} much better: {better}. The {which} and the model "
-        "differ by this factor{units}.",
+        "{where}: the measurements are {value:.3g} times the response{units}{better}.",
         "Check the gain of the sensor, and the units of file, model (it returns SI units) and base motion.",
     ),
     "sign": (
         "A sign may be wrong",
-        "Response and measurements have opposite signs: {where}; with the other sign, {better}.",
+        "{where}: measurements and response have opposite signs{better}.",
         "Where the sensor counts the other way, name it in `reversed` of [measurements], or change its sign.",
     ),
     "swap": (
         "Channels may be swapped",
-        "The channels {where} may be exchanged: the other way round, {better}.",
+        "{where}: the measurements may be exchanged{better}.",
         "Check the columns of the file and the places of sensors.",
     ),
     "lag": (
         "Clocks may differ",
-        "The {which} of {where} {are} {value:.3g} s {late} than the response: with this lag, {better}.{support}",
-        "Check the time at which the base motion begins (zero in [measurements]) and the clocks; see `align`.",
+        "{where}: the measurements are {value:.3g} s {late} than the response{better}.",
+        "Check the clocks of sensors and motions, and when the motion begins (zero in [measurements]); see `align`.",
     ),
 }
 """Kind, text and action of each fault of data."""
+PLACES = "Check units, signs, clocks and the place of the sensor in the model; or the model lacks what moves it."
 
 
 def check_fit(posterior: Posterior, samples: Any = None) -> tuple[Finding, ...]:
@@ -91,47 +90,72 @@ def check_fit(posterior: Posterior, samples: Any = None) -> tuple[Finding, ...]:
     >>> wrong_sign = Measurements(measurements.channels, record.dt, -measurements.values)
     >>> for finding in check_fit(Posterior(FELikelihood(model, wrong_sign), prior)):
     ...     print(finding.severity, finding)
-    wrong A sign may be wrong: Response and measurements have opposite signs...
+    wrong A sign may be wrong: acceleration and displacement: measurements and response have opposite signs...
     """
-    points, found = draws_to_compare(posterior), []
+    draws, found, fits = draws_to_compare(posterior), list[Finding](), list[Fit]()
+    mean = None
     if samples is not None:
         samples = as_points(samples, posterior.prior.names)
-        points = np.concatenate([samples.mean(axis=0)[None], points])
-        none = np.full(posterior.ndim, np.nan)
+        mean, none = samples.mean(axis=0), np.full(posterior.ndim, np.nan)
         rows = rows_of(posterior.parameters, posterior.prior, Moments.of_samples(samples, none, none), none)
-        limits = limits_of_model(posterior.likelihood, posterior.parameters, rows, points[0])
-        found += check_parameters(rows, limits)
-    compared: list[Compared] = []
+        found += check_parameters(rows, limits_of_model(posterior.likelihood, posterior.parameters, rows, mean))
     for key, likelihood, columns in data_sets_of(posterior):
-        own = None if samples is None else samples[:, columns]
-        compared += compare(likelihood, points[:, columns], samples is not None, key, own)
+        own, point = (None if each is None else each[..., columns] for each in (samples, mean))
+        of_data, _ = compare(likelihood, draws[:, columns], key, point, samples=own)
+        fits += of_data
         found += check_supports(likelihood.model)
-        found += [] if samples is None else check_damping(likelihood.model, points[0, columns], compared)
-    return (*check_responses(compared), *found)
+        found += [] if point is None else check_damping(likelihood.model, point, of_data)
+    return (*check_responses(fits), *found)
 
 
-def check_responses(compared: Iterable[Compared]) -> list[Finding]:
-    """What responses show of the data and of the fit, if there is one: faults of the data, and missed channels.
-
-    A fault that draws of the prior show before a run is named after it as well: a fit may make up for it.
-    """
-    found, compared = [], list(compared)
-    modal, compared = [each.modal for each in compared if each.modal], [each for each in compared if not each.modal]
-    for each in compared:
-        faults = find_faults(each.measurements, each.responses)
-        slow = {(fault.kind, *fault.names): (fault, band) for fault, band in find_slow_faults(each.slow)}
-        for fault in faults:
-            own = [slow.pop((fault.kind, name))[0].value for name in fault.names if (fault.kind, name) in slow]
-            found.append(_of_a_fault(each, fault._replace(value=float(np.median(own))) if own else fault, WRONG))
-        found += [_of_a_fault(each, fault, WRONG, band) for fault, band in slow.values()]
-        if each.fitted:
-            before = find_faults(each.measurements, each.draws)
-            known = {fault.kind for fault in (*faults, *(fault for fault, _ in slow.values()))}
-            found += [_of_a_fault(each, fault, CARE) for fault in before if fault.kind not in known]
+def check_responses(fits: Iterable[Fit]) -> list[Finding]:
+    """What responses show of the data and of the fit, if there is one: faults of the data, and missed channels."""
+    found, histories = list[Finding](), list[Fit]()
+    for fit in fits:
+        found += check_modes(fit.modal) if fit.modal else check_faults(fit)
+        histories += [] if fit.modal else [fit]
     unexplained = all(each.severity != WRONG for each in found)
-    for each in compared:
-        found += _check_offset(each) if each.fitted and each.is_history else []
-    return found + _check_errors(compared, unexplained) + [fault for each in modal for fault in check_modes(each)]
+    return found + (check_errors(histories) if unexplained else [])
+
+
+def check_faults(fit: Fit) -> list[Finding]:
+    """Faults of the data. One that draws of the prior show before a run is named after it: a fit may make up for it."""
+    found, faults = list[Finding](), find_faults(fit.measurements, fit.responses)
+    slow = {(fault.kind, *fault.names): (fault, band) for fault, band in find_slow_faults(fit.slow)}
+    for fault in faults:
+        own = [slow.pop((fault.kind, name))[0].value for name in fault.names if (fault.kind, name) in slow]
+        found.append(_of_a_fault(fit, fault._replace(value=float(np.median(own))) if own else fault, WRONG))
+    found += [
+        _of_a_fault(fit, fault, WRONG, f" between {low:.2g} and {high:.2g} Hz, where parameters hardly change it")
+        for fault, (low, high) in slow.values()
+    ]
+    known = {fault.kind for fault in (*faults, *(fault for fault, _ in slow.values()))}
+    if fit.after is not None:
+        before, how = (
+            find_faults(fit.measurements, fit.draws),
+            " at the best draw of the prior; the fit may make up for it",
+        )
+        found += [_of_a_fault(fit, fault, CARE, how) for fault in before if fault.kind not in known]
+        found += _check_offset(fit) if fit.is_history else []
+    return found
+
+
+def _of_a_fault(fit: Fit, fault: Fault, severity: str, how: str = "") -> Finding:
+    dimensions = sorted({each.dimension for each in fit.measurements.channels if each.name in fault.names})
+    near = [describe_unit(fault.value, each) for each in dimensions] if fault.kind == "factor" else []
+    units = " or ".join(filter(None, dict.fromkeys(near)))
+    words = {
+        "where": fit.where(*fault.names),
+        "better": f" (error, RRMSE, {percent(fault.after)} instead of {percent(fault.before)}{how})",
+        "value": abs(fault.value),
+        "late": "later" if fault.value > 0.0 else "earlier",
+        "what": "unit" if units else "gain",
+        "units": f", about the ratio of {units}" if units else "",
+    }
+    kind, text, action = (each.format(**words) for each in FAULTS[fault.kind])
+    return Finding(
+        kind, severity, text, action, {"before": fault.before, "after": fault.after, fault.kind: fault.value}
+    )
 
 
 def check_supports(model: Any) -> list[Finding]:
@@ -144,117 +168,77 @@ def check_supports(model: Any) -> list[Finding]:
     for k, gain in ((k, gain) for k, gain in apart.items() if k not in unknown):
         unit = describe_unit(abs(gain), "acceleration")
         kind = "A sign may be wrong" if gain < 0.0 else "A unit may be wrong" if unit else "A gain may be wrong"
-        text = (
-            f"Where it is slow, the motion of {motions[k].name} is {gain:.2g} times the motion of the other supports"
-            f"{f', about the ratio of {unit}' if unit and gain > 0.0 else ''}; slow motions of one site are equal."
-        )
-        action = "Check sign, unit and gain of its file. If supports move so: nothing."
+        near = f", about the ratio of {unit}" if unit and gain > 0.0 else ""
+        text = f"Where it is slow, the motion {motions[k].name} is {gain:.2g} times that of the other supports{near}."
+        action = "Check sign, unit and gain of its file: slow motions of one site are equal. If it moved so: nothing."
         found.append(Finding(kind, WRONG, text, action, {motions[k].name: gain}))
     return found
 
 
-def _where(names: Sequence[str], compared: Compared | Fit) -> str:
-    return f"{listed(list(names))}{f' ({compared.title})' if compared.title else ''}"
-
-
-def _of_a_fault(compared: Compared, fault: Fault, severity: str, band: tuple[float, float] | None = None) -> Finding:
-    """A fault in words, and the band [Hz] in which it was found; one that limits a fit was seen among draws alone."""
-    better = f"the error (RRMSE) is {percent(fault.after)} instead of {percent(fault.before)}"
-    better += "" if severity == WRONG else " for the best draw of the prior; the fit may make up for it"
-    if band is not None:
-        better += f" between {band[0]:.2g} and {band[1]:.2g} Hz, where parameters hardly change the response"
-    dimensions = sorted({each.dimension for each in compared.measurements.channels if each.name in fault.names})
-    near = [describe_unit(fault.value, each) for each in dimensions] if fault.kind == "factor" else []
-    units, several = " or ".join(filter(None, dict.fromkeys(near))), len(fault.names) > 1
-    words = {
-        "where": _where(fault.names, compared),
-        "better": better,
-        "which": "measurements" if several else "measurement",
-        "are": "are" if several else "is",
-        "value": abs(fault.value),
-        "late": "later" if fault.value > 0.0 else "earlier",
-        "what": "unit" if units else "gain",
-        "units": f", about the ratio of {units}" if units else "",
-        "support": " The clock of a support's recorder may be the wrong one as well." if compared.supports > 1 else "",
-    }
-    kind, text, action = FAULTS[fault.kind]
-    numbers = {"before": fault.before, "after": fault.after, fault.kind: fault.value}
-    return Finding(kind.format(**words), severity, text.format(**words), action, numbers)
-
-
-def _check_offset(compared: Compared) -> list[Finding]:
+def _check_offset(fit: Fit) -> list[Finding]:
     """Channels whose residuals are mostly a constant, a slope or a parabola: 3 / n of n independent samples."""
-    shares = {}
-    for channel, measured, response in zip(
-        compared.measurements.channels, compared.measurements.values, compared.responses[0], strict=True
-    ):
-        residuals = (measured - response)[np.isfinite(measured - response)]
-        if len(residuals) >= FEWEST and residuals.any():
-            smooth = np.polynomial.Legendre.fit(np.arange(len(residuals)), residuals, 2)(np.arange(len(residuals)))
-            shares[channel.name] = float(np.square(smooth).sum() / np.square(residuals).sum())
-    large = {name: share for name, share in shares.items() if share > HALF}
+    large = {}
+    for channel, values in zip(fit.measurements.channels, fit.residuals, strict=True):
+        left = values[np.isfinite(values)]
+        if len(left) >= FEWEST and left.any():
+            smooth = np.polynomial.Legendre.fit(np.arange(len(left)), left, 2)(np.arange(len(left)))
+            share = float(np.square(smooth).sum() / np.square(left).sum())
+            large |= {channel.name: share} if share > HALF else {}
     if not large:
         return []
     text = (
-        f"What the fit leaves of {_where(list(large), compared)} is mostly an offset or a drift: a parabola has "
-        f"{percent(max(large.values()))} of the power of the residuals. The noise takes it for scatter."
+        f"What the fit leaves of {fit.where(*large)} is mostly a parabola, with {percent(max(large.values()))} of the "
+        "power; the noise takes it for scatter."
     )
     action = "Correct the baseline of the measurement, or let the model have the residual displacement."
     return [Finding("A measurement may have an offset or a drift", CARE, text, action, large)]
 
 
-def _check_errors(compared: Sequence[Compared], unexplained: bool) -> list[Finding]:
-    """Channels that the fit, or the best draw of the prior, does not reproduce, where no fault explains it."""
-    found: list[Finding] = []
+def check_errors(fits: Sequence[Fit]) -> list[Finding]:
+    """Channels that the fit, or the best draw of the prior, does not reproduce.
+
+    Noise, white and normal, is in no model: a channel with more noise than signal is hardly reproduced.
+    """
     useless, poor, far = {}, {}, {}
-    for each in compared:
-        errors = np.nan_to_num(relative_errors(each.measurements.values - each.responses, each.measurements.values))
-        levels = np.exp(np.log(np.maximum(errors, 1e-3)).mean(axis=1))
-        closest = int(np.argmin(levels))
-        if each.fitted and levels[closest] < BETTER * levels[0] and (errors[0] > LARGE_ERROR).any():
-            text = (
-                f"Another response that was simulated fits much better{f' ({each.title})' if each.title else ''}: its "
-                f"error (RRMSE) is {percent(levels[closest])}, and {percent(levels[0])} at the fit (geometric means "
-                "of the channels)."
-            )
-            action = "The sampler or the search may have missed the best fit, or the noise prefers another one."
-            found.append(Finding("The fit is not the best one known", CARE, text, action))
-        for row, channel in enumerate(each.measurements.channels):
-            place, error = _where([channel.name], each), float(errors[0 if each.fitted else closest, row])
-            if not each.fitted:
-                far |= {place: error} if error > EXPLAINED else {}
-            elif error > LARGE_ERROR:
-                noise = _is_noise(each.measurements.values[[row]] - each.responses[0, [row]])
-                useless |= {place: error} if error**2 > HALF and not noise else {}
-                poor |= {place: error} if (error**2 > HALF) == noise else {}
-
-    def shown(errors: dict[str, float]) -> str:
-        return listed([f"{place} ({percent(error)})" for place, error in errors.items()])
-
-    action = "Check units, signs, clocks and the place of the sensor in the model; or the model lacks what moves it."
-    if useless and unexplained:
-        text = f"After the update, the model explains less than half of the power of {shown(useless)} (error, RRMSE)."
-        found.append(Finding("The model does not follow the measurements", WRONG, text, action, useless))
-    if poor and unexplained:
-        text = f"After the update, the relative error (RRMSE) is still large: {shown(poor)}."
-        found.append(Finding("A channel is hardly reproduced", CARE, text, action, poor))
-    if far and unexplained:
-        text = f"No draw of the prior comes near the measurements; the best one has an error (RRMSE) of {shown(far)}."
-        action = (
-            "Check the model and the priors. A model of your own must return SI units (m, m/s², N, Pa, rad), whatever "
-            "the units in [model.channels], and zero in [measurements] is the time at which the base motion begins."
-        )
-        found.append(Finding("The prior does not reach the measurements", CARE, text, action, far))
-    return found
+    for fit in fits:
+        errors = np.nan_to_num(relative_errors(fit.measurements.values - fit.responses, fit.measurements.values))
+        if not len(errors):
+            continue
+        best = 0 if fit.after is not None else int(np.argmin(np.log(np.maximum(errors, 1e-3)).sum(axis=1)))
+        for row, channel in enumerate(fit.measurements.channels):
+            error = {fit.where(channel.name): float(errors[best, row])}
+            if fit.after is None:
+                far |= error if errors[best, row] > EXPLAINED else {}
+            elif errors[best, row] > LARGE_ERROR:
+                checks = checks_of(fit.residuals[row])
+                noise = checks is None or min(checks.white[0], checks.normal[0]) > SMALL_PROBABILITY
+                useless |= error if errors[best, row] ** 2 > HALF and not noise else {}
+                poor |= error if (errors[best, row] ** 2 > HALF) == noise else {}
+    kinds = [
+        (
+            useless,
+            "The model does not follow the measurements",
+            "After the update, the model explains less than half of the power of {} (error, RRMSE).",
+            PLACES,
+        ),
+        (poor, "A channel is hardly reproduced", "After the update, the error (RRMSE) is still large: {}.", PLACES),
+        (
+            far,
+            "The prior does not reach the measurements",
+            "No draw of the prior comes near the measurements; the best one has an error (RRMSE) of {}.",
+            "Check model and priors. A model of your own must return SI units (m, m/s², N, Pa, rad), and zero in "
+            "[measurements] is the time at which the base motion begins.",
+        ),
+    ]
+    return [
+        Finding(kind, WRONG if errors is useless else CARE, text.format(_shares(errors)), action, errors)
+        for errors, kind, text, action in kinds
+        if errors
+    ]
 
 
-def _is_noise(residuals: np.ndarray) -> bool:
-    """Whether the residuals (1, n_samples) of a channel are white and normal, so that no model explains more."""
-    try:
-        checks = residual_checks(residuals)
-    except ValueError:  # hardly any sample
-        return True
-    return min(checks.white[0], checks.normal[0]) > SMALL_PROBABILITY
+def _shares(named: dict[str, float]) -> str:
+    return listed([f"{name} ({percent(share)})" for name, share in named.items()])
 
 
 def edges(rows: Sequence[ParameterRow]) -> dict[str, tuple[str, float, float]]:
@@ -285,75 +269,50 @@ def limits_of_model(
     return found
 
 
-def check_damping(model: Any, theta: np.ndarray, compared: Iterable[Compared]) -> list[Finding]:
+def check_damping(model: Any, theta: np.ndarray, fits: Iterable[Fit]) -> list[Finding]:
     """Damping ratios at the structural parameters (n_parameters,) that no structure has by itself.
 
-    Where gain and clock of every channel are known to be right, the ratio makes up for neither, and limits nothing.
+    Soil and abutments do radiate so much energy; where gain and clock of every channel are known to be right, the ratio
+    makes up for neither, and is no fault.
     """
     large = {}
     for name, value in zip(model.parameter_names, theta.tolist(), strict=False):
         own = 1.0 if hasattr(model, "supports") else getattr(model, "damping_ratio", None)
         ratio = value * getattr(model, "nominal", {}).get(name, np.nan if own is None else own)
-        if re.fullmatch(r"damping(_\d+)?", name) and ratio > LARGE_DAMPING:
-            large[name] = ratio
-    if not large:
+        large |= {name: ratio} if re.fullmatch(r"damping(_\d+)?", name) and ratio > LARGE_DAMPING else {}
+    fits = [each for each in fits if not each.modal]
+    if not large or all(len(each.slow) == len(each.channels) and not find_slow_faults(each.slow) for each in fits):
         return []
-    compared = [each for each in compared if not each.modal]
-    known = all(len(each.slow) == each.measurements.n_channels and not find_slow_faults(each.slow) for each in compared)
     text = f"The damping ratio of the fit is {listed([f'{ratio:.2g} ({name})' for name, ratio in large.items()])}."
-    if known:
-        text += " It does not make up for gains or clocks, which are right where parameters hardly change the response."
-        action = "Ask where the energy goes: soil and abutments radiate it, and other modes look like damping."
-        return [Finding("The damping is large", NOTE, text, action, large)]
     action = "Damping makes up for a gain, a clock or a sensor that was stuck. Look at the data and at the model."
     return [Finding("The damping is not plausible", WRONG, text, action, large)]
 
 
 def check_parameters(rows: Sequence[ParameterRow], limits: Container[str] = ()) -> list[Finding]:
-    """Parameters at bounds, far from their prior or not informed, and missed true values.
+    """Parameters at bounds, far from their prior or not informed.
 
     The bounds of the names in `limits` are limits of the model as well, and end a posterior rightly.
     """
     found = []
     far = {row.label: (row.mean - row.prior_mean) / row.prior_sd for row in rows}
     far = {name: distance for name, distance in far.items() if abs(distance) > SURE}
-    flat = [row for row in rows if row.sd > SAME_AS_PRIOR * row.prior_sd and row.label not in far]
+    flat = [row.label for row in rows if row.sd > SAME_AS_PRIOR * row.prior_sd and row.label not in far]
     at = [f"{label} at {bound:.4g}" for name, (label, bound, _) in edges(rows).items() if name not in limits]
     if at:
         text = f"The posterior reaches the edge of its prior: {listed(at)}. The bound, not the data, ends it there."
         action = "Widen the prior, and ask what the parameter makes up for in the model."
         found.append(Finding("At the edge of the prior", CARE, text, action))
     if flat:
-        names = listed([row.label for row in flat])
-        text = f"The posterior of {names} is nearly as wide as its prior: these data say little about it."
+        text = f"The posterior of {listed(flat)} is nearly as wide as its prior: these data say little about it."
         action = "Do not report it as identified. A stronger excitation or another sensor may inform it."
         found.append(Finding("Not informed by the data", NOTE, text, action))
     if far:
         text = (
-            f"The posterior mean of {listed(list(far))} is more than {SURE:.2g} standard deviations of the "
-            "prior away from the mean of the prior: prior and data disagree."
+            f"The mean of {listed(list(far))} is more than {SURE:.2g} prior standard deviations from the prior's mean."
         )
-        action = (
-            "Check the nominal value and the width of the prior; the parameter may make up for an error of the model."
-        )
+        action = "Check nominal value and prior; the parameter may make up for an error of the model."
         found.append(Finding("Far from the prior", CARE, text, action, far))
-    return found + _check_truth(rows)
-
-
-def _check_truth(rows: Sequence[ParameterRow]) -> list[Finding]:
-    """A finding if fewer true values are within their intervals than chance explains."""
-    known = [row for row in rows if np.isfinite(row.truth)]
-    outside = [row.label for row in known if not row.low <= row.truth <= row.high]
-    # probability that so many 90 % intervals or more miss, if they were independent
-    n, k = len(known), len(outside)
-    if not k or sum(comb(n, j) * 0.1**j * 0.9 ** (n - j) for j in range(k, n + 1)) >= SMALL_PROBABILITY:
-        return []
-    text = (
-        f"The true values of {listed(outside)} are outside of their 90 % intervals, {k} of {n}; about one in ten is "
-        "usual. The model that was updated is not the one that made the data."
-    )
-    action = "Expect the same of real data: intervals do not contain the error of the model. Try a finer model or step."
-    return [Finding("True values are missed", CARE, text, action)]
+    return found
 
 
 def check_other_events(rows: Sequence[ParameterRow]) -> list[Finding]:
@@ -364,66 +323,55 @@ def check_other_events(rows: Sequence[ParameterRow]) -> list[Finding]:
     if not factors:
         return []
     differing = [f"{row.label} by about {percent(sd)} (factor {factors[row.label]:.2g})" for row, sd in known]
-    text = (
-        "The standard deviations hold for this event. For another event of the same structure they are too small, "
-        f"because parameters differ between events: {listed(differing)}."
-    )
+    text = f"For another event the standard deviations are too small: parameters differ, {listed(differing)}."
     action = "Predict another event with this spread (in Python, predict_new_event), or calibrate several events."
     return [Finding("Another event differs", NOTE, text, action, factors)]
 
 
-def check_residuals(fits: Fits) -> list[Finding]:
+def check_residuals(fits: Iterable[Fit]) -> list[Finding]:
     """How much successive errors depend on each other, which widens standard deviations.
 
     Residuals of real measurements are always correlated, so that this alone limits no result.
     """
-    checked = [(fit, each) for fit in fits.fits for each in fit.channels if each.checks is not None]
-    coloured = [_where([each.channel.name], fit) for fit, each in checked if _is_coloured(each)]
+    checked = [(fit, each) for fit in fits for each in fit.channels if each.checks is not None]
+    coloured = [fit.where(each.channel.name) for fit, each in checked if each.checks.white[0] < SMALL_PROBABILITY]
     # the information of independent samples is proportional to their number
     assumed = sum(each.assumed for _, each in checked)
-    independent = [min(each.checks.n_effective[0], each.assumed) for _, each in checked if _is_coloured(each)]
-    worth = sum(independent) + sum(each.assumed for _, each in checked if not _is_coloured(each))
+    worth = sum(
+        min(each.checks.n_effective[0], each.assumed) if each.checks.white[0] < SMALL_PROBABILITY else each.assumed
+        for _, each in checked
+    )
     factor = float(np.sqrt(assumed / worth)) if coloured else 1.0
     if round(factor, 1) <= 1.0:
         return []
     text = (
-        f"The errors of {listed(coloured)} are correlated: the noise takes {assumed:.0f} samples for independent that "
-        f"are worth {worth:.0f}. Standard deviations from the data are too small by a factor of about {factor:.2g}."
+        f"The errors of {listed(coloured)} are correlated: {assumed:.0f} samples are worth {worth:.0f} independent "
+        f"ones, and standard deviations from the data are too small by a factor of about {factor:.2g}."
     )
     action = (
-        "Use the wider standard deviations. Compare with AutoregressiveNoise (in a TOML file: kind = "
-        '"autoregressive" in [noise]), with GaussianNoise with bands of frequency (groups = [1.0, 5.0]) or with '
-        "effective_samples=, and look at the residuals for an effect that the model lacks."
+        'Use the wider standard deviations, or AutoregressiveNoise (kind = "autoregressive" in [noise]), and look at '
+        "the residuals for an effect that the model lacks."
     )
     return [Finding(CORRELATED, NOTE, text, action, {"factor": factor})]
 
 
-def check_stated_errors(fits: Fits) -> list[Finding]:
+def check_stated_errors(fits: Iterable[Fit]) -> list[Finding]:
     """Whether data without time differ from the model by more than the standard deviations of their errors."""
     found = []
-    for fit in fits.fits:
+    for fit in fits:
         if fit.deviations is None or fit.residuals is None:
             continue
-        errors = fit.residuals / fit.deviations
-        square, n = float(np.nansum(np.square(errors))), int(np.isfinite(errors).sum())
-        if not chi2.sf(square, n) < SMALL_PROBABILITY:
-            continue
-        factor = float(np.sqrt(square / n))
-        text = (
-            f"The {n} values{f' of {fit.title}' if fit.title else ''} differ from the model by {factor:.2g} times the "
-            "standard deviations of their errors (root mean square). The model differs from the structure, a load case "
-            "or a sensor is another one, or the stated errors are too small: intervals of the parameters are too "
-            "narrow."
-        )
-        action = (
-            "Look at the values one by one. Leave out known errors, which then are parameters, or state larger ones."
-        )
-        found.append(Finding("Values differ more than their stated errors", CARE, text, action, {"factor": factor}))
+        squares = np.square(fit.residuals / fit.deviations)
+        square, n = float(np.nansum(squares)), int(np.isfinite(squares).sum())
+        if chi2.sf(square, n) < SMALL_PROBABILITY:
+            factor = float(np.sqrt(square / n))
+            text = (
+                f"The {n} values{f' of {fit.title}' if fit.title else ''} differ from the model by {factor:.2g} times "
+                "their stated errors (root mean square): intervals of the parameters are too narrow."
+            )
+            action = "Look for a wrong load case, sensor or value, and at the model. Or leave out known errors."
+            found.append(Finding("Values differ more than their stated errors", CARE, text, action, {"factor": factor}))
     return found
-
-
-def _is_coloured(each: ChannelFit) -> bool:
-    return each.checks.white[0] < SMALL_PROBABILITY
 
 
 def describe_residuals(checks: ResidualChecks) -> list[str]:
@@ -442,7 +390,6 @@ def describe_residuals(checks: ResidualChecks) -> list[str]:
 
 def residual_sentence(fit: Fit, each: ChannelFit) -> str:
     """What the residuals of one channel look like, in a sentence."""
-    where = _where([each.channel.name], fit)
     if each.checks is None:
-        return f"{where}: the residuals could not be checked (too few samples, or an exact fit)."
-    return f"{where}: {describe_residuals(each.checks)[0]}"
+        return f"{fit.where(each.channel.name)}: not checked (too few samples, or an exact fit)."
+    return f"{fit.where(each.channel.name)}: {describe_residuals(each.checks)[0]}"

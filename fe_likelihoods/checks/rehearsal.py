@@ -5,7 +5,6 @@ result. `check_model` simulates a few times what a run would simulate thousands 
 """
 
 from collections.abc import Mapping
-from contextlib import contextmanager
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -17,8 +16,9 @@ from ..emulation.target import ResponseTarget
 from ..likelihood.likelihood import FELikelihood
 from ..likelihood.posterior import Posterior
 from ..simulation.model import SimulationBatch, simulate_batch
+from .compared import compare, data_sets_of, draws_to_compare
 from .finding import CARE, WRONG, Finding, by_severity
-from .fit import check_responses, check_supports, compare, draws_to_compare
+from .fit import check_responses, check_supports
 from .screening import check_data, check_gaps
 from .steps import (
     NOTHING,
@@ -46,26 +46,6 @@ class ModelCheck(NamedTuple):
     seconds: float  # per simulation [s]
     searched: float  # simulations of a search for the best fit from one start; NaN without one
     best_fit: tuple[Posterior, Mode] | None = None  # of this search; None without a fit, or where data are wrong
-
-
-class _Stage:
-    """Runs, times and counts simulations of models other than the likelihood's."""
-
-    def __init__(self, bar: tqdm) -> None:
-        self.bar, self.made, self.seconds = bar, 0, np.inf
-
-    def count(self, n: int) -> None:
-        self.made += n
-        self.bar.update(n)
-
-    def simulate(self, model: Any, points: np.ndarray, pool: Any = None) -> SimulationBatch:
-        """Responses at points (n, n_parameters)."""
-        self.bar.total = max(self.bar.total or 0, self.bar.n + len(points))
-        start = perf_counter()
-        batch = simulate_batch(model, points, pool)
-        self.seconds = min(self.seconds, (perf_counter() - start) / len(points))  # the first one may compile
-        self.count(len(points))
-        return batch
 
 
 def check_model(posterior: Posterior, events: Mapping[str, Any] | None = None, *, progress: bool = False) -> ModelCheck:
@@ -98,42 +78,50 @@ def check_model(posterior: Posterior, events: Mapping[str, Any] | None = None, *
     >>> [finding.kind for finding in checked.findings if finding.severity == "wrong"]
     []
     """
-    found: list[Finding] = []
-    mean = posterior.prior.mean()
-    with tqdm(total=0, disable=not progress, unit="simulation", desc="check") as bar, _announced(posterior, bar):
-        stage, before = _Stage(bar), _made(posterior)
-        seconds, compared = 0.0, []
-        for key, (likelihood, columns) in zip(
-            posterior.likelihood.likelihoods, posterior.likelihood.parts(), strict=True
-        ):
-            theta = mean[columns][: len(likelihood.model.parameter_names)]
-            batch = likelihood.simulate(theta[None])
-            if batch.reasons[0]:
-                raise ValueError(
-                    f"the simulation at the mean of the prior has failed: {batch.reasons[0]}; check model and priors"
+    mean, found, fits, seconds, before = posterior.prior.mean(), list[Finding](), [], 0.0, _made(posterior)
+    with tqdm(disable=not progress, unit="simulation", desc="check") as bar:
+        posterior.when_simulated(bar.update)
+
+        def simulate(model: Any, points: np.ndarray, pool: Any = None) -> SimulationBatch:
+            batch = simulate_batch(model, points, pool)
+            bar.update(len(points))
+            nonlocal made
+            made += len(points)
+            return batch
+
+        made = 0
+        try:
+            for key, likelihood, columns in data_sets_of(posterior):
+                model, n = likelihood.model, len(likelihood.model.parameter_names)
+                theta = mean[columns][:n]
+                batch = likelihood.simulate(theta[None])
+                if batch.reasons[0]:
+                    raise ValueError(
+                        f"the simulation at the mean of the prior has failed: {batch.reasons[0]}; check model, priors"
+                    )
+                start = perf_counter()
+                again = simulate(model, theta[None])
+                took = perf_counter() - start
+                fits += compare(likelihood, draws_to_compare(posterior, took)[:, columns], key)[0]
+                # generators of workers have moved on meanwhile
+                chance = _check_chance(batch.response[0], again) or _check_chance(
+                    batch.response[0], simulate(model, np.tile(theta, (2, 1)), likelihood.simulator.pool)
                 )
-            stage.seconds = np.inf
-            chance = _check_chance(batch.response[0], stage.simulate(likelihood.model, theta[None]))
-            draws = draws_to_compare(posterior, stage.seconds)[:, columns]
-            compared += compare(likelihood, draws, False, key)
-            if not chance:  # generators of workers have moved on meanwhile
-                later = stage.simulate(likelihood.model, np.tile(theta, (2, 1)), likelihood.simulator.pool)
-                chance = _check_chance(batch.response[0], later)
-            # where responses differ by chance, other differences say nothing
-            found += chance or _check_motions(stage, likelihood.model, theta, batch.response[0], events or {})
-            found += check_supports(likelihood.model)
-            found += check_data(likelihood.measurements, motions_to_replace(likelihood.model))
-            found += check_gaps(likelihood.noise)
-            seconds += stage.seconds
-        best = _BestFit(StepTest([], {}))
-        if isinstance(posterior.likelihood, FELikelihood) and not any(each.severity == WRONG for each in found):
-            best = _check_best_fit(stage, posterior, seconds)
-        of_fit = check_responses(compared)
-        simulations = stage.made + _made(posterior) - before
+                # where responses differ by chance, other differences say nothing
+                found += chance or _check_motions(simulate, model, theta, batch.response[0], events or {})
+                found += check_supports(model) + list(check_data(likelihood.measurements, motions_to_replace(model)))
+                found += check_gaps(likelihood.noise)
+                seconds += took
+            best = _BestFit(StepTest([], {}))
+            if isinstance(posterior.likelihood, FELikelihood) and all(each.severity != WRONG for each in found):
+                best = _check_best_fit(simulate, posterior, seconds)
+            of_fit = check_responses(fits)
+        finally:
+            posterior.when_simulated(None)
     found += [*best.test.findings, *of_fit, *_check_failures(posterior)]
     # what the data tell is not known where they are wrong or out of reach
-    known = None if of_fit else best.found
-    return ModelCheck(by_severity(found), best.test.tests, simulations, seconds, best.searched, known)
+    known, made = None if of_fit else best.found, made + _made(posterior) - before
+    return ModelCheck(by_severity(found), best.test.tests, made, seconds, best.searched, known)
 
 
 def _made(posterior: Posterior) -> int:
@@ -154,21 +142,6 @@ def refuse_chance(posterior: Posterior) -> None:
                 raise ValueError(str(finding))
 
 
-@contextmanager
-def _announced(posterior: Posterior, bar: tqdm) -> Any:
-    """Count the simulations of the posterior in the bar."""
-
-    def update(n: float) -> None:
-        bar.total = max(bar.total or 0, bar.n + n)
-        bar.update(n)
-
-    posterior.when_simulated(update)
-    try:
-        yield
-    finally:
-        posterior.when_simulated(None)
-
-
 def _check_chance(response: np.ndarray, later: SimulationBatch) -> list[Finding]:
     """Whether later simulations of the same parameters give the same response."""
     text = ""
@@ -177,14 +150,8 @@ def _check_chance(response: np.ndarray, later: SimulationBatch) -> list[Finding]
         if reason:
             text = f"The first simulation at the mean of the prior succeeded, a later one failed: {reason}."
         elif share > NOTHING:
-            text = (
-                f"Two simulations of the same parameters differ by {100.0 * share:.2g} % of the response: the "
-                "likelihood of a point is another one each time, no sampler converges, and stored simulations are "
-                "refused."
-            )
-    action = (
-        "Set the seeds of the model, give each simulation a folder of its own, and read no results of earlier runs."
-    )
+            text = f"Two simulations of the same parameters differ by {100.0 * share:.2g} %: no sampler converges."
+    action = "Set the seeds of the model, give each simulation a folder of its own, read no results of earlier runs."
     return [Finding("The model is not repeatable", WRONG, text, action)] if text else []
 
 
@@ -200,23 +167,22 @@ def _check_failures(posterior: Posterior) -> list[Finding]:
 
 
 def _check_motions(
-    stage: _Stage, model: Any, theta: np.ndarray, response: np.ndarray, events: Mapping[str, Any]
+    simulate: Any, model: Any, theta: np.ndarray, response: np.ndarray, events: Mapping[str, Any]
 ) -> list[Finding]:
     """Whether the response follows the motion: twice the motion, and one other event; all are read in the same way."""
-    found = check_stronger_motion(model, theta, response, stage.simulate)
+    found = check_stronger_motion(model, theta, response, simulate)
     if not motions_to_replace(model) or any(each.severity == WRONG for each in found):
         return found
     for name, record in list(events.items())[:1]:
         other = model.with_record(record)
-        batch = stage.simulate(other, theta[None])
+        batch = simulate(other, theta[None])
         if batch.reasons[0]:
             text = f"Event {name}: the simulation at the mean of the prior fails: {batch.reasons[0]}."
             found.append(Finding("An event fails", CARE, text, "Check its motion and the steps of the model."))
         elif other.fingerprint != model.fingerprint:
             n = min(batch.response.shape[2], response.shape[1])
-            found += check_same_response(
-                relative_difference(batch.response[0][:, :n] - response[:, :n], response[:, :n]), name
-            )
+            change = relative_difference(batch.response[0][:, :n] - response[:, :n], response[:, :n])
+            found += check_same_response(change, name)
     return found
 
 
@@ -228,7 +194,7 @@ class _BestFit(NamedTuple):
     found: tuple[Posterior, Mode] | None = None
 
 
-def _check_best_fit(stage: _Stage, posterior: Posterior, seconds: float) -> _BestFit:
+def _check_best_fit(simulate: Any, posterior: Posterior, seconds: float) -> _BestFit:
     """The error of step and mesh at the best fit, where a search for it takes a minute at most."""
     n = len(posterior.likelihood.model.parameter_names)
     limit = min(MOST_SEARCHED, SECONDS / max(seconds, 1e-6))
@@ -245,6 +211,6 @@ def _check_best_fit(stage: _Stage, posterior: Posterior, seconds: float) -> _Bes
     mode = search.modes[0]
     factor = np.linalg.cholesky(mode.covariance)
     around = target.parameters(mode.coords + np.random.default_rng(1).standard_normal((400, len(factor))) @ factor.T)
-    test = halve_steps(posterior, mode.parameters, around.std(axis=0), stage.simulate)
+    test = halve_steps(posterior, mode.parameters, around.std(axis=0), simulate)
     # without convergence neither shares nor the cost of a search are known
     return _BestFit(test, search.simulations, (posterior, mode)) if mode.converged else _BestFit(test)

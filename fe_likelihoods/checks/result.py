@@ -10,7 +10,7 @@ from samplers.judgement.failures import check_failed_region
 from ..cache.simulation_cache import SimulationCache
 from ..signals.events import find_events
 from ..simulation.model import SimulationBatch, simulate_batch
-from .compared import Fits, fit_data_sets
+from .compared import Fits, data_sets_of, fit_data_sets
 from .failed_simulations import Failures, failures
 from .finding import CARE, NOTE, TAIL, WRONG, Finding, Judgement, judge
 from .fit import (
@@ -106,19 +106,19 @@ def check_run(
     found = _check_sampling(run) + _check_chain(run) + _check_failures(run, failed)
     for text in fits.failures:
         found.append(Finding("A response is missing", CARE, f"{text}.", "Use another point or mend the model."))
-    found += check_responses(fits.compared) + model.findings
+    found += check_responses(fits.fits) + model.findings
+    for likelihood, columns in [] if run.likelihood is None else run.likelihood.parts():
+        found += [] if run.is_inconclusive else check_damping(likelihood.model, run.centre[columns], fits.fits)
+        found += check_supports(likelihood.model)
+        found += check_data(likelihood.measurements, motions_to_replace(likelihood.model))
+        found += check_gaps(likelihood.noise) + _check_range(likelihood)
     if not run.is_inconclusive:
         known = run.likelihood is not None
         limits = limits_of_model(run.likelihood, run.parameters, rows, run.centre) if known else set()
         found += check_parameters(rows, limits)
-    for likelihood, columns in [] if run.likelihood is None else run.likelihood.parts():
-        found += [] if run.is_inconclusive else check_damping(likelihood.model, run.centre[columns], fits.compared)
-        found += check_supports(likelihood.model)
-        found += check_data(likelihood.measurements, motions_to_replace(likelihood.model))
-        found += check_gaps(likelihood.noise) + _check_range(likelihood)
-    if not run.is_inconclusive and all(each.severity != WRONG for each in found):  # a fault explains the residuals
-        found += check_residuals(fits) + check_stated_errors(fits)
-        found += check_other_events([row for row in rows if row.name in _of_one_event(run)])
+        if all(each.severity != WRONG for each in found):  # a fault explains the residuals
+            found += check_residuals(fits.fits) + check_stated_errors(fits.fits)
+            found += check_other_events([row for row in rows if row.name in _of_one_event(run)])
     unique = dict.fromkeys(found)  # data sets may share a description or a motion
     return judge(unique, (*_tests(run, fits, failed), *model.tests.items()))
 
@@ -135,19 +135,14 @@ def _tests(run: FinishedRun, fits: Fits, failed: Failures) -> list[tuple[str, st
     """Names of the tests of a run, and what was tested or why it was not."""
     checked = [each for fit in fits.fits for each in fit.channels if each.checks is not None]
     sampling = "by the sampler" if run.tempered else "the length of the chain alone: a Markov chain gives no verdict"
-    responses = max((len(each.modal.points if each.modal else each.responses) for each in fits.compared), default=0)
-    slow, unknown, timed = [], [], has_steps(run.likelihood)
-    for each in (each for each in fits.compared if each.is_history):
-        known = each.slow
-        for channel in each.measurements.channels:
-            where = f"{channel.name} ({each.title})" if each.title else channel.name
-            if channel.name in known:
-                slow.append(f"{where} ({known[channel.name].lowest:.2g} to {known[channel.name].highest:.2g} Hz)")
-            else:
-                unknown.append(where)
-    gains = [", ".join(slow)] if slow else []
-    gains += [f"not tested: {', '.join(unknown)}, which parameters or noise change everywhere"] if unknown else []
-    slow_band = ("Gains and clocks where parameters change nothing", "; ".join(gains) or "not tested: no response")
+    responses = max((len(each.modal.points if each.modal else each.responses) for each in fits.fits), default=0)
+    clocks = [
+        f"{fit.where(each.channel.name)} {'' if each.channel.name in fit.slow else 'not '}tested"
+        for fit in fits.fits
+        for each in fit.channels
+        if fit.is_history
+    ]
+    timed = has_steps(run.likelihood)
     return [
         ("Sampling", sampling),
         ("Failed simulations", f"not tested: {failed.unknown}" if failed.unknown else f"{failed.attempts} simulations"),
@@ -155,7 +150,7 @@ def _tests(run: FinishedRun, fits: Fits, failed: Failures) -> list[tuple[str, st
             f"Units, signs, {'clocks, ' if timed else ''}swapped channels",
             f"{responses} responses were compared" if responses else "not tested: there is no response to compare",
         ),
-        *([slow_band] if timed else []),
+        *([("Gains and clocks where parameters change nothing", "; ".join(clocks) or "not tested")] if timed else []),
         ("Residuals", f"channels: {len(checked)}" if checked else "not tested: there are none"),
     ]
 
@@ -169,7 +164,7 @@ def _check_model(run: FinishedRun) -> tuple[StepTest, int]:
     if run.likelihood is None or run.prior is None:
         return StepTest([], {}), 0
     known = {likelihood.model.fingerprint: likelihood for likelihood, _ in run.likelihood.parts()}
-    before, others = run.likelihood.simulations, 0
+    report, others = run.likelihood.report(), 0
 
     def simulate(model: Any, points: np.ndarray) -> SimulationBatch:
         nonlocal others
@@ -179,29 +174,25 @@ def _check_model(run: FinishedRun) -> tuple[StepTest, int]:
         return simulate_batch(model, points)
 
     unread, motion = [], "not tested: no model has a motion that can be replaced"
-    for likelihood, columns in run.likelihood.parts():
+    for _, likelihood, columns in data_sets_of(run):
         theta = run.centre[columns][: len(likelihood.model.parameter_names)]
         batch = likelihood.simulate(theta[None])
         if not batch.reasons[0] and motions_to_replace(likelihood.model):
             motion = "twice the motion was simulated"
             found = check_stronger_motion(likelihood.model, theta, batch.response[0], simulate)
             unread += [each for each in found if each.severity == WRONG]  # failures are said where they are predicted
-    test = StepTest([], {})
-    if not unread and not run.is_inconclusive:
-        test = _test_steps(run, simulate)
-    test = StepTest(unread + test.findings, {"Motion": motion} | test.tests if has_steps(run.likelihood) else {})
-    return test, run.likelihood.simulations - before + others
-
-
-def _test_steps(run: FinishedRun, simulate: Any) -> StepTest:
-    """The error of step and mesh, or why it was not tested."""
-    if run.n_modes > 1:
-        return not_tested(run.likelihood, "the samples have several modes, which have no common standard deviation")
-    needed, report = simulations_of_the_test(run.posterior), run.posterior.report()
+    test, needed = StepTest([], {}), simulations_of_the_test(run.posterior)
     seconds = report["seconds"] / max(report["simulations"], 1)
-    if needed > LARGEST_TEST * report["simulations"] and needed * seconds > TEST_SECONDS:
-        return not_tested(run.likelihood, f"the test takes {needed} simulations of {seconds:.2g} s")
-    return halve_steps(run.posterior, run.centre, run.samples.std(axis=0), simulate)
+    if unread or run.is_inconclusive:
+        pass
+    elif run.n_modes > 1:
+        test = not_tested(run.likelihood, "the samples have several modes, which have no common standard deviation")
+    elif needed > LARGEST_TEST * report["simulations"] and needed * seconds > TEST_SECONDS:
+        test = not_tested(run.likelihood, f"the test takes {needed} simulations of {seconds:.2g} s")
+    else:
+        test = halve_steps(run.posterior, run.centre, run.samples.std(axis=0), simulate)
+    tests = {"Motion": motion} | test.tests if has_steps(run.likelihood) else {}
+    return StepTest(unread + test.findings, tests), run.likelihood.simulations - report["simulations"] + others
 
 
 def _check_sampling(run: FinishedRun) -> list[Finding]:
@@ -220,39 +211,30 @@ def _check_sampling(run: FinishedRun) -> list[Finding]:
 
 def _check_chain(run: FinishedRun) -> list[Finding]:
     """Whether the samples are many enough, for a Markov chain too, and have one mode."""
-    found = [] if run.tempered else _check_markov_chain(run)
-    size = run.effective_sample_size
-    if not size >= FEW_SAMPLES:
+    found, n, size = list[Finding](), len(run.samples), run.effective_sample_size
+    if run.is_inconclusive and not run.tempered:
+        time = f"{run.autocorrelation_time:.0f} iterations" if np.isfinite(run.autocorrelation_time) else "not known"
         text = (
-            f"The {len(run.samples)} samples are worth about {size:.0f} independent ones: interval ends are rough, and "
-            f"standard deviations have an error of about {100.0 / np.sqrt(2.0 * max(size, 1.0)):.0f} %."
-        )
-        if not np.isfinite(size):
-            text = f"How many independent samples the {len(run.samples)} samples are worth is not known."
-        found.append(Finding("Few independent samples", CARE, text, "Make more iterations, or use more walkers."))
-    if run.n_modes > 1 and not run.is_inconclusive:
-        shares = ", ".join(f"{mode.share:.2f} ± {mode.share_error:.2g}" for mode in run.verdict.modes)
-        text = (
-            f"The posterior has {run.n_modes} separate regions, with shares {shares}. Mean and standard deviation "
-            "describe none of them, and the fit below is shown for the best sample."
-        )
-        action = "Look at the corner figure. Data of another kind, or a narrower prior, may tell the regions apart."
-        found.append(Finding("Several modes", CARE, text, action))
-    return found
-
-
-def _check_markov_chain(run: FinishedRun) -> list[Finding]:
-    iterations, time, found = run.sampler.iteration - run.discard, run.autocorrelation_time, []
-    if run.is_inconclusive:
-        known = f"its autocorrelation time is about {time:.0f} iterations"
-        if not np.isfinite(time):
-            known = "its autocorrelation time is not known"
-        text = (
-            f"The chain has {iterations} iterations, and {known}. A chain of fewer than 50 autocorrelation times gives "
-            "no reliable error, and may still be on its way to the posterior."
+            f"The chain has {run.sampler.iteration - run.discard} iterations, its autocorrelation time is {time}: with "
+            "fewer than 50 of these times it may still be on its way to the posterior."
         )
         action = "Continue it, or use SMCSampler for the same posterior."
         found.append(Finding("The chain is short", WRONG, text, action))
+    if not size >= FEW_SAMPLES:
+        text = f"How many independent samples the {n} samples are worth is not known."
+        if np.isfinite(size):
+            text = (
+                f"The {n} samples are worth about {size:.0f} independent ones: interval ends are rough, and standard "
+                f"deviations have an error of about {100.0 / np.sqrt(2.0 * max(size, 1.0)):.0f} %."
+            )
+        found.append(Finding("Few independent samples", CARE, text, "Make more iterations, or use more walkers."))
+    if run.n_modes > 1 and not run.is_inconclusive:
+        shares = ", ".join(f"{mode.share:.2f} ± {mode.share_error:.2g}" for mode in run.verdict.modes)
+        text = f"The posterior has {run.n_modes} regions (shares {shares}); mean and standard deviation describe none."
+        action = (
+            "See the corner figure; the fit is the best sample. Other data or a narrower prior may tell them apart."
+        )
+        found.append(Finding("Several modes", CARE, text, action))
     return found
 
 
@@ -265,10 +247,7 @@ def _check_failures(run: FinishedRun, failed: Failures) -> list[Finding]:
         f"{failed.count} of {failed.attempts} simulations failed ({100.0 * share:.2g} %). A failed simulation counts "
         "as impossible: the posterior has no samples there."
     )
-    action = (
-        "See the table of failures. If the parameters there are plausible, mend the model and run again; if they are "
-        "not, a narrower prior saves these simulations."
-    )
+    action = "See the table of failures: mend the model where its parameters are plausible, else narrow the prior."
     found = [Finding("Simulations failed", CARE if share > TAIL else NOTE, text, action, {"share": share})]
     said = run.verdict is not None and run.verdict.near_failures is not None
     return found if said or (run.is_inconclusive and not run.tempered) else found + check_failed_region(failed.near)
@@ -280,7 +259,6 @@ def _check_range(likelihood: Any) -> list[Finding]:
         return []
     text, cache = likelihood.model.range_remark, likelihood.simulator.cache
     text = text or (cache.look_up_remark(likelihood.model) if isinstance(cache, SimulationCache) else "")
-    if not text:
-        return []
     action = "See whether samples of the posterior are concerned, or only draws far from it."
-    return [Finding("Beyond the range of a law of the model", CARE, f"{text[0].upper()}{text[1:]}.", action)]
+    title = "Beyond the range of a law of the model"
+    return [Finding(title, CARE, f"{text[0].upper()}{text[1:]}.", action)] if text else []

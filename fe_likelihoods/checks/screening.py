@@ -69,7 +69,20 @@ def check_data(measurements: Measurements, record: Record | Sequence[Record] | N
     found += check_sensors(screen(measurements))
     for each in (part for motion in motions for part in getattr(motion, "records", (motion,))):
         found += check_sensors(screen_motion(each))
-    found += _check_silence(measurements) + _note_synthetic(measurements.description)
+    silent = []  # of data without time, zeros alone
+    for channel, values in zip(measurements.channels, measurements.values, strict=True):
+        known = values[np.isfinite(values)]
+        equal = len(known) > 1 and np.ptp(known) == 0.0
+        silent += [channel.name] if equal and (measurements.is_history or known[0] == 0.0) else []
+    if silent:
+        text, action = (
+            f"All samples of {', '.join(silent)} are equal.",
+            "Leave the channel out, or read another column.",
+        )
+        found.append(Finding("A sensor was silent", CARE, text, action))
+    if "synthetic" in measurements.description.lower():
+        text = "The measurements were computed with a model, not measured."
+        found.append(Finding("Synthetic data", NOTE, text, "Say so wherever you show the numbers."))
     return by_severity(found)
 
 
@@ -193,68 +206,41 @@ def _check_size(name: str, kind: str, peak: float) -> list[Finding]:
     return [Finding("A size is not plausible", CARE, text, action, {"peak": peak})]
 
 
-def _check_silence(measurements: Measurements) -> list[Finding]:
-    """Channels whose samples are all equal; of data without time, whose samples are all zero."""
-    silent = []
-    for channel, values in zip(measurements.channels, measurements.values, strict=True):
-        known = values[np.isfinite(values)]
-        equal = len(known) > 1 and np.ptp(known) == 0.0
-        silent += [channel.name] if equal and (measurements.is_history or known[0] == 0.0) else []
-    if not silent:
-        return []
-    text = f"All samples of {', '.join(silent)} are equal."
-    return [Finding("A sensor was silent", CARE, text, "Leave the channel out, or read another column.")]
-
-
-def _note_synthetic(description: str) -> list[Finding]:
-    """Data that were computed, by their description."""
-    if "synthetic" not in description.lower():
-        return []
-    text = "The measurements were computed with a model, not measured. The result shows how the method works."
-    return [Finding("Synthetic data", NOTE, text, "Say so wherever you show the numbers.")]
-
-
 def check_gaps(noise: Any) -> list[Finding]:
     """Gaps in the measurements of a noise whose shares refer to the level of the measured part of a motion."""
     shares = noise.gap_shares() if hasattr(noise, "gap_shares") else {}
     large = {name: share for name, share in shares.items() if share > TAIL}
-    if not large:
-        return []
     text = (
-        f"Samples are missing within the channels {', '.join(f'{name} ({share:.0%})' for name, share in large.items())}"
-        f". The share of {noise.title} refers to the mean square of the other samples. If the strong part of the "
-        "motion is missing, the share is too large and predictions of whole motions too wide."
+        f"Samples are missing in {', '.join(f'{name} ({share:.0%})' for name, share in large.items())}: the share of "
+        f"{noise.title if large else ''} refers to the others, and is too large if the strong part is missing."
     )
-    return [Finding("Gaps in the data", CARE, text, "Use local=1, whose level is taken from samples near by.", large)]
+    action = "Use local=1, whose level is taken from samples near by."
+    return [Finding("Gaps in the data", CARE, text, action, large)] if large else []
 
 
 def check_noise_prior(channel: str, unit: str, expected: float, largest: float) -> list[Finding]:
     """Whether the noise that a prior expects exceeds every measured value of a channel [SI]."""
-    if not expected > largest:
-        return []
     text = f"The prior expects a noise that is larger than every measured value of {channel}."
     action = f'A number without a unit is in SI units; give one, such as "half-normal(5 {unit})".'
-    return [Finding("A prior of the noise is large", CARE, text, action, {"ratio": expected / largest})]
+    numbers = {"ratio": expected / largest if largest else np.inf}
+    return [Finding("A prior of the noise is large", CARE, text, action, numbers)] if expected > largest else []
 
 
 def check_steps_of_mass(names: Sequence[str], step: float) -> list[Finding]:
     """Accelerations below the top of a column, whose own mass vibrates above 20 Hz, by integration steps [s]."""
-    if not names or step <= SHORT_STEP:
-        return []
     text = (
         f"{', '.join(names)}: accelerations below the top contain vibrations above 20 Hz, which a step of {step:.2g} s "
         "does not resolve (with 1/256 s, they are wrong by 48 %)."
     )
     action = f"Give substeps= so that a step is {SHORT_STEP:.2g} s or shorter, and compare different n_elements."
-    return [Finding("The steps are long for an acceleration", CARE, text, action, {"step": step})]
+    long = bool(names) and step > SHORT_STEP
+    return [Finding("The steps are long for an acceleration", CARE, text, action, {"step": step})] if long else []
 
 
 def check_phases(scatter: np.ndarray) -> list[Finding]:
     """Whether complex mode shapes are real up to a factor, by the scatter of the phases of each (m,) [deg]."""
-    modes = np.flatnonzero(np.asarray(scatter) > REAL_PHASES)
-    if not len(modes):
-        return []
-    found = ", ".join(f"{scatter[mode]:.0f} degrees (shape {mode + 1})" for mode in modes)
-    text = f"The phases of complex mode shapes scatter by {found}; their real parts are taken."
+    found = {f"shape {k + 1}": float(each) for k, each in enumerate(scatter) if each > REAL_PHASES}
+    shown = ", ".join(f"{each:.0f} degrees ({name})" for name, each in found.items())
+    text = f"The phases of complex mode shapes scatter by {shown}; their real parts are taken."
     action = "Identify these modes again, or leave their shapes out: dampers or noise make shapes complex."
-    return [Finding("Mode shapes are complex", CARE, text, action, {"degrees": float(np.max(scatter))})]
+    return [Finding("Mode shapes are complex", CARE, text, action, found)] if found else []

@@ -6,11 +6,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ..likelihood.parameters import Parameter
-from ..priors.distributions import Distribution, HalfNormal, LogNormal, TruncatedNormal, Uniform
 from ..priors.priors import Prior
 from .run import FinishedRun
 
-__all__ = ["Moments", "ParameterRow", "describe_prior", "moments_of", "parameter_rows", "rows_of"]
+__all__ = ["Moments", "ParameterRow", "moments_of", "parameter_rows", "rows_of"]
 
 
 class Moments(NamedTuple):
@@ -83,61 +82,27 @@ def parameter_rows(run: FinishedRun) -> list[ParameterRow]:
 
 
 def rows_of(
-    parameters: Sequence[Parameter],
-    prior: Prior | None,
-    moments: Moments,
-    truth: np.ndarray,
+    parameters: Sequence[Parameter], prior: Prior | None, moments: Moments, truth: np.ndarray
 ) -> list[ParameterRow]:
     """One row for each parameter; errors of the means and true values (ndim,) may be NaN."""
     mean, mean_error, sd, _, low, _, high = moments
     rows, known = [], [] if prior is None else prior.table()[1]
     for i, parameter in enumerate(parameters):
-        text, of_prior, bounds = "", (np.nan, np.nan), (-np.inf, np.inf)
-        if prior is not None:
-            text = _words_of(prior, parameter.name, parameter.factor)
-            of_prior, bounds = known[i][2:4], known[i][4:6]
-        numbers = mean[i], mean_error[i], sd[i]
-        shown = [float(each) for each in parameter.shown([*of_prior, *numbers])]
-        others = [float(each) for each in parameter.shown([low[i], high[i], parameter.nominal, truth[i], *bounds])]
+        family, *of_prior = ("", np.nan, np.nan, -np.inf, np.inf) if prior is None else known[i][1:]
+        prior_mean, prior_sd, lower, upper = (float(each) for each in parameter.shown(of_prior))
+        numbers = parameter.shown([mean[i], mean_error[i], sd[i], low[i], high[i], parameter.nominal, truth[i]])
+        *of_posterior, lowest, highest, nominal, true = (float(each) for each in numbers)
         cv = float(sd[i] / abs(mean[i])) if mean[i] else np.nan
         unit = parameter.label.removeprefix(parameter.name).strip()
-        rows.append(ParameterRow(parameter.name, parameter.label, unit, text, *shown, cv, *others))
+        text = (
+            f"{family.split('(')[0]}, mean {prior_mean:.4g}, sd {prior_sd:.4g}{_limits(lower, upper)}" if family else ""
+        )
+        shown = text, prior_mean, prior_sd, *of_posterior, cv, lowest, highest, nominal, true, lower, upper
+        rows.append(ParameterRow(parameter.name, parameter.label, unit, *shown))
     return rows
 
 
-def _words_of(prior: Prior, name: str, factor: float) -> str:
-    for key, distribution in prior.distributions.items():
-        if key == name:
-            return describe_prior(distribution, factor)
-        if isinstance(key, tuple) and name in key:
-            return f"{type(distribution).__name__}, jointly with {', '.join(other for other in key if other != name)}"
-    return ""
-
-
-def describe_prior(distribution: Distribution, factor: float = 1.0) -> str:
-    """A distribution in words: "normal (1, 0.25), above 0"; `factor` is the text's unit in the distribution's unit."""
-    if isinstance(distribution, TruncatedNormal):
-        text = f"normal, mean {distribution.mean / factor:.4g}, sd {distribution.sd / factor:.4g}"
-        return text + _limits(distribution, factor)
-    if isinstance(distribution, HalfNormal):
-        return f"half-normal, scale {distribution.sd / factor:.4g}"
-    if isinstance(distribution, Uniform):
-        return f"uniform from {distribution.low / factor:.4g} to {distribution.high / factor:.4g}"
-    if isinstance(distribution, LogNormal):
-        return f"lognormal, median {distribution.median / factor:.4g}, sd of the logarithm {distribution.log_sd:.3g}"
-    mean, sd = distribution.moments
-    return f"{_name(distribution)}, mean {mean / factor:.4g}, sd {sd / factor:.4g}" + _limits(distribution, factor)
-
-
-def _name(distribution: Distribution) -> str:
-    frozen = getattr(distribution, "frozen", None)
-    return type(distribution).__name__ if frozen is None else f"{frozen.dist.name} (scipy)"
-
-
-def _limits(distribution: Distribution, factor: float) -> str:
-    lower, upper = (bound / factor for bound in distribution.bounds)
+def _limits(lower: float, upper: float) -> str:
     if np.isfinite(lower) and np.isfinite(upper):
-        return f", between {lower:.4g} and {upper:.4g}"
-    if np.isfinite(lower):
-        return f", above {lower:.4g}"
-    return f", below {upper:.4g}" if np.isfinite(upper) else ""
+        return f", from {lower:.4g} to {upper:.4g}"
+    return f", above {lower:.4g}" if np.isfinite(lower) else f", below {upper:.4g}" if np.isfinite(upper) else ""

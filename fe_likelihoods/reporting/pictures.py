@@ -113,11 +113,12 @@ def draw_posterior(run: FinishedRun) -> list[Picture]:
     ]
 
 
-def draw_fit(fit: Fit) -> list[Picture]:
-    """Measured and computed histories, points or modes, before and after the update."""
+def draw_fit(fit: Fit, before: str, after: str) -> list[Picture]:
+    """Measured and computed histories, points or modes, before and after the update, which have these names."""
     if fit.modal is not None:
         return _draw_modes(fit)
-    if not fit.responses:
+    responses = {name: each for name, each in ((before, fit.before), (after, fit.after)) if each is not None}
+    if not responses:
         return []
     if not fit.measurements.is_history:
         return [
@@ -126,7 +127,7 @@ def draw_fit(fit: Fit) -> list[Picture]:
                 "After the update, about two of three measured values should be within their standard deviations of "
                 "the computed ones.",
                 f"Values of {', '.join(channel.name for channel in fit.measurements.channels)}.",
-                lambda: plot_points(fit.measurements, fit.responses, fit.deviations),
+                lambda: plot_points(fit.measurements, responses, fit.deviations),
             )
         ]
     return [
@@ -135,8 +136,8 @@ def draw_fit(fit: Fit) -> list[Picture]:
             "After the update, the two lines should lie on one another at the strong peaks. RRMSE "
             "is the relative root mean square error: 0 for a perfect fit, 100 % for a response of zero.",
             f"Histories of {', '.join(channel.name for channel in fit.measurements.channels)}, "
-            f"{' and '.join(fit.responses)}.",
-            lambda: plot_fit(fit.measurements, fit.responses),
+            f"{' and '.join(responses)}.",
+            lambda: plot_fit(fit.measurements, responses),
         )
     ]
 

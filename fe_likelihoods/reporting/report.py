@@ -222,7 +222,9 @@ def gather(
         fits=fits,
         told=_told(run),
         posterior_pictures=draw_posterior(run),
-        fit_pictures=[(fit.title, [*draw_fit(fit), *draw_residuals(fit)]) for fit in fits.fits],
+        fit_pictures=[
+            (fit.title, [*draw_fit(fit, fits.before, fits.after), *draw_residuals(fit)]) for fit in fits.fits
+        ],
         run_pictures=draw_run(run),
         predictions=[_predicted(name, *each) for name, each in predictions.items()],
         events=list(events),

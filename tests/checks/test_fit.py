@@ -23,8 +23,6 @@ from fe_likelihoods import (
     Uniform,
     check_fit,
 )
-from fe_likelihoods.checks.compared import compare, draws_to_compare
-from fe_likelihoods.checks.fit import check_responses
 from fe_likelihoods.problems import table_motion
 from samplers import SMCSampler
 
@@ -106,34 +104,6 @@ def test_the_fault_of_one_event_is_named_with_it():
     prior |= {name: HalfNormal(1.0) for name in likelihood.noise.parameter_names}
     (found,) = check_fit(Posterior(likelihood, prior))
     assert "(EQ2)" in found.text and " m and mm" in found.text
-
-
-def test_a_fit_that_another_response_beats_is_named():
-    posterior = Posterior(FELikelihood(LinearOscillator(MOTION), _oscillation()), _prior())
-    points = draws_to_compare(posterior)[:20]
-    good = np.array([1.05, 1.0, *points[0, 2:]])
-    (compared,) = compare(posterior.likelihood, np.stack([good, *points]), True)
-    assert check_responses([compared]) == []
-    poor = np.array([1.9, 0.4, *points[0, 2:]])
-    (compared,) = compare(posterior.likelihood, np.stack([poor, good, *points]), True)
-    found = {each.kind: each for each in check_responses([compared])}
-    assert "its error (RRMSE) is 5" in found["The fit is not the best one known"].text
-    assert "The model does not follow the measurements" in found and not {
-        "A unit may be wrong",
-        "Clocks may differ",
-    } & {*found}
-
-
-def _oscillation():
-    model = LinearOscillator(MOTION)
-    response = model.simulate([1.05, 1.0])
-    noise = np.random.default_rng(2).standard_normal(response.shape)
-    return Measurements(model.channels, model.dt, response + 0.05 * response.std(axis=1, keepdims=True) * noise)
-
-
-def _prior():
-    known = {name: TruncatedNormal(1.0, 0.3) for name in ("stiffness", "damping")}
-    return known | {name: HalfNormal(1.0) for name in ("sigma_acceleration", "sigma_displacement")}
 
 
 @pytest.mark.slow

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import Channel, Measurements
-from fe_likelihoods.checks.compared import ChannelFit, Compared, Fit, Fits
+from fe_likelihoods.checks.compared import Fit
 from fe_likelihoods.checks.finding import judge
 from fe_likelihoods.checks.fit import check_other_events, check_residuals, check_responses, describe_residuals
 from fe_likelihoods.checks.table import ParameterRow
@@ -16,7 +16,8 @@ OSCILLATION = 0.05 * np.exp(-0.1 * TIME) * np.cos(6.5 * TIME)
 
 def compared(values, responses, fitted=True):
     measured = Measurements(TOP, 0.02, np.atleast_2d(values))
-    return Compared("", measured, np.array(responses)[:, None], fitted)
+    responses = np.array(responses)[:, None]
+    return Fit("", measured, responses[1:], responses[0]) if fitted else Fit("", measured, responses)
 
 
 def kinds(found):
@@ -52,9 +53,11 @@ def test_a_fault_that_draws_show_before_a_run_is_named_after_it():
 
 
 def fits_of(errors, assumed=None):
-    checks = residual_checks(errors[None])
-    channel = ChannelFit(TOP[0], errors.size, 0.5, 0.1, checks, float(errors.size if assumed is None else assumed))
-    return Fits((Fit("", Measurements(TOP, 0.02, errors[None]), {}, errors[None], (channel,)),), "", "", 0, ())
+    counts = None if assumed is None else np.array([assumed])
+    measured = Measurements(TOP, 0.02, errors[None])
+    return [
+        Fit("", measured, np.empty((0, *errors[None].shape)), 0.0 * errors[None], white=errors[None], assumed=counts)
+    ]
 
 
 def test_correlated_errors_are_a_note_with_the_factor_in_the_first_sentence(rng):

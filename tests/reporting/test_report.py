@@ -110,7 +110,7 @@ def test_the_table_has_every_parameter_in_the_units_of_a_reader(page, vibrating)
     rows = {row[0]: row for row in page.tables[0][1:]}
     assert list(rows) == [ODD, "damping", "sigma_top [mm]"]
     name, prior, mean, mean_error, sd, cv, interval, nominal, truth = rows["sigma_top [mm]"]
-    assert prior == "half-normal, scale 10" and truth == "2" and nominal == "–"
+    assert prior == "HalfNormal, mean 7.979, sd 6.028, above 0" and truth == "2" and nominal == "–"
     assert float(mean) == pytest.approx(1e3 * samples[:, 2].mean(), rel=1e-3)
     assert float(mean_error) == pytest.approx(1e3 * error[2], rel=0.1)
     assert float(sd) == pytest.approx(1e3 * samples[:, 2].std(), rel=1e-2)
@@ -156,12 +156,12 @@ def test_the_fit_is_that_of_the_posterior_mean_and_its_simulations_are_counted(v
     fits = fit_data_sets(read_run(sampler, posterior))
     assert fits.simulations == posterior.report()["simulations"] > 2  # before, after, draws of the prior
     centre = sampler.get_chain(flat=True).mean(axis=0)
-    median = posterior.prior_transform(np.full(3, 0.5))  # a function has no nominal values
+    mean = posterior.prior.mean()  # a function has no nominal values
     measured = posterior.likelihood.measurements.values
-    for point, error in ((median, fits.fits[0].channels[0].before), (centre, fits.fits[0].channels[0].after)):
+    for point, error in ((mean, fits.fits[0].channels[0].before), (centre, fits.fits[0].channels[0].after)):
         residuals = posterior.likelihood.residuals(point)
         assert error == pytest.approx(np.sqrt(np.square(residuals).sum() / np.square(measured).sum()), rel=1e-12)
-    np.testing.assert_array_equal(fits.fits[0].residuals, posterior.likelihood.residuals(centre))
+    np.testing.assert_allclose(fits.fits[0].residuals, posterior.likelihood.residuals(centre), atol=1e-15)
     assert fit_data_sets(read_run(sampler, posterior)).simulations == 0
 
 
@@ -184,10 +184,10 @@ def test_correlated_errors_and_edges_are_named():
 def test_a_sensor_with_the_opposite_sign_is_named(vibrating):
     finished = read_run(*vibrating)
     rows, fits = parameter_rows(finished), fit_data_sets(finished)
-    (one,) = fits.compared
-    turned = fits._replace(compared=(replace(one, responses=-one.responses),))
+    (one,) = fits.fits
+    turned = fits._replace(fits=(replace(one, after=-one.after, draws=-one.draws),))
     notes = {n.kind: n for n in check_run(finished, rows, turned, Failures((), 0, 1)).findings}
-    assert "opposite signs: top" in notes["A sign may be wrong"].text
+    assert notes["A sign may be wrong"].text.startswith("top: measurements and response have opposite signs")
     assert "The model does not follow the measurements" not in notes  # the sign explains it
     quiet = {n.kind for n in check_run(finished, rows, fits, Failures((), 0, 1)).findings}
     assert not quiet & {"A sign may be wrong", "The model does not follow the measurements"}
@@ -198,12 +198,6 @@ def test_parameters_that_the_data_leave_alone_and_those_that_they_move_far_are_n
     finished = read_run(sampler, posterior)
     rows = parameter_rows(finished)
     fits = fit_data_sets(finished)
-    assert "True values are missed" not in {
-        n.kind for n in check_run(finished, rows, fits, Failures((), 0, 1)).findings
-    }
-    missed = [row._replace(truth=row.high + row.sd) for row in rows]
-    notes = {note.kind: note for note in check_run(finished, missed, fits, Failures((), 0, 1)).findings}
-    assert "sigma_top [mm]" in notes["True values are missed"].text
     known = {note.kind for note in check_run(finished, rows, fits, Failures((), 0, 1)).findings}
     for title, shift in (("Not informed by the data", 0.0), ("Far from the prior", 4.0)):
         moved = [row._replace(prior_mean=row.mean - shift * row.sd, prior_sd=1.01 * row.sd) for row in rows]
@@ -295,7 +289,7 @@ def test_the_most_severe_finding_decides_and_is_the_first_sentence(page, vibrati
     assert judge([remark, wrong, care]).findings == (wrong, care, remark)
     sampler, posterior = vibrating
     judgement = check_result(sampler, posterior)
-    assert {finding.kind for finding in judgement.findings} >= set(page.notes) - {"True values are missed"}
+    assert {finding.kind for finding in judgement.findings} >= set(page.notes)
     assert str(judgement) in page.text and judgement.status in page.text
     (other,) = (each for each in judgement.findings if each.kind == "Another event differs")
-    assert other.numbers["damping"] > 1.0 and "For another event of the same structure" in page.text
+    assert other.numbers["damping"] > 1.0 and "For another event the standard deviations are too small" in page.text
