@@ -92,7 +92,9 @@ class Fit:
 
     @cached_property
     def channels(self) -> tuple[ChannelFit, ...]:
-        """The table of the fit."""
+        """The table of the fit; none of modes."""
+        if self.modal is not None:
+            return ()
         measured, none = self.measurements.values, np.full(self.measurements.n_channels, np.nan)
         counts = np.isfinite(measured).sum(axis=1)
         assumed = counts if self.assumed is None else np.minimum(counts, self.assumed)

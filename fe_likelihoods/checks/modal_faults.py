@@ -13,6 +13,7 @@ from scipy.stats import chi2
 from ..text_tables import listed
 from .data_faults import FACTOR, SAME_UNITS
 from .finding import CARE, HALF, SMALL_PROBABILITY, TAIL, WRONG, Finding
+from .slow_motion import FEWEST_DRAWS
 
 __all__ = ["check_modes"]
 
@@ -46,16 +47,14 @@ def _check_errors(fit: Any) -> list[Finding]:
     deviations = np.repeat(np.concatenate(noise.deviations(np.zeros((1, 0))), axis=1), noise.n_sets, axis=1)
     squares = sums[:, len(noise.channels) :] / np.square(deviations)
     least, data = float(np.nanmin(squares.sum(axis=1))), sum(noise.counts) + sum(noise.freedoms)
-    if not chi2.sf(least, data) < SMALL_PROBABILITY:
-        return []
     factor = float(np.sqrt(least / data))
     text = (
-        f"At the best sample, the errors of frequencies and shapes are {factor:.2g} times the stated standard "
-        "deviations (root mean square). The model differs from the structure, a mode is wrongly identified, or the "
-        "stated errors are too small: intervals of the parameters are too narrow."
+        f"At the best sample, frequencies and shapes differ from the model by {factor:.2g} times their stated errors "
+        "(root mean square): intervals of the parameters are too narrow."
     )
-    action = 'Add an unknown error, frequency_error="common" and shape_error="common", or state larger ones.'
-    return [Finding("Modes differ more than their stated errors", CARE, text, action, {"factor": factor})]
+    action = 'Add an unknown error, frequency_error="common" and shape_error="common"; or look for a wrong mode.'
+    found = [Finding("Modes differ more than their stated errors", CARE, text, action, {"factor": factor})]
+    return found if chi2.sf(least, data) < SMALL_PROBABILITY else []
 
 
 def _number(modes: Any, k: int) -> str:
@@ -71,28 +70,24 @@ def _check_frequencies(draws: Any, severity: str) -> list[Finding]:
     common, median = logs.mean(axis=1), float(np.median(logs))
     numbers = {"factor": float(np.exp(median))}
     if np.abs(common).min() > np.log(FACTOR) and len(set(np.sign(common))) == 1:
-        which = "measured" if median > 0.0 else "computed"
-        units = {  # square roots of factors of stiffness or mass, besides those of frequencies
+        ratios = {  # square roots of factors of stiffness or mass, besides those of frequencies
             2.0 * np.pi: "rad/s instead of Hz",
             60.0: "1/min instead of Hz",
             1000.0**0.5: "a stiffness in kN instead of N, or a mass in t instead of kg",
             9.81**0.5: "a weight instead of a mass",
         }
-        near = [text for factor, text in units.items() if abs(abs(median) - np.log(factor)) < np.log(SAME_UNITS)]
-        text = (
-            f"The {which} frequencies are about {np.exp(abs(median)):.3g} times the others"
-            f"{f', as with {near[0]}' if near else ''}."
-        )
+        near = [f", as with {each}" for r, each in ratios.items() if abs(abs(median) - np.log(r)) < np.log(SAME_UNITS)]
+        which, factor = "measured" if median > 0.0 else "computed", np.exp(abs(median))
+        text = f"The {which} frequencies are about {factor:.3g} times the others{''.join(near[:1])}."
         action = "Check the unit of the measured frequencies, and the units of stiffness and mass in the model (SI)."
         return [Finding("A unit may be wrong", severity, text, action, numbers)]
     # further from the nearest draw than all draws are from each other
     outside = np.flatnonzero(np.maximum(logs.min(axis=0), -logs.max(axis=0)) > np.ptp(logs, axis=0))
-    if not len(outside) or len(logs) < 5:
+    if not len(outside) or len(logs) < FEWEST_DRAWS:
         return []
     shown = [
-        f"{_number(draws, resemble[k])}, computed {draws.frequencies[:, resemble[k]].min():.4g} to "
-        f"{draws.frequencies[:, resemble[k]].max():.4g} Hz"
-        for k in outside
+        f"{_number(draws, k)}, computed {draws.frequencies[:, k].min():.4g} to {draws.frequencies[:, k].max():.4g} Hz"
+        for k in resemble[outside]
     ]
     text = f"No draw of the prior comes near the measured frequency of mode {listed(shown)}."
     action = "Check masses, boundary conditions and priors of the model, and the numbers of the modes."
@@ -105,44 +100,36 @@ def _check_sensors(modes: Any) -> list[Finding]:
     if n < 3 or not data.has_shape.any():
         return []
     rows = np.unique(np.linspace(0, len(modes.computed) - 1, MOST_DRAWS).astype(int))
-    few = modes.of(modes.paired, modes.computed[rows])
+    few, every = modes.of(modes.paired, modes.computed[rows]), np.arange(n)
 
-    def best(each: Any) -> float:
-        return float(np.nanmean(each.assurance, axis=1).max())
+    def best(shapes: np.ndarray) -> float:
+        return float(np.nanmean(few.against(replace(data, shapes=shapes)).assurance, axis=1).max())
 
-    before = best(few)
+    before = best(data.shapes)
     if before > POOR:
         return []
-    faults = {}
-    for j in range(n):
-        signs = np.where(np.arange(n) == j, -1.0, 1.0)
-        faults[f"the sensor {data.sensors[j]} counts the other way round"] = data.shapes * signs
+    faults = {
+        f"the sensor {data.sensors[j]} counts the other way round": data.shapes * np.where(every == j, -1.0, 1.0)
+        for j in every
+    }
     for i, j in combinations(range(n), 2):
-        order = np.arange(n)
-        order[[i, j]] = j, i
+        order = np.where(every == i, j, np.where(every == j, i, every))
         faults[f"the sensors {data.sensors[i]} and {data.sensors[j]} are exchanged"] = data.shapes[:, :, order]
-    found = {text: best(few.against(replace(data, shapes=shapes))) for text, shapes in faults.items()}
-    text, after = max(found.items(), key=lambda each: each[1])
-    if not 1.0 - after < MENDED * (1.0 - before):
-        return []
+    text, after = max(((text, best(shapes)) for text, shapes in faults.items()), key=lambda each: each[1])
     said = f"If {text}, the mean MAC of the best sample is {after:.2f} instead of {before:.2f}."
     action = "Check the directions, places and names of sensors, and the rows or channels of the model."
-    return [Finding("A sensor may be reversed or exchanged", WRONG, said, action, {"before": before, "after": after})]
+    numbers = {"before": before, "after": after}
+    found = [Finding("A sensor may be reversed or exchanged", WRONG, said, action, numbers)]
+    return found if 1.0 - after < MENDED * (1.0 - before) else []
 
 
 def _check_shapes(modes: Any) -> list[Finding]:
     """Measured modes that no computed one resembles."""
-    found, resembling = [], np.median(modes.assurance, axis=0)
+    found, resembling, numbers = [], np.median(modes.assurance, axis=0), modes.data.mode_numbers
     for k in np.flatnonzero(resembling < RESEMBLES):
-        others = [number for number in modes.data.mode_numbers if number != modes.data.mode_numbers[k]]
-        text = (
-            f"No computed mode resembles the measured mode {_number(modes, k)}: its best MAC is {resembling[k]:.2f}. "
-            "It is compared all the same."
-        )
-        action = (
-            f"If its identification is doubtful, leave it out: data.select({others}), or modes = {others} in a TOML "
-            "file. Otherwise look for what the model lacks, or compute more modes."
-        )
+        others = [number for number in numbers if number != numbers[k]]
+        text = f"No computed mode resembles the measured mode {_number(modes, k)}: its best MAC is {resembling[k]:.2f}."
+        action = f"Leave it out, data.select({others}) or modes = {others} in a TOML file; or compute more modes."
         found.append(Finding("A mode has no counterpart", CARE, text, action, {"mac": float(resembling[k])}))
     return found
 

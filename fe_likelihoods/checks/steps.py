@@ -117,11 +117,8 @@ def check_same_response(difference: float | None, motion: str = "this motion") -
     """Whether another motion gives the response of the calibration; `difference` is relative to this response."""
     if difference is None or difference > NOTHING:
         return []
-    text = (
-        f"The response to {motion} equals the response to the motion of the calibration: the model does not use the "
-        "motion that it is given, and predictions of other events repeat the calibration."
-    )
-    action = "Check that the model reads the motion that it is given, and not one file that is always the same."
+    text = f"The response to {motion} equals that of the calibration, and so will predictions of other events."
+    action = "Let the model read the motion that it is given, and not one file that is always the same."
     return [Finding("The motion changes nothing", WRONG, text, action, {"difference": difference})]
 
 
@@ -188,12 +185,9 @@ def _compare(
     numbers = {names[i]: float(shift[i]) for i in np.flatnonzero(shift >= SHIFT)}
     if not numbers:
         return []
-    text = (
-        f"Half of {what} changes the response by {100.0 * np.sqrt(squares[0] / squares[1]):.2g} %, which moves "
-        f"{', '.join(f'{name} by {by:.2g}' for name, by in numbers.items())} posterior standard deviations: intervals "
-        "that are narrower than the error of the model miss the truth."
-    )
-    wrong = (shift > LARGE_SHIFT) & ~(shift * widths < LARGE_SHARE)
-    severity = WRONG if wrong.any() else CARE
+    moves = ", ".join(f"{name} by {by:.2g}" for name, by in numbers.items())
+    change = 100.0 * np.sqrt(squares[0] / squares[1])
+    text = f"Half of {what} changes the response by {change:.2g} %, which moves {moves} posterior standard deviations."
+    severity = WRONG if ((shift > LARGE_SHIFT) & ~(shift * widths < LARGE_SHARE)).any() else CARE
     action = f"Halve {what} until this is small."
     return [Finding("The model is too coarse for its data", severity, text, action, numbers)]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..checks.finding import labelled, warn
-from ..checks.stored_posteriors import check_new_test
+from ..checks.transfer import check_new_test
 from ..priors.distributions import RandomState
 from ..priors.points import as_points, complete_repr
 from ..text_tables import number, text_table

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from scipy import special
 
 from ..checks.finding import warn
-from ..checks.stored_posteriors import check_equal_ratios
+from ..checks.transfer import check_equal_ratios
 from ..text_tables import number, text_table
 
 __all__ = ["PRIOR_EVENTS", "PRIOR_SD", "SLOPE_SD", "EventRatios", "RatioPopulations"]

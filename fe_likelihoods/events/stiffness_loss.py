@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..checks.finding import Finding, judge, labelled
-from ..checks.stiffness import check_most, check_normal
+from ..checks.transfer import check_most, check_normal
 from ..priors.distributions import Distribution, HalfNormal, LogNormal
 from ..text_tables import text_table
 from .scales import scales_of

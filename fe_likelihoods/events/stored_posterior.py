@@ -15,7 +15,7 @@ from samplers.estimates.weights import effective_sample_size
 from samplers.resampling import systematic
 
 from ..checks.finding import NOTE, Finding
-from ..checks.stiffness import check_laplace
+from ..checks.transfer import check_laplace
 from ..priors.distributions import TruncatedNormal
 from ..priors.mixture_prior import MixtureDistribution, fit_mixture
 from ..priors.points import as_points

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from ..checks.finding import warn
-from ..checks.stored_posteriors import check_impossible_draws
+from ..checks.transfer import check_impossible_draws
 from ..events.hierarchy_result import Hierarchy
 from ..events.ratios import PRIOR_EVENTS, PRIOR_SD, EventRatios
 from ..events.scatter import REMAINDER, log_variance, remainder_variance, spread_rows

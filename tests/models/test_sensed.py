@@ -144,7 +144,7 @@ def test_a_fault_of_a_sensor_is_found_as_such(gain, lag):
     priors = {"f": TruncatedNormal(1.0, 0.1), "sigma_top": HalfNormal(0.5), "sigma_drift": HalfNormal(0.01)}
     posterior = Posterior(FELikelihood(sensed, data), Prior(priors | sensed.priors))
     sampler = SMCSampler(
-        100, posterior.ndim, posterior, vectorize=True, seed=1, guide=posterior.guide(), max_simulations=800
+        100, posterior.ndim, posterior, vectorize=True, seed=1, guide=posterior.guide(), max_simulations=1600
     )
     sampler.run_mcmc(None, 1)
     samples = sampler.get_chain(flat=True)
