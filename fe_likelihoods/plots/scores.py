@@ -1,8 +1,8 @@
 """Figure of prediction scores: calibration, coverage with its error, and sharpness beside it.
 
 A single share of samples in a band says little. The figure shows where measured values are in the predicted
-distributions (histogram of the probability integral transform, PIT), whether weak and strong response are covered
-alike, and the cost: the band's width, and the interval score, which adds a penalty for every value outside it.
+distributions (histogram of the probability integral transform, PIT), the coverage of all and of strong response,
+and the cost: the band's width, and the interval score, which adds a penalty for every value outside it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["plot_scores"]
 
-_LEVELS = ("weak", "moderate", "strong")
+_PARTS = {"all": "coverage", "strong part": "coverage_strong"}
 _BAND = 0.9  # probability of the bands for calibrated predictions
 _BINS = 10
 _SPAN = 0.1  # of coverages below the level that is shown at least
@@ -46,8 +46,8 @@ def plot_scores(
         Three axes. Left: shares of the PIT in equal parts of 0 to 1 (ten for histories), with the band that contains
         90 % of the shares of calibrated predictions (binomial, for the number of independent samples), and standard
         errors of their mean between histories for three events or more. Histories:
-        coverage of weak, moderate and strong response with its standard error (between events for three events or more,
-        else binomial, for the number of independent samples), and the interval score of each channel, which is the
+        coverage of all samples and of the strong part with its standard error (between events for three events or more,
+        else binomial, for the number of independent samples, of all samples alone), and the interval score of each channel, which is the
         width of the band and a penalty, as multiples of the root mean square of the measured channel. Numbers: median,
         50 % and outer interval divided by the measured value, in the order of the events, and the shares of
         measured values in the intervals, with the mean width and score of the outer ones.
@@ -65,7 +65,7 @@ def plot_scores(
     import matplotlib.pyplot as plt
 
     events = dict(scores) if isinstance(scores, Mapping) else {"": scores}
-    histories = {hasattr(each, "coverage_by_level") for each in events.values()}
+    histories = {hasattr(each, "coverage") for each in events.values()}
     if len(histories) != 1 or len({each.level for each in events.values()}) != 1:
         raise ValueError(
             "plot_scores: expected scores of one event or more, all of histories or all of numbers, with one level; "
@@ -101,13 +101,13 @@ def _history_axes(axes: np.ndarray, events: Mapping[str, HistoryScores]) -> None
     names = list(dict.fromkeys(channel.name for each in events.values() for channel in each.channels))
     for k, name in enumerate(names):
         coverage, errors = _coverage_of(name, list(events.values()))
-        at = np.arange(len(_LEVELS)) + 0.12 * (k - 0.5 * (len(names) - 1))
+        at = np.arange(len(_PARTS)) + 0.12 * (k - 0.5 * (len(names) - 1))
         axes[1].errorbar(at, coverage, errors, fmt="o", markersize=4, linewidth=1, color=_colour(k), label=name)
     axes[1].axhline(level, color=GREY, linewidth=0.8)
-    axes[1].set_xticks(range(len(_LEVELS)), _LEVELS)
-    axes[1].set_xlabel("response")
+    axes[1].set_xticks(range(len(_PARTS)), _PARTS)
+    axes[1].set_xlabel("samples")
     axes[1].set_ylabel(f"share in the {level:.0%} band [-]")
-    axes[1].set_title("coverage by level of the response", fontsize="medium")
+    axes[1].set_title("coverage", fontsize="medium")
     axes[1].set_ylim(min(level - _SPAN, axes[1].dataLim.ymin - 0.02), 1.03)
     if len(names) > 1:
         axes[1].legend(
@@ -137,19 +137,14 @@ def _sharpness_of(name: str, events: Sequence[HistoryScores]) -> tuple[float, fl
 
 
 def _coverage_of(name: str, events: Sequence[HistoryScores]) -> tuple[np.ndarray, np.ndarray]:
-    """Mean coverage (3,) of a channel by level, and its standard errors."""
-    found, errors = [], []
-    for each in events:
-        for k, channel in enumerate(each.channels):
-            if channel.name == name:
-                found.append(each.coverage_by_level[k])
-                errors.append(each.coverage_error[k])
-    shares, there = np.array(found), np.isfinite(found)
-    count = np.maximum(there.sum(axis=0), 1)
-    mean = np.where(there.any(axis=0), np.where(there, shares, 0.0).sum(axis=0) / count, np.nan)
-    within = np.sqrt(np.where(there, np.square(errors), 0.0).sum(axis=0)) / count
-    between = np.sqrt(np.where(there, np.square(shares - mean), 0.0).sum(axis=0) / np.maximum(count - 1, 1) / count)
-    return mean, np.where(count >= _FEWEST, between, within)
+    """Mean coverage (2,) of a channel, of all samples and of the strong part, and its standard errors."""
+    found = [(each, k) for each in events for k, channel in enumerate(each.channels) if channel.name == name]
+    shares = np.array([[getattr(each, part)[k] for part in _PARTS.values()] for each, k in found])
+    errors = shares.std(axis=0, ddof=1) / np.sqrt(len(found)) if len(found) >= _FEWEST else np.full(2, np.nan)
+    if len(found) < _FEWEST:
+        worth, level = np.array([each.effective_samples[k] for each, k in found]), events[0].level
+        errors[0] = np.sqrt(level * (1.0 - level) * np.sum(1.0 / np.maximum(worth, 1.0))) / len(found)
+    return shares.mean(axis=0), errors
 
 
 def _number_axes(axes: np.ndarray, events: Mapping[str, QuantityScores]) -> None:

@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import stats
 
 from ..events.hierarchy_result import Hierarchy
 from ..events.ratios import EventRatios
@@ -70,9 +69,6 @@ class Fragility(NamedTuple):
     from_state : str
         State of the structure at the beginning of each record, "virgin" or "end", as in
         `fe_likelihoods.prediction.propagation.propagate`.
-    draws : ndarray, shape (n_draws, n_records), or None
-        Probabilities for posterior draws of the ratio distribution, from which intervals and bands are made. None
-        without ratios.
     uncertainty : str
         Which uncertainties the probabilities contain.
     unit : str
@@ -92,7 +88,6 @@ class Fragility(NamedTuple):
     curve: FragilityCurve | None
     threshold: float
     from_state: str = "virgin"
-    draws: np.ndarray | None = None
     uncertainty: str = ""
     unit: str = "SI"
     intensity_unit: str = ""
@@ -113,43 +108,6 @@ class Fragility(NamedTuple):
         return "\n".join([*lines, *([f"The probabilities contain {self.uncertainty}."] if self.uncertainty else [])])
 
     __repr__ = __str__
-
-    def band(self, level: float = 0.9) -> tuple[np.ndarray, np.ndarray]:
-        """Band that contains the probabilities under all records together.
-
-        Parameters
-        ----------
-        level : float
-            Probability that the whole curve is in the band; each of its points is in it with a larger probability.
-
-        Returns
-        -------
-        lower, upper : ndarray, shape (n_records,)
-            The narrowest band between quantiles of equal probabilities at all records (Besag et al. 1995, section 6.3),
-            extended to the probabilities where these are outside, as intervals are (`Exceedance`).
-
-        Raises
-        ------
-        ValueError
-            If there are no draws, or the level is not between 0 and 1.
-
-        References
-        ----------
-        J. Besag, P. Green, D. Higdon, K. Mengersen (1995), Bayesian computation and stochastic systems, Statistical
-        Science 10(1), 3-41, doi:10.1214/ss/1177010123.
-        """
-        if self.draws is None:
-            raise ValueError("a band needs what is unknown of the events: give fragility ratios=")
-        check_level(level)
-        whole = self.draws[np.isfinite(self.draws).all(axis=1)]
-        if len(whole) < 20:
-            raise ValueError(f"a band needs 20 draws whose simulations did not fail; got {len(whole)}")
-        ordered = np.sort(whole, axis=0)
-        ranks = np.stack([stats.rankdata(column) for column in whole.T], axis=1)
-        outermost = np.maximum(ranks, len(whole) + 1.0 - ranks).max(axis=1)
-        last = int(np.ceil(np.quantile(outermost, level, method="higher"))) - 1
-        lower, upper = ordered[len(whole) - 1 - last], ordered[last]
-        return np.minimum(lower, self.probability), np.maximum(upper, self.probability)
 
 
 def peak_ground_acceleration(record: Record | Sequence[Record]) -> float:
@@ -186,7 +144,6 @@ def fragility(
     ratios: EventRatios | None = None,
     noise: bool | str | None = None,
     intensity: Callable[[Record], float] = peak_ground_acceleration,
-    failures_exceed: bool = False,
     from_state: str | None = None,
     rest: float = 10.0,
     level: float = 0.95,
@@ -222,9 +179,6 @@ def fragility(
     intensity : callable
         Function that returns a positive number for an element of `records`. Default: peak acceleration [m/s²], of the
         first record of a tuple (the horizontal component, or the first support).
-    failures_exceed : bool
-        Count a failed simulation as an exceedance, for models whose simulation fails at collapse without saying so.
-        Default: failed samples are left out. A failure whose reason begins with "collapse" is always an exceedance.
     from_state, rest
         State of the structure at the beginning of each record, as in `propagate`. With "end" every record follows the
         excitation of the model, not the other records.
@@ -246,7 +200,7 @@ def fragility(
         As `propagate` and `exceedance`, before any simulation where possible. Also if there are no records, an
         intensity is not positive, or the quantity is not one number.
     SimulationFailed
-        If every simulation under a record fails, none by collapse, and failures do not count as exceedances.
+        If every simulation under a record fails, none by collapse.
 
     Warns
     -----
@@ -322,14 +276,13 @@ def fragility(
                 collapsed[prediction.collapsed, k] = True
         except AllFailed as error:
             collapsed[error.collapsed[error.collapsed < n], k] = True
-            if not failures_exceed and not collapsed[:, k].any():
+            if not collapsed[:, k].any():
                 raise SimulationFailed(f"record {_name(record)!r}: {error.reason}") from error
-        if not failures_exceed and np.isnan(values[:, k]).all() and not collapsed[:, k].any():
+        if np.isnan(values[:, k]).all() and not collapsed[:, k].any():
             raise SimulationFailed(f"record {_name(record)!r}: the simulation at the median parameters failed")
-    exceeding = np.isnan(values) if failures_exceed else collapsed
     columns = [
         estimate(each, limit, of_record, exceeds, effective, level, seed)
-        for each, of_record, exceeds in zip(values.T, under, exceeding.T, strict=True)
+        for each, of_record, exceeds in zip(values.T, under, collapsed.T, strict=True)
     ]
     found = Estimate(*(None if each[0] is None else np.array(each) for each in zip(*columns, strict=True)))
     draws = None if found.draws is None else found.draws.T
@@ -353,7 +306,6 @@ def fragility(
         curve,
         float(limit),
         state,
-        draws,
         contents(bool(noise), ratios),
         unit_of_threshold(unit, known.channels),
         intensity_unit,

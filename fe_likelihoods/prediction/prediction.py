@@ -14,7 +14,7 @@ from ..signals.comparison import Comparison, compare_with
 from ..text_tables import number, text_table
 from ..units import find_unit
 from .quantities import measured_quantity
-from .score_tables import HistoryScores, QuantityScores, envelope, score_histories, score_values
+from .score_tables import HistoryScores, QuantityScores, score_histories, score_values
 
 if TYPE_CHECKING:
     import xarray
@@ -191,13 +191,12 @@ class Prediction:
             raise ValueError(f"score: a prediction of histories needs Measurements; got {type(measured).__name__}")
         compared = self._compared(measured)
         values = _values_of(compared)
-        mean, sd, around = (_at_samples(compared, each) for each in [self.mean, self.sd, envelope(self.mean)])
+        mean, sd = (_at_samples(compared, each) for each in (self.mean, self.sd))
         ends = (self._near_quantile(0.5 - 0.5 * level), self._near_quantile(0.5 + 0.5 * level))
         lower, upper = _band_at_samples(compared, *ends)
-        scored = (each[:, part] for each in (values, mean, sd, lower, upper, around))
-        values, mean, sd, lower, upper, around = scored
+        values, mean, sd, lower, upper = (each[:, part] for each in (values, mean, sd, lower, upper))
         _check_number(self.n_samples, 2, level)
-        return score_histories(self.channels, values, (mean, sd), (lower, upper), around, level)
+        return score_histories(self.channels, values, (mean, sd), (lower, upper), level)
 
     def _score_values(self, measured: Measurements | ArrayLike, level: float) -> QuantityScores:
         """Scores of numbers against the same numbers of measurements."""

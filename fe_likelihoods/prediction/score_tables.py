@@ -15,18 +15,14 @@ from ..units import from_si
 from .scores import crps_normal, crps_samples, interval_score, pit_normal, pit_samples
 
 __all__ = [
-    "LEVELS",
     "HistoryScores",
     "QuantityScores",
     "central_interval",
-    "envelope",
     "score_histories",
     "score_values",
     "strong_part",
 ]
 
-LEVELS = (0.1, 0.5)
-"""Shares of the largest predicted envelope that separate weak, moderate and strong response."""
 _BINS = 10  # of the histograms of the PIT
 
 
@@ -58,19 +54,13 @@ class HistoryScores(NamedTuple):
         Share of the measured samples in the band.
     coverage_strong : ndarray, shape (n_channels,)
         The same in the strong part, between 5 and 95 % of the measured history's sum of squares.
-    coverage_by_level : ndarray, shape (n_channels, 3)
-        The same where the envelope of the predicted mean is below 10 %, between 10 and 50 %, and above 50 % of its
-        largest value; NaN without such samples.
     pit : ndarray, shape (n_channels, 10)
         Shares of the measured samples whose PIT (for the normal distributions) is in each tenth of 0 to 1: about 0.1
         each for a calibrated prediction; high at both ends if the prediction is too narrow, in the middle if too wide.
         A sample with a predicted standard deviation of zero is at an end, or left out if it equals the mean.
     effective_samples : ndarray, shape (n_channels,)
         Number of independent samples that the measured ones are worth, from the autocorrelation of the normalised
-        errors (`fe_likelihoods.effective_samples`): for the standard error of a coverage.
-    coverage_error : ndarray, shape (n_channels, 3)
-        Standard errors of `coverage_by_level` for a band that has its nominal level: binomial, with the number of
-        independent samples that the part is worth. NaN without such samples.
+        errors (`fe_likelihoods.effective_samples`).
     """
 
     channels: tuple[Channel, ...]
@@ -83,20 +73,17 @@ class HistoryScores(NamedTuple):
     width: np.ndarray
     coverage: np.ndarray
     coverage_strong: np.ndarray
-    coverage_by_level: np.ndarray
     pit: np.ndarray
     effective_samples: np.ndarray
-    coverage_error: np.ndarray
 
     def __str__(self) -> str:
         head = ["channel", "unit", "RMS", "RRMSE", "CRPS", "interval score", "width"]
-        head += [f"in {self.level:.0%} band", "strong part", "weak", "moderate", "strong"]
-        rows = [head]
+        rows = [[*head, f"in {self.level:.0%} band", "strong part"]]
         for k, channel in enumerate(self.channels):
             scaled = [from_si(a[k], channel.unit) for a in (self.rms, self.crps, self.interval_score, self.width)]
             rms, crps, score, width = (f"{each:.3g}" for each in scaled)
             row = [channel.name, channel.unit, rms, f"{self.rrmse[k]:.1%}", crps, score, width]
-            shares = [self.coverage[k], self.coverage_strong[k], *self.coverage_by_level[k]]
+            shares = self.coverage[k], self.coverage_strong[k]
             rows.append(row + ["-" if np.isnan(share) else f"{share:.1%}" for share in shares])
         return text_table(rows)
 
@@ -176,25 +163,19 @@ def score_histories(
     measured: np.ndarray,
     moments: tuple[np.ndarray, np.ndarray],
     band: tuple[np.ndarray, np.ndarray],
-    envelope: np.ndarray,
     level: float,
 ) -> HistoryScores:
     """Score predicted histories [SI]; all arrays are (n_channels, n_samples), measured values NaN where missing.
 
     Moments are means and standard deviations, the band has quantiles with the probabilities (1 - level) / 2 and (1 +
-    level) / 2, and the envelope is of the predicted mean. ValueError if a channel has no sample or is zero at all of
-    them.
+    level) / 2. ValueError if a channel has no sample or is zero at all of them.
     """
     error = rrmse(moments[0], measured, [channel.name for channel in channels])
     there = np.isfinite(measured)
     inside = (band[0] <= measured) & (measured <= band[1])
-    largest = np.array(LEVELS)[:, None, None] * envelope.max(axis=1, keepdims=True)
-    classes = (envelope >= largest).sum(axis=0)
     spread = there & (moments[1] > 0.0)
     shares = [_histogram(row[np.isfinite(row)]) for row in pit_normal(*moments, measured)]
-    counts = np.stack([(there & (classes == k)).sum(axis=1) for k in range(len(LEVELS) + 1)], axis=1)
     worth = _effective(np.where(spread, measured - moments[0], np.nan) / np.where(spread, moments[1], 1.0))
-    parts = counts * (worth / there.sum(axis=1))[:, None]
     return HistoryScores(
         channels=tuple(channels),
         level=level,
@@ -206,10 +187,8 @@ def score_histories(
         width=_mean(band[1] - band[0], there),
         coverage=_mean(inside, there),
         coverage_strong=_mean(inside, there & strong_part(measured)),
-        coverage_by_level=np.stack([_mean(inside, there & (classes == k)) for k in range(len(LEVELS) + 1)], axis=1),
         pit=np.array(shares),
         effective_samples=worth,
-        coverage_error=np.sqrt(level * (1.0 - level) / np.where(counts > 0, np.maximum(parts, 1.0), np.nan)),
     )
 
 
@@ -245,16 +224,6 @@ def central_interval(ascending: np.ndarray, level: float) -> tuple[np.ndarray, n
     n = len(ascending)
     rank = max(1, math.ceil(0.5 * (1.0 - level) * (n + 1) - 0.5))  # as `share_within` of the PIT (rank + 0.5) / (n + 1)
     return ascending[rank - 1], ascending[n - rank]
-
-
-def envelope(histories: np.ndarray) -> np.ndarray:
-    """Amplitude of oscillating histories at each step: 2 for ``2 * sin(omega * t)``.
-
-    It is the absolute value of the analytic signal, the history plus i times its Hilbert transform.
-    """
-    from scipy.signal import hilbert  # imported here because it is slow to import
-
-    return np.abs(hilbert(histories, axis=-1))
 
 
 def strong_part(measured: ArrayLike, start: float = 0.05, stop: float = 0.95) -> np.ndarray:
