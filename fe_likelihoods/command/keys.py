@@ -13,7 +13,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, get_type_hints
 
-from ..signals.clock_times import is_clock
+from ..signals.tables import is_clock
 from ..units import DIMENSIONS, to_si
 
 __all__ = [

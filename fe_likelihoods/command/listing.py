@@ -14,7 +14,6 @@ from ..checks.finding import NOTE
 from ..checks.screening import Screened, check_data, check_sensors, repair_lines, screen, screen_motion
 from ..checks.sensor_faults import find_sensor_faults
 from ..signals.datasets import read_dataset
-from ..signals.header_statements import Statements
 from ..signals.read import read_record, recognise_format
 from ..signals.records import Record
 from ..signals.strong_motion import find_v2_channels, parse_geonet, parse_v2
@@ -27,10 +26,10 @@ from ..signals.tables import (
     table_start,
     table_step,
     text_unit,
+    uniform_times,
     value_columns,
 )
-from ..signals.text_files import dimension_of, read_text
-from ..signals.uneven_times import uniform_times
+from ..signals.text_files import Statements, dimension_of, read_text
 from ..text_tables import number, text_table
 from ..units import from_si, to_si
 

@@ -26,11 +26,11 @@ from .tables import (
     row_times,
     table_start,
     table_step,
+    uniform_times,
     value_column,
     warn_if_absent,
 )
 from .text_files import Series, agree_on_unit, read_bytes, read_text
-from .uneven_times import uniform_times
 
 __all__ = [
     "ImposedTest",

@@ -53,14 +53,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..units import to_si
-from .clock_times import is_clock
-from .header_statements import check_peaks, read_statements
+from .tables import is_clock
 from .text_files import (
     LINE_END,
     NUMBER,
     Series,
     agree_on_unit,
     check_count,
+    check_peaks,
     decimals_of,
     decode_text,
     is_number,
@@ -68,6 +68,7 @@ from .text_files import (
     parse_count,
     parse_number,
     read_bytes,
+    read_statements,
 )
 
 __all__ = [

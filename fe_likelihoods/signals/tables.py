@@ -11,6 +11,7 @@ are read if commas do not separate cells; separators of thousands go if a number
 
 import contextlib
 import csv
+import datetime
 import itertools
 import math
 import re
@@ -25,12 +26,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..units import find_unit, to_si
-from .clock_times import ClockTime, is_clock, is_date, parse_clock, seconds_since_midnight, unix_seconds
-from .header_statements import Statements, check_peaks, read_statements
-from .logger_formats import logger_table
+from .sampling import check_step
 from .text_files import (
+    Statements,
     agree_on_unit,
     check_count,
+    check_peaks,
     decimals_of,
     decode_text,
     dimension_of,
@@ -39,8 +40,8 @@ from .text_files import (
     parse_count,
     parse_number,
     read_bytes,
+    read_statements,
 )
-from .uneven_times import uniform_times
 
 __all__ = [
     "Column",
@@ -88,6 +89,106 @@ _POINTS = "Numbers with decimal commas need another separator between columns, s
 _SKIP = "If the text is about other samples, give skip= to leave it out"
 
 _Line = tuple[int, list[str]]  # its number and cells
+
+
+# clock times ----------------------------------------------------------------------------------------------------------
+# 03:19:53.010, 2019-07-06T03:19:53.010Z or 06.07.2019 03:19:53 PM, and dates: the year is first, or last after points.
+
+_DATE = r"(?P<first>\d{1,4})(?P<mark>[-/.])(?P<month>\d{1,2})(?P=mark)(?P<last>\d{1,4})"
+_AFTER = r"(?:[ \u00a0\u202f]?(?:([AP])\.?M\.?|(Z|UTC|[-+]\d{2}:?\d{2})))?"
+_CLOCK = re.compile(rf"(?:{_DATE}(?:T| +))?(\d{{1,2}}):([0-5]\d):([0-5]\d)(?:[.,](\d+))?{_AFTER}", re.IGNORECASE)
+_DAY_ONLY = re.compile(_DATE)
+_HOUR, _DAY = 3600, 86400
+_EPOCH = datetime.date(1970, 1, 1).toordinal()
+
+
+class ClockTime(NamedTuple):
+    """A clock time."""
+
+    day: int | None  # number of the day, None without a date
+    seconds: float  # since the midnight before [s]
+    decimals: int  # of the seconds
+    zone: int | None  # minutes by which the clock is before UTC, None without a time zone
+    halves: bool = False  # hours from 1 to 12 with AM and PM
+
+
+def is_clock(cell: str) -> bool:
+    """Whether a cell is a clock time, with a date or without."""
+    return ":" in cell and _CLOCK.fullmatch(cell) is not None
+
+
+def _is_date(cell: str) -> bool:
+    """Whether a cell is a date without a time, in any order of day, month and year."""
+    return _DAY_ONLY.fullmatch(cell) is not None
+
+
+def _parse_clock(cell: str, where: str) -> ClockTime:
+    """The clock time in a cell; ValueError for anything else."""
+    found = _CLOCK.fullmatch(cell)
+    if found is None:
+        raise ValueError(
+            f"{where}: expected a clock time such as '03:19:53.010' or '2019-07-06T03:19:53.010', got {cell[:100]!r}"
+        )
+    *_, hour, minute, second, fraction, half, zone = found.groups()
+    if not (1 <= int(hour) <= 12 if half else int(hour) <= 24):
+        hours = "with AM and PM have hours from 1 to 12" if half else "have hours from 0 to 23"
+        raise ValueError(f"{where}: clock times {hours}; got {cell[:100]!r}")
+    hours = int(hour) % 12 + 12 * (half in ("P", "p")) if half else int(hour)
+    whole = _HOUR * hours + 60 * int(minute) + int(second)
+    if zone is not None:  # minutes of a time zone such as +02:00; Z and UTC are zero
+        zone = 0 if zone.upper() in ("Z", "UTC") else int(f"{zone[0]}1") * (60 * int(zone[1:3]) + int(zone[-2:]))
+    day = None if found["first"] is None else _day_number(found, where)
+    return ClockTime(day, float(f"{whole}.{fraction or 0}"), len(fraction or ""), zone, bool(half))
+
+
+def _day_number(found: re.Match[str], where: str) -> int:
+    """Number of the day in a date with the year first, or last after points."""
+    year, day = found["first"], found["last"]
+    if len(year) != 4:
+        if found["mark"] != "." or len(day) != 4:
+            raise ValueError(
+                f"{where}: expected a date such as 2019-07-06 or 06.07.2019, got {found[0][:100]!r}, which may begin "
+                "with the day or the month; write the year first"
+            )
+        year, day = day, year
+    try:
+        return datetime.date(int(year), int(found["month"]), int(day)).toordinal()
+    except ValueError as error:
+        raise ValueError(f"{where}: expected a date, got {found[0][:100]!r} ({error})") from None
+
+
+def _seconds_since_midnight(times: list[ClockTime | None], where: str) -> list[float]:
+    """Seconds since the midnight before the first time, NaN for None.
+
+    Without dates, a time that is more than half a day earlier than the previous time belongs to the next day. 1 o'clock
+    after 12 o'clock is refused: it is on a 12-hour clock.
+    """
+    known = [time for time in times if time is not None]
+    first, zones = known[0], {time.zone for time in known}
+    for differ, expected in (
+        (len({time.day is None for time in known}) > 1, "a date in all clock times or in none"),
+        (len(zones) > 1, f"one time zone in all clock times, got {len(zones)}"),
+        (len({time.halves for time in known}) > 1, "AM or PM in all clock times or in none"),
+    ):
+        if differ:
+            raise ValueError(f"{where}: expected {expected}; write them alike")
+    day, last, found = 0, 0.0, []
+    for time in times:
+        if time is None:
+            found.append(math.nan)
+            continue
+        if not first.halves and 12 * _HOUR <= last < 13 * _HOUR and _HOUR <= time.seconds < 2 * _HOUR:
+            raise ValueError(
+                f"{where}: the clock times go back from 12 to 1 o'clock, as on a clock of 12 hours; write hours from 0 "
+                "to 23"
+            )
+        day = time.day - first.day if time.day is not None else day + (time.seconds < last - _DAY / 2)
+        last = time.seconds
+        found.append(day * _DAY + time.seconds)
+    return found
+
+
+# the table ------------------------------------------------------------------------------------------------------------
 
 
 class Column(NamedTuple):
@@ -148,7 +249,7 @@ def read_table(
             lines += [(number, line)] * (not comment)
     separator = "\t" if is_book else _separator([line for _, line in lines[-_LAST_LINES:]])
     rows = [(number, _split(line, separator, f"{file}, line {number}")) for number, line in lines]
-    rows, stated = logger_table(rows, file)
+    rows, stated = _logger_table(rows, file)
     along_rows = along_rows and not any("rows" in row for _, row in rows[:_LAST_LINES])
     announced = None if along_rows or stated else _announced(rows, file)
     if rows and announced is None:
@@ -269,6 +370,54 @@ def _announced(lines: list[_Line], file: str) -> tuple[list[_Line], list[str]] |
     return numbers, [*(" ".join(cells) for _, cells in lines[: min(place, 1)]), f"dt = {head[1]} s"]
 
 
+# formats of logger programs -------------------------------------------------------------------------------------------
+
+
+def _logger_table(lines: list[_Line], file: str) -> tuple[list[_Line], list[str]]:
+    """Header line, line of units and rows of a logger program's format, and what comments would state (a step).
+
+    Campbell Scientific TOA5 has four header lines: environment, names, units, processing (LoggerNet manual). A LabVIEW
+    file (.lvm) has tags and values up to ``***End_of_Header***``, twice, a line of names that begins with ``X_Value``,
+    and rows; with X_Columns "No" the cells of this column are empty, with "Multi" each channel has its own, and they
+    must agree (National Instruments, "Specification for the LabVIEW Measurement File"). Other lines stay.
+    """
+    first = lines[0][1][0] if lines and lines[0][1] else ""
+    if first == "TOA5" and len(lines) > 3:
+        units = [f"[{unit}]" if unit not in ("", "TS", "RN") else "" for unit in lines[2][1]]
+        return [lines[1], (lines[2][0], units), *lines[4:]], []
+    if not first.startswith("LabVIEW Measurement"):
+        return lines, []
+    ends = [place for place, (_, cells) in enumerate(lines) if cells[0] == "***End_of_Header***"]
+    if len(ends) != 2:
+        raise ValueError(
+            f"{file}: expected a LabVIEW file with one segment, found {max(len(ends) - 1, 0)}; write a file for each "
+            "segment (option 'Overwrite file' or 'One header only')"
+        )
+    tags = {cells[0]: cells[1:] for _, cells in lines[: ends[1]]}
+    (number, header), rows = lines[ends[1] + 1] if lines[ends[1] + 1 :] else (0, [""]), lines[ends[1] + 2 :]
+    columns, axis = (next(iter(tags.get(tag, ())), "") for tag in ("X_Columns", "X_Dimension"))
+    if header[0] != "X_Value" or (axis or "Time") != "Time":
+        raise ValueError(
+            f"{file}: expected a LabVIEW file whose first column X_Value has times, got {header[0]!r} and X_Dimension "
+            f"{axis!r}; write it with times"
+        )
+    width = len(header) - (header[-1] == "Comment")
+    labels = ["", *tags.get("Y_Unit_Label", []), *[""] * width]
+    names = ["time [s]" if name == "X_Value" else name for name in header[:width]]
+    units = ["s" if name == "X_Value" else label for name, label in zip(header[:width], labels, strict=False)]
+    for k, (_, cells) in enumerate(rows):
+        # the text in the column of comments goes; numbers in it show that a row is damaged
+        if len(cells) == width + 1 and not any(map(str.isdigit, cells[-1])):
+            rows[k] = rows[k][0], cells[:width]
+    table = [(number, names), (number, [f"[{unit}]" if unit else "" for unit in units]), *rows]
+    if columns != "No":
+        return table, []
+    steps = sorted({cell for cell in tags.get("Delta_X", []) if cell})
+    if len(steps) != 1:
+        raise ValueError(f"{file}: expected one step Delta_X, got {', '.join(steps) or 'none'}; write it with times")
+    return [(number, cells[1:]) for number, cells in table], [f"dt = {steps[0].replace(',', '.')} s"]
+
+
 # header line and decimal marks ----------------------------------------------------------------------------------------
 
 
@@ -281,7 +430,7 @@ def _known(cell: str) -> bool:
     if _is_missing(cell):
         return False
     return (
-        is_number(cell) or bool(_DECIMAL_COMMA.match(cell) or _GROUPED.match(cell)) or is_clock(cell) or is_date(cell)
+        is_number(cell) or bool(_DECIMAL_COMMA.match(cell) or _GROUPED.match(cell)) or is_clock(cell) or _is_date(cell)
     )
 
 
@@ -406,7 +555,7 @@ def _with_points(lines: list[_Line], separator: str, file: str) -> tuple[list[_L
             for k, cell in enumerate(row):
                 if mark in cell and grouped.match(cell):
                     row[k] = cell.replace(mark, "")
-                elif mark in cell and _known(cell) and not (is_clock(cell) or is_date(cell)):
+                elif mark in cell and _known(cell) and not (is_clock(cell) or _is_date(cell)):
                     raise ValueError(
                         f"{file}: {mark!r} separates thousands in {shown[1]!r}, line {shown[0]}, but not in {cell!r}, "
                         f"line {number}; write all numbers alike, without separators of thousands"
@@ -445,11 +594,11 @@ def _columns(
         filled = [cell for cell, _ in cells if cell]
         kind, decimals = "number", 0
         if any(map(is_clock, filled)):
-            kind, times = "clock", [parse_clock(cell, where) if cell else None for cell, where in cells]
-            values = seconds_since_midnight(times, file)
+            kind, times = "clock", [_parse_clock(cell, where) if cell else None for cell, where in cells]
+            values = _seconds_since_midnight(times, file)
             known = [time for time in times if time is not None]
             first, decimals = first or known[0], max(time.decimals for time in known)
-        elif filled and all(is_date(cell) or _is_word(cell) for cell in filled):
+        elif filled and all(_is_date(cell) or _is_word(cell) for cell in filled):
             kind, values = "text", [math.nan] * len(cells)
         else:
             values = [parse_number(cell, where) if cell else math.nan for cell, where in cells]
@@ -763,7 +912,7 @@ def table_start(table: Table, step: float, zero: float | str = 0.0) -> float:
 
 def _clock_zero(table: Table, text: str) -> float:
     """Return the clock time `zero` in the times of the table [s]; what it does not state is as in the first row."""
-    zero, first = parse_clock(text, "zero"), table.clock
+    zero, first = _parse_clock(text, "zero"), table.clock
     column = None if table.time is None else table.columns[table.time]
     if column is None or column.kind != "clock":
         if column is None or not _is_unix(to_si(column.values[0], _time_unit(table))):
@@ -773,10 +922,101 @@ def _clock_zero(table: Table, text: str) -> float:
                 f"{table.file}: the times are Unix times: give zero={text!r} with date and time zone, as in "
                 "'2019-07-06T03:19:53Z'"
             )
-        return unix_seconds(zero)
+        return _DAY * (zero.day - _EPOCH) + zero.seconds - 60 * zero.zone
     if zero.day is not None and first.day is None:
         raise ValueError(f"{table.file}: the times have no date; give zero={text!r} without one")
     if zero.zone is not None and first.zone is None:
         raise ValueError(f"{table.file}: the times have no time zone; give zero={text!r} without one, as in the file")
     days = 0 if zero.day is None else zero.day - first.day
     return 86400 * days + zero.seconds - (0 if zero.zone is None else 60 * (zero.zone - first.zone))
+
+
+# uneven times, from a clock with jitter or a logger that loses packets ------------------------------------------------
+
+_GAP = 1.5  # usual steps between two samples, from which on samples are missing
+_NEAR = 0.1  # usual steps from a sample, within which a time beside a gap has its value
+_MOST_REPEATED = 0.05  # share of rows that repeat a time; more are the times of packets
+_LARGEST_DIFFERENCE = 0.05  # relative, of the new step from the usual one
+
+
+class UniformTimes(NamedTuple):
+    """Times with a uniform step instead of uneven ones."""
+
+    times: NDArray[np.float64]  # (n_samples,) uneven [s]
+    step: float  # [s]
+    uniform: NDArray[np.float64]  # (n_steps,) from the first uneven time on [s]
+    usual: float  # mean step without gaps [s]
+    gaps: NDArray[np.float64]  # (n_gaps,) lengths [s]
+    note: str  # what is done, for the description of the data
+    kept: NDArray[np.bool_]  # (n_rows,) samples that are used: of those with equal times the first
+
+    def interpolate(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Values (n_steps,) at the uniform times, linear between known samples, NaN in gaps and beyond the last."""
+        values = values[self.kept]
+        known = np.flatnonzero(~np.isnan(values))
+        if known.size == 0:
+            return np.full(self.uniform.size, np.nan)
+        times = self.times[known]
+        after = np.searchsorted(times, self.uniform).clip(0, times.size - 1)
+        before = (after - 1).clip(0)
+        ahead, behind = times[after] - self.uniform, self.uniform - times[before]
+        nearest = np.where(np.abs(ahead) < np.abs(behind), after, before)
+        found = np.interp(self.uniform, times, values[known])
+        apart = (ahead + behind > _GAP * self.usual) | (ahead < 0.0) | (behind < 0.0)
+        near = np.minimum(np.abs(ahead), np.abs(behind)) <= _NEAR * self.usual
+        return np.where(apart, np.where(near, values[known][nearest], np.nan), found)
+
+    def straight(self, values: NDArray[np.float64], where: str, stacklevel: int) -> NDArray[np.float64]:
+        """Values (n_steps,) at the uniform times, with straight lines over gaps and a warning about them."""
+        if self.gaps.size:
+            warnings.warn(
+                f"{where}: {self.note}; an excitation needs all samples, so the gaps are straight lines: compare with "
+                "another record of the motion if a gap is in its strong part",
+                UserWarning,
+                stacklevel=stacklevel + 1,
+            )
+        return np.interp(self.uniform, self.times, values[self.kept])
+
+
+def uniform_times(times: NDArray[np.float64], step: float | None, where: str) -> UniformTimes:
+    """Return times with the uniform `step` [s] from the first to the last of the given times (n_samples,) [s].
+
+    The default step is a whole number of samples per second within 5 % of the usual step, else the usual step. Raises
+    ValueError if times decrease or many repeat, more than half of the samples are missing, or the step differs from the
+    usual one by more than 5 %: that would need a filter (`Record.resample`, `Measurements.decimate`). Of samples with
+    equal times the first one is used.
+    """
+    step = None if step is None else check_step(step, f"resample of {where}")
+    kept = np.concatenate([[True], np.diff(times) != 0.0])
+    if 0 < (repeated := np.count_nonzero(~kept)) <= _MOST_REPEATED * times.size:
+        first_repeated, times = float(times[~kept][0]), times[kept]
+    else:
+        repeated, kept = 0, np.ones(times.size, dtype=bool)
+    increments = np.diff(times)
+    if times.size < 2 or not np.all(increments > 0.0):
+        place = int(np.argmax(~(increments > 0.0))) if times.size > 1 else 0
+        raise ValueError(
+            f"{where}: expected times that increase, got {times[min(place + 1, times.size - 1)]:.15g} s after "
+            f"{times[place]:.15g} s; if the times are those of packets, leave the column of times out and give dt="
+        )
+    usual = float(increments[increments <= _GAP * np.median(increments)].mean())
+    if step is None:
+        whole = 1.0 / max(round(1.0 / usual), 1) if usual > 1e-9 else usual
+        step = whole if abs(whole - usual) < 0.999 * _LARGEST_DIFFERENCE * usual else usual
+    if abs(step - usual) > _LARGEST_DIFFERENCE * usual:
+        raise ValueError(
+            f"{where}: expected the nominal step of the samples, about {usual:.4g} s, got resample={step:g}; resample "
+            "the record or decimate the measurements afterwards"
+        )
+    gaps, others = (increments[chosen] for chosen in (increments > _GAP * usual, increments <= _GAP * usual))
+    note = f"interpolated linearly to a step of {step:g} s from steps of {others.min():.4g} to {others.max():.4g} s"
+    note += f", with {gaps.size} gap(s) of up to {gaps.max():.4g} s" if gaps.size else ""
+    note += f", without {repeated} row(s) of a repeated time, the first at {first_repeated:g} s" if repeated else ""
+    duration = times[-1] - times[0]
+    if duration > 2 * times.size * step:
+        raise ValueError(
+            f"{where}: expected samples at most times, got {times.size} in {duration:.4g} s with a gap of "
+            f"{gaps.max():.4g} s; cut the file at its long gaps"
+        )
+    uniform = times[0] + step * np.arange(int(duration / step + 1e-6) + 1)
+    return UniformTimes(times, step, uniform, usual, gaps, note, kept)

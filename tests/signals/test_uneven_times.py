@@ -5,7 +5,7 @@ import pytest
 
 from fe_likelihoods import Channel, read_columns
 from fe_likelihoods.signals.read import read_record
-from fe_likelihoods.signals.uneven_times import uniform_times
+from fe_likelihoods.signals.tables import uniform_times
 from fe_likelihoods.units import G0
 
 TOP = Channel("top", "acceleration", "g")
