@@ -20,7 +20,7 @@ from .job import Job, read_job
 from .models import Problem, make_problem, noise_channels_of
 from .results import names_of
 from .runs import CACHE, default_folder, is_free
-from .sampling import is_emcee, make_sampler
+from .sampling import make_sampler
 
 __all__ = ["check_job"]
 
@@ -52,11 +52,7 @@ def check_job(file: Path, picture: Path, say: Callable[[str], None], progress: b
         steps = f"{event.record.n_steps} samples at {event.record.dt:g} s"
         compared = "without measurements" if event.measured is None else "compared with measurements"
         say(f"Event {event.name}: {event.record.name}, {steps}, {compared}")
-    if is_emcee(job):
-        simulations = sampler.nwalkers * (job.sampler.steps + 1)
-        say(f"emcee makes {simulations} simulations: {sampler.nwalkers} walkers, {job.sampler.steps} steps")
-    else:
-        _say_cost(make_problem(job).posterior, job, sampler, checked, say)
+    _say_cost(make_problem(job).posterior, job, sampler, checked, say)
     pictures = _draw(problem, checked.seconds, picture)
     names = ", ".join(map(str, pictures))
     say(f"{names}: the measurements should lie within the band of the simulations at draws of the prior")

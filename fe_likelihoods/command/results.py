@@ -1,7 +1,6 @@
 """Files of a finished run: tables as text and CSV, samples for arviz, the prediction, and the report."""
 
 import csv
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ __all__ = ["names_of", "write_csv", "write_samples", "write_tables"]
 def write_tables(folder: Path, run: FinishedRun, judgement: Judgement, agreement: str = "") -> tuple[str, ...]:
     """Write judgement, moments of the parameters, stages and errors of the fit; returns the names of the files.
 
-    `agreement` says how independent runs agree. A run without tempering has no ``stages.txt``.
+    `agreement` says how independent runs agree.
     """
     from samplers import ladder_table, summary
 
@@ -35,15 +34,15 @@ def write_tables(folder: Path, run: FinishedRun, judgement: Judgement, agreement
     fits = {}  # of each data set: rows of a table, and lines of text
     for key, (part, columns) in zip(names_of(posterior.likelihood), posterior.likelihood.parts(), strict=True):
         fits[key] = (_modes if part.is_modal else _fit)(part, run.samples[:, columns])
-    simulations = run.sampler.simulations if run.tempered else 0.0
     lines = [
         str(judgement),
         "",
         str(moments),
         "",
-        *_of_the_sampler(run),
+        f"log-evidence {run.sampler.log_evidence:.2f} +- {run.sampler.log_evidence_error:.2g}",
+        str(run.verdict),
         *filter(None, [agreement]),
-        *_model_runs(next(iter(posterior.likelihood.parts()))[0], simulations),
+        *_model_runs(next(iter(posterior.likelihood.parts()))[0], run.sampler.simulations),
         "",
     ]
     lines += [line for _, text in fits.values() for line in text]
@@ -53,39 +52,13 @@ def write_tables(folder: Path, run: FinishedRun, judgement: Judgement, agreement
     values = (labels, moments.mean, errors, moments.sd, of_sd, moments.cv, low, median, high, nominal)
     rows = [dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True)]
     write_csv(folder / "summary.csv", rows)
-    files = ["summary.txt", "summary.csv"]
+    files = ["summary.txt", "summary.csv", "stages.txt"]
     for key, (rows, _) in fits.items():
         name = f"fit-{key}.csv" if key else "fit.csv"
         write_csv(folder / name, rows)
         files.append(name)
-    if run.tempered:
-        (folder / "stages.txt").write_text(ladder_table(run.sampler) + "\n", encoding="utf-8")
-        files.append("stages.txt")
+    (folder / "stages.txt").write_text(ladder_table(run.sampler) + "\n", encoding="utf-8")
     return tuple(files)
-
-
-def _of_the_sampler(run: FinishedRun) -> list[str]:
-    """Evidence and verdict, or the length of a Markov chain, as lines of text."""
-    if run.tempered:
-        value, error = run.sampler.log_evidence, run.sampler.log_evidence_error
-        return [f"log-evidence {value:.2f} +- {error:.2g}", str(run.verdict)]
-    used = run.sampler.iteration - run.discard
-    worth = (
-        f"worth about {run.effective_sample_size:.0f} independent ones (longest autocorrelation time "
-        f"{run.autocorrelation_time:.0f} iterations)"
-        if math.isfinite(run.effective_sample_size)
-        else "too few to estimate the autocorrelation time and the error of the means"
-    )
-    lines = [
-        f"{len(run.samples)} samples of {run.sampler.nwalkers} walkers in {used} iterations, after {run.discard} that "
-        f"are left out; {worth}. emcee gives neither an evidence nor a verdict."
-    ]
-    if run.is_inconclusive:
-        lines.append(
-            "Not usable: the chain is shorter than 50 autocorrelation times. Give more `steps` in [sampler] and give "
-            'the same command again, or use kind = "smc".'
-        )
-    return lines
 
 
 def _model_runs(likelihood: FELikelihood, simulations: float) -> list[str]:
@@ -169,7 +142,5 @@ def _agreement(data: Any, samplers: Sequence[Any]) -> str:
     found = found["posterior"] if "posterior" in getattr(found, "children", {}) else found
     name, worst = max(((name, float(each)) for name, each in found.data_vars.items()), key=lambda each: each[1])
     text = f"{len(samplers)} independent runs: r_hat at most {worst:.3f} ({name}; above 1.01 they differ)"
-    if not hasattr(samplers[0], "log_evidence"):
-        return text
     evidences = (f"{each.log_evidence:.2f} +- {each.log_evidence_error:.2g}" for each in samplers)
     return f"{text}, log-evidences {', '.join(evidences)}"

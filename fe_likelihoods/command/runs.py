@@ -22,12 +22,11 @@ from ..checks.rehearsal import refuse_chance
 from ..checks.result import judge_run
 from ..checks.run import read_run
 from ..prediction.prediction import Prediction
-from ..signals.datasets import DAMAGE
 from .events import Event, describe_events, predict_events, predict_quietly, read_events, write_events
 from .job import Job, parse_job, read_job
 from .models import Problem, make_problem, runs_code_of_user
 from .results import write_samples, write_tables
-from .sampling import STEPS, discarded, is_emcee, make_sampler, run_sampler
+from .sampling import STEPS, make_sampler, run_sampler
 
 __all__ = ["CACHE", "Outcome", "default_folder", "is_free", "report_run", "run_job"]
 
@@ -77,8 +76,8 @@ def run_job(
     if runs_code_of_user(job) and not (folder / CHAIN).exists():
         refuse_chance(problem.posterior)
     samplers = _stored_samplers(job, problem, folder)
-    for chain, sampler in enumerate(samplers):
-        run_sampler(job, problem, sampler, progress, chain)
+    for sampler in samplers:
+        run_sampler(job, sampler, progress)
     return Outcome(folder, samplers[0], problem, *_write(folder, job, job.file, samplers, problem, events, progress))
 
 
@@ -104,13 +103,13 @@ def report_run(path: Path, runs_code: bool = False) -> Outcome:
     cache = SimulationCache(folder / CACHE) if (folder / CACHE).is_file() else None
     problem = make_problem(job, cache)
     samplers = _stored_samplers(job, problem, folder)
-    if min(sampler.iteration for sampler in samplers) <= discarded(job):
+    if not all(sampler.iteration for sampler in samplers):
         raise ValueError(
             f"the run in {folder} has no samples yet; continue it with: fe-likelihoods run {origin['file']} --out "
             f"{folder}"
         )
     steps = job.sampler.steps or STEPS
-    for sampler in [] if is_emcee(job) else samplers:
+    for sampler in samplers:
         if sampler.iteration >= steps:
             # the annealing is made again without an evaluation; the chain alone has lost which walkers are copies
             with _without_messages("samplers.tempered"):
@@ -146,24 +145,11 @@ def _origin(folder: Path) -> dict[str, Any]:
 
 def _stored_samplers(job: Job, problem: Problem, folder: Path) -> list[Any]:
     """A sampler for each independent run of a folder, whose chains are in run.h5, run-2.h5, ..."""
-    names = [CHAIN, *(f"run-{k}.h5" for k in range(2, job.sampler.chains + 1))]
-    return [_stored_sampler(job, problem, folder / name, chain) for chain, name in enumerate(names)]
-
-
-def _stored_sampler(job: Job, problem: Problem, path: Path, chain: int) -> Any:
-    """The sampler with a stored chain; ValueError if a chain of emcee is damaged."""
     import emcee
 
-    backend = emcee.backends.HDFBackend(str(path))
-    if is_emcee(job) and path.is_file() and path.stat().st_size:
-        try:
-            with backend.open():  # `initialized` of emcee is silent about a damaged file
-                pass
-            if backend.initialized and backend.iteration:
-                backend.get_chain(), backend.get_log_prob()
-        except (*DAMAGE, ValueError) as error:
-            raise _damaged(path, error) from error
-    return make_sampler(job, problem, backend, chain)
+    names = [CHAIN, *(f"run-{k}.h5" for k in range(2, job.sampler.chains + 1))]
+    backends = [emcee.backends.HDFBackend(str(folder / name)) for name in names]
+    return [make_sampler(job, problem, backend, chain) for chain, backend in enumerate(backends)]
 
 
 @contextlib.contextmanager
@@ -188,7 +174,7 @@ def _write(
     from ..reporting.report import write_page
 
     sampler = samplers[0]
-    run = read_run(sampler, problem.posterior, truth=problem.truth, discard=discarded(job))
+    run = read_run(sampler, problem.posterior, truth=problem.truth)
     drawn = _drawn(job, problem, sampler)
     prediction = _predict(job, problem, drawn, progress)
     predicted = predict_events(job, events, problem, drawn, progress)
@@ -247,15 +233,13 @@ def _changes(old: str, new: str) -> list[str]:
     found = []
     for section in sorted({*before, *after} - {*CHANGEABLE}):
         ours, theirs = before.get(section, {}), after.get(section, {})
-        if section == "sampler" and ours.get("kind") == "emcee":  # a chain may be continued, and more of it left out
-            ours, theirs = ({k: v for k, v in each.items() if k not in ("steps", "discard")} for each in (ours, theirs))
         found += [f"[{section}] {key}" for key in sorted({*ours, *theirs}) if ours.get(key) != theirs.get(key)]
     return found
 
 
 def _drawn(job: Job, problem: Problem, sampler: Any) -> np.ndarray:
     """Draws of the posterior to predict with, evenly from the chain."""
-    samples, n = sampler.get_chain(flat=True, discard=discarded(job)), job.prediction.draws
+    samples, n = sampler.get_chain(flat=True), job.prediction.draws
     rows = np.unique(np.linspace(0, len(samples) - 1, min(n, len(samples))).round().astype(int))
     return problem.posterior.draw_noise(samples[rows], job.sampler.seed) if job.marginal else samples[rows]
 

@@ -346,7 +346,7 @@ def test_another_file_of_the_same_name_is_refused(finished):
         (
             "guide = true",
             'guide = true\nkind = "mcmc"',
-            "[sampler] kind: expected one of smc, tmcmc, emcee; got 'mcmc'",
+            "[sampler] kind: expected one of smc, tmcmc; got 'mcmc'",
         ),
         ("[prediction]", "[budget]\nworkers = 2\n[prediction]", "[budget] workers: a built-in model uses all cores"),
         (
