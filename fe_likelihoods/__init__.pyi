@@ -23,7 +23,6 @@ from .modal.modal_data import ModalData
 from .modal.modal_likelihood import ModalLikelihood
 from .modal.modal_readers import read_modal_data
 from .modal.mode_models import FunctionModes
-from .models.equivalent_linear import EquivalentLinear
 from .models.executable import ExecutableModel
 from .models.function import FunctionModel
 from .models.isolated_bridge import IsolatedBridge
@@ -35,7 +34,7 @@ from .models.rc_column import RCColumn
 from .models.rc_column_curves import material_curves, moment_curvature
 from .models.rc_column_parts import Bars, Concrete, Hoops, LowCycleFatigue, Steel
 from .models.sensed import SensedModel, Sensor
-from .models.tall_buildings import GroupedFrame, ModalModel, ShearFlexuralBeam
+from .models.tall_buildings import GroupedFrame, ModalModel
 from .models.umbridge import UMBridgeModel
 from .noise.autoregressive import AutoregressiveNoise
 from .noise.gaussian import GaussianNoise
@@ -79,7 +78,6 @@ __all__ = [
     "Concrete",
     "DaskExecutor",
     "DisplacementHistory",
-    "EquivalentLinear",
     "EventRatios",
     "Events",
     "ExecutableModel",
@@ -109,7 +107,6 @@ __all__ = [
     "Prior",
     "RCColumn",
     "Record",
-    "ShearFlexuralBeam",
     "SensedModel",
     "Sensor",
     "ShearFrame",

@@ -11,8 +11,7 @@ uncouple in the complex modes, q' = lam q + f(t). With accelerations that are li
 has a closed-form solution without time-stepping error (``docs/theory/time_integration.rst``).
 
 `LinearStructure` makes a model from any object that computes these matrices from parameters: a bridge deck and a frame
-(`fe_likelihoods.models.linear_structure_parts`), tall buildings (`fe_likelihoods.models.tall_buildings`), or one of
-these with stiffness and damping that depend on the amplitude (`fe_likelihoods.models.equivalent_linear`).
+(`fe_likelihoods.models.linear_structure_parts`), or a tall building (`fe_likelihoods.models.tall_buildings`).
 
 References
 ----------
@@ -21,7 +20,6 @@ A. K. Chopra, Dynamics of Structures, 4th edition, Prentice Hall, 2012.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -31,7 +29,6 @@ from numpy.typing import ArrayLike
 from ..signals.channels import Channel
 from ..signals.records import Record
 from ..signals.sampling import same_sampling, sample_window
-from .equivalent_linear import EquivalentLinear
 from .linear_system import Parts, complex_modes, superpose
 from .undamped_modes import Modes, undamped_modes
 from .user_model import ExternalModel
@@ -81,7 +78,7 @@ class LinearStructure(ExternalModel):
 
     Parameters
     ----------
-    parts : BridgeDeck, ShearFrame, EquivalentLinear, or an object with the interface `Parts`
+    parts : BridgeDeck, ShearFrame, or an object with the interface `Parts`
         Parameters and matrices of the structure.
     supports : Record or sequence of Record
         Absolute accelerations of the supports, with the same step and length, in the order that `parts` documents.
@@ -150,11 +147,8 @@ class LinearStructure(ExternalModel):
         self.unit = unit
         self.lead = float(lead)
         self._acceleration = np.stack([support.acceleration for support in supports])
-        self._stamp()
-
-    def _stamp(self) -> None:
-        supports = [support.fingerprint for support in self.supports]
-        self.fingerprint = self._digest(repr(self.parts), self._window.start, supports, *(self.outputs or ()))
+        motions = [support.fingerprint for support in self.supports]
+        self.fingerprint = self._digest(repr(self.parts), self._window.start, motions, *(self.outputs or ()))
 
     def with_record(self, record: Record | Sequence[Record]) -> LinearStructure:
         """Return the same structure under other support accelerations; errors as for a new structure.
@@ -166,16 +160,8 @@ class LinearStructure(ExternalModel):
     def followed_by(self, record: Record | Sequence[Record], rest: float = 10.0) -> LinearStructure:
         """Return the same structure under its present motions, a pause of `rest` [s] and further support motions.
 
-        Its response ends with the samples of ``with_record(record)``.
-
-        ValueError as `Record.followed_by`, and if the properties depend on the amplitude (`EquivalentLinear`).
+        Its response ends with the samples of ``with_record(record)``. ValueError as `Record.followed_by`.
         """
-        if isinstance(self.parts, EquivalentLinear):
-            raise ValueError(
-                "the properties of an EquivalentLinear structure follow from one level for the whole record, which "
-                "would be the same for both events: simulate each event alone, with_record(record), or "
-                'from_state="virgin" in predictions'
-            )
         further = self.with_record(record).supports
         joined = [own.followed_by(each, rest) for own, each in zip(self.supports, further, strict=True)]
         return self.with_record(joined)
@@ -186,23 +172,14 @@ class LinearStructure(ExternalModel):
         `seconds` is the time of the last sample of the response [s], which starts after the lead. ValueError if it is
         not within the response, or fewer than two samples remain.
         """
-        kept = sample_window("the response", self.n_steps, self.dt, 0.0, seconds).stop
-        last = self._window.start + kept
-        if not isinstance(self.parts, EquivalentLinear):
-            return self.with_record([support.trim(0.0, (last - 1) * self.dt) for support in self.supports])
-        part = copy.copy(self)  # later motion counts: its level
-        part.n_steps, part._window = kept, slice(self._window.start, last)
-        part._stamp()
-        return part
+        last = self._window.start + sample_window("the response", self.n_steps, self.dt, 0.0, seconds).stop
+        return self.with_record([support.trim(0.0, (last - 1) * self.dt) for support in self.supports])
 
     def modes(self, theta: ArrayLike, n: int | None = None) -> Modes:
         """Return the lowest n undamped modes (default: all), with shapes (n, n_channels) at the channels of the parts.
 
-        `theta` is as for `simulate`. Raises SimulationFailed as `undamped_modes`, and ValueError for an
-        `EquivalentLinear`, whose stiffness depends on the motion.
+        `theta` is as for `simulate`. Raises SimulationFailed as `undamped_modes`.
         """
-        if isinstance(self.parts, EquivalentLinear):
-            raise ValueError("an EquivalentLinear structure has no modes of its own: take the modes of its parts")
         values = check_theta(theta, self.parameter_names)
         system = self.parts.assemble(values)
         modes = undamped_modes(system.stiffness, system.mass, n)
@@ -210,10 +187,7 @@ class LinearStructure(ExternalModel):
 
     def _respond(self, theta: np.ndarray) -> np.ndarray:
         motion = self._acceleration
-        if isinstance(self.parts, EquivalentLinear):
-            system = self.parts.settle(theta, motion, self.dt).system
-        else:
-            system = self.parts.assemble(theta)
+        system = self.parts.assemble(theta)
         modes = complex_modes(system)
         weights, direct = system.shape, system.direct
         if self.outputs is not None:

@@ -45,12 +45,12 @@ def plot_scores(
     matplotlib Figure
         Three axes. Left: shares of the PIT in equal parts of 0 to 1 (ten for histories), with the band that contains
         90 % of the shares of calibrated predictions (binomial, for the number of independent samples), and standard
-        errors of their mean between histories for three events or more. Histories:
-        coverage of all samples and of the strong part with its standard error (between events for three events or more,
-        else binomial, for the number of independent samples, of all samples alone), and the interval score of each channel, which is the
-        width of the band and a penalty, as multiples of the root mean square of the measured channel. Numbers: median,
-        50 % and outer interval divided by the measured value, in the order of the events, and the shares of
-        measured values in the intervals, with the mean width and score of the outer ones.
+        errors of their mean between histories for three events or more. Histories: coverage of all samples and of the
+        strong part, with its standard error between events for three events or more, else, for all samples, binomial
+        for the number of independent ones; and the interval score of each channel, which is the width of the band and
+        a penalty, as multiples of the root mean square of the measured channel. Numbers: median, 50 % and outer
+        interval divided by the measured value, in the order of the events, and the shares of measured values in the
+        intervals, with the mean width and score of the outer ones.
 
     Raises
     ------

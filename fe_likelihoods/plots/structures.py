@@ -91,8 +91,8 @@ def plot_sensors(model: RCColumn | LinearStructure, axes: Axes | None = None, ra
     Parameters
     ----------
     model : RCColumn or LinearStructure
-        The column, or a building whose parts have floors or heights (`ShearFrame`, `GroupedFrame`,
-        `ShearFlexuralBeam`); its channels have the names of its outputs.
+        The column, or a building whose parts have floors (`ShearFrame`, `GroupedFrame`); its channels
+        have the names of its outputs.
     axes : matplotlib Axes, optional
         Where to draw. Default: a new figure.
     ranks : sequence of str
@@ -102,12 +102,12 @@ def plot_sensors(model: RCColumn | LinearStructure, axes: Axes | None = None, ra
     Returns
     -------
     matplotlib Axes
-        The axes with the figure; lengths in metres, floors by their number, or shares of the height.
+        The axes with the figure; lengths in metres, floors by their number.
 
     Raises
     ------
     ValueError
-        If a rank is of no channel, or the structure has no heights.
+        If a rank is of no channel, or the structure has no floors.
 
     Examples
     --------
@@ -160,19 +160,17 @@ def _draw_column(column: RCColumn, axes: Axes) -> Drawn:
 
 
 def _draw_building(model: LinearStructure, axes: Axes) -> Drawn:
-    parts = getattr(model.parts, "parts", model.parts)  # of an EquivalentLinear
-    places = dict(getattr(parts, "floors", None) or getattr(parts, "heights", None) or ())
+    parts = model.parts
+    places = dict(getattr(parts, "floors", ()))
     if not places:
         raise ValueError(
-            f"expected a building whose parts have floors or heights; got {type(parts).__name__}: its channels have no "
-            "known places"
+            f"expected a building whose parts have floors; got {type(parts).__name__}: its channels have no places"
         )
-    floors = hasattr(parts, "floors")
-    height, radius = (len(parts.masses), 0.25 * len(parts.masses)) if floors else (1.0, 0.25)
+    height, radius = len(parts.masses), 0.25 * len(parts.masses)
     axes.vlines([-radius, radius], 0.0, height, color="0.5", linewidth=1.5)
-    axes.hlines(np.arange(1, height + 1) if floors else [height], -radius, radius, color="0.5", linewidth=3.0)
+    axes.hlines(np.arange(1, height + 1), -radius, radius, color="0.5", linewidth=3.0)
     axes.hlines(0.0, -2.0 * radius, 2.0 * radius, color="0.4", linewidth=4.0)
-    axes.set_ylabel("floor" if floors else "height, as a share of the building's")
+    axes.set_ylabel("floor")
     axes.set_xticks([])
     names = list(places)
 

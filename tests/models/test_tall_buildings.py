@@ -1,4 +1,4 @@
-"""Models of tall buildings against eigenvalue solutions, the shear frame, beam elements, and OpenSees."""
+"""Models of tall buildings against eigenvalue solutions and the shear frame."""
 
 import math
 
@@ -11,11 +11,9 @@ from fe_likelihoods import (
     LinearStructure,
     ModalModel,
     Record,
-    ShearFlexuralBeam,
     ShearFrame,
     SimulationFailed,
 )
-from fe_likelihoods.models.tall_buildings import beam_modes
 
 DT, N = 0.02, 6
 FLOORS = {"middle": 3, "roof": 6}
@@ -71,56 +69,6 @@ def test_groups_are_the_frame_with_equal_factors(record):
     np.testing.assert_array_equal(grouped.simulate([1.1, 0.8, 1.3, 0.03]), expected)
 
 
-def beam_elements(alpha: float, n: int, stations: list[int], n_modes: int):
-    """Frequency ratios and effective shapes of a cantilever of n cubic elements of flexural and shear stiffness."""
-    h, size = 1.0 / n, 2 * n + 2
-    bending = np.array(
-        [[12, 6 * h, -12, 6 * h], [6 * h, 4 * h * h, -6 * h, 2 * h * h]]
-        + [[-12, -6 * h, 12, -6 * h], [6 * h, 2 * h * h, -6 * h, 4 * h * h]]
-    )
-    shear = np.array(
-        [[36, 3 * h, -36, 3 * h], [3 * h, 4 * h * h, -3 * h, -h * h]]
-        + [[-36, -3 * h, 36, -3 * h], [3 * h, -h * h, -3 * h, 4 * h * h]]
-    )
-    inertia = np.array(
-        [[156, 22 * h, 54, -13 * h], [22 * h, 4 * h * h, 13 * h, -3 * h * h]]
-        + [[54, 13 * h, 156, -22 * h], [-13 * h, -3 * h * h, -22 * h, 4 * h * h]]
-    )
-    stiffness, mass = np.zeros((size, size)), np.zeros((size, size))
-    for e in range(n):
-        at = slice(2 * e, 2 * e + 4)
-        stiffness[at, at] += bending / h**3 + alpha**2 * shear / (30.0 * h)
-        mass[at, at] += h * inertia / 420.0
-    squares, vectors = eigh(stiffness[2:, 2:], mass[2:, 2:], subset_by_index=[0, n_modes - 1])
-    unit = np.zeros(size)
-    unit[::2] = 1.0  # rigid translation
-    participation = vectors.T @ (mass @ unit)[2:]
-    rows = [2 * (station - 1) for station in stations]
-    return np.sqrt(squares / squares[0]), (vectors * participation)[rows]
-
-
-@pytest.mark.parametrize("alpha", [0.0, 0.5, 4.0, 30.0])
-def test_modes_of_the_shear_flexural_beam_by_finite_elements(alpha):
-    ratios, shapes = beam_elements(alpha, 80, [40, 60, 80], 6)
-    found = beam_modes(alpha, 6, np.array([0.5, 0.75, 1.0]))
-    np.testing.assert_allclose(found.frequency_ratios, ratios, rtol=3e-5)
-    np.testing.assert_allclose(found.shapes, shapes, rtol=0, atol=3e-5)
-
-
-def test_limits_of_the_shear_flexural_beam():
-    """alpha = 0: cos x cosh x = -1 (Blevins 1979, table 8-1); large alpha: frequencies 1, 3, 5 of a shear beam."""
-    roots = np.array([1.87510407, 4.69409113, 7.85475744])
-    top = np.array([1.0])
-    np.testing.assert_allclose(beam_modes(0.0, 3, top).frequency_ratios, (roots / roots[0]) ** 2, rtol=1e-8)
-    shear = beam_modes(1000.0, 3, top)
-    np.testing.assert_allclose(shear.frequency_ratios, [1.0, 3.0, 5.0], rtol=1e-4)
-    np.testing.assert_allclose(shear.shapes[0], 4.0 / np.pi * np.array([1.0, -1.0 / 3.0, 1.0 / 5.0]), rtol=2e-3)
-    many = beam_modes(3.0, 50, np.array([0.4, 1.0])).shapes.cumsum(axis=1)
-    np.testing.assert_allclose(many[:, -1], 1.0, atol=0.02)  # shapes add to 1
-    with np.errstate(over="raise", invalid="raise", divide="raise"):
-        assert np.isfinite(beam_modes(1000.0, 50, top).shapes).all()
-
-
 @pytest.mark.parametrize(
     ("parts", "theta", "words"),
     [
@@ -128,8 +76,6 @@ def test_limits_of_the_shear_flexural_beam():
         (ModalModel(["roof"], 1), [-1.0, 0.02, 1.0], "positive and ascending"),
         (ModalModel(["roof"], 1), [1.0, 0.0, 1.0], "damping ratios must be positive"),
         (GroupedFrame({"roof": 2}, [1, 1], [9, 9], [1, 1]), [1.0, -0.1], "not positive: damping"),
-        (ShearFlexuralBeam({"roof": 1.0}), [0.2, -1.0, 0.02], "alpha from 0 to 1000"),
-        (ShearFlexuralBeam({"roof": 1.0}), [0.2, 1.0, math.nan], "must be positive"),
     ],
 )
 def test_impossible_parameters_fail_with_reasons(record, parts, theta, words):
@@ -146,8 +92,6 @@ def test_impossible_parameters_fail_with_reasons(record, parts, theta, words):
         (lambda: GroupedFrame({"roof": 2}, [1, 1], [9, 9], [1, 3]), "without gaps; got"),
         (lambda: GroupedFrame({"roof": 2}, [1, 1], [9, 9], [1]), "each of 2 storeys"),
         (lambda: GroupedFrame({"roof": 3}, [1, 1], [9, 9], [1, 1]), "floors from 1 to 2"),
-        (lambda: ShearFlexuralBeam({"roof": 1.2}), "shares of that of the building"),
-        (lambda: ShearFlexuralBeam({"roof": 1.0}, 2.5), "n_modes of a ShearFlexuralBeam"),
     ],
 )
 def test_wrong_arguments_are_rejected(make, words):
@@ -161,7 +105,5 @@ def test_fingerprints_differ(record):
         ModalModel(["roof"], 3),
         GroupedFrame({"roof": 2}, [1, 1], [9, 9], [1, 1]),
         GroupedFrame({"roof": 2}, [1, 1], [9, 9], [1, 2]),
-        ShearFlexuralBeam({"roof": 1.0}),
-        ShearFlexuralBeam({"roof": 0.9}),
     ]
     assert len({LinearStructure(each, record).fingerprint for each in parts}) == len(parts)
