@@ -19,7 +19,7 @@ import numpy as np
 from .settings import Settings, as_whole_number
 from .smc import SMCSampler
 from .tempered import TemperedSampler
-from .tempering.recycling import DRAWS_PER_TARGET, POINTS_PER_DIMENSION, TARGET_SHARE, search_draws
+from .tempering.recycling import DRAWS_PER_TARGET, search_draws, smallest_target
 
 __all__ = ["CostEstimate", "as_duration", "estimate_cost", "expected_evaluations"]
 
@@ -188,7 +188,7 @@ def expected_evaluations(settings: Settings, nwalkers: int, ndim: int, beta: flo
     """Fewest and most evaluations of a run whose first stage has the exponent `beta` > 0."""
     if settings.recycle:
         left = -np.log(beta) / min(1.7, 2.9 * ndim**-0.55)
-        per_stage = DRAWS_PER_STAGE * max(TARGET_SHARE * nwalkers, POINTS_PER_DIMENSION * (ndim + 1.0))
+        per_stage = DRAWS_PER_STAGE * smallest_target(nwalkers, ndim)
         stages = left * (per_stage + search_draws(nwalkers) / max(left, 1.0))
         low, high = ((2.0 + end) * nwalkers for end in AT_THE_END)
         return 0.65 * stages + low, 1.4 * stages + high

@@ -40,6 +40,8 @@ SIGNIFICANT, SPREADS = 0.5, 5.0
 KEPT, CONCENTRATIONS = 0.7, 4
 # Points needed per coefficient, and largest number of coefficients of a quadratic with all products.
 PER_COEFFICIENT, MOST_COEFFICIENTS = 1.5, 700
+# Largest number of points that are fitted, evenly spaced: more would take most of the time of a run in 30 dimensions.
+MOST_FITTED = 4000
 STRENGTHS = (1e-6, 1e-4, 1e-2, 1.0, 100.0)
 # Eigenvalues of A: a basin may be wider than the component by a factor of 1.8, and narrower by 100.
 CURVATURES = (0.3, 1e4)
@@ -147,7 +149,8 @@ def _basins_of_points(mixture: Mixture, points: np.ndarray, target: np.ndarray, 
         if count < PER_COEFFICIENT * (ndim + 2):
             explained[own] = np.inf
             continue
-        quadratic, spread, uncertainty = _fit_most(standard[own], target[own] + log_volume, fulls[k])
+        fitted = np.flatnonzero(own)[:: -(-count // MOST_FITTED)]
+        quadratic, spread, uncertainty = _fit_most(standard[fitted], target[fitted] + log_volume, fulls[k])
         basin = _own_basin(quadratic, variance) if fulls[k] and spread < AGREEING else None
         found += [] if basin is None else [(k, basin)]
         # a quadratic with a mode explains points of its neighbours too

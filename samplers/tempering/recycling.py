@@ -51,14 +51,16 @@ from .next_beta import next_beta
 from .pending_points import PendingPoints
 from .population import Density, Population
 
-__all__ = ["Recycled", "StartingDensity", "most_running", "recycle", "search_draws", "submit_start"]
+__all__ = ["Recycled", "StartingDensity", "most_running", "recycle", "search_draws", "smallest_target", "submit_start"]
 
 # Wanted effective sample size at each beta (the target), as a share of the number of starting points. A small target
 # allows large steps of beta; the fresh draws of a round then restore the effective sample size.
 TARGET_SHARE = 0.2
 # Smallest target per dimension (and one more): fewer effective points do not determine the covariances of the mixture.
-# Also per component, once a fit has had several: with fewer, the shares of modes drift from beta to beta.
-POINTS_PER_DIMENSION, POINTS_PER_COMPONENT = 5.0, 8.0
+# Also per component, once a fit has had several: with fewer, the shares of modes drift from beta to beta. And the
+# smallest target per number of a mean and a covariance: with a quarter, draws of a normal posterior in 40 dimensions
+# have an efficiency of 2 %.
+POINTS_PER_DIMENSION, POINTS_PER_COMPONENT, POINTS_PER_NUMBER = 5.0, 8.0, 0.5
 # Draws of a round, as a multiple of the target.
 DRAWS_PER_TARGET = 3.0
 # Further draws, spread over the stages below beta = 1: they find narrow modes, which hold few points at small beta.
@@ -149,7 +151,7 @@ def recycle(
     # another starting density was fitted by a separate search
     search, basin_rounds = _Search(search_draws(n) if start is None else 0.0), 0
     start = StartingDensity(n, lambda _, records: records["log_prior"]) if start is None else start
-    target = least = max(TARGET_SHARE * n, POINTS_PER_DIMENSION * (ndim + 1.0))
+    target = least = smallest_target(n, ndim)
     points, bounds = WeightedPoints(pending, start), find_support_bounds(density.inside, pending.coords)
     beta, efficiencies, increments, checks, most = 0.0, [], [], 0, 1
     drawn: list[_Drawn] = []  # at the present beta
@@ -361,6 +363,13 @@ def submit_start(coords: np.ndarray, density: Density, whole: bool = False) -> P
         few, records = pending.arrived_part()
         raise stop_at(Population(0.0, few, records, float(len(few))), 0.0, 0.0)
     return pending
+
+
+def smallest_target(size: int, ndim: int) -> float:
+    """Wanted effective sample size of each beta with one component, for a number of starting points."""
+    numbers = ndim * (ndim + 3) / 2.0  # of a mean and a covariance
+    of_numbers = min(POINTS_PER_NUMBER * numbers, LARGEST_SHARE_KEPT * size)
+    return max(TARGET_SHARE * size, POINTS_PER_DIMENSION * (ndim + 1.0), of_numbers)
 
 
 def search_draws(size: int) -> float:

@@ -11,6 +11,7 @@ from samplers import SMCSampler, TMCMCSampler
 from samplers.moves.population_moves import MixtureMove, RandomWalkMove
 from samplers.presets import CHING_CHEN_2007, RAMANCHA_2022_CONSTANT, RAMANCHA_2022_LITERAL
 from tests.contract.targets import Box, Gaussian
+from tests.statistics.analytic_posteriors import gaussian
 
 MODES = {
     "default": {"recycle": True},
@@ -209,3 +210,17 @@ def test_the_backend_changes_no_draw(mode, seed, tmp_path):
     assert np.array_equal(memory.get_chain(), stored.get_chain())
     assert np.array_equal(memory.get_log_prob(), stored.get_log_prob())
     assert memory.log_evidence == stored.log_evidence
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("ndim", "walkers", "most"), [(30, 500, 60_000), (40, 1000, 150_000)])
+def test_many_parameters_are_recycled(ndim, walkers, most):
+    """Moves need 0.42 and 1.14 million evaluations; a check above the earlier points is no reason for them."""
+    posterior = gaussian(1, ndim, width=0.02)
+    sampler = SMCSampler(walkers, ndim, posterior, vectorize=True, seed=1)
+    sampler.run_mcmc(None, 1)
+    samples = sampler.get_chain(flat=True)
+    assert sampler.evaluations < most
+    assert abs(sampler.log_evidence - posterior.log_evidence) < 4.0 * sampler.log_evidence_error
+    assert np.all(np.abs(samples.mean(axis=0) - posterior.mean) < 4.5 * sampler.mean_error())
+    np.testing.assert_allclose(samples.std(axis=0), posterior.sd, rtol=0.15)
