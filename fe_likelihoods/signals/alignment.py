@@ -1,12 +1,8 @@
 r"""Lag, gain and sign of measured channels, compared with an excitation or a response.
 
-A channel is modelled as :math:`y(t) = a\, r(t - \tau) + e(t)` with a reference r, the gain a, which is negative for the
-other sign, the lag :math:`\tau` and an error e. With the correlation :math:`c(\tau)` of y and the shifted reference,
-the log-likelihood, maximised over a and the standard deviation of e, is :math:`-\frac n2 \log(1 - c^2(\tau))`. The lag
-is where the sum over the channels, with the effective number of samples in place of n, is largest.
-
-A structure delays and filters its excitation, so a channel of the structure is not a shifted record. Compare like with
-like: the record with the channel at its base, and the channels of the structure with a simulated response.
+With the correlation :math:`c(\tau)` of a channel and the reference that is later by :math:`\tau`, the log-likelihood,
+maximised over gain and standard deviation of the error, is :math:`-\frac n2 \log(1 - c^2(\tau))`. The lag is where the
+sum over the channels, with the effective number of samples in place of n, is largest.
 """
 
 import math
@@ -25,6 +21,7 @@ _LEAST = 1e-3  # energy of the reference at a lag, of the largest at any lag, be
 _CONTRADICTION = 8.0  # advantage of a channel's own lag over the common one that is stated: 4 standard errors
 _GOOD = 0.7  # correlation below which the reference does not explain the channel
 _SMOOTH = 0.02  # share of the lines over which the spectrum of errors is averaged
+_SURE = 0.99  # probability of the highest peak below which the second one is stated
 _NEARLY_ONE = 1.0 - 1e-12  # largest squared correlation
 
 
@@ -62,17 +59,30 @@ class Alignment(NamedTuple):
     def statement(self) -> str:
         """Lag, gains and their uncertainty, in words."""
         shown = ", ".join(f"{name} {self.gain[name]:.3g} ({c:.3f})" for name, c in self.correlation.items())
-        text = f"lag {self.lag:.5g} s, standard error {self.standard_error:.2g} s, gain (correlation) {shown}"
-        if opposite := [name for name, value in self.correlation.items() if value < -_GOOD]:
-            text += f"; the sign is opposite: {', '.join(opposite)}"
-        if self.own_lags:
-            lags = ", ".join(f"{name} {lag:.5g} s" for name, lag in self.own_lags.items())
-            text += f"; NOT SURE: parts have other lags, each by itself {lags}: see own_lags"
-        if low := [name for name, value in self.correlation.items() if abs(value) < _GOOD]:
-            text += f"; NOT SURE: {', '.join(low)} is not a shifted copy of the reference"
-        if self.probability < 0.99:
-            text += f"; NOT SURE: {self.second_lag:.5g} s is nearly as good, {self.probability:.0%} for the first"
-        return text
+        lags = ", ".join(f"{name} {lag:.5g} s" for name, lag in self.own_lags.items())
+        opposite = ", ".join(name for name, value in self.correlation.items() if value < -_GOOD)
+        low = ", ".join(name for name, value in self.correlation.items() if abs(value) < _GOOD)
+        nearly = "" if self.second_lag is None else f"{self.second_lag:.5g} s is nearly as good, {self.probability:.0%}"
+        return "; ".join(
+            [f"lag {self.lag:.5g} s, standard error {self.standard_error:.2g} s, gain (correlation) {shown}"]
+            + ([f"the sign is opposite: {opposite}"] if opposite else [])
+            + ([f"NOT SURE: parts have other lags, each by itself {lags}: see own_lags"] if lags else [])
+            + ([f"NOT SURE: {low} is not a shifted copy of the reference"] if low else [])
+            + ([f"NOT SURE: {nearly} for the first"] if self.probability < _SURE else [])
+        )
+
+
+class _Fit(NamedTuple):
+    """A channel by the shifted reference."""
+
+    gain: float
+    correlation: float  # zero where nothing is compared
+    effective: float  # number of samples
+    spectrum: np.ndarray  # of the errors
+
+    def score(self, size: float) -> float:
+        """Log-likelihood of as many independent samples."""
+        return -0.5 * size * math.log1p(-min(self.correlation**2, _NEARLY_ONE))
 
 
 class _Pair(NamedTuple):
@@ -95,12 +105,57 @@ class _Pair(NamedTuple):
         """Step of the lags [s]: the channel's, divided so that it is not longer than the reference's."""
         return self.step / max(1, math.ceil(self.step / self.dt - 1e-9))
 
+    def only(self, chosen: np.ndarray) -> "_Pair":
+        """The pair without the samples that are not chosen."""
+        return self._replace(values=np.where(chosen, self.values, np.nan))
+
+    def at(self, times: np.ndarray) -> np.ndarray:
+        """The reference at times within its ends."""
+        return interpolate(self.reference, make_interpolation(self.dt, len(self.reference), times))
+
     def shifted(self, lag: float) -> np.ndarray:
         """The shifted reference at the times of the samples, NaN where it, or the sample, is unknown."""
         times, end = self.start + self.step * np.arange(len(self.values)) - lag, self.ends[1]
-        motion = interpolate(self.reference, make_interpolation(self.dt, len(self.reference), np.clip(times, 0.0, end)))
         known = (times >= -1e-9) & (times <= end + 1e-9) & np.isfinite(self.values)
-        return np.where(known, motion, np.nan)
+        return np.where(known, self.at(np.clip(times, 0.0, end)), np.nan)
+
+    def fit(self, lag: float) -> _Fit:
+        """Least squares at a lag."""
+        from scipy.ndimage import uniform_filter1d  # slow to import
+
+        shifted = self.shifted(lag)
+        both = np.isfinite(shifted)
+        y, r = (x[both] - x[both].mean() if both.sum() > 2 else np.zeros(3) for x in (self.values, shifted))
+        product, power, own = float(y @ r), float(r @ r), float(y @ y)
+        gain = product / max(power, 1e-300)
+        lines = np.abs(np.fft.fft(y - gain * r)) ** 2
+        spectrum = uniform_filter1d(lines, max(1, round(_SMOOTH * len(lines))), mode="wrap") + 1e-300
+        scaled = spectrum / spectrum.max()
+        correlation = product / math.sqrt(power * own) if power * own > 0.0 else 0.0
+        return _Fit(gain, correlation, float(scaled.sum() ** 2 / (scaled @ scaled)), spectrum)
+
+    def information(self, lag: float) -> float:
+        """Information about the lag [1/s²]."""
+        ahead, behind = (self.shifted(lag + sign * 0.05 * self.dt) for sign in (1.0, -1.0))
+        common = np.isfinite(ahead + behind)
+        fit = self.only(common).fit(lag)
+        slope = fit.gain * (ahead - behind)[common] / (0.1 * self.dt)
+        lines = np.abs(np.fft.fft(slope)) ** 2
+        return float((len(slope) * (slope @ slope)) ** 2 / max(lines @ fit.spectrum, 1e-300))
+
+    def on(self, lags: np.ndarray) -> np.ndarray:
+        """Correlations (n_lags,); what a channel has outside of the reference counts against a lag."""
+        from scipy.signal import correlate  # slow to import
+
+        step, end = self.grid, self.ends[1]
+        every, steps = round(self.step / step), int(end / step + 1e-9) + 1
+        history = self.at(np.minimum(step * np.arange(steps), end))
+        there, values = np.zeros((2, every * (len(self.values) - 1) + 1))
+        there[::every], values[::every] = np.isfinite(self.values), np.nan_to_num(self.values)
+        power, product = (correlate(*each, method="fft") for each in ((there, history**2), (values, history)))
+        found = product / np.sqrt((values @ values) * np.maximum(power, _LEAST * power.max()))
+        grid = self.start + step * np.arange(1 - steps, len(there))
+        return np.interp(lags, grid, np.clip(found, -1.0, 1.0), left=0.0, right=0.0)
 
 
 def align(
@@ -161,37 +216,26 @@ def align(
             f"the correlation is largest at a lag of {lag:g} s, an end of the range; give a larger max_lag, or other "
             "channels"
         )
-    own: dict[str, float] = {}
-    for parts in ({pair.name: [pair] for pair in pairs}, _halves(pairs, lag)):
-        found = {name: _best_lag(part, lags)[0] for name, part in parts.items() if _matter(part)}
+    own, halves = dict[str, float](), {"first half": list[_Pair](), "second half": list[_Pair]()}
+    for pair in pairs:  # the samples with the first and the second half of the energy
+        energy = np.nancumsum(np.square(pair.shifted(lag)))
+        for part, chosen in zip(halves.values(), (energy < 0.5 * energy[-1], energy >= 0.5 * energy[-1]), strict=True):
+            part.append(pair.only(chosen))
+    for parts in ({pair.name: [pair] for pair in pairs}, halves):
+        some = {name: part for name, part in parts.items() if all(np.nan_to_num(pair.values).any() for pair in part)}
+        found = {name: _best_lag(part, lags)[0] for name, part in some.items()}
         apart = [abs(t - lag) > step and _advantage(parts[name], t, lag) > _CONTRADICTION for name, t in found.items()]
         own = found if any(apart) and not own else own
-    fits = {pair.name: _fit(pair, lag) for pair in pairs}
-    information = sum(_information(pair, lag) for pair in pairs)
+    fits, information = {pair.name: pair.fit(lag) for pair in pairs}, sum(pair.information(lag) for pair in pairs)
     return Alignment(
         lag,
         1.0 / math.sqrt(information) if information > 0.0 else math.inf,
-        {name: gain for name, (gain, _, _) in fits.items()},
-        {name: correlation for name, (_, correlation, _) in fits.items()},
+        {name: fit.gain for name, fit in fits.items()},
+        {name: fit.correlation for name, fit in fits.items()},
         1.0 / (1.0 + math.exp(-advantage)),
         second,
         own,
     )
-
-
-def _halves(pairs: Sequence[_Pair], lag: float) -> dict[str, list[_Pair]]:
-    """The samples with the first and the second half of the energy of the shifted reference."""
-    found: dict[str, list[_Pair]] = {"first half": [], "second half": []}
-    for pair in pairs:
-        energy = np.nancumsum(np.square(pair.shifted(lag)))
-        late = energy >= 0.5 * energy[-1]
-        for name, chosen in zip(found, (~late, late), strict=True):
-            found[name].append(pair._replace(values=np.where(chosen, pair.values, np.nan)))
-    return found
-
-
-def _matter(pairs: Sequence[_Pair]) -> bool:
-    return all(np.nan_to_num(pair.values).any() for pair in pairs)
 
 
 def _pairs(reference: Record | Measurements, measurements: Measurements, channels: Sequence[str] | None) -> list[_Pair]:
@@ -230,36 +274,19 @@ def _pairs(reference: Record | Measurements, measurements: Measurements, channel
     return pairs
 
 
-def _on_lags(pair: _Pair, lags: np.ndarray) -> np.ndarray:
-    """Correlations (n_lags,); what a channel has outside of the reference counts against a lag."""
-    from scipy.signal import correlate  # slow to import
-
-    step, end = pair.grid, pair.ends[1]
-    every, steps = round(pair.step / step), int(end / step + 1e-9) + 1
-    times = np.minimum(step * np.arange(steps), end)
-    history = interpolate(pair.reference, make_interpolation(pair.dt, len(pair.reference), times))
-    there, values = np.zeros((2, every * (len(pair.values) - 1) + 1))
-    there[::every], values[::every] = np.isfinite(pair.values), np.nan_to_num(pair.values)
-    power, product = (correlate(*each, method="fft") for each in ((there, history**2), (values, history)))
-    found = product / np.sqrt((values @ values) * np.maximum(power, _LEAST * power.max()))
-    grid = pair.start + step * np.arange(1 - steps, len(there))
-    return np.interp(lags, grid, np.clip(found, -1.0, 1.0), left=0.0, right=0.0)
-
-
 def _best_lag(pairs: Sequence[_Pair], lags: np.ndarray) -> tuple[float, float | None, float]:
     """The lag of the highest score, that of the second highest peak, and the difference of their scores."""
     from scipy.optimize import minimize_scalar  # slow to import
 
-    squares = np.minimum(np.square([_on_lags(pair, lags) for pair in pairs]), _NEARLY_ONE)
+    squares = np.minimum(np.square([pair.on(lags) for pair in pairs]), _NEARLY_ONE)
     rough = float(lags[np.argmax(-np.log1p(-squares).sum(axis=0))])
-    effective = np.array([_fit(pair, rough)[2] for pair in pairs])
+    effective = np.array([pair.fit(rough).effective for pair in pairs])
     score, step = -0.5 * effective @ np.log1p(-squares), lags[1] - lags[0]
     if np.argmax(score) in (0, len(lags) - 1):
         return float(lags[np.argmax(score)]), None, math.inf
 
     def negative(trial: float) -> float:
-        found = np.array([_fit(pair, trial)[1] ** 2 for pair in pairs])
-        return float(effective @ np.log1p(-np.minimum(found, _NEARLY_ONE)))
+        return -sum(pair.fit(trial).score(size) for pair, size in zip(pairs, effective, strict=True))
 
     peaks = 1 + np.flatnonzero((score[1:-1] >= score[:-2]) & (score[1:-1] > score[2:]) & (score[1:-1] > 0.0))
     tops = [  # the peaks of a periodic signal differ on the grid of lags more than at their tops
@@ -276,41 +303,6 @@ def _advantage(pairs: Sequence[_Pair], lag: float, other: float) -> float:
     """Difference between the scores of two lags, over the samples that both compare."""
     total = 0.0
     for pair in pairs:
-        both = np.isfinite(pair.shifted(lag) + pair.shifted(other))
-        common = pair._replace(values=np.where(both, pair.values, np.nan))
-        (_, first, size), (_, second, _) = (_fit(common, each) for each in (lag, other))
-        total += 0.5 * size * (math.log1p(-min(second**2, _NEARLY_ONE)) - math.log1p(-min(first**2, _NEARLY_ONE)))
+        first, second = map(pair.only(np.isfinite(pair.shifted(lag) + pair.shifted(other))).fit, (lag, other))
+        total += first.score(first.effective) - second.score(first.effective)
     return total
-
-
-def _errors(pair: _Pair, lag: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A channel and the shifted reference where both are known, without means, and the spectrum of the errors."""
-    from scipy.ndimage import uniform_filter1d  # slow to import
-
-    shifted = pair.shifted(lag)
-    both = np.isfinite(shifted)
-    own, shifted = (
-        each[both] - each[both].mean() if both.sum() > 2 else np.zeros(3) for each in (pair.values, shifted)
-    )
-    gain = float(own @ shifted) / max(float(shifted @ shifted), 1e-300)
-    lines = np.abs(np.fft.fft(own - gain * shifted)) ** 2
-    return own, shifted, uniform_filter1d(lines, max(1, round(_SMOOTH * len(lines))), mode="wrap") + 1e-300
-
-
-def _fit(pair: _Pair, lag: float) -> tuple[float, float, float]:
-    """Gain, correlation (zero where nothing is compared), and effective number of samples."""
-    own, shifted, spectrum = _errors(pair, lag)
-    product, power = float(own @ shifted), float(shifted @ shifted)
-    correlation = product / math.sqrt(power * float(own @ own)) if power * float(own @ own) > 0.0 else 0.0
-    scaled = spectrum / spectrum.max()
-    return product / max(power, 1e-300), correlation, float(scaled.sum() ** 2 / (scaled @ scaled))
-
-
-def _information(pair: _Pair, lag: float) -> float:
-    """Information about the lag [1/s²]."""
-    ahead, behind = (pair.shifted(lag + sign * 0.05 * pair.dt) for sign in (1.0, -1.0))
-    common = np.isfinite(ahead + behind)
-    part = pair._replace(values=np.where(common, pair.values, np.nan))
-    slope = _fit(part, lag)[0] * (ahead - behind)[common] / (0.1 * pair.dt)
-    lines = np.abs(np.fft.fft(slope)) ** 2
-    return float((len(slope) * (slope @ slope)) ** 2 / max(lines @ _errors(part, lag)[2], 1e-300))
