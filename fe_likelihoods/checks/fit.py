@@ -46,22 +46,22 @@ FEWEST = 10  # samples that the tests of correlation and distribution need
 FAULTS = {
     "factor": (
         "A {what} may be wrong",
-        "{where}: the measurements are {value:.3g} times the response{units}{better}.",
-        "Check the gain of the sensor, and the units of file, model (it returns SI units) and base motion.",
+        "{where}: measured values are {value} times the computed ones{units}{better}.",
+        "Correct the unit or gain of the channel, or of the base motion. A model of your own must return SI units.",
     ),
     "sign": (
         "A sign may be wrong",
-        "{where}: measurements and response have opposite signs{better}.",
+        "{where}: measured and computed values have opposite signs{better}.",
         "Where the sensor counts the other way, name it in `reversed` of [measurements], or change its sign.",
     ),
     "swap": (
         "Channels may be swapped",
-        "{where}: the measurements may be exchanged{better}.",
-        "Check the columns of the file and the places of sensors.",
+        "{where}: these channels may be exchanged{better}.",
+        "Exchange their columns, if the places of the sensors say so.",
     ),
     "lag": (
         "Clocks may differ",
-        "{where}: the measurements are {value:.3g} s {late} than the response{better}.",
+        "{where}: measured values are {value} s {late} than the computed ones{better}.",
         "Check the clocks of sensors and motions, and when the motion begins (zero in [measurements]); see `align`.",
     ),
 }
@@ -90,7 +90,7 @@ def check_fit(posterior: Posterior, samples: Any = None) -> tuple[Finding, ...]:
     >>> wrong_sign = Measurements(measurements.channels, record.dt, -measurements.values)
     >>> for finding in check_fit(Posterior(FELikelihood(model, wrong_sign), prior)):
     ...     print(finding.severity, finding)
-    wrong A sign may be wrong: acceleration and displacement: measurements and response have opposite signs...
+    wrong A sign may be wrong: acceleration and displacement: measured and computed values have opposite signs...
     """
     draws, found, fits = draws_to_compare(posterior), list[Finding](), list[Fit]()
     mean = None
@@ -133,7 +133,7 @@ def check_faults(fit: Fit) -> list[Finding]:
     if fit.after is not None:
         before, how = (
             find_faults(fit.measurements, fit.draws),
-            " at the best draw of the prior; the fit may make up for it",
+            " at the best draw of the prior, and the fit may make up for it",
         )
         found += [_of_a_fault(fit, fault, CARE, how) for fault in before if fault.kind not in known]
         found += _check_offset(fit) if fit.is_history else []
@@ -146,8 +146,8 @@ def _of_a_fault(fit: Fit, fault: Fault, severity: str, how: str = "") -> Finding
     units = " or ".join(filter(None, dict.fromkeys(near)))
     words = {
         "where": fit.where(*fault.names),
-        "better": f" (error, RRMSE, {percent(fault.after)} instead of {percent(fault.before)}{how})",
-        "value": abs(fault.value),
+        "better": f"; corrected, the error (RRMSE) is {percent(fault.after)} instead of {percent(fault.before)}{how}",
+        "value": f"{abs(fault.value):.0f}" if abs(fault.value) >= 1e3 else f"{abs(fault.value):.3g}",
         "late": "later" if fault.value > 0.0 else "earlier",
         "what": "unit" if units else "gain",
         "units": f", about the ratio of {units}" if units else "",
@@ -170,7 +170,7 @@ def check_supports(model: Any) -> list[Finding]:
         kind = "A sign may be wrong" if gain < 0.0 else "A unit may be wrong" if unit else "A gain may be wrong"
         near = f", about the ratio of {unit}" if unit and gain > 0.0 else ""
         text = f"Where it is slow, the motion {motions[k].name} is {gain:.2g} times that of the other supports{near}."
-        action = "Check sign, unit and gain of its file: slow motions of one site are equal. If it moved so: nothing."
+        action = "Check sign, unit and gain of its file: slow motions of one site are equal, unless it did move so."
         found.append(Finding(kind, WRONG, text, action, {motions[k].name: gain}))
     return found
 
@@ -283,8 +283,9 @@ def check_damping(model: Any, theta: np.ndarray, fits: Iterable[Fit]) -> list[Fi
     fits = [each for each in fits if not each.modal]
     if not large or all(len(each.slow) == len(each.channels) and not find_slow_faults(each.slow) for each in fits):
         return []
-    text = f"The damping ratio of the fit is {listed([f'{ratio:.2g} ({name})' for name, ratio in large.items()])}."
-    action = "Damping makes up for a gain, a clock or a sensor that was stuck. Look at the data and at the model."
+    shown = listed([f"{name} {ratio:.2g}" for name, ratio in large.items()])
+    text = f"The fit has damping ratios that structures seldom have: {shown} (at most {LARGE_DAMPING:g} is usual)."
+    action = "Look for a wrong gain, a clock or a sensor that was stuck, which damping makes up for, and at the model."
     return [Finding("The damping is not plausible", WRONG, text, action, large)]
 
 

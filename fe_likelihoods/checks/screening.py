@@ -188,8 +188,12 @@ def check_sensors(channels: Sequence[Screened]) -> list[Finding]:
         )
         action = "Check the file, or take another record of the motion: a motion needs all samples."
         if not channel.is_motion:
-            action = f"In [measurements] of a TOML file: {repair_lines([only])[0].removeprefix('# ')}"
-            action += ". If it moved so: nothing." if fault.level else "."
+            line = repair_lines([only])[0].removeprefix("# ")
+            action = f"Leave these samples out; in [measurements] of a TOML file: {line}."
+            if fault.level:
+                action = f"Subtract it, unless the structure did move so; in [measurements] of a TOML file: {line}."
+            elif fault.kind == "noise":
+                action = f"{line[0].upper()}{line[1:]}."
         severity = NOTE if fault.kind == "noise" else CARE
         found.append(Finding(kind, severity, text, action, {channel.name: float(fault.size)}))
     return found

@@ -94,9 +94,9 @@ def rows_of(
         *of_posterior, lowest, highest, nominal, true = (float(each) for each in numbers)
         cv = float(sd[i] / abs(mean[i])) if mean[i] else np.nan
         unit = parameter.label.removeprefix(parameter.name).strip()
-        text = (
-            f"{family.split('(')[0]}, mean {prior_mean:.4g}, sd {prior_sd:.4g}{_limits(lower, upper)}" if family else ""
-        )
+        family = family.split("(")[0]
+        moments_of_prior = "" if family == "Uniform" else f", mean {prior_mean:.4g}, sd {prior_sd:.3g}"
+        text = f"{family}{moments_of_prior}{_limits(lower, upper)}" if family else ""
         shown = text, prior_mean, prior_sd, *of_posterior, cv, lowest, highest, nominal, true, lower, upper
         rows.append(ParameterRow(parameter.name, parameter.label, unit, *shown))
     return rows

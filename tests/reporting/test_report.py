@@ -192,7 +192,7 @@ def test_a_sensor_with_the_opposite_sign_is_named(vibrating):
     (one,) = fits.fits
     turned = fits._replace(fits=(replace(one, after=-one.after, draws=-one.draws),))
     notes = {n.kind: n for n in check_run(finished, rows, turned, Failures((), 0, 1)).findings}
-    assert notes["A sign may be wrong"].text.startswith("top: measurements and response have opposite signs")
+    assert notes["A sign may be wrong"].text.startswith("top: measured and computed values have opposite signs")
     assert "The model does not follow the measurements" not in notes  # the sign explains it
     quiet = {n.kind for n in check_run(finished, rows, fits, Failures((), 0, 1)).findings}
     assert not quiet & {"A sign may be wrong", "The model does not follow the measurements"}
