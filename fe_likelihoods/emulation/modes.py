@@ -170,6 +170,7 @@ def search_modes(
     fits: Callable[[float], bool] = lambda _: True,
     first: int | None = None,
     remaining: Callable[[], float] = lambda: np.inf,
+    shares: Sequence[float] = _SHARES,
 ) -> Generator[float, None, ModeSearch]:
     """Search from starts (n, n_structural) [standard normal coordinates], on growing parts of the record if possible.
 
@@ -177,7 +178,7 @@ def search_modes(
     may have been on their way to another one; on a growing record, some follow once), and while `unseen_share` is large
     (modes that one start alone led to say that others may have been missed). They begin in the order of their
     likelihoods, for which each of them is simulated once on the first part of the record: high ones are given up less
-    often.
+    often. If all fail there, which may be too short for the model, they begin on the whole record.
 
     `remember` stores responses for a resumed run, ``fits(n)`` says whether n more simulations of the whole record fit
     into the budget, and `remaining` how many are left of it. Yields the cost of each batch, in simulations of the whole
@@ -185,7 +186,7 @@ def search_modes(
     """
     first = len(starts) if first is None else first
     most = min(_MOST_STARTS * first, len(starts))
-    shortened = [*target.shortened(_SHARES), target]
+    shortened = [*target.shortened(shares), target]
     parts = [_Part(part, part.n_steps / target.n_steps, {}, Jacobians()) for part in shortened]
     standing_for: list[int] = []  # start that has taken the place of each; -1 for none
     spent = 0.0
@@ -212,6 +213,9 @@ def search_modes(
             heights = yield from counted(_heights(parts[0], starts, remember, fits), spend)
             if heights is None:
                 return search._replace(simulations=spent, finished=False)
+            if len(parts) > 1 and np.isneginf(heights).all():
+                whole = search_modes(target, starts, remember, fits, first, remaining, shares=())
+                return (yield from counted(whole, spend))._replace(simulations=spent)
             starts = np.concatenate([starts[:following], starts[_in_order(starts, heights, following)]])
             most = min(most, len(starts))
             if following == most:  # every simulation has failed

@@ -112,15 +112,14 @@ class LeftOutTests(NamedResults):
 def leave_one_out(hierarchy: Hierarchy, *, seed: int = 0) -> LeftOutTests:
     """Leave each test out of a hierarchical model in turn. No simulation is run.
 
-    The hyper-samples are weighted where this suffices; otherwise the population without the test is sampled anew, by
-    `samplers.SMCSampler` with 500 walkers and four steps.
+    The population without the test is sampled anew, by `samplers.SMCSampler` with 500 walkers and four steps.
 
     Parameters
     ----------
     hierarchy : Hierarchy
         Population of two tests or more.
     seed : int
-        Seed of resampling and sampler.
+        Seed of the sampler.
 
     Returns
     -------

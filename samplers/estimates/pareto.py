@@ -1,8 +1,7 @@
-r"""The Pareto tail of importance weights: its shape, which says whether they can be used, and weights smoothed by it.
+r"""The Pareto tail of importance weights: its shape says whether they can be used.
 
 The largest weights follow a generalised Pareto distribution. If its shape k is below 0.5, the weights have a variance;
-above 0.7, points that were not drawn dominate the mean. Smoothing replaces the largest weights by the expected order
-statistics of this distribution.
+above 0.7, points that were not drawn dominate the mean.
 
 References
 ----------
@@ -12,7 +11,7 @@ Zhang & Stephens (2009), Technometrics 51(3), doi:10.1198/tech.2009.08017 (estim
 
 import numpy as np
 
-__all__ = ["LARGEST_SHAPE", "pareto_shape", "smoothed_weights", "tail_size"]
+__all__ = ["LARGEST_SHAPE", "pareto_shape", "tail_size"]
 
 # Weights with a larger Pareto shape have no useful mean (Vehtari et al. 2024, section 3.2.4).
 LARGEST_SHAPE = 0.7
@@ -33,25 +32,7 @@ def pareto_shape(log_weights: np.ndarray) -> float:
     It is -inf for weights without a tail, and inf for too few weights.
     """
     excess, shape = _excess(log_weights)
-    return shape if excess is None else _fit(excess)[0]
-
-
-def smoothed_weights(log_weights: np.ndarray) -> tuple[np.ndarray, float]:
-    """Smoothed weights (n,) with sum 1, and their `pareto_shape`, from finite log-weights (n,).
-
-    No weight is larger than the largest weight before smoothing.
-    """
-    weights = np.exp(log_weights - log_weights.max())
-    excess, shape = _excess(log_weights)
-    if excess is not None:
-        shape, scale = _fit(excess)
-        n = len(excess)
-        largest = np.argsort(weights, kind="stable")[-n:]
-        levels = np.log1p(-(np.arange(n) + 0.5) / n)
-        expected = -levels if abs(shape) < 1e-12 else np.expm1(-shape * levels) / shape
-        threshold = weights[largest[-1]] - excess[-1]
-        weights[largest] = np.minimum(threshold + scale * expected, 1.0)
-    return weights / weights.sum(), shape
+    return shape if excess is None else _fit(excess)
 
 
 def _excess(log_weights: np.ndarray) -> tuple[np.ndarray | None, float]:
@@ -71,8 +52,8 @@ def _excess(log_weights: np.ndarray) -> tuple[np.ndarray | None, float]:
     return (tail, np.nan) if len(tail) >= FEWEST_OF_TAIL else (None, float("inf"))
 
 
-def _fit(excess: np.ndarray) -> tuple[float, float]:
-    """Shape and scale of a generalised Pareto distribution from ascending excesses (n,) over a threshold."""
+def _fit(excess: np.ndarray) -> float:
+    """Shape of a generalised Pareto distribution from ascending excesses (n,) over a threshold."""
     n = len(excess)
     grid = 30 + int(np.sqrt(n))
     quartile = excess[max(int(n / 4.0 + 0.5) - 1, 0)]
@@ -82,5 +63,5 @@ def _fit(excess: np.ndarray) -> tuple[float, float]:
     posterior = np.exp(profile - profile.max())
     theta = float(theta @ posterior / posterior.sum())
     shape = float(np.mean(np.log1p(-theta * excess)))
-    # A weak prior towards 0.5 stabilises the shape from few weights. The scale has no prior (Vehtari et al. 2024).
-    return (n * shape + 5.0) / (n + 10.0), -shape / theta
+    # A weak prior towards 0.5 stabilises the shape from few weights (Vehtari et al. 2024).
+    return (n * shape + 5.0) / (n + 10.0)

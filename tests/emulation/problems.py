@@ -79,15 +79,15 @@ class Shortened:
         return self.respond(theta, np.arange(self.n_steps) / self.whole)[None]
 
 
-def _late(theta, phase):
+def late_response(theta, phase):
     amplitude, ratio, late = theta
     early = amplitude * (np.sin(40.0 * phase) + ratio * np.cos(33.0 * phase))
     return early + (phase > 0.5) * late**2 * np.sin(25.0 * phase)
 
 
-def acts_late(seed=1):
+def acts_late(seed=1, respond=late_response):
     """Two modes of equal shares, late = 1 and late = -1; the first half of the record does not depend on `late`."""
-    model = Shortened(_late, ("amplitude", "ratio", "late"))
+    model = Shortened(respond, ("amplitude", "ratio", "late"))
     measured = noisy(model, np.array([1.2, 0.8, 1.0]), np.array([0.05]), seed)
     prior = {"amplitude": TruncatedNormal(1.0, 0.3), "ratio": TruncatedNormal(1.0, 0.3), "late": Uniform(-2.0, 2.0)}
     return _marginal(model, measured, prior)

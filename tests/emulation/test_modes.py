@@ -32,7 +32,7 @@ from fe_likelihoods.emulation.target import ResponseTarget
 from samplers import SamplingWarning, SMCSampler
 from samplers.judgement.guides import DOUBTED_SHARE
 
-from .problems import acts_late, free_vibration, misleading, noisy, symmetric, vibration
+from .problems import acts_late, free_vibration, late_response, misleading, noisy, symmetric, vibration
 
 
 def _log_density(posterior, coords):
@@ -210,6 +210,16 @@ def test_a_failing_start_leads_nowhere_and_failing_steps_are_shortened():
     search = find_modes(vibration(function=fails_near_the_median), starts=4, seed=2)
     assert search.ends[0] == -1 and len(search.modes) == 1
     assert search.modes[0].parameters == pytest.approx([1.2, 0.8], abs=0.05)
+
+
+def test_a_model_that_needs_the_whole_record_is_searched_on_it():
+    def needs_the_end(theta, phase):
+        if phase[-1] < 0.9:
+            raise RuntimeError("the record is too short")
+        return late_response(theta, phase)
+
+    search = find_modes(acts_late(respond=needs_the_end), starts=3, seed=1)
+    assert search.modes and all(mode.converged for mode in search.modes)
 
 
 def test_a_search_in_which_everything_fails_finds_nothing():
