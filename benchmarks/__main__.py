@@ -11,12 +11,27 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from . import badge, bridge, column, cost, executors, few_simulations, growth, job, samplers, screening, startup, truth
+from . import (
+    badge,
+    bridge,
+    column,
+    cost,
+    executors,
+    few_simulations,
+    growth,
+    job,
+    new_events,
+    samplers,
+    screening,
+    startup,
+    truth,
+)
 from .rows import as_table, machine, write_json
 
 BENCHMARKS: dict[str, Callable[..., Iterable[tuple]]] = {
     "badge": badge.badge,
     "supports": badge.supports,
+    "new_events": new_events.new_events,
     "simulation": column.simulation,
     "batch": column.batch,
     "sensors": column.sensors,
@@ -36,6 +51,7 @@ BENCHMARKS: dict[str, Callable[..., Iterable[tuple]]] = {
 QUICK: dict[str, dict[str, Any]] = {
     "badge": {"structures": ("Meloland",)},
     "supports": {"structures": ("Meloland", "Painter Street")},
+    "new_events": {"structures": ("frame two floors",), "sizes": (1,), "subsets": 1},
     "job": {"limit": 20.0},
     "truth": {"families": ("sharp", "two"), "ratios": (1.0,), "walkers": (200,)},
     "samplers": {"targets": ("T3",)},

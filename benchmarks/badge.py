@@ -42,13 +42,13 @@ from fe_likelihoods import (
 )
 from fe_likelihoods.checks.finding import Judgement, judge
 from fe_likelihoods.checks.slow_motion import support_gains, supports_apart
-from fe_likelihoods.emulation.modes import find_modes
+from fe_likelihoods.emulation.modes import Mode, find_modes
 from fe_likelihoods.emulation.target import ResponseTarget
 
 from .rows import Row
 from .targets import SHARED
 
-__all__ = ["badge", "supports"]
+__all__ = ["STRUCTURES", "Deck", "badge", "best_mode", "posterior_of", "supports"]
 
 _FOLDER = SHARED / "measured"
 _MEMBERS = ("CHAN{:d}.V2", "CHAN{:02d}.V2", "CHAN{:03d}.V2", "chan{:03d}.v2")
@@ -70,7 +70,7 @@ _OFFSET = {"A measurement may have an offset or a drift", "A channel has an offs
 
 
 @dataclass(frozen=True)
-class _Deck:
+class Deck:
     """Channels of a deck: supports (base of the column, ends), outputs, and one that is no output."""
 
     files: str
@@ -125,25 +125,25 @@ class _Event(NamedTuple):
     wrong: np.ndarray
 
 
-_STRUCTURES = {
-    "Painter Street": _Deck("*ce89324p.zip", (3, 4, 9), (7,), 6),
-    "Painter Street ground": _Deck("*ce89324p.zip", (3, 17, 20), (7,), 8),
-    "Painter Street along": _Deck("*ce89324p.zip", (1, 15, 18), (11,), 7),
-    "Meloland": _Deck("*ce01336p.zip", (2, 3, 13), (7,), 8),
-    "Meloland three": _Deck("*ce01336p.zip", (2, 3, 13), (5, 7, 9), 8),
-    "Meloland embankment": _Deck("*ce01336p.zip", (2, 11, 11), (7,), 6),
-    "Meloland along": _Deck("*ce01336p.zip", (4, 12, 12), (8,), 9),
+STRUCTURES = {
+    "Painter Street": Deck("*ce89324p.zip", (3, 4, 9), (7,), 6),
+    "Painter Street ground": Deck("*ce89324p.zip", (3, 17, 20), (7,), 8),
+    "Painter Street along": Deck("*ce89324p.zip", (1, 15, 18), (11,), 7),
+    "Meloland": Deck("*ce01336p.zip", (2, 3, 13), (7,), 8),
+    "Meloland three": Deck("*ce01336p.zip", (2, 3, 13), (5, 7, 9), 8),
+    "Meloland embankment": Deck("*ce01336p.zip", (2, 11, 11), (7,), 6),
+    "Meloland along": Deck("*ce01336p.zip", (4, 12, 12), (8,), 9),
     "frame two floors": _Frame(("1", "3")),
     "frame three floors": _Frame(("1", "2", "3")),
 }
 
 
-def badge(repeats: int = 1, structures: tuple[str, ...] = tuple(_STRUCTURES), every: int = 12) -> list[Row]:
+def badge(repeats: int = 1, structures: tuple[str, ...] = tuple(STRUCTURES), every: int = 12) -> list[Row]:
     """Counts of judgements: all events as recorded, and one in `every` of each structure with each fault."""
     counts: dict[str, Counter] = defaultdict(Counter)
     notes: dict[str, Counter] = defaultdict(Counter)
     for name in structures:
-        for number, event in enumerate(_STRUCTURES[name].events()):
+        for number, event in enumerate(STRUCTURES[name].events()):
             right, theta = _judge(event)
             print(f"badge, {name}, event {number}: {right}", flush=True)
             counts["right"][right.status] += 1
@@ -178,20 +178,20 @@ def badge(repeats: int = 1, structures: tuple[str, ...] = tuple(_STRUCTURES), ev
     return rows
 
 
-def supports(repeats: int = 1, structures: tuple[str, ...] = tuple(_STRUCTURES)) -> list[Row]:
+def supports(repeats: int = 1, structures: tuple[str, ...] = tuple(STRUCTURES)) -> list[Row]:
     """Gain and sign of supports by the slow motion of the others; limits chosen with the other bridges alone.
 
     Each support has 2 times, half, the negative of its motion, and g read as m/s². The limits with the fewest right
     events named, then the most wrong ones, then the largest ratio and coherence, are chosen from a grid; "as set" are
     the limits of the library.
     """
-    decks = [name for name in structures if isinstance(_STRUCTURES[name], _Deck)]
+    decks = [name for name in structures if isinstance(STRUCTURES[name], Deck)]
     grid = [*itertools.product((0.8, 0.85, 0.9, 0.95), (7, 14, 21, 28), (1.3, 1.4, 1.5, 1.75, 2.0)), None]
     scores: dict[str, np.ndarray] = {}  # right events named, and wrong ones named, by limits (n_limits, 2)
     sizes: dict[str, np.ndarray] = {}
     for name in decks:
         scores[name], sizes[name] = np.zeros((len(grid), 2)), np.zeros(2)
-        for event in _STRUCTURES[name].events():
+        for event in STRUCTURES[name].events():
             motions = [each.acceleration for each in event.model.supports]
             step, known = event.model.supports[0].dt, {}
             wrong = [(k, factor) for k in range(len(motions)) for factor in (2.0, 0.5, -1.0, 1.0 / 9.80665)]
@@ -220,24 +220,35 @@ def supports(repeats: int = 1, structures: tuple[str, ...] = tuple(_STRUCTURES))
     return rows
 
 
-def _judge(event: _Event) -> tuple[Judgement, np.ndarray]:
-    """The judgement of a fit, and its structural parameters."""
+def posterior_of(event: _Event) -> Posterior:
+    """The posterior of an event under white noise."""
     model, measured = event.model, Measurements(event.model.channels, event.model.dt, event.values)
     noise = GaussianNoise(model.channels)
     prior = {name: (_PRIOR | _FRAME)[name] for name in model.parameter_names}
     prior |= {n: HalfNormal(float(r)) for n, r in zip(noise.parameter_names, measured.root_mean_squares, strict=True)}
-    posterior = Posterior(FELikelihood(model, measured, noise), prior)
+    return Posterior(FELikelihood(model, measured, noise), prior)
+
+
+def best_mode(posterior: Posterior) -> Mode | None:
+    """The highest mode of a search; None without one."""
+    more = len(posterior.likelihood.model.parameter_names) > 4
+    modes = find_modes(posterior, starts=2 + more, seed=1, max_simulations=200 + 100 * more).modes
+    return modes[0] if modes else None
+
+
+def _judge(event: _Event) -> tuple[Judgement, np.ndarray]:
+    """The judgement of a fit, and its structural parameters."""
+    posterior = posterior_of(event)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        more = len(model.parameter_names) > 4
-        modes = find_modes(posterior, starts=2 + more, seed=1, max_simulations=200 + 100 * more).modes
-        samples = posterior.prior.mean()[None]
-        if modes:
-            rng, factor = np.random.default_rng(1), np.linalg.cholesky(modes[0].covariance)
-            coords = modes[0].coords + rng.standard_normal((300, len(factor))) @ factor.T
+        mode, samples = best_mode(posterior), posterior.prior.mean()[None]
+        if mode is not None:
+            rng, factor = np.random.default_rng(1), np.linalg.cholesky(mode.covariance)
+            coords = mode.coords + rng.standard_normal((300, len(factor))) @ factor.T
             samples = ResponseTarget(posterior).parameters(coords)
-        found = (*check_fit(posterior, samples), *check_data(measured, list(model.supports)))
-    return judge(found), samples.mean(axis=0)[: len(model.parameter_names)]
+        measured = posterior.likelihood.measurements
+        found = (*check_fit(posterior, samples), *check_data(measured, list(event.model.supports)))
+    return judge(found), samples.mean(axis=0)[: len(event.model.parameter_names)]
 
 
 def _channel(path: Path, number: int) -> Record:

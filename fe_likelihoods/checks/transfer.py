@@ -11,7 +11,6 @@ from .finding import CARE, SMALL_PROBABILITY, Finding
 
 __all__ = [
     "check_bandwidth",
-    "check_equal_ratios",
     "check_failed_samples",
     "check_final_values",
     "check_impossible_draws",
@@ -119,13 +118,6 @@ def check_impossible_draws(possible: np.ndarray) -> list[Finding]:
     action = "Use level='response', or a narrower prior of the spread of shares between events."
     found = [Finding("Impossible draws", CARE, text, action, {"share": share})]
     return found if share > SMALL_PROBABILITY else []
-
-
-def check_equal_ratios(n_events: int, spread: float, resolution: float) -> list[Finding]:
-    """Whether ratios of events are equal: the spread of their logarithms is below its `resolution`."""
-    text = f"The ratios of {n_events} events are equal: intervals have no width, and probabilities are 0 or 1."
-    found = [Finding("No spread between events", CARE, text, "Leave the prior of the scatter in (prior_events=).")]
-    return [] if spread > resolution else found
 
 
 def check_reweighting(tests: Mapping[str, _Reweighted], error: float, parameters: Sequence[str]) -> list[Finding]:

@@ -23,8 +23,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import special
 
-from ..checks.finding import warn
-from ..checks.transfer import check_equal_ratios
 from ..text_tables import number, text_table
 
 __all__ = ["PRIOR_EVENTS", "PRIOR_SD", "SLOPE_SD", "EventRatios", "RatioPopulations"]
@@ -36,7 +34,6 @@ PRIOR_EVENTS = 6.0
 SLOPE_SD = 0.05
 """Slope of the log ratio over the log level: 0.03 to 0.08 is best for a bridge in eleven events of 0.02 to 0.9 g."""
 _SHOWN = 0.9  # probability of printed intervals
-_REACH = 1e-9
 
 
 class RatioPopulations(NamedTuple):
@@ -52,13 +49,7 @@ class RatioPopulations(NamedTuple):
         rows = (-1, *(1,) * (log_predicted.ndim - 1))
         center, slope, sd = (each.reshape(rows) for each in (self.center, self.slope, self.sd))
         center = center + slope * (log_predicted - self.log_level)
-        return special.ndtr(_standardised(center - np.log(ratio), sd))
-
-
-def _standardised(difference: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Differences divided by a scale. If the scale is zero: infinite, with negative sign for a difference of zero."""
-    positive = np.asarray(scale) > 0.0
-    return np.where(positive, difference / np.where(positive, scale, 1.0), np.where(difference > 0.0, np.inf, -np.inf))
+        return special.ndtr((center - np.log(ratio)) / sd)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +64,7 @@ class EventRatios:
         Scatter that is expected before these events: standard deviation of log ratios between events. An Arias
         intensity or an energy scatters twice as much as a peak. `event_ratios` computes it for each event and quantity.
     prior_events : float
-        Number of events that the expected scatter is worth; 0 for none, which needs two events or more. See
-        `prior_share`.
+        Number of events that the expected scatter is worth, positive. See `prior_share`.
     levels : array_like, optional
         Predicted values of the events, in the shape of `values`; positive. The log ratio may then follow a line in
         their logarithm, because a linear model may be right for weak motions and predict too large peaks for strong
@@ -93,12 +83,7 @@ class EventRatios:
     Raises
     ------
     ValueError
-        If a ratio, a level or a scatter is not positive, shapes differ, or the events are too few without a prior.
-
-    Warns
-    -----
-    UserWarning
-        If all ratios of a quantity are equal and there is no prior: their spread is then zero.
+        If a ratio, a level or a scatter is not positive, or shapes differ.
 
     Notes
     -----
@@ -143,9 +128,9 @@ class EventRatios:
         if values.ndim not in (1, 2) or not values.size or not _positive(values):
             raise ValueError(f"EventRatios: expected positive ratios, one row per event; got {self.values!r}")
         sd = np.asarray(self.prior_sd, dtype=float)
-        if not (_positive(sd) and 0.0 <= self.prior_events < np.inf and 0.0 <= self.slope_sd < np.inf):
+        if not (_positive(sd) and 0.0 < self.prior_events < np.inf and 0.0 <= self.slope_sd < np.inf):
             raise ValueError(
-                "EventRatios: prior_sd must be positive, prior_events and slope_sd zero or more; got "
+                "EventRatios: prior_sd and prior_events must be positive, slope_sd zero or more; got "
                 f"{self.prior_sd!r}, {self.prior_events!r} and {self.slope_sd!r}"
             )
         if sd.shape not in ((), values.shape[1:], values.shape):
@@ -160,11 +145,6 @@ class EventRatios:
                 f"{self.levels!r}"
             )
         degrees = self.prior_events + len(values) - 1.0
-        if not degrees > 0.0:
-            raise ValueError(
-                "EventRatios: one event does not show how ratios scatter between events; leave the prior of the "
-                f"scatter in, such as prior_sd={PRIOR_SD:g}, prior_events={PRIOR_EVENTS:g}"
-            )
         sd = np.broadcast_to(sd, values.shape)
         new_sd = np.sqrt(np.square(sd).mean(axis=0)) if self.new_sd is None else np.asarray(self.new_sd, dtype=float)
         if not _positive(new_sd) or new_sd.shape not in ((), values.shape[1:]):
@@ -178,8 +158,6 @@ class EventRatios:
         slope = gain * (weights * offsets * logs).sum(axis=0)
         squares = (weights * np.square(logs - mean - slope * offsets)).sum(axis=0)
         squares = squares + (np.square(slope) / slope_sd**2 if slope_sd else 0.0)
-        if not self.prior_events:
-            warn(check_equal_ratios(len(values), float((np.sqrt(squares) * sd.max(axis=0)).min()), _REACH), 3)
         found = {"values": values, "degrees_of_freedom": degrees, "new_sd": new_sd, "_log_level": log_level}
         found |= {"_mean": mean, "_slope": slope, "_gain": gain, "_total": total, "_squares": squares}
         for name, value in found.items():
@@ -202,8 +180,7 @@ class EventRatios:
     @property
     def prior_share(self) -> np.ndarray:
         """Share of the squared width of intervals that is due to the expected scatter, shaped like one row."""
-        total = self.prior_events + self._squares
-        return np.where(total > 0.0, self.prior_events / np.where(total > 0.0, total, 1.0), 0.0)
+        return self.prior_events / (self.prior_events + self._squares)
 
     @property
     def sd(self) -> np.ndarray:
@@ -273,7 +250,7 @@ class EventRatios:
     def probability_above(self, ratio: np.ndarray, log_predicted: np.ndarray) -> np.ndarray:
         """Probability that the ratio of a new event exceeds `ratio`, at logarithms of predicted values."""
         center, scale = self._center_and_scale(log_predicted)
-        return special.stdtr(self.degrees_of_freedom, _standardised(center - np.log(ratio), scale))
+        return special.stdtr(self.degrees_of_freedom, (center - np.log(ratio)) / scale)
 
     def draw_populations(self, n: int, rng: np.random.Generator) -> RatioPopulations:
         """Draw the line and the standard deviation of log ratios from their posterior; ValueError for quantities."""

@@ -350,7 +350,7 @@ def test_ratios_add_the_error_of_the_model_to_limit_states_and_extent():
     samples = 0.05 * np.exp(0.1 * rng.standard_normal((400, 1)))
     prediction = propagate(model, samples, quantity=measures, progress=False)
     states = [LimitState("moved", "peak drift", 0.07), LimitState("stays", "residual drift", 0.02)]
-    ratios = EventRatios([1.1, 0.9, 1.3, 1.0], prior_events=0)
+    ratios = EventRatios([1.1, 0.9, 1.3, 1.0], prior_events=1e-9)
     found = damage(prediction, states, ratios={"peak drift": ratios}, noise=False)
     drift = measures.split(prediction.values)["peak drift"][:, 0]
     t = stats.t(3, np.log(ratios.quantile(0.5)), ratios.sd * np.sqrt(1.25))

@@ -1,13 +1,10 @@
 """Ratios of events: the t distributions of the textbook, the prior of their scatter, coverage with controls."""
 
-import warnings
-
 import numpy as np
 import pytest
 from scipy import stats
 
 from fe_likelihoods.events.ratios import PRIOR_EVENTS, PRIOR_SD, EventRatios
-from fe_likelihoods.prediction.reliability import exceedance
 
 LOGS = np.array([0.1, -0.05, 0.2, 0.0])
 
@@ -19,13 +16,11 @@ def events(rng):
 
 
 def test_ratio_of_a_new_event_is_the_t_distribution_of_the_textbook():
-    ratios = EventRatios(np.exp(LOGS), prior_events=0)
+    ratios = EventRatios(np.exp(LOGS), prior_events=1e-9)
     expected = stats.t(3, LOGS.mean(), LOGS.std(ddof=1) * np.sqrt(1.25))
     p = np.array([0.05, 0.5, 0.95])
-    np.testing.assert_allclose(np.log(ratios.quantile(p)), expected.ppf(p), rtol=1e-10)
-    draws = np.log(ratios.draw(np.ones(20_000), np.random.default_rng(1)))
-    assert stats.kstest(draws, expected.cdf).pvalue > 1e-3
-    assert ratios.prior_share == 0.0
+    np.testing.assert_allclose(np.log(ratios.quantile(p)), expected.ppf(p), rtol=1e-6)
+    assert ratios.prior_share < 1e-6
 
 
 def test_the_prior_of_the_scatter_is_worth_its_events_and_says_how_much_of_the_width_it_is():
@@ -94,7 +89,7 @@ def test_the_prior_covers_where_scatters_differ_as_it_states_and_helps_the_worst
     inside = np.abs(np.log(new / ratios.quantile(0.5))) < np.log(ratios.quantile(0.95) / ratios.quantile(0.5))
     assert abs(inside.mean() - 0.9) < 4.0 * np.sqrt(0.09 / sets)
     if n_events > 1:  # control: without the prior the interval is right on average, and wider for it
-        alone = EventRatios(found, prior_events=0)
+        alone = EventRatios(found, prior_events=1e-9)
         widths = [np.log(each.quantile(0.95) / each.quantile(0.5)) for each in (ratios, alone)]
         assert np.quantile(widths[0] / spread, 0.05) > 1.2 * np.quantile(widths[1] / spread, 0.05)
         assert np.mean(widths[0]) < np.mean(widths[1])
@@ -104,12 +99,12 @@ def test_what_cannot_be_used_is_refused():
     for bad in ([], [0.0, 1.0], [np.nan, 1.0], 1.2):
         with pytest.raises(ValueError, match="expected positive ratios"):
             EventRatios(bad)
-    with pytest.raises(ValueError, match="prior_sd must be positive"):
+    with pytest.raises(ValueError, match="prior_sd and prior_events must be positive"):
         EventRatios([1.0, 1.1], prior_sd=0.0)
     with pytest.raises(ValueError, match=r"one prior_sd, one per quantity, \(2,\)"):
         EventRatios([[1.0, 1.1]], prior_sd=[0.1, 0.1, 0.1])
-    with pytest.raises(ValueError, match="does not show how ratios scatter"):
-        EventRatios([1.1], prior_events=0)
+    with pytest.raises(ValueError, match="prior_events must be positive"):
+        EventRatios([1.0, 1.1], prior_events=0)
     with pytest.raises(ValueError, match="new_sd must be positive"):
         EventRatios([1.0, 1.1], new_sd=0.0)
     with pytest.raises(ValueError, match="slope_sd zero or more"):
@@ -122,19 +117,3 @@ def test_what_cannot_be_used_is_refused():
             EventRatios([1.0, 1.1]).quantile(p, level)
     with pytest.raises(ValueError, match="ratios of one quantity"):
         EventRatios([[1.0, 1.1], [0.9, 1.2]]).draw_populations(3, np.random.default_rng(1))
-
-
-def test_equal_ratios_without_a_prior_are_said_and_have_no_nan():
-    with pytest.warns(UserWarning, match="The ratios of 2 events are equal.*prior_events="):
-        equal = EventRatios([1.0, 1.0], prior_events=0)
-    with pytest.warns(UserWarning, match="are equal"):  # one of two quantities
-        EventRatios([[1.0, 1.1], [1.0, 1.2]], prior_events=0)
-    found = equal.probability_above(np.array([0.9, 1.0, 1.1]), np.zeros(3))
-    assert found.tolist() == [1.0, 0.0, 0.0]  # strictly above, as without ratios
-    for limit, expected in ((0.9, 1.0), (1.0, 0.0), (1.1, 0.0)):
-        one = exceedance(np.ones(50), limit, ratios=equal)
-        assert (one.lower, one.probability, one.upper) == (expected,) * 3
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert EventRatios([1.0, 1.0]).sd > 0.0
-        EventRatios([1.0, 1.001], prior_events=0)

@@ -169,7 +169,7 @@ def test_intervals_cover_new_events_whose_ratio_goes_with_their_parameters(n_eve
         gains, ratios = np.exp(mixing @ rng.standard_normal((2, n_events + new)))
         peaks = MEDIAN * LARGEST * gains * ratios
         posteriors = likelihoods(scales * peaks[:n_events])
-        options = {"model": Amplified(), "quantity": peak("top"), "n": 400, "seed": row, "prior_events": 0}
+        options = {"model": Amplified(), "quantity": peak("top"), "n": 400, "seed": row, "prior_events": 1e-9}
         found = predict_new_event(hierarchy, posteriors, 1.0, **options)
         together[row] = np.searchsorted(np.sort(found.values), peaks[n_events:]) / 400.0
     for level in (0.5, 0.9):
