@@ -47,11 +47,12 @@ def test_errors_cover(n, number, shift, scale, rng):
             scores[name].append((found.value - truth) / found.error)
         scores["log Z"].append((sample.log_evidence - LOG_EVIDENCE) / sample.log_evidence_error)
     for name, score in scores.items():
-        # 150 independent samples: a share of .95 has a standard error of .018
+        # 150 independent samples: a share of .95 has a standard error of .018; a standard deviation that is not
+        # determined (NaN, a variance too low by more than its error) covers nothing
         covered = np.mean(np.abs(score) < 2.0)
         assert covered > 0.90, (name, covered)
         # errors may be too large, but not useless
-        assert np.sqrt(np.mean(np.square(score))) > 0.3, name
+        assert np.sqrt(np.nanmean(np.square(score))) > 0.3, name
 
 
 def test_few_draws_are_worth_many(rng):
