@@ -19,8 +19,7 @@ from .events import Event, read_events
 from .job import Job, read_job
 from .models import Problem, make_problem, noise_channels_of
 from .results import names_of
-from .runs import CACHE, default_folder, is_free
-from .sampling import make_sampler
+from .runs import CACHE, default_folder, is_free, make_sampler
 
 __all__ = ["check_job"]
 

@@ -26,9 +26,8 @@ from .events import Event, describe_events, predict_events, predict_quietly, rea
 from .job import Job, parse_job, read_job
 from .models import Problem, make_problem, runs_code_of_user
 from .results import write_samples, write_tables
-from .sampling import STEPS, make_sampler, run_sampler
 
-__all__ = ["CACHE", "Outcome", "default_folder", "is_free", "report_run", "run_job"]
+__all__ = ["CACHE", "Outcome", "default_folder", "is_free", "make_sampler", "report_run", "run_job"]
 
 SETTINGS, ORIGIN, CHAIN = "settings.toml", "origin.json", "run.h5"
 CACHE = "simulations.sqlite"
@@ -58,6 +57,31 @@ def is_free(folder: Path) -> bool:
     return folder.is_dir() and all(each.name.startswith(CACHE) for each in folder.iterdir())
 
 
+def make_sampler(job: Job, problem: Problem, backend: Any = None, chain: int = 0) -> Any:
+    """Make the sampler of a TOML file, in memory without a backend; ValueError for a setting names its section.
+
+    `chain` is the number of the independent run.
+    """
+    import samplers
+
+    given, where, posterior = job.sampler, job.where("sampler"), problem.posterior
+    settings = given.given("recycle", "ess_ratio", "min_moves", "max_moves", "max_failure_share")
+    try:
+        return {"smc": samplers.SMCSampler, "tmcmc": samplers.TMCMCSampler}[given.kind](
+            given.walkers,
+            posterior.ndim,
+            posterior,
+            backend=backend,
+            vectorize=True,
+            seed=given.seed + chain,
+            guide=posterior.guide() if given.guide else None,
+            max_simulations=job.budget.max_simulations,
+            **settings,
+        )
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{where} {error}") from error
+
+
 def run_job(
     file: Path, folder: Path | None = None, resume: bool = False, overwrite: bool = False, progress: bool = True
 ) -> Outcome:
@@ -77,7 +101,8 @@ def run_job(
         refuse_chance(problem.posterior)
     samplers = _stored_samplers(job, problem, folder)
     for sampler in samplers:
-        run_sampler(job, sampler, progress)
+        # the annealing of a stored run is made again from its record, also where no step is missing
+        sampler.run_mcmc(None, max(job.sampler.steps - sampler.iteration, 0), progress=progress)
     return Outcome(folder, samplers[0], problem, *_write(folder, job, job.file, samplers, problem, events, progress))
 
 
@@ -108,9 +133,8 @@ def report_run(path: Path, runs_code: bool = False) -> Outcome:
             f"the run in {folder} has no samples yet; continue it with: fe-likelihoods run {origin['file']} --out "
             f"{folder}"
         )
-    steps = job.sampler.steps or STEPS
     for sampler in samplers:
-        if sampler.iteration >= steps:
+        if sampler.iteration >= job.sampler.steps:
             # the annealing is made again without an evaluation; the chain alone has lost which walkers are copies
             with _without_messages("samplers.tempered"):
                 sampler.run_mcmc(None, 0, progress=False)

@@ -235,8 +235,8 @@ class Sampler(Section):
     """``[sampler]``."""
 
     kind: Annotated[Any, "one of smc, tmcmc"] = key("Sampler", "smc")
-    walkers: Count = key("Number of walkers (500)")
-    steps: Count = key("Sweeps at beta = 1, each of which stores all walkers (4)")
+    walkers: Count = key("Number of walkers", 500)
+    steps: Count = key("Sweeps at beta = 1, each of which stores all walkers", 4)
     seed: Size = key("Seed", 1)
     chains: Count = key(
         "Independent runs with successive seeds, which r_hat compares; tables and report are of the first", 1
