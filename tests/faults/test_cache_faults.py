@@ -179,6 +179,21 @@ def test_two_programs_on_one_cache(path, thetas, expected):
 # damaged --------------------------------------------------------------------------------------------------------------
 
 
+def test_another_program_that_holds_a_lock_on_the_file(path, thetas, expected, caplog, monkeypatch):
+    cache = SimulationCache(path)
+    cache.file.timeout = 0.05
+    cache.close()  # the next connection has this limit
+    blocker = sqlite3.connect(path, isolation_level=None)
+    blocker.execute("BEGIN IMMEDIATE")
+    likelihood = likelihood_of(cache)
+    np.testing.assert_array_equal(likelihood.misfit(thetas[:200]), expected[:200])
+    assert warnings_of(caplog, "cannot be written") == 1
+    blocker.execute("ROLLBACK")
+    blocker.close()
+    cache.close()  # stores the waiting rows
+    assert cache.info().simulations == 200
+
+
 def warnings_of(caplog, text):
     """Number of warnings with this text."""
     return sum(text in record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING)

@@ -53,6 +53,20 @@ def test_the_likelihood_is_that_of_white_noise_with_the_scaled_deviations(rng):
     )
 
 
+def test_level_of_a_response():
+    time = 0.01 * np.arange(2000)
+    history = np.where(time < 10.0, 3.0, 0.1) * np.sin(2.0 * np.pi * 5.0 * time)
+    both = np.stack([history, np.ones(2000)])
+    np.testing.assert_allclose(local_level(both, None)[:, 0], np.sqrt(np.mean(both**2, axis=1)))
+    level = local_level(both, 101.0)
+    np.testing.assert_allclose(level[0, 100:900], 3.0 / np.sqrt(2.0), rtol=0.01)
+    np.testing.assert_allclose(level[0, 1100:1900], 0.1 / np.sqrt(2.0), rtol=0.01)
+    np.testing.assert_allclose(level[1], 1.0, rtol=1e-12)
+    np.testing.assert_allclose(local_level(both, 1.0), np.abs(both), rtol=1e-6, atol=1e-6)
+    # a mean square is kept, so that the share of the whole motion is that of its parts
+    assert np.mean(level[0] ** 2) == pytest.approx(np.mean(history**2), rel=0.02)
+
+
 @pytest.mark.parametrize("window", (None, 1.0))
 def test_a_prediction_of_a_weaker_motion_has_the_noise_of_the_weaker_response(record, window):
     model = LinearOscillator(record)

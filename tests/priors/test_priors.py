@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 import pytest
 from scipy import integrate, stats
-from scipy.special import ndtr
+from scipy.special import log_ndtr, ndtr
 
 from fe_likelihoods.priors.distributions import Distribution, HalfNormal, LogNormal, TruncatedNormal, Uniform
 from fe_likelihoods.priors.priors import Prior
@@ -64,6 +64,19 @@ def test_quantiles_return_through_both_tails(ours, theirs):
 SCORES = np.concatenate([np.linspace(-37.0, 37.0, 1481), [-1e-3, 1e-9, 1e-3]])
 
 
+@both
+def test_inverse_survival_function_keeps_small_probabilities(ours, theirs):
+    q = np.logspace(-250, -0.31, 100)
+    x = ours.isf(q)
+    resolution = np.spacing(np.maximum(np.abs(x), 8.0 * abs(getattr(ours, "mean", 0.0))))  # of scipy near a bound
+    slack = 1e-11 + 2.0 * theirs.pdf(x) * resolution / q
+    error = np.abs(np.expm1(theirs.logsf(x) - np.log(q)))
+    assert (error <= slack)[slack < 0.1].all()
+    assert (slack < 0.1).sum() > 4
+    np.testing.assert_array_equal(ours.isf([0.0, 1.0]), ours.bounds[::-1])
+    assert ours.isf(0.25) == pytest.approx(ours.ppf(0.75), rel=1e-12)
+
+
 def slope(distribution, x, z):
     """dz / dx = p(x) / phi(z)."""
     return np.exp(distribution.logpdf(x) + 0.5 * z * z + 0.5 * math.log(2.0 * math.pi))
@@ -84,6 +97,24 @@ def test_normal_scores_return_through_both_tails(ours, theirs):
     for side, bound in ((-1.0, low), (1.0, high)):
         reach = 3.7 if bound != 0.0 and np.isfinite(bound) else 37.0
         assert (slack < 1e-9)[(side * z > 0.0) & (side * z <= reach)].all()
+
+
+@both
+def test_normal_scores_have_the_probabilities_of_scipy(ours, theirs):
+    z = SCORES[np.abs(SCORES) <= 30.0]
+    x = ours.from_normal(z)
+    inside = (x > ours.bounds[0]) & (x < ours.bounds[1])
+    x, z = x[inside], z[inside]
+    with np.errstate(all="ignore"):
+        low, high = theirs.logcdf(x) - log_ndtr(z), theirs.logsf(x) - log_ndtr(-z)
+    # scipy's probabilities of a truncated normal lose their digits next to a bound
+    scale = max(abs(getattr(ours, "mean", 0.0)), getattr(ours, "sd", 0.0), 1e-300)
+    lost = slope(ours, x, z) * (8 * np.finfo(float).eps * scale + np.spacing(np.abs(x)))
+    error = np.where(z < 0.0, low, high)
+    slack = 1e-10 + 2.0 * (1.0 + np.abs(z)) * lost
+    assert (np.abs(error) <= slack)[lost < 1e-3].all()
+    assert (lost < 1e-3).sum() > 100
+    assert (np.abs(error + 1e-3) > slack)[lost < 1e-5].all()  # the test can fail
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from samplers import SMCSampler
-from samplers.estimates.genealogy import standard_error_of_mean
+from samplers.estimates.genealogy import standard_error_of_mean, trace_founders
 from samplers.moves.population_moves import RandomWalkMove
 from samplers.resampling import multinomial
 from tests.contract.targets import Box, Gaussian
@@ -57,6 +57,18 @@ def test_resampled_weights_give_the_error_of_importance_sampling(rng):
         errors.append(standard_error_of_mean(x[ancestors][None, :, None], ancestors)[0])
     # the error of one run varies here (few points carry the weight); its square is right on average
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(np.std(estimates), rel=0.2)
+
+
+def test_founders_are_followed_while_there_are_enough(rng):
+    n, generations, lineage = 200, [], np.arange(200)
+    for _ in range(4):
+        ancestors = multinomial(np.full(n, 1 / n), rng)
+        generations = trace_founders(generations, ancestors, min_share=0.1)
+        lineage = lineage[ancestors]
+    assert len(generations) == 4
+    assert np.array_equal(generations[0], lineage) and np.array_equal(generations[-1], ancestors)
+    few = trace_founders(generations, np.repeat([3, 7], n // 2), min_share=0.1)
+    assert len(few) == 1 and set(few[0]) == {3, 7}
 
 
 def scores(posterior, samplers, stated):
