@@ -30,7 +30,7 @@ from .evaluation.asynchronous import AsynchronousEvaluator, advise_on_pool, chec
 from .evaluation.evaluator import Evaluator, most_common_reasons, unpack
 from .evaluation.user_target import Target
 from .interrupts import deferred_interrupts, interrupts_end_the_run
-from .judgement.checks import check_likelihood
+from .judgement.checks import check_likelihood, check_prior
 from .judgement.failures import judged_failures
 from .judgement.verdict import CONVERGED, describe_early_stop, independent_points, judge
 from .moves.fast_parameters import with_fast_sweeps
@@ -653,6 +653,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
             result = result._replace(ladder=self._output.result.ladder)  # with the wall times of the evaluations
         coords, log_prob = self._record.first(self.nwalkers)
         said = check_end(result, population.coords) + check_likelihood(log_prob, self._target.log_prior(coords))
+        begun = self._record.start.coords
+        said += check_prior(begun, self._target.log_prior(begun))
         said += [] if guidance is None else list(guidance.guide.findings)
         for finding in said:
             warn(finding.message)

@@ -21,6 +21,7 @@ __all__ = [
     "check_evidence",
     "check_guide_against_recycling",
     "check_likelihood",
+    "check_prior",
     "check_shares",
     "check_stages",
     "describe_unused_guide",
@@ -39,6 +40,7 @@ LARGE_ERROR, LARGE_ERROR_OF_MODES = 0.4, 0.35
 HIGHER_CHECK = 1.5
 # Log-likelihoods are equal if they differ by less than this share of their size, the rounding error of a sum of 1e4
 # terms. With 1e-9, right runs with a log-likelihood of 1e11 and a range of 100 were refused.
+VOLUME_ERROR = 0.5  # of the logarithm of a volume; from 40 draws in 20 dimensions its standard error is 0.16
 ROUNDING = 1e-12
 # Smallest difference between two shares of a component that is reported if it is also significant.
 LARGE_SHARE_DIFFERENCE = 0.1
@@ -78,6 +80,22 @@ def check_likelihood(log_prob: np.ndarray, log_prior: np.ndarray) -> list[Findin
         f"narrow the prior to where the model works.{indicator}"
     )
     return [Finding("The likelihood tells nothing", WRONG if known.all() else CARE, text, action)]
+
+
+def check_prior(coords: np.ndarray, log_prior: np.ndarray) -> list[Finding]:
+    """A finding if the log-prior is 0 at all draws of the prior (n, ndim), and the volume that they fill is not 1."""
+    n, sides = len(coords), np.ptp(coords, axis=0)
+    if n < 2 or np.any(log_prior != 0.0) or np.any(sides == 0.0):
+        return []
+    log_volume = float(np.sum(np.log(sides * (n + 1) / (n - 1))))  # uniform draws leave two of n + 1 parts of each side
+    if abs(log_volume) < VOLUME_ERROR:
+        return []
+    text = (
+        "The log-prior is 0 at all points that the run began with, which fill a box with a volume of about "
+        f"{np.exp(log_volume):.2g}: it is not normalised. The samples are right, and the log-evidence is off by about "
+        f"{log_volume:+.2g}."
+    )
+    return [Finding("The prior is not normalised", CARE, text, "Return -log(volume) inside the bounds instead of 0.")]
 
 
 def check_stages(stages: Sequence[Stage], nwalkers: int, ndim: int) -> list[Finding]:

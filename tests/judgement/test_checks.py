@@ -9,7 +9,7 @@ from scipy import stats
 
 from samplers import SamplingWarning, SMCSampler, TMCMCSampler
 from samplers.estimates.importance import EvidenceCheck
-from samplers.judgement.checks import check_evidence, check_likelihood
+from samplers.judgement.checks import check_evidence, check_likelihood, check_prior
 from tests.covering import covering
 from tests.statistics import analytic_posteriors as analytic
 
@@ -196,3 +196,28 @@ def test_penalties_at_a_part_of_the_draws_are_a_hard_edge(Sampler, certain, valu
         log_evidences.append(sampler.log_evidence)
     error = np.std(log_evidences, ddof=1) / np.sqrt(12)
     assert abs(np.mean(log_evidences) - expected) < stats.t(11).isf(1e-5) * error
+
+
+@pytest.mark.parametrize(
+    ("sides", "log_prior", "said"),
+    [([5.5, 10.0], 0.0, True), ([0.1, 0.2], 0.0, True), ([5.5, 10.0], -np.log(55.0), False), ([1.0] * 8, 0.0, False)],
+)
+def test_a_prior_of_0_inside_a_box_is_not_normalised(sides, log_prior, said, rng):
+    """As in most scripts for emcee; a unit cube is."""
+    for _ in range(50):
+        coords = rng.uniform(0.0, sides, size=(32, len(sides)))
+        found = check_prior(coords, np.full(32, log_prior))
+        assert [finding.severity for finding in found] == ["care"] * said
+    assert not said or f"off by about {np.log(np.prod(sides)):+.0f}"[:-1] in found[0].text
+
+
+@pytest.mark.parametrize("Sampler", [SMCSampler, TMCMCSampler])
+def test_a_script_for_emcee_that_keeps_its_prior_is_warned_of_the_evidence(Sampler):
+    def log_prior(x):
+        return 0.0 if np.all((x > 0.0) & (x < 10.0)) else -INF
+
+    sampler = Sampler(200, 2, lambda x: log_prior(x) - 0.5 * np.sum((x - 5.0) ** 2), log_prior_fn=log_prior, seed=1)
+    with pytest.warns(SamplingWarning, match=r"off by about \+4.6. Return -log"):
+        sampler.run_mcmc(np.random.default_rng(1).uniform(0.0, 10.0, (200, 2)), 2)
+    assert sampler.verdict.status == "usable"
+    assert abs(sampler.log_evidence - np.log(2.0 * np.pi)) < 4.0 * sampler.log_evidence_error
