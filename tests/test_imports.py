@@ -15,7 +15,7 @@ import samplers
 
 ROOT = Path(__file__).resolve().parents[1]
 HEAVY = {
-    *("arviz", "distributed", "emcee", "h5py", "matplotlib", "numba", "pandas", "xarray"),
+    *("arviz", "corner", "distributed", "emcee", "h5py", "matplotlib", "numba", "pandas", "xarray"),
     *("scipy.signal", "scipy.special", "scipy.stats"),
 }
 

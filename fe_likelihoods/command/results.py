@@ -125,15 +125,13 @@ def write_samples(
 
     Independent runs are chains. Returns the name of the file, and how the runs agree, empty for one.
     """
-    from samplers.reporting.arviz_data import groups_of
+    from samplers import to_arviz
 
     options = {"draws": max(draws, len(samplers))} if draws else {}
-    groups = groups_of(samplers, run.posterior if draws else None, prediction, discard=run.discard, **options)
-    groups["posterior"].attrs["judgement"] = str(judgement)
-    for group, data in groups.items():  # what `to_netcdf` of arviz writes
-        mode = "w" if group == "posterior" else "a"
-        data.to_netcdf(folder / "posterior.nc", mode, group=group, engine="h5netcdf")
-    return "posterior.nc", _agreement(groups["posterior"], samplers) if len(samplers) > 1 else ""
+    data = to_arviz(samplers, run.posterior if draws else None, prediction, discard=run.discard, **options)
+    data.posterior.attrs["judgement"] = str(judgement)
+    data.to_netcdf(str(folder / "posterior.nc"))
+    return "posterior.nc", _agreement(data, samplers) if len(samplers) > 1 else ""
 
 
 def _agreement(data: Any, samplers: Sequence[Any]) -> str:
@@ -141,6 +139,7 @@ def _agreement(data: Any, samplers: Sequence[Any]) -> str:
     import arviz
 
     found = arviz.rhat(data)
+    found = found["posterior"] if "posterior" in getattr(found, "children", {}) else found
     name, worst = max(((name, float(each)) for name, each in found.data_vars.items()), key=lambda each: each[1])
     text = f"{len(samplers)} independent runs: r_hat at most {worst:.3f} ({name}; above 1.01 they differ)"
     evidences = (f"{each.log_evidence:.2f} +- {each.log_evidence_error:.2g}" for each in samplers)

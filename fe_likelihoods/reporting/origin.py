@@ -12,7 +12,7 @@ from ..checks.run import FinishedRun
 
 __all__ = ["fingerprints", "how_to_repeat", "sampler_settings", "versions"]
 
-_PACKAGES = ("fe-likelihoods", "numpy", "scipy", "numba", "emcee", "h5py", "arviz", "matplotlib")
+_PACKAGES = ("fe-likelihoods", "numpy", "scipy", "numba", "emcee", "h5py", "corner", "arviz", "matplotlib")
 
 
 def versions() -> list[tuple[str, str]]:

@@ -18,7 +18,7 @@ from .summary import is_tempered, log_posterior_of, names_of_parameters
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["groups_of", "to_arviz"]
+__all__ = ["to_arviz"]
 
 _PRIOR_DRAWS = 1000
 _ORDER = (
@@ -83,35 +83,6 @@ def to_arviz(
     import arviz
     import xarray
 
-    groups = groups_of(
-        sampler,
-        posterior,
-        prediction,
-        parameter_names=parameter_names,
-        discard=discard,
-        draws=draws,
-        block=block,
-        seed=seed,
-    )
-    if arviz.__version__.startswith("0."):
-        return arviz.InferenceData(**groups)
-    return xarray.DataTree.from_dict(groups)
-
-
-def groups_of(
-    sampler: Any,
-    posterior: Any = None,
-    prediction: Any = None,
-    *,
-    parameter_names: Sequence[str] | None = None,
-    discard: int = 0,
-    draws: int = 400,
-    block: float | None = None,
-    seed: int = 0,
-) -> "dict[str, xarray.Dataset]":
-    """The groups that `to_arviz` describes by their names, without arviz, whose import takes 0.7 s."""
-    import xarray
-
     runs = list(sampler) if isinstance(sampler, Sequence) else [sampler]
     if len({id(run) for run in runs}) < len(runs):
         raise ValueError(
@@ -149,7 +120,10 @@ def groups_of(
         groups |= _predictive_groups(posterior, chains, groups["observed_data"], draws, block, seed)
     if prediction is not None:
         groups["predictions"] = prediction.to_xarray()
-    return {group: _without_slashes(dataset) for group, dataset in groups.items()}
+    groups = {group: _without_slashes(dataset) for group, dataset in groups.items()}
+    if arviz.__version__.startswith("0."):
+        return arviz.InferenceData(**groups)
+    return xarray.DataTree.from_dict(groups)
 
 
 def _without_slashes(dataset: "xarray.Dataset") -> "xarray.Dataset":

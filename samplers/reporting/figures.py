@@ -1,7 +1,7 @@
 """Figures of posterior samples: all pairs of parameters (`plot_corner`) and single parameters (`plot_marginals`).
 
 Units, labels and nominal values come from ``posterior.parameters``; otherwise labels are ``posterior.parameter_names``
-or x0, x1, ... matplotlib is imported inside the functions.
+or x0, x1, ... matplotlib and corner are imported inside the functions.
 """
 
 import textwrap
@@ -68,7 +68,7 @@ def plot_corner(
     labels: Sequence[str] | None = None,
     title: str = "",
 ) -> "Figure":
-    """Plot the posterior for all pairs of parameters in the style of corner.py, with the prior on the diagonal.
+    """Plot the posterior for all pairs of parameters by `corner.corner`, with the prior on the diagonal.
 
     See Foreman-Mackey (2016), corner.py, Journal of Open Source Software 1(2), 24, doi:10.21105/joss.00024. The
     contours hold 50 and 90 % of the samples. Fewer than 150 distinct samples from one sampler are drawn as points.
@@ -94,12 +94,13 @@ def plot_corner(
     Returns
     -------
     matplotlib.figure.Figure
-        With k (k + 1) / 2 axes for k parameters: row by row, up to the diagonal.
+        With axes of shape (k, k) for k parameters; the axes above the diagonal are empty.
 
     Examples
     --------
     >>> figure = plot_corner(samples, posterior, names=["stiffness", "damping"])
     """
+    import corner
     import matplotlib.pyplot as plt
 
     drawn = _choose(samples, posterior, truths, labels, names, MOST_PARAMETERS)
@@ -111,30 +112,50 @@ def plot_corner(
     width = left + k * panel + right + max(0.0, 3.0 - (k - 1) * panel)  # the legend is beside the first panel
     height = left + k * panel + top
     figure = plt.figure(figsize=(width, height))
-    end = left + k * panel
-    edges = {"left": left / width, "right": end / width, "bottom": left / height, "top": end / height}
-    cells = figure.add_gridspec(k, k, wspace=0.05, hspace=0.05, **edges)
-    axes = {(i, j): figure.add_subplot(cells[i, j]) for i in range(k) for j in range(i + 1)}
     shown_as_points = []
     for label, colour in drawn.shades():
-        x, bins = drawn.samples[label], _bins(drawn.samples[label])
+        x = drawn.samples[label]
         few = len(np.unique(x, axis=0)) < FEW_POINTS
         shown_as_points.append(few)
-        for (i, j), each in axes.items():
-            if i == j:
-                _draw_histogram(each, x[:, i], bins, drawn, i, colour)
-            elif few:
-                each.plot(x[:, j], x[:, i], "o", color=colour, ms=2.5, alpha=0.6, mec="none")
-            else:
-                _draw_contours(each, x[:, [j, i]], bins, drawn.limits[[j, i]], colour, filled=not several)
+        corner.corner(
+            x,
+            bins=_bins(x),
+            range=[tuple(each) for each in drawn.limits],
+            color=colour,
+            labels=[""] * k,
+            fig=figure,
+            max_n_ticks=3,
+            hist_kwargs={"density": True, "linewidth": 1.2} | drawn.fill(colour),
+            levels=LEVELS,
+            smooth=1.0,
+            plot_density=False,
+            plot_datapoints=few,
+            plot_contours=not few,
+            fill_contours=not several,
+            no_fill_contours=several,  # a white interior would hide the samplers drawn before
+            data_kwargs={"ms": 2.5, "alpha": 0.6, "mec": "none"},
+            contour_kwargs={"linewidths": 1.1},
+            quiet=True,
+        )
+    for values, colour, dashes in ((drawn.nominal, GREY, "--"), (drawn.truths, RED, "-")):
+        corner.overplot_lines(
+            figure, [x if np.isfinite(x) else None for x in values], color=colour, linestyle=dashes, linewidth=1.1
+        )
+    end = left + k * panel
+    figure.subplots_adjust(left=left / width, right=end / width, bottom=left / height, top=end / height)
+    axes = np.array(figure.axes).reshape(k, k)
     size = 7.0 if k > 6 else 8.0
     for i, text in enumerate(texts):
         _finish_diagonal(axes[i, i], drawn, i, size)
-        for row in range(i, k):
-            _set_axis(axes[row, i].xaxis, text if row == k - 1 else "", drawn, i, size, -0.5 / panel)
-        for column in range(i):
-            _set_axis(axes[i, column].yaxis, "" if column else text, drawn, i, size, -0.5 / panel)
-            axes[i, column].set(xlim=drawn.limits[column], ylim=drawn.limits[i])
+        for axis in (*(each.xaxis for each in axes[i:, i]), *(each.yaxis for each in axes[i, :i])):
+            axis.set_ticks(_inner_ticks(drawn.limits[i]))
+        axes[-1, i].set_xlabel(text, fontsize=size + 1.0)
+        axes[-1, i].xaxis.set_label_coords(0.5, -0.5 / panel)
+        _set_digits(axes[-1, i].xaxis, drawn.limits[i], size)
+        if i > 0:
+            axes[i, 0].set_ylabel(text, fontsize=size + 1.0)
+            axes[i, 0].yaxis.set_label_coords(-0.5 / panel, 0.5)
+            _set_digits(axes[i, 0].yaxis, drawn.limits[i], size)
     notes = {
         "contours hold 50 and 90 % of the samples": not all(shown_as_points),
         f"points: fewer than {FEW_POINTS} distinct samples": any(shown_as_points),
@@ -187,8 +208,9 @@ def plot_marginals(
         axes, limits, note = figure.add_subplot(rows, columns, i + 1), drawn.limits[i], ""
         spread = max(float(x[:, i].std()) for x in drawn.samples.values())
         for name, colour in drawn.shades():
-            x = drawn.samples[name]
-            _draw_histogram(axes, x[:, i], _bins(x), drawn, i, colour)
+            x, fill = drawn.samples[name], drawn.fill(colour)
+            axes.hist(x[:, i], _bins(x), range=tuple(limits), density=True, linewidth=1.2, color=colour, **fill)
+        axes.set_ylim(0.0, 1.1 * axes.dataLim.y1)
         if drawn.prior_draws is not None and spread > 1e-12 * np.abs(limits).max():
             prior = np.quantile(drawn.prior_draws[:, i], [0.005, 0.995])
             room = 0.5 * (LARGEST_PANEL - 1.0) * (limits[1] - limits[0])
@@ -198,7 +220,9 @@ def plot_marginals(
                 min(limits[0], max(prior[0], limits[0] - room)),
                 max(limits[1], min(prior[1], limits[1] + room)),
             ]
-        _mark(axes.xaxis, drawn, i)
+        axes.set(xlim=tuple(drawn.limits[i]), yticks=[])
+        for value, colour, dashes in ((drawn.nominal[i], GREY, "--"), (drawn.truths[i], RED, "-")):
+            axes.axvline(value, color=colour, linestyle=dashes, linewidth=1.1)
         _finish_diagonal(axes, drawn, i, 8.0)
         axes.set_title("\n".join(text for text in (axes.get_title(), note) if text), fontsize=8.0, pad=4)
         axes.set_xlabel(label, fontsize=9.5)
@@ -320,57 +344,10 @@ def _bins(x: np.ndarray) -> int:
     return int(np.clip(np.sqrt(len(np.unique(x[:, 0]))), 12, 36))
 
 
-def _draw_histogram(axes: "Axes", x: np.ndarray, bins: int, drawn: _Drawn, i: int, colour: str) -> None:
-    """Density of samples (n,) of the parameter `i` from one sampler."""
-    low, high = drawn.limits[i]
-    axes.hist(x, bins, range=(low, high), density=True, linewidth=1.2, color=colour, **drawn.fill(colour))
-
-
-def _draw_contours(axes: "Axes", pairs: np.ndarray, bins: int, limits: np.ndarray, colour: str, filled: bool) -> None:
-    """Contours that hold the shares `LEVELS` of pairs (n, 2), of their smoothed histogram, as by corner.py."""
-    from matplotlib.colors import to_rgba
-    from scipy.ndimage import gaussian_filter
-
-    counts, *edges = np.histogram2d(*pairs.T, bins, limits)
-    density = gaussian_filter(counts, 1.0)
-    falling = np.sort(density, axis=None)[::-1]
-    shares = np.cumsum(falling) / falling.sum()
-    levels = np.array([falling[max(np.searchsorted(shares, each, "right") - 1, 0)] for each in sorted(LEVELS)[::-1]])
-    if not np.diff(levels).all():
-        return  # all samples are in one cell
-    density = np.pad(np.pad(density, 1, mode="edge"), 1, constant_values=density.min())  # contours end at the edges
-    x, y = (edge[0] + np.diff(edge[:2]) * (np.arange(len(edge) + 3) - 1.5) for edge in edges)
-    if filled:
-        shades = [to_rgba(colour, (1.0 + k) / (1.0 + len(levels))) for k in range(len(levels))]
-        axes.contourf(x, y, density.T, [*levels, 1.0001 * density.max()], colors=[*shades[:-1], colour])
-    axes.contour(x, y, density.T, levels, colors=[colour], linewidths=1.1)
-
-
-def _set_axis(axis: Any, text: str, drawn: _Drawn, i: int, size: float, outside: float) -> None:
-    """Marks of the parameter `i`, ticks, and at the edge of the figure, where there is a text, its label and values."""
-    _mark(axis, drawn, i)
-    axis.set_ticks(_inner_ticks(drawn.limits[i]))
-    if not text:
-        axis.set_tick_params(label1On=False)
-        return
-    axis.set_label_text(text, fontsize=size + 1.0)
-    axis.set_label_coords(*((0.5, outside) if axis.axis_name == "x" else (outside, 0.5)))
-    _set_digits(axis, drawn.limits[i], size)
-
-
-def _mark(axis: Any, drawn: _Drawn, i: int) -> None:
-    """Lines at the nominal and the true value of the parameter `i`; none for NaN."""
-    draw = axis.axes.axvline if axis.axis_name == "x" else axis.axes.axhline
-    for value, colour, dashes in ((drawn.nominal[i], GREY, "--"), (drawn.truths[i], RED, "-")):
-        if np.isfinite(value):
-            draw(value, color=colour, linestyle=dashes, linewidth=1.1)
-
-
 def _finish_diagonal(axes: "Axes", drawn: _Drawn, i: int, size: float) -> None:
     """Prior density, values outside the panel, and mean and standard deviation of one parameter."""
     low, high = drawn.limits[i]
-    axes.set(xlim=(low, high), yticks=[])
-    highest = 1.1 * max(patch.get_xy()[:, 1].max() for patch in axes.patches)
+    highest = 1.1 * max(patch.get_xy()[:, 1].max() for patch in axes.patches)  # corner's limit is of the last sampler
     if drawn.densities:
         places = np.linspace(low, high, 200)
         density = drawn.densities[i](places)

@@ -55,11 +55,8 @@ def close():
 
 
 def grid(figure) -> np.ndarray:
-    """Axes (n, n) of a figure of pairs, None above the diagonal."""
-    n = round((2 * len(figure.axes)) ** 0.5 - 0.5)
-    found = np.full((n, n), None)
-    found[np.tril_indices(n)] = figure.axes
-    return found
+    n = round(len(figure.axes) ** 0.5)
+    return np.array(figure.axes, dtype=object).reshape(n, n)
 
 
 def lines(axes, colour: str) -> list[float]:
@@ -96,6 +93,7 @@ def test_corner_shows_units_prior_truth_and_nominal_values(updated):
         1e-3 * np.exp(Posterior.prior.distributions["sigma"].logpdf(1e-3 * of_sigma.get_xdata()[0]))
     )
     assert axes[0, 0].get_title() == f"{updated[:, 0].mean():.3f} ± {updated[:, 0].std():.3f}"
+    assert all(not axes[i, j].get_frame_on() and not axes[i, j].lines for i in range(3) for j in range(i + 1, 3))
     for i in range(3):
         for j in range(i):
             assert axes[i, j].collections, "contours"
