@@ -74,6 +74,7 @@ _FACTORS = {
         "kip/in": 1e3 * POUND_FORCE / INCH,
         "kip/ft": 1e3 * POUND_FORCE / FOOT,
     },
+    "rotational stiffness": {"N m/rad": 1.0, "kN m/rad": 1e3, "MN m/rad": 1e6},
     "mass": {"kg": 1.0, "tonne": 1e3, "lb": POUND_FORCE / G0, "lbf s2/in": POUND_FORCE / INCH},
     "frequency": {"Hz": 1.0, "kHz": 1e3, "rad/s": 0.5 / np.pi, "rpm": 1.0 / 60.0},
     "eigenvalue": {"1/s2": 1.0},
@@ -110,6 +111,10 @@ def find_unit(name: str, dimension: str | None = None) -> Unit:
     if dimension is not None and dimension not in DIMENSIONS:
         raise ValueError(f"unknown dimension {dimension!r}; known dimensions: {', '.join(DIMENSIONS)}")
     unit = _lookup(name) if isinstance(name, str) else None
+    if dimension == "mass" and name == "t":  # elsewhere a single letter is too short to be a unit
+        unit = UNITS["tonne"]
+    if unit is None and dimension == "temperature" and name in ("K", "kelvin"):
+        raise ValueError("temperatures in kelvin are not converted by a factor: subtract 273.15, and give degC")
     if unit is None:
         raise ValueError(f"unknown unit {name!r}; known units: {_known(dimension)}")
     if dimension is not None and unit.name in _FACTORS[dimension]:

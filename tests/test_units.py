@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from fe_likelihoods import Channel
 from fe_likelihoods.units import UNITS, find_unit, from_si, to_si
 
 
@@ -56,8 +57,12 @@ def test_a_share_is_a_strain_only_where_no_other_dimension_is_stated():
 
 def test_a_temperature_is_in_degrees_and_an_underscore_in_a_moment_is_no_quotient():
     assert find_unit("°C").dimension == "temperature" and find_unit("kN_m").name == "kN m"
-    with pytest.raises(ValueError, match="temperature: degC"):
+    with pytest.raises(ValueError, match="subtract 273.15, and give degC"):
         find_unit("K", "temperature")
+    assert to_si(2.0, "t", "mass") == 2000.0 and to_si(3.0, "kN m/rad") == 3000.0
+    assert Channel("joint", "rotational stiffness", "kN m/rad").si_unit == "N m/rad"
+    with pytest.raises(ValueError, match="unknown unit 't'"):
+        find_unit("t")
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,17 @@ from ..text_tables import listed
 from .run import FinishedRun
 from .slow_motion import FEWEST_DRAWS, SlowMotion, slow_motions
 
-__all__ = ["ChannelFit", "Fit", "Fits", "checks_of", "compare", "data_sets_of", "draws_to_compare", "fit_data_sets"]
+__all__ = [
+    "ChannelFit",
+    "Fit",
+    "Fits",
+    "ModalFit",
+    "checks_of",
+    "compare",
+    "data_sets_of",
+    "draws_to_compare",
+    "fit_data_sets",
+]
 
 logger = logging.getLogger(__name__)
 
@@ -41,7 +51,8 @@ class ModalFit(NamedTuple):
     likelihood: Any
     draws: Any  # modes at draws of the prior; None if none can be simulated
     points: np.ndarray | None = None  # samples of the posterior (n, ndim); None before a run
-    samples: Any = None  # modes there
+    samples: Any = None  # modes at samples, as `predict_modes` takes them
+    held_out: Any = None  # modes that were measured, but not compared, at these samples
 
 
 class ChannelFit(NamedTuple):
@@ -248,18 +259,18 @@ def _cut(inside: np.ndarray, rows: np.ndarray, columns: np.ndarray, values: np.n
 
 
 def _modes(likelihood: Any, draws: np.ndarray, samples: np.ndarray | None) -> ModalFit:
-    """Modes at draws of the prior, and at as many samples of the posterior (n, ndim)."""
+    """Modes at draws of the prior, and at four times as many samples of the posterior (n, ndim)."""
     found: list[Any] = []
-    if samples is not None:
-        rows = np.linspace(0, len(samples) - 1, max(min(len(draws), len(samples)), 1)).round().astype(int)
-        samples = samples[np.unique(rows)]
     for points in (draws, samples):
         try:
-            found.append(likelihood.predict_modes(points) if points is not None and len(points) else None)
+            some = points is not None and len(points)
+            found.append(likelihood.predict_modes(points, most=4 * max(len(draws), 5)) if some else None)
         except SimulationFailed as error:
             logger.warning("modes are not compared: %s", error)
             found.append(None)
-    return ModalFit(likelihood, found[0], samples, found[1])
+    few = None if samples is None else samples[:: -(-len(samples) // max(len(draws), 1))]
+    held_out = None if None in (found[1], likelihood.held_out) else found[1].against(likelihood.held_out)
+    return ModalFit(likelihood, found[0], few, found[1], held_out)
 
 
 def fit_data_sets(run: FinishedRun) -> Fits:

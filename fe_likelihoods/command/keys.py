@@ -126,6 +126,10 @@ KINDS: dict[str, tuple[Callable[[Any], bool], str]] = {
         _either(_is_number, _list(_is_number)),
         "a number, or a list of numbers, such as [0.005, 0.01]",
     ),
+    "matrix": (
+        _list(_list(_is_number)),
+        "a list of rows of numbers, such as [[1e-4, 0.0], [0.0, 2e-4]]",
+    ),
     "text or numbers": (
         _either(_is_text, _list(_is_number)),
         "a text in quotes, or a list of numbers, such as [1.0, 5.0]",

@@ -22,10 +22,10 @@ from ..simulation.model import Model
 from .data import is_dataset, read_base_motion, read_bundled, read_measured, reduce_data
 from .job import Job
 from .keys import did_you_mean, read_by_channel
-from .modes_and_loads import FRAMES, modal_likelihood, modes_of_user, read_load_cases, read_modes
+from .modes_and_loads import STRUCTURES, modal_likelihood, modes_of_user, read_load_cases, read_modes
 from .priors import parse_prior
 from .sections import USER_MODELS
-from .structure import built_in, load_function, shear_frame, user_channels, user_model
+from .structure import built_in, linear_parts, load_function, user_channels, user_model
 
 __all__ = ["Problem", "make_problem", "noise_channels_of", "runs_code_of_user"]
 
@@ -116,21 +116,28 @@ def _histories(job: Job, cache: SimulationCache | None) -> _DataSet:
 
 
 def _modes(job: Job, cache: SimulationCache | None) -> _DataSet:
-    _check_kind(job, "modes", FRAMES)
+    if job.kind == "oscillator":
+        raise ValueError(
+            f"{job.where('model')} kind: with [modes], an oscillator is a frame of one storey, whose parameter is "
+            'stiffness_1: kind = "frame", floors = {top = 1}, masses = [m], stiffnesses = [k]'
+        )
+    _check_kind(job, "modes", STRUCTURES)
     if job.noise is not None:
         raise ValueError(f"{job.where('noise')} modes have no such errors: give frequency_cv and others in [modes]")
-    data = read_modes(job)
-    make, channels, n_modes = modes_of_user(job, data) if job.kind in USER_MODELS else (None, (), 0)
+    data, held_out = read_modes(job)
+    numbers = (data.n_modes, *data.mode_numbers, *(held_out.mode_numbers if held_out else ()))
+    make, channels, n_modes = modes_of_user(job, numbers) if job.kind in USER_MODELS else (None, (), 0)
 
     def make_model() -> Any:
-        if job.kind in FRAMES:
-            return shear_frame(job)
+        if job.kind in STRUCTURES:
+            return linear_parts(job)
         steps = {} if make else {"dt": 1.0, "n_steps": n_modes}
         return user_model(job, channels, make=make, **steps)
 
-    return _DataSet(
-        job, make_model, lambda model, pool: modal_likelihood(job, model, data, pool, cache), (channels, 1.0, n_modes)
-    )
+    def make_likelihood(model: Model, pool: Any) -> FELikelihood:
+        return modal_likelihood(job, model, data, held_out, pool, cache)
+
+    return _DataSet(job, make_model, make_likelihood, (channels, 1.0, n_modes))
 
 
 def _load_test(job: Job, cache: SimulationCache | None) -> _DataSet:

@@ -16,33 +16,45 @@ from ..signals.channels import Channel
 from .job import Job
 from .keys import read_by_channel
 
-__all__ = ["FRAMES", "modal_likelihood", "modes_of_user", "read_load_cases", "read_modes"]
+__all__ = ["STRUCTURES", "modal_likelihood", "modes_of_user", "read_load_cases", "read_modes"]
 
-FRAMES = "frame", "grouped frame"  # built-in structures that have modes
+STRUCTURES = "frame", "grouped frame", "bridge deck"  # built-in ones that have modes
 
 
-def read_modes(job: Job) -> ModalData:
-    """The data of ``[modes]``."""
+def read_modes(job: Job) -> tuple[ModalData, ModalData | None]:
+    """The data of ``[modes]``, and the modes that are held out."""
     given = job.modes
-    if given.n_modes is not None and job.kind in FRAMES:
-        raise ValueError(f"n_modes: a {job.kind} has a mode for each storey; leave it out")
+    if given.n_modes is not None and job.kind in STRUCTURES:
+        raise ValueError(f"n_modes: a {job.kind} has a mode for each storey or shape; leave it out")
     columns = given.columns or {}
     sensors = tuple(columns if given.variables else columns.values())
     data = read_modal_data(job.path("modes", "file", given.file), sensors, **given.given("unit", "variables"))
     data = replace(data, sensors=tuple(columns)) if columns and not given.variables else data
-    data = data if given.modes is None else data.select(given.modes)
-    return replace(data.mean() if given.mean else data, **given.given("frequency_cv", "shape_error"))
+    data = replace(data, **given.given("temperatures"))
+    data = data.mean() if given.mean else data
+    errors = given.given("frequency_cv", "covariance", "shape_error")
+    known = {name: value for name, value in errors.items() if isinstance(value, float)}  # of every mode
+    held_out = None if given.held_out is None else replace(data.select(given.held_out), **known)
+    if both := set(given.held_out or ()) & set(given.modes or ()):
+        raise ValueError(f"held_out: the modes {sorted(both)} are in modes too: leave them out of one of them")
+    compared = given.modes or [each for each in data.mode_numbers if each not in (given.held_out or ())]
+    if "covariance" in errors:  # instead of a column of the file
+        errors = {"frequency_cv": None} | errors
+    return replace(data.select(compared), **errors), held_out
 
 
-def modes_of_user(job: Job, data: ModalData) -> tuple[Callable | None, tuple[Channel, ...], int]:
-    """What makes the model of a function (None for others), channels of the response, and its number of modes."""
+def modes_of_user(job: Job, numbers: tuple[int, ...]) -> tuple[Callable | None, tuple[Channel, ...], int]:
+    """What makes the model of a function (None for others), channels of the response, and its number of modes.
+
+    `numbers` are those of the measured modes.
+    """
     sensors = job.model.get("sensors")
     if sensors is None or "channels" in job.model:
         raise ValueError(
             f"{job.where('model')} sensors: with [modes], give sensors = {{top = 0}} with the rows of the matrices "
             "that the function returns, or a list of names, and no channels"
         )
-    n_modes = job.modes.n_modes or 2 * max(data.n_modes, *data.mode_numbers)
+    n_modes = job.modes.n_modes or 2 * max(numbers)
 
     def modes_of(function: Callable, names: Any, _: Any, **options: Any) -> FunctionModes:
         return FunctionModes(function, names, sensors, n_modes, **options)
@@ -51,11 +63,11 @@ def modes_of_user(job: Job, data: ModalData) -> tuple[Callable | None, tuple[Cha
 
 
 def modal_likelihood(
-    job: Job, model: Any, data: ModalData, pool: Any, cache: SimulationCache | None
+    job: Job, model: Any, data: ModalData, held_out: ModalData | None, pool: Any, cache: SimulationCache | None
 ) -> ModalLikelihood:
     """The likelihood of ``[modes]``."""
     unknown, options = job.modes.unknown_errors, job.modes.given("close", "student_t")
-    return ModalLikelihood(model, data, unknown, unknown, pool, cache=cache, **options)
+    return ModalLikelihood(model, data, unknown, unknown, pool, cache=cache, held_out=held_out, **options)
 
 
 def read_load_cases(job: Job, channels: tuple[Channel, ...]) -> LoadTest:

@@ -7,18 +7,19 @@ from typing import Any
 
 import numpy as np
 
+from ..checks.compared import ModalFit
 from ..checks.finding import Judgement
+from ..checks.result import JudgedRun
 from ..checks.run import FinishedRun
 from ..checks.table import moments_of
 from ..likelihood.likelihood import FELikelihood
-from ..modal.modal_likelihood import ModalLikelihood
 from ..prediction.prediction import Prediction
 from ..signals.error_measures import rrmse
 
 __all__ = ["names_of", "write_csv", "write_samples", "write_tables"]
 
 
-def write_tables(folder: Path, run: FinishedRun, judgement: Judgement, agreement: str = "") -> tuple[str, ...]:
+def write_tables(folder: Path, run: FinishedRun, judged: JudgedRun, agreement: str = "") -> tuple[str, ...]:
     """Write judgement, moments of the parameters, stages and errors of the fit; returns the names of the files.
 
     `agreement` says how independent runs agree.
@@ -33,9 +34,10 @@ def write_tables(folder: Path, run: FinishedRun, judgement: Judgement, agreement
     moments = summary(run.samples, labels)._replace(mean=mean, sd=sd, cv=cv, mean_error=errors, sd_error=of_sd)
     fits = {}  # of each data set: rows of a table, and lines of text
     for key, (part, columns) in zip(names_of(posterior.likelihood), posterior.likelihood.parts(), strict=True):
-        fits[key] = (_modes if part.is_modal else _fit)(part, run.samples[:, columns])
+        modal = next((fit.modal for fit in judged.fits.fits if fit.modal and fit.title == key), None)
+        fits[key] = _modes(modal) if modal else _fit(part, run.samples[:, columns])
     lines = [
-        str(judgement),
+        str(judged.judgement),
         "",
         str(moments),
         "",
@@ -90,19 +92,25 @@ def _fit(likelihood: FELikelihood, samples: np.ndarray) -> Table:
     return rows, ["Relative RMS error of the response (RRMSE):", *shown]
 
 
-def _modes(likelihood: ModalLikelihood, samples: np.ndarray) -> Table:
-    """Measured and computed modes [Hz] at samples of the posterior, as rows and as lines."""
-    modes = likelihood.predict_modes(samples)
-    low, high = modes.interval()
-    columns = {
-        "mode": modes.data.mode_numbers,
-        "measured_Hz": modes.data.mean_frequencies.tolist(),
-        "median_Hz": np.median(modes.frequencies, axis=0).tolist(),
-        "q05_Hz": low.tolist(),
-        "q95_Hz": high.tolist(),
-        "mac": np.median(modes.assurance, axis=0).tolist(),
-    }
-    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)], [str(modes)]
+def _modes(fit: ModalFit) -> Table:
+    """Measured and computed modes [Hz] at samples of the posterior, as rows and as lines; the same as in the report."""
+    rows, lines = [], []
+    for modes, compared in ((fit.samples, "yes"), (fit.held_out, "no")):
+        if modes is None:
+            continue
+        low, high = modes.interval()
+        columns = {
+            "mode": modes.data.mode_numbers,
+            "measured_Hz": modes.data.mean_frequencies.tolist(),
+            "median_Hz": np.median(modes.frequencies, axis=0).tolist(),
+            "q05_Hz": low.tolist(),
+            "q95_Hz": high.tolist(),
+            "mac": np.median(modes.assurance, axis=0).tolist(),
+            "compared": [compared] * modes.data.n_modes,
+        }
+        rows += [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+        lines += [str(modes) if compared == "yes" else f"Held out, predicted:\n{modes}"]
+    return rows or [{"mode": ""}], lines
 
 
 def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:

@@ -210,7 +210,7 @@ def _write(
     samples, agreement = write_samples(folder, run, samplers, prediction, job.prediction.draws, judgement)
     page = folder / "report.html"
     write_page(page, run, prediction, judged, events=predicted, measured=measured, repeat=_command(file, folder))
-    tables = write_tables(folder, run, judgement, agreement)  # last: they say how many simulations there are
+    tables = write_tables(folder, run, judged, agreement)  # last: they say how many simulations there are
     sources = {"": judgement.findings, "prediction: ": () if prediction is None else prediction.findings}
     sources |= {f"event {each.name}: ": each.findings for each in described}
     said = tuple(f"{title}{each}" for title, found in sources.items() for each in found if each.severity != NOTE)

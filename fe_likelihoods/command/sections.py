@@ -95,6 +95,7 @@ Text, Texts, TextTable = Annotated[Any, "text"], Annotated[Any, "texts"], Annota
 Whole, Wholes = Annotated[Any, "whole number"], Annotated[Any, "whole numbers"]
 Size, Count = Annotated[Any, "whole number >= 0"], Annotated[Any, "whole number >= 1"]
 Number, Errors = Annotated[Any, "number"], Annotated[Any, "number or numbers"]
+Matrix = Annotated[Any, "matrix"]
 Switch, Time, Clock = Annotated[Any, "yes or no"], Annotated[Any, "time"], Annotated[Any, CLOCK]
 Columns, Quantities = Annotated[Any, "table of texts or numbers"], Annotated[Any, "table of quantities"]
 Missing, Points = Annotated[Any, "numbers and times"], Annotated[Any, "points by name"]
@@ -190,9 +191,14 @@ class Modes(Section):
     unit: Text = key('Unit of the frequencies, if the file does not state it: "Hz" or "rad/s"')
     columns: TextTable = key("Sensor of the model = name of its column; by default the column of this name")
     variables: TextTable = key("Of a MATLAB file: frequencies, shapes and damping = names of the variables")
-    modes: Wholes = key("Numbers of the modes to compare; by default all")
+    modes: Wholes = key("Numbers of the modes to compare; by default all but those held out")
+    held_out: Wholes = key("Numbers of modes that are not compared, but predicted and shown beside the measured ones")
     mean: Switch = key("Take the mean of several identifications, and their scatter as the errors", False)
     frequency_cv: Errors = key("Known coefficient of variation of the frequencies, such as 0.005, or one per mode")
+    covariance: Matrix = key("Known covariance of the compared frequencies [Hz²], instead of frequency_cv")
+    temperatures: Errors = key(
+        "Temperature of each identification [°C], if the file does not state it; adds the parameter temperature_slope"
+    )
     shape_error: Errors = key("Known standard deviation of a component of a shape with a norm of 1, such as 0.02")
     unknown_errors: Annotated[Any, "one of common, mode"] = key(
         "Parameters frequency_error and shape_error, of all modes or of each, are added to the known errors; by "

@@ -17,7 +17,7 @@ from .job import Job
 from .keys import did_you_mean
 from .sections import part_keys
 
-__all__ = ["built_in", "load_function", "shear_frame", "user_channels", "user_model"]
+__all__ = ["built_in", "linear_parts", "load_function", "user_channels", "user_model"]
 
 
 def built_in(job: Job, record: Record, names: tuple[str, ...] | None, measured: Measurements | None = None) -> Model:
@@ -51,20 +51,20 @@ def built_in(job: Job, record: Record, names: tuple[str, ...] | None, measured: 
 
         return LinearOscillator(record, **values)
     from ..models.linear_structure import LinearStructure
-    from ..models.linear_structure_parts import BridgeDeck
 
+    motion = record
     if job.kind == "bridge deck":
-        supports = [reduce_data(job, each, None)[0] for each in read_supports(job)]
-        return LinearStructure(BridgeDeck(**values), supports, outputs=names)
-    return LinearStructure(shear_frame(job), record, outputs=names)
+        motion = [reduce_data(job, each, None)[0] for each in read_supports(job)]
+    return LinearStructure(linear_parts(job), motion, outputs=names)
 
 
-def shear_frame(job: Job) -> Any:
-    """A shear frame, with groups of storeys or without."""
-    from ..models.linear_structure_parts import ShearFrame
+def linear_parts(job: Job) -> Any:
+    """A shear frame, with groups of storeys or without, or a bridge deck."""
+    from ..models.linear_structure_parts import BridgeDeck, ShearFrame
     from ..models.tall_buildings import GroupedFrame
 
-    return job.located("model", lambda: (GroupedFrame if job.kind == "grouped frame" else ShearFrame)(**job.model))
+    kinds = {"frame": ShearFrame, "grouped frame": GroupedFrame, "bridge deck": BridgeDeck}
+    return job.located("model", lambda: kinds[job.kind](**job.model))
 
 
 def _changed(job: Job, part: str, usual: Any, changes: Mapping[str, Any]) -> Any:

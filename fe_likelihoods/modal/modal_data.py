@@ -123,7 +123,10 @@ class ModalData:
         m = frequencies.shape[1]
         covariance = np.array(self.covariance, dtype=float)
         if self.frequency_cv is not None or np.isnan(frequencies).any():
-            raise ValueError("ModalData: covariance= is instead of frequency_cv, and for modes that were never missed")
+            raise ValueError(
+                "ModalData: covariance and frequency_cv state the same errors: leave one out (frequency_cv=None, "
+                "where a file has them); a covariance is for modes that were never missed"
+            )
         symmetric = covariance.shape == (m, m) and np.allclose(covariance, covariance.T, rtol=1e-8, atol=0.0)
         if not symmetric or not np.linalg.eigvalsh(covariance)[0] > 0.0:
             raise ValueError(

@@ -16,7 +16,7 @@ from ..text_tables import text_table
 from .modal_data import ModalData
 from .modal_noise import ModalNoise
 from .mode_models import StructureModes
-from .paired_modes import PairedModes
+from .paired_modes import PairedModes, sensor_rows
 
 __all__ = ["ModalLikelihood", "PredictedModes"]
 
@@ -52,6 +52,8 @@ class ModalLikelihood(FELikelihood):
     close : float
         Measured frequencies that differ by less than this share are compared by the plane of their shapes, and their
         frequencies by the order in the pair. Zero compares each shape.
+    held_out : ModalData, optional
+        Measured modes that are not compared, but that reports show beside the predicted ones.
     **options
         Of `FELikelihood`, such as ``cache``.
 
@@ -83,6 +85,7 @@ class ModalLikelihood(FELikelihood):
         *,
         student_t: float | None = None,
         close: float = _CLOSE,
+        held_out: ModalData | None = None,
         **options: Any,
     ) -> None:
         if not isinstance(data, ModalData):
@@ -94,6 +97,9 @@ class ModalLikelihood(FELikelihood):
         if student and data.covariance is not None:
             raise ValueError("ModalLikelihood: student_t is for independent errors: give frequency_cv, no covariance")
         noise = _noise(paired, data, frequency_error, shape_error, student)
+        self.held_out = held_out
+        if held_out is not None:
+            sensor_rows(paired.model, held_out)  # refuses what cannot be predicted
         super().__init__(paired, paired.measurements, noise, pool, **options)
 
     def with_noise(self, noise: Noise) -> "ModalLikelihood":
@@ -152,8 +158,8 @@ def _noise(paired: PairedModes, data: ModalData, frequency_error: Any, shape_err
     freedoms = (data.has_shape * np.maximum(data.n_sensors - sizes, 0)).T
     if data.covariance is not None and frequency_error is not None:
         raise ValueError(
-            "ModalLikelihood: the covariance of the frequencies is known; leave frequency_error out, or give the data "
-            "frequency_cv instead of covariance to add an unknown error"
+            "ModalLikelihood: an unknown frequency_error cannot be added to the covariance of the data: leave "
+            "frequency_error out (unknown_errors in a TOML file), or give the data frequency_cv and no covariance"
         )
     frequency, frequency_known = _error("frequency_error", frequency_error, paired.frequency_cv, data.n_modes)
     shape, shape_known = _error("shape_error", shape_error, data.shape_error, data.n_modes)

@@ -27,7 +27,7 @@ _WORDS = {
     "quality": ("mac", "automac", "mpc", "mpd", "mcf", "complexity", "order", "quality", "confidence"),
 }
 _NAMES = {"f": "frequency", "f_hz": "frequency", "fn": "frequency", "fn_hz": "frequency", "xi": "damping", "no": "mode"}
-_BY_UNIT = {"s": "period", "sec": "period", "°c": "temperature", "degc": "temperature", "c": "temperature"}  # of T
+_BY_UNIT = {"s": "period", "sec": "period", **dict.fromkeys(("°c", "degc", "c", "k"), "temperature")}  # of T
 
 
 def read_modal_data(
@@ -169,7 +169,8 @@ def _of_table(table: Table, sensors: Sequence[str], unit: str | None, options: d
         squares[rows] = np.square(_coefficients(table, found["deviation"], frequencies))
         options = {"frequency_cv": np.sqrt(np.nanmean(squares, axis=0))} | options
     if values["temperature"] is not None:
-        by_set = [np.unique(values["temperature"][sets == each]) for each in order]
+        degrees = values["temperature"] - (273.15 if re.search(r"[\[( _]K\W*$", names[found["temperature"]]) else 0.0)
+        by_set = [np.unique(degrees[sets == each]) for each in order]
         if any(len(each) > 1 for each in by_set):
             raise ValueError(f"{table.file}: expected one temperature for each identification (column 'set')")
         options = {"temperatures": np.concatenate(by_set)} | options
@@ -220,6 +221,8 @@ def _of_matlab(
         content = {name: value for name, value in loadmat(path).items() if not name.startswith("__")}
     except NotImplementedError:
         raise ValueError(f"{path}: a file of version 7.3; save it with '-v7', or read it with h5py") from None
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path}: cannot be read as a MATLAB file: {error}; save it again with '-v7'") from None
     missing = [name for name in variables.values() if name not in content]
     if missing or not {"frequencies"} <= set(variables) <= {"frequencies", "shapes", "damping"}:
         raise ValueError(

@@ -170,20 +170,18 @@ class StructureModes(ExternalModel):
     """Modes of a linear structure of this library, such as a `ShearFrame`, as a model with derivatives.
 
     Its parameters are those of the structure except dampings, which the undamped modes do not depend on. Its sensors
-    are the channels of the structure. The default of `n_modes` are all of a frame or a `ModalModel`; ValueError if the
-    number is not known, or the structure has fewer.
+    are the channels of the structure. The default of `n_modes` are all; ValueError if the structure has fewer.
     """
 
     path_dependent = False
 
     def __init__(self, parts: Parts, n_modes: int | None = None) -> None:
-        known = len(getattr(parts, "masses", ())) or getattr(parts, "n_modes", None)
-        if n_modes is None and known is None:
-            raise ValueError(f"StructureModes: give n_modes, the number of modes of the {type(parts).__name__}")
-        if n_modes is not None and known is not None and n_modes > known:
-            raise ValueError(f"StructureModes: the {type(parts).__name__} has {known} modes; got n_modes={n_modes}")
         names = tuple(name for name in parts.parameter_names if not name.startswith("damping"))
-        super().__init__(names, modal_channels(parts.channel_names), 1.0, known if n_modes is None else n_modes)
+        ascending = dict(zip(names, np.linspace(0.5, 1.0, len(names)), strict=True))  # as frequencies must
+        size = len(parts.assemble(np.array([ascending.get(name, _DAMPING) for name in parts.parameter_names])).mass)
+        if n_modes is not None and n_modes > size:
+            raise ValueError(f"StructureModes: the {type(parts).__name__} has {size} modes; got n_modes={n_modes}")
+        super().__init__(names, modal_channels(parts.channel_names), 1.0, size if n_modes is None else n_modes)
         self.parts = parts
         self.fingerprint = self._digest(repr(parts))
 

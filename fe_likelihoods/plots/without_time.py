@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 __all__ = ["plot_modes", "plot_points"]
 
 _MOST_BARS = 30  # in one panel
-_MOST_MODES = 11  # whose shapes are drawn
+_MOST_MODES = 12  # whose shapes are drawn
+_LETTERS = 11  # of small labels side by side in an inch
 _WIDTH = 0.6  # of a bar
 
 
@@ -129,14 +130,16 @@ def _panels(measurements: Measurements, numeric: bool) -> list[_Panel]:
     return panels
 
 
-def _name(axes: Axes, names: list[str]) -> None:
-    """Names below bars, upright where they are long."""
-    long = sum(max(map(len, name.split("\n"))) for name in names) > 90
-    axes.set_xticks(np.arange(len(names)), names, rotation=90 if long else 0, fontsize="small")
+def _name(axes: Axes, names: list[str], inches: float = 8.0) -> None:
+    """Names below the places of axes that are some inches wide, upright where they are long."""
+    upright = sum(max(map(len, name.split("\n"))) + 1 for name in names) > _LETTERS * inches
+    axes.set_xticks(np.arange(len(names)), names, rotation=90 if upright else 0, fontsize="small")
     axes.set_xlim(-0.6, len(names) - 0.4)
 
 
-def plot_modes(modes: PredictedModes, before: PredictedModes | None = None, label: str = "posterior, 90 %") -> Figure:
+def plot_modes(
+    modes: PredictedModes, before: PredictedModes | None = None, label: str = "posterior with errors, 90 %"
+) -> Figure:
     """Plot measured and computed natural frequencies, and the mode shapes at the sensors.
 
     Parameters
@@ -158,16 +161,24 @@ def plot_modes(modes: PredictedModes, before: PredictedModes | None = None, labe
 
     data = modes.data
     shaped = [k for k in range(data.n_modes) if data.has_shape[:, k].any() and data.n_sensors > 1][:_MOST_MODES]
-    columns = min(3, 1 + len(shaped))
-    lines = -(-(1 + len(shaped)) // columns)
-    size = (4.2 * columns if columns > 1 else 6.5, 1.0 + 2.6 * lines)
-    figure, grid = plt.subplots(lines, columns, squeeze=False, figsize=size, layout="constrained")
-    first, *others = grid.ravel()
+    columns = min(3, max(len(shaped), 1))
+    lines = -(-len(shaped) // columns)
+    width = max(4.2 * columns, 7.0)
+    figure = plt.figure(figsize=(width, 3.4 + 1.9 * lines), layout="constrained")
+    grid = figure.add_gridspec(1 + lines, columns)
+    first = figure.add_subplot(grid[0, :])
     places, measured = np.arange(data.n_modes), data.mean_frequencies
     if before is not None:
         middle, reach = _of_frequencies(before, measured)
         first.errorbar(
-            places - 0.2, middle, reach, fmt="D", color=GREY, fillstyle="none", label="prior, 90 %", capsize=3
+            places - 0.2,
+            middle,
+            reach,
+            fmt="D",
+            color=GREY,
+            fillstyle="none",
+            label="prior with errors, 90 %",
+            capsize=3,
         )
     middle, reach = _of_frequencies(modes, measured)
     first.errorbar(places + 0.2, middle, reach, fmt="s", color=BLUE, markersize=3, label=label, capsize=3)
@@ -175,28 +186,29 @@ def plot_modes(modes: PredictedModes, before: PredictedModes | None = None, labe
     text = "measured" if errors is None else "measured, with its standard deviation"
     for each in data.frequencies / measured:
         first.errorbar(places, each, errors, fmt="o", color=ORANGE, markersize=4, label=text)
-    _name(first, [f"{number}\n{f:.4g} Hz" for number, f in zip(data.mode_numbers, measured, strict=True)])
-    first.set(ylabel="computed over measured frequency", xlabel="mode")
+    _name(first, [f"mode {number}\n{f:.4g} Hz" for number, f in zip(data.mode_numbers, measured, strict=True)], width)
+    first.set_ylabel("computed / measured\nfrequency")
     first.grid(alpha=0.25)
-    for axes, k in zip(others, shaped, strict=False):
+    for place, k in enumerate(shaped):
+        axes = figure.add_subplot(grid[1 + place // columns, place % columns])
         middle, reach = _interval(modes.shapes[:, k])
-        axes.bar(np.arange(data.n_sensors), middle, _WIDTH, color=BLUE, alpha=0.35)
-        axes.errorbar(np.arange(data.n_sensors), middle, reach, fmt="none", ecolor=BLUE, capsize=3)
+        axes.bar(np.arange(data.n_sensors), middle, _WIDTH, color=BLUE, alpha=0.35, label="computed shape, median")
+        axes.errorbar(np.arange(data.n_sensors), middle, reach, fmt="none", ecolor=BLUE, capsize=2)
         error = None if data.shape_error is None else data.shape_error[k]
         sets = data.shapes[data.has_shape[:, k], k]
         for each in sets:
             sign = np.sign(each @ sets[0]) or 1.0
             axes.errorbar(np.arange(data.n_sensors), sign * each, error, fmt="o", color=ORANGE, markersize=4)
         axes.axhline(0.0, color="0.75", linewidth=0.7, zorder=0)
-        assurance = np.median(modes.assurance[:, k])
-        axes.set_title(f"mode {data.mode_numbers[k]}: shape, MAC {assurance:.3f}", fontsize="small")
-        _name(axes, list(data.sensors))
+        axes.set_title(
+            f"shape of mode {data.mode_numbers[k]}, MAC {np.median(modes.assurance[:, k]):.3f}", fontsize="small"
+        )
+        _name(axes, list(data.sensors), width / columns)
+        axes.tick_params(labelbottom=place + columns >= len(shaped))  # names below the lowest of each column alone
         axes.grid(alpha=0.25)
-    for axes in others[len(shaped) :]:
-        axes.set_axis_off()
-    handles, labels = first.get_legend_handles_labels()
-    unique = dict(zip(labels, handles, strict=True))
-    figure.legend(unique.values(), unique, loc="outside lower center", ncols=3, frameon=False, fontsize="small")
+    found = [axes.get_legend_handles_labels() for axes in figure.axes]
+    unique = {text: handle for handles, texts in found for handle, text in zip(handles, texts, strict=True)}
+    figure.legend(unique.values(), unique, loc="outside lower center", ncols=4, frameon=False, fontsize="small")
     return figure
 
 

@@ -144,18 +144,24 @@ def draw_fit(fit: Fit, before: str, after: str) -> list[Picture]:
 
 def _draw_modes(fit: Fit) -> list[Picture]:
     """Measured and computed modes."""
-    if fit.modal.samples is None:
-        return []
-    return [
-        _picture(
-            "Measured and computed modes",
-            "After the update, computed frequencies should be within the errors of the measured ones, and the shapes "
-            "should agree at all sensors. MAC is 1 for equal shapes and 0 for orthogonal ones. Scale and sign of a "
-            "shape are arbitrary.",
-            "Frequencies over measured frequencies, and shapes of the measured modes.",
-            lambda: plot_modes(fit.modal.samples, fit.modal.draws),
+    pictures = []
+    if fit.modal.samples is not None:
+        caption = (
+            "Intervals of frequencies contain the errors of an identification, known and unknown ones, so they should "
+            "hold nine of ten measured values; those of shapes contain the uncertainty of the parameters alone. MAC is "
+            "1 for equal shapes and 0 for orthogonal ones. Scale and sign of a shape are arbitrary."
         )
-    ]
+        alt = "Frequencies over measured frequencies, and shapes of the measured modes."
+        pictures.append(
+            _picture(
+                "Measured and computed modes", caption, alt, lambda: plot_modes(fit.modal.samples, fit.modal.draws)
+            )
+        )
+    if fit.modal.held_out is not None:
+        caption = "These modes were measured, but not compared: they test the prediction. Intervals are as above."
+        alt = "Predicted and measured frequencies and shapes of the modes that were held out."
+        pictures.append(_picture("Modes that were held out", caption, alt, lambda: plot_modes(fit.modal.held_out)))
+    return pictures
 
 
 def draw_residuals(fit: Fit) -> list[Picture]:

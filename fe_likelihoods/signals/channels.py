@@ -65,8 +65,10 @@ class Channel:
 
     @property
     def dimension(self) -> str:
-        """Dimension of the values, the last word of the quantity: a key of `fe_likelihoods.units.DIMENSIONS`."""
-        return self.quantity.split()[-1] if self.quantity.split() else ""
+        """Dimension of the values, the last words of the quantity: a key of `fe_likelihoods.units.DIMENSIONS`."""
+        words = self.quantity.split()
+        two = " ".join(words[-2:])
+        return two if two in DIMENSIONS else words[-1] if words else ""
 
     @property
     def si_unit(self) -> str:

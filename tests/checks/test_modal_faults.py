@@ -63,20 +63,51 @@ def test_frequencies_out_of_reach_are_named():
     assert before(changed(identified(1), [1.0, 2.0, 1.0])) == ["The prior does not reach the measurements"]
 
 
-@pytest.mark.parametrize("fault", ["reversed", "exchanged"])
-def test_faults_of_sensors_are_named(fault):
+@pytest.mark.parametrize(
+    ("gain", "order", "wanted"),
+    [
+        (-1.0, [0, 1, 2, 3], "sensor floor 4 counts the other way"),
+        (1.0, [0, 3, 2, 1], "floor 2 and floor 4 are exchanged"),
+        (0.02, [0, 1, 2, 3], "sensor floor 4 is dead"),
+        (3.0, [0, 1, 2, 3], "sensor floor 4 has a gain of"),
+    ],
+)
+def test_faults_of_sensors_are_named(gain, order, wanted):
     """With the right names, except where a fault changes the shapes as another one does."""
     named = 0
     for seed in range(10):
         data = identified(seed)
-        shapes = data.shapes[0].copy()
-        shapes[:, 3] *= -1.0 if fault == "reversed" else 1.0
-        shapes = shapes[:, [0, 3, 2, 1]] if fault == "exchanged" else shapes
+        shapes = (data.shapes[0] * [1.0, 1.0, 1.0, gain])[:, order]
         found = check_fit(Posterior(ModalLikelihood(FRAME, changed(data, shapes=shapes)), PRIOR))
-        assert "A sensor may be reversed or exchanged" in [each.kind for each in found]
-        wanted = "sensor floor 4 counts the other way" if fault == "reversed" else "floor 2 and floor 4 are exchanged"
-        named += wanted in found[0].text
+        named += any(each.kind == "A sensor may be wrong" and wanted in each.text for each in found)
     assert named >= 9
+
+
+def test_a_mode_that_was_identified_twice_is_named():
+    for seed in range(5):
+        data = identified(seed)
+        shapes = data.shapes[0][[0, 1, 0]] + 0.01 * np.random.default_rng(seed).normal(size=(3, 4))
+        assert before(changed(data, [1.0, 1.0, 0.8], shapes)) == ["Two measured modes are one"]
+
+
+def test_wrong_numbers_and_planes_of_modes_are_named():
+    named = 0
+    for seed in range(5):
+        right = identified(seed, (1, 2, 4)).frequencies
+        posterior = Posterior(ModalLikelihood(FRAME, ModalData(right, frequency_cv=0.005)), PRIOR)
+        named += any("with the numbers [1, 2, 4]" in each.text for each in check_fit(posterior))
+        assert not before(ModalData(right, mode_numbers=[1, 2, 4], frequency_cv=0.005))
+
+    assert named >= 3
+
+    def square(theta):
+        return np.diag([theta[0], theta[0] * 1.01, 4.0]), np.eye(3)
+
+    model = FunctionModes(square, ("k",), {"x": 0, "y": 1, "z": 2}, 3)
+    modes = model.simulate([1.0])
+    for close, expected in ((0.02, ["Close modes are compared as a plane"]), (0.0, [])):
+        likelihood = ModalLikelihood(model, ModalData(modes[0], modes[1:].T, ("x", "y", "z"), **KNOWN), close=close)
+        assert kinds(Posterior(likelihood, {"k": LogNormal(1.0, 0.2)})) == expected
 
 
 def test_a_mode_without_a_counterpart_is_named():

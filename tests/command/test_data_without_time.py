@@ -107,6 +107,17 @@ def test_other_models_have_modes(tmp_path):
     assert make_problem(read_job(path)).posterior(point) == pytest.approx(frame(point), rel=1e-12)
 
 
+def test_held_out_modes_are_predicted_and_shown(tmp_path, monkeypatch):
+    """The intervals of the report are those of fit.csv."""
+    monkeypatch.chdir(tmp_path)
+    call("run", str(changed(tmp_path, "modal", ("modes = [1, 2, 3]", "held_out = [4, 3]"))), "--quiet")
+    with (tmp_path / "results-changed" / "fit.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["mode"], row["compared"]) for row in rows] == [("1", "yes"), ("2", "yes"), ("4", "no"), ("3", "no")]
+    page = (tmp_path / "results-changed" / "report.html").read_text()
+    assert "Modes that were held out" in page and all(f"{float(row['q05_Hz']):.4g}<" in page for row in rows)
+
+
 def test_columns_and_errors_of_modes(tmp_path):
     write_templates("modal", tmp_path)
     modes = (tmp_path / "synthetic_modes.csv").read_text()
@@ -119,6 +130,23 @@ def test_columns_and_errors_of_modes(tmp_path):
     assert [name for name in problem.assumed if name.startswith("frequency")] == [
         f"frequency_error_{i}" for i in (1, 2, 3)
     ]
+    known = "covariance = [[1e-4, 5e-5], [5e-5, 4e-4]]\ntemperatures = 12"
+    path = changed(tmp_path, "modal", ("frequency_cv = 0.005", known), ("[1, 2, 3]", "[1, 2]"))
+    (tmp_path / "synthetic_modes.csv").write_text(modes)
+    path.write_text(path.read_text().replace("[priors]", '[priors]\ntemperature_slope = "uniform(-0.001, 0)"'))
+    data = make_problem(read_job(path)).posterior.likelihood.model.data
+    assert data.covariance.tolist() == [[1e-4, 5e-5], [5e-5, 4e-4]] and data.temperatures.tolist() == [12.0]
+
+
+def test_a_bridge_deck_has_a_mode(tmp_path):
+    (tmp_path / "deck.csv").write_text("frequency_Hz,quarter,mid\n3.0,0.7,1.0\n")
+    model = '[model]\nkind = "bridge deck"\nmiddle = "mid"\nfirst_span = "quarter"\nshare = 0.5\n'
+    modes = '[modes]\nfile = "deck.csv"\nfrequency_cv = 0.01\nshape_error = 0.02\n'
+    priors = '[priors]\nfrequency = "log-normal(3, 0.2)"\nshape = "uniform(0, 1)"\n'
+    (tmp_path / "deck.toml").write_text(model + modes + priors)
+    posterior = make_problem(read_job(tmp_path / "deck.toml")).posterior
+    assert posterior.parameter_names == ["frequency", "shape"]
+    assert posterior.log_likelihood([3.0, 0.7]) > posterior.log_likelihood([3.0, 0.5])
 
 
 @pytest.mark.parametrize(
@@ -127,7 +155,10 @@ def test_columns_and_errors_of_modes(tmp_path):
         ("modal", [("[sampler]", '[record]\nfile = "a.csv"\n[sampler]')], "modes and load tests have no"),
         ("modal", [("[sampler]", "[load_test]\nfile = 'a'\n[sampler]")], r"beside other data, \[load_test.model\] is"),
         ("modal", [('"frame"  ', '"column" '), ("floors =", "# floors =")], r"\[model\]"),
+        ("modal", [('"frame"  ', '"oscillator" '), ("floors =", "# floors =")], r"\[model\]"),
         ("modal", [("modes = [1, 2, 3]", "modes = [1, 7]")], r"\[modes\] ModalData has no modes"),
+        ("modal", [("[modes]", "[modes]\nheld_out = [3]")], r"the modes \[3\] are in modes too"),
+        ("modal", [("[modes]", "[modes]\ncovariance = [[1e-4]]")], "state the same errors: leave one out"),
         ("modal", [("[modes]", "[modes]\nn_modes = 3")], "a frame has a mode for each storey"),
         ("modal", [("[sampler]", '[noise]\nlevel = "si"\n[sampler]')], "modes have no such errors"),
         ("modal", [("floor_4 = 4}", "roof = 4}")], "the model has no sensors floor_4"),

@@ -92,7 +92,7 @@ def test_bad_data_are_refused_with_what_to_do(arguments, text):
         ({"shape_error": 0.0}, "norm of 1"),
         ({"covariance": [[1.0, 2.0], [2.0, 1.0]]}, "positive definite"),
         ({"covariance": [[1.0, 0.5], [0.2, 1.0]]}, "symmetric"),
-        ({"covariance": np.eye(2), "frequency_cv": 0.01}, "instead of frequency_cv"),
+        ({"covariance": np.eye(2), "frequency_cv": 0.01}, "leave one out"),
         ({"mode_numbers": [1, 1]}, "different whole numbers"),
         ({"mode_numbers": [0, 1]}, "from 1 on"),
         ({"damping": [0.01]}, "damping must be real numbers"),

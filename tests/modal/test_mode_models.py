@@ -132,6 +132,4 @@ def test_what_are_no_modes_is_a_failed_simulation(returned, sensors, text):
 def test_bad_models_are_refused():
     with pytest.raises(ValueError, match="expected a function"):
         FunctionModes("frame", ("x",), ["a"], 2)
-    with pytest.raises(ValueError, match="give n_modes"):
-        StructureModes(type("Parts", (), {"parameter_names": ("a",)})())
     assert modal_channels([])[0] == Channel("frequency", "frequency", "Hz")
