@@ -105,7 +105,7 @@ class ModalLikelihood(FELikelihood):
     def with_noise(self, noise: Noise) -> "ModalLikelihood":
         """The same likelihood with other errors, as `FELikelihood.with_noise`."""
         other = object.__new__(type(self))
-        vars(other).update(vars(super().with_noise(noise)))
+        vars(other).update(vars(super().with_noise(noise)) | {"held_out": self.held_out})
         return other
 
     def predict_modes(self, samples: Any, data: ModalData | None = None, most: int = 400) -> "PredictedModes":

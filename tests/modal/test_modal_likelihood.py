@@ -277,14 +277,16 @@ def test_a_model_without_modes_is_refused(rng):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_a_guide_finds_an_error_that_the_data_do_not_determine(seed):
-    """Four stiffnesses fit two frequencies exactly; the error may be as small as its half-normal prior lets it be."""
+def test_a_guide_finds_an_error_that_the_data_do_not_determine():
+    """Four stiffnesses fit two frequencies exactly; the error may be as small as its half-normal prior lets it be.
+
+    Two minutes, as the run goes on by recycling: the emulated posterior is not close enough where the error is small.
+    """
     from samplers import SMCSampler
 
     prior = PRIOR | {"frequency_error": HalfNormal(0.02), "shape_error": HalfNormal(0.05)}
+    seed, found = 3, []
     data = identified([1.0, 0.9, 1.1, 1.0], [1, 2], np.random.default_rng(seed))
-    found = []
     for walkers, guided in ((400, True), (1000, False)):
         posterior = Posterior(ModalLikelihood(FRAME, data), prior)
         guide = posterior.guide(starts=4) if guided else None

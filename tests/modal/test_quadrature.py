@@ -37,10 +37,10 @@ def quadrature(posterior, bounds, n):
 
 
 def guided(posterior, walkers=300, seed=3):
-    """Log-evidence and samples of a guided run."""
+    """A guided run."""
     sampler = SMCSampler(walkers, posterior.ndim, posterior, guide=posterior.guide(), seed=seed, vectorize=True)
     sampler.run_mcmc(None, 1)
-    return sampler.log_evidence, sampler.get_chain(flat=True)
+    return sampler
 
 
 def two_storeys(theta):
@@ -135,10 +135,14 @@ def test_guided_runs_agree_with_quadrature(problem):
     make, bounds, n = PROBLEMS[problem]
     evidence, mean, deviation = quadrature(make(), bounds, n)
     runs = [guided(make(), seed=seed) for seed in range(5)]
-    assert all(found == pytest.approx(evidence, abs=0.05) for found, _ in runs)
-    samples = np.concatenate([each for _, each in runs])
-    assert (abs(samples.mean(axis=0) - mean) < 0.05 * deviation).all()
-    assert samples.std(axis=0) == pytest.approx(deviation, rel=0.08)
+    assert all(run.log_evidence == pytest.approx(evidence, abs=0.05) for run in runs)
+    # 1500 draws of the chains alone have an error of 0.026 standard deviations
+    means, spreads = (
+        np.mean([getattr(run.signed_sample, what)().value for run in runs], axis=0)
+        for what in ("expectation", "standard_deviation")
+    )
+    assert (abs(means - mean) < 0.05 * deviation).all()
+    assert spreads == pytest.approx(deviation, rel=0.05)
 
 
 @pytest.mark.slow
@@ -169,7 +173,7 @@ def test_held_out_modes_of_a_measured_frame_are_predicted(shared):
     frame = ShearFrame(floors, [to_si(12.06, "lb")] * 4, [to_si(10.0, "lbf/in")] * 4)
     likelihood = ModalLikelihood(frame, data.select([1, 2]), "common")
     prior = {f"stiffness_{i}": LogNormal(1.0, 0.2) for i in (1, 2, 3, 4)} | {"frequency_error": LogNormal(0.01, 0.5)}
-    _, samples = guided(Posterior(likelihood, prior), 200)
+    samples = guided(Posterior(likelihood, prior), 200).get_chain(flat=True)
     modes = likelihood.predict_modes(samples, data)
     low, high = modes.interval(0.9)
     assert (low < data.frequencies[0]).all() and (data.frequencies[0] < high).all()
