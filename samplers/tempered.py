@@ -27,8 +27,9 @@ from emcee import EnsembleSampler, State
 from .budget import Budget, BudgetExhausted, as_limit
 from .emcee_internals import get_moves, get_previous_state, get_random, set_moves, set_previous_state, trim_chain
 from .evaluation.asynchronous import AsynchronousEvaluator, advise_on_pool, check_asynchronous
-from .evaluation.evaluator import Evaluator, most_common_reasons, unpack
+from .evaluation.evaluator import Evaluator, unpack
 from .evaluation.user_target import Target
+from .evaluation.values import most_common_reasons
 from .interrupts import deferred_interrupts, interrupts_end_the_run
 from .judgement.checks import check_likelihood, check_prior
 from .judgement.failures import judged_failures
@@ -396,6 +397,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
             except Exception as error:
                 self._undo(random_state)
                 if self.evaluations > evaluations:  # not for an argument that was refused
+                    if reasons := self._target.failure_reasons:
+                        error.add_note(f"Failed simulations: {reasons}.")
                     error.add_note(f"{self._kept} When the cause is removed, call run_mcmc again to go on.")
                 raise
             except (KeyboardInterrupt, SystemExit):
@@ -406,7 +409,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         if self.failure_count > failures:
             warn(
                 f"{self.failure_count - failures} evaluations failed and count as impossible "
-                f"({most_common_reasons(self._record.failed)}); see failures"
+                f"({most_common_reasons(reason for _, reason in self._record.failed)}); see failures"
             )
 
     @property

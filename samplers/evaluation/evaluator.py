@@ -6,7 +6,6 @@ time, finished points are entered every 0.05 s, so that a killed process loses o
 """
 
 import time
-from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -19,15 +18,9 @@ from ..record import EvaluatedBatch, Incomplete, Record, Remember, merge_batches
 from ..tempering.pending_points import PendingPoints
 from .user_target import Target, map_in
 
-__all__ = ["Evaluator", "most_common_reasons", "unpack"]
+__all__ = ["Evaluator", "unpack"]
 
 SECONDS_BETWEEN_NOTES = 0.05
-
-
-def most_common_reasons(failed: Sequence[tuple[np.ndarray, str]], number: int = 3) -> str:
-    """The most frequent reasons of failed evaluations (point, reason) as text."""
-    reasons = Counter(reason for _, reason in failed)
-    return "; ".join(f"{count} x {reason}" for reason, count in reasons.most_common(number))
 
 
 class Evaluator:

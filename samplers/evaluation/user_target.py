@@ -12,7 +12,7 @@ from emcee.ensemble import ndarray_to_list_of_dicts
 from ..interrupts import Ended, SentFunction, interrupts_end_the_run, raise_if_it_ends_the_run
 from ..record import EvaluatedBatch
 from .starts import SEED, compare_with_draws, draws_to_compare, spread_by_metropolis
-from .values import Caught, log_densities, outcomes
+from .values import Caught, log_densities, most_common_reasons, outcomes
 
 __all__ = ["Target", "map_in"]
 
@@ -99,9 +99,18 @@ class Target:
     @property
     def failure_count(self) -> int | None:
         """Failed simulations by the count of the function, so that -inf may be one of them; None without a count."""
+        report = self._report()
+        return int(report["failure_count"]) if "failure_count" in report else None
+
+    @property
+    def failure_reasons(self) -> str:
+        """The most frequent reasons of failed simulations that the function reports; empty if it reports none."""
+        return most_common_reasons(self._report().get("failure_reasons") or {})
+
+    def _report(self) -> Mapping[str, Any]:
         report = getattr(self.function, "report", None)
         found = report() if callable(report) else None
-        return int(found["failure_count"]) if isinstance(found, Mapping) and "failure_count" in found else None
+        return found if isinstance(found, Mapping) else {}
 
     def may_be_positive(self, coords: np.ndarray) -> np.ndarray:
         """Whether points (n, ndim) may have a positive density, (n,) bool, by the method `possible` of the function.

@@ -8,7 +8,8 @@ not a number is refused with an explanation.
 import copy
 import logging
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,9 +17,14 @@ import numpy as np
 from ..blobs import stacked
 from ..interrupts import interrupts, raise_if_interrupted, raise_if_it_ends_the_run
 
-__all__ = ["Caught", "Failed", "log_densities", "outcomes"]
+__all__ = ["Caught", "Failed", "log_densities", "most_common_reasons", "outcomes"]
 
 logger = logging.getLogger(__name__)
+
+
+def most_common_reasons(reasons: Iterable[str] | Mapping[str, int], number: int = 3) -> str:
+    """The most frequent reasons of failures, given one by one or counted, as text."""
+    return "; ".join(f"{count} x {reason}" for reason, count in Counter(reasons).most_common(number))
 
 
 class Failed:
