@@ -39,8 +39,8 @@ def test_frequencies_and_shapes_of_modes():
     posterior = Posterior(likelihood, {"stiffness_1": LogNormal(1.0, 0.1), "stiffness_2": LogNormal(1.0, 0.1)})
     modes = likelihood.predict_modes(posterior.sample_prior(20, 1))
     first, *shapes = plot_modes(modes, modes).axes
-    assert [text.get_text() for text in first.get_xticklabels()] == ["1\n0.98 Hz", "2\n2.6 Hz"]
-    assert [axes.get_title()[:6] for axes in shapes] == ["mode 1", "mode 2"]
+    assert [text.get_text() for text in first.get_xticklabels()] == ["mode 1\n0.98 Hz", "mode 2\n2.6 Hz"]
+    assert [axes.get_title().split(",")[0] for axes in shapes] == ["shape of mode 1", "shape of mode 2"]
     heights = [bar.get_height() for bar in shapes[0].patches]
     np.testing.assert_allclose(heights, np.median(modes.shapes[:, 0], axis=0))
     np.testing.assert_allclose(modes.shapes[:, 0] @ data.shapes[0, 0], modes.assurance[:, 0])
