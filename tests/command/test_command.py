@@ -505,7 +505,7 @@ def test_a_sensor_with_the_opposite_sign_is_told(tmp_path, monkeypatch):
     assert "opposite" not in call("check", "upright.toml")
     (tmp_path / "synthetic_measured.csv").write_text("\n".join([comment, header, *turned]))
     output = call("check", "upright.toml")
-    assert "opposite signs: displacement; with" in output and "SI units" not in output
+    assert "displacement: measured and computed values have opposite signs" in output and "SI units" not in output
     text = (tmp_path / "upright.toml").read_text()
     given = text.replace("[measurements]\n", '[measurements]\nreversed = ["displacement"]\n')
     (tmp_path / "turned.toml").write_text(given)
