@@ -135,13 +135,14 @@ def _check_duplicates(modes: Any) -> list[Finding]:
     data, groups, found = modes.data, modes.paired.groups, []
     for i, j in combinations(np.flatnonzero(data.has_shape.any(axis=0)) if data.n_sensors > 2 else (), 2):
         here, there = (data.shapes[data.has_shape[:, k].argmax(), k] for k in (i, j))
+        same = (here @ there) ** 2
+        if same <= POOR:
+            continue
         pair = modes.shapes[:, [i, j]] / np.linalg.norm(modes.shapes[:, [i, j]], axis=2, keepdims=True)
         alike = np.square(pair.prod(axis=1).sum(axis=1)).max()
         ratios = np.median(modes.frequencies[:, [i, j]], axis=0) / data.mean_frequencies[[i, j]]
-        if np.abs(np.log(ratios)).max() > np.log(FACTOR):  # a far mode may look the same at few sensors
-            alike = 0.0
-        same = (here @ there) ** 2
-        if same > POOR and (alike < RESEMBLES or any(i in group and j in group for group in groups)):
+        far = np.abs(np.log(ratios)).max() > np.log(FACTOR)  # a far mode may look the same at few sensors
+        if alike < RESEMBLES or far or any(i in group and j in group for group in groups):
             text = f"The measured modes {_number(modes, i)} and {_number(modes, j)} have one shape: MAC {same:.3f}."
             action = "One of them may be identified twice, a harmonic, or another column: leave it out."
             found.append(Finding("Two measured modes are one", WRONG, text, action, {"mac": float(same)}))

@@ -214,12 +214,13 @@ def check_gaps(noise: Any) -> list[Finding]:
     """Gaps in the measurements of a noise whose shares refer to the level of the measured part of a motion."""
     shares = noise.gap_shares() if hasattr(noise, "gap_shares") else {}
     large = {name: share for name, share in shares.items() if share > TAIL}
+    if not large:
+        return []
     text = (
         f"Samples are missing in {', '.join(f'{name} ({share:.0%})' for name, share in large.items())}: the share of "
-        f"{noise.title if large else ''} refers to the others, and is too large if the strong part is missing."
+        f"{noise.title} refers to the others, and is too large if the strong part is missing."
     )
-    action = "Use local=1, whose level is taken from samples near by."
-    return [Finding("Gaps in the data", CARE, text, action, large)] if large else []
+    return [Finding("Gaps in the data", CARE, text, "Use local=1, whose level is taken from samples near by.", large)]
 
 
 def check_noise_prior(channel: str, unit: str, expected: float, largest: float) -> list[Finding]:
