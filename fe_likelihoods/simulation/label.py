@@ -74,6 +74,7 @@ _OF_SHELLS = {"_", "PWD", "OLDPWD", "SHLVL"}  # changes are irrelevant for simul
 _PARTS = {"function", "class", "output", "statistic", "library", "python"}
 _first: dict[str, str] = {}  # first digests of values that running code changes
 _opened: dict[str, Opened] = {}  # by code, in this process
+_sources: dict[str, tuple[types.ModuleType, Any, str, frozenset[str]]] = {}  # by name: module, its spec, digest, words
 
 
 class ModelLabel:
@@ -377,13 +378,21 @@ def _attribute(value: Any, name: str) -> Any:
 
 
 def _source(module: types.ModuleType) -> tuple[str, frozenset[str]]:
-    """Digest of a module's source file when it was first read, and the words in it."""
-    file = getattr(module, "__file__", None)
-    return ("", frozenset()) if file is None else _read_source(file, id(module))
+    """Digest of the source file that a module was imported from, and the words in it.
+
+    The file is read once for each import: a later edit is not what runs. A reload gives the module a new
+    ``__spec__``. The module is kept beside its digest, so that no other object gets its id.
+    """
+    file, spec = getattr(module, "__file__", None), getattr(module, "__spec__", None)
+    if file is None:
+        return "", frozenset()
+    known = _sources.get(module.__name__)
+    if known is None or known[0] is not module or known[1] is not spec:
+        known = _sources[module.__name__] = (module, spec, *_read_source(file))
+    return known[2:]
 
 
-@functools.cache
-def _read_source(file: str, module: int) -> tuple[str, frozenset[str]]:
+def _read_source(file: str) -> tuple[str, frozenset[str]]:
     try:
         content = Path(file).read_bytes()
         if not file.endswith(".py"):

@@ -119,6 +119,28 @@ def test_an_unchanged_model_has_the_same_label_in_every_process(workshop):
     assert len(found) == 1
 
 
+def test_the_source_in_a_label_is_that_of_the_last_import(workshop):
+    """An edit alone changes nothing that runs; a module that is imported again may have the address of the first."""
+
+    def source():
+        return label.items_of({"function": sys.modules["model"].f})["source of model"]
+
+    importlib.import_module("model")
+    first = source()
+    workshop.write(model=MODEL.replace("x", "strain"))
+    importlib.invalidate_caches()
+    assert source() == first
+    importlib.reload(sys.modules["model"])
+    assert source() != first
+    for repeat in range(20):
+        workshop.write(model=MODEL.replace("x", f"strain{repeat}"))
+        del sys.modules["model"]
+        importlib.invalidate_caches()
+        importlib.import_module("model")
+        assert source() != first
+        first = source()
+
+
 CHANGES = {
     "everywhere": {"helper": HELPER.replace("2.5", "3.5")},
     "a value": {"model": MODEL.replace("Steel(2.0)", "Steel(2.1)")},
