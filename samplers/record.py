@@ -53,7 +53,7 @@ MAGIC, BLOCK = b"samplers record 1\n", struct.Struct("<4sQII")  # kind, length, 
 # a record in memory keeps only the latest points of a long chain, which a repeated step or the verdict needs
 KEPT_IN_MEMORY = 20_000
 _LARGE = 2**20  # bytes of arrays under a key from which they are in a file only
-Remember = Callable[[str, Callable[[], Sequence[np.ndarray]]], list[np.ndarray]]
+Remember = Callable[..., list[np.ndarray] | None]  # see `Record.remembering`
 _open_records: "weakref.WeakValueDictionary[Path, Record]" = weakref.WeakValueDictionary()
 
 
@@ -199,15 +199,17 @@ class Record:
         """A function ``remember(key, compute)`` for a run that is made from its start, now or again.
 
         It returns the arrays that ``compute()`` returns, or those that it returned when the run was made before. For
-        equal keys, the arrays that were stored first are returned first.
+        equal keys, the arrays that were stored first are returned first. Without `compute`, None instead of new arrays.
         """
         used: Counter[str] = Counter()
 
-        def remember(key: str, compute: Callable[[], Sequence[np.ndarray]]) -> list[np.ndarray]:
+        def remember(key: str, compute: Callable[[], Sequence[np.ndarray]] | None = None) -> list[np.ndarray] | None:
             known = self._arrays.setdefault(key, [])
             if used[key] == len(known):
                 if self.is_complete:
                     raise Incomplete
+                if compute is None:
+                    return None
                 arrays = [np.asarray(array) for array in compute()]
                 with deferred_interrupts():
                     known.append(self._kept(arrays, self._write(b"MEMO", [_text(key), *arrays])))

@@ -350,8 +350,14 @@ class TemperedSampler(RunResults, EnsembleSampler):
                     start_of_run, stored, skip = state, self._output.last_state(), True
                     try:
                         with self._annealing(start_of_run, stored, bar) as (steps, guidance, take):
-                            for population, report in steps:
-                                take(population, report)
+                            answer = None
+                            while True:
+                                try:
+                                    population, report = steps.send(answer)
+                                except StopIteration:
+                                    break
+                                # the search of a guide asks for a function to be called: it is no part of the stack
+                                answer = report() if callable(report) else take(population, report)
                         state = self._annealed(population, guidance, stored)
                     except Incomplete:
                         state = self._go_on_without_annealing(stored)

@@ -39,7 +39,7 @@ from .modes import (
     search_modes,
     unseen_share,
 )
-from .target import SCALES, ResponseTarget
+from .target import SCALES, ResponseTarget, at_once
 
 __all__ = ["ResponseGuide"]
 
@@ -180,7 +180,7 @@ class ResponseGuide:
     # ------------------------------------------------------------------ what a sampler calls
 
     def prepare(self, session: Any) -> Iterator[None]:
-        """Search for modes; each item is a batch of simulations."""
+        """Search for modes; yields as `search_modes`."""
         starts = draw_starts(self._target, self._starts, session.random)
         search = search_modes(self._target, starts, session.remember, session.fits, self._starts, session.remaining)
         self.search = yield from counted(search, self._spend)
@@ -223,7 +223,7 @@ class ResponseGuide:
         """Simulate the responses of points (n, ndim) that are evaluated next, or take cached ones, and keep them."""
         structural = parameters[:, : self._target.n_structural]
         coords = self._target.coordinates(parameters)[:, : self._target.n_structural]
-        self._target.run_parameters(structural, coords, session.remember)
+        at_once(self._target.run(coords, session.remember, structural))
 
     def refine(self, parameters: np.ndarray, log_prob: np.ndarray, session: Any) -> None:
         """Learn from evaluated points (n, ndim): new emulators."""

@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .target import NoiseFit, Remember, ResponseTarget, Runs
+from .target import NoiseFit, Remember, ResponseTarget, Runs, Steps
 
 __all__ = [
     "TOLERANCE",
@@ -516,11 +516,11 @@ def complete(
     remember: Remember,
     fits: Callable[[float], bool],
     share: float = 1.0,
-) -> Generator[float, None, bool]:
+) -> Steps:
     """Run generators of requests, by their numbers, side by side to their ends: all requests together are one batch.
 
-    Yields the cost of each batch, `share` for each new simulation. Returns False as soon as one does not fit in the
-    budget; `remember` and `fits` are as for `search_modes`.
+    Yields as `search_modes`; the cost is `share` for each new simulation. Returns False as soon as a batch does not fit
+    in the budget; `remember` and `fits` are as for `search_modes`.
     """
     answers: dict[int, Any] = dict.fromkeys(ascents)
     while True:
@@ -539,8 +539,8 @@ def complete(
         if not fits(cost):
             return False
         at = np.array([waiting[index].coords for index in wanted])
-        slopes = iter(target.derivatives(at, remember) if wanted else ())
-        runs = target.run(coords, remember) if points else None
+        slopes = iter((yield from target.derivatives(at, remember)) if wanted else ())
+        runs = (yield from target.run(coords, remember)) if points else None
         answers, end = {}, 0
         for index, each in waiting.items():
             if isinstance(each, Derivatives):

@@ -6,7 +6,7 @@ and their misfit is smoother, because errors in a period have had less time to a
 centred on each start, so that starts keep their differences in parameters without effect on the early part.
 """
 
-from collections.abc import Callable, Container, Generator, Sequence
+from collections.abc import Callable, Container, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,7 +23,7 @@ from .levenberg_marquardt import (
     complete,
     distinct_ends,
 )
-from .target import Remember, ResponseTarget, run_at_once
+from .target import Remember, ResponseTarget, Steps, at_once, nothing_stored
 
 __all__ = [
     "Mode",
@@ -166,12 +166,12 @@ class _Part(NamedTuple):
 def search_modes(
     target: ResponseTarget,
     starts: np.ndarray,
-    remember: Remember = run_at_once,
+    remember: Remember = nothing_stored,
     fits: Callable[[float], bool] = lambda _: True,
     first: int | None = None,
     remaining: Callable[[], float] = lambda: np.inf,
     shares: Sequence[float] = _SHARES,
-) -> Generator[float, None, ModeSearch]:
+) -> Steps:
     """Search from starts (n, n_structural) [standard normal coordinates], on growing parts of the record if possible.
 
     `first` starts begin (default: all). Further ones follow until enough have reached a mode (ascents that are given up
@@ -181,8 +181,8 @@ def search_modes(
     often. If all fail there, which may be too short for the model, they begin on the whole record.
 
     `remember` stores responses for a resumed run, ``fits(n)`` says whether n more simulations of the whole record fit
-    into the budget, and `remaining` how many are left of it. Yields the cost of each batch, in simulations of the whole
-    record.
+    into the budget, and `remaining` how many are left of it. Yields functions that simulate, and is sent their results;
+    and the cost of each batch when it is made, in simulations of the whole record.
     """
     first = len(starts) if first is None else first
     most = min(_MOST_STARTS * first, len(starts))
@@ -223,9 +223,7 @@ def search_modes(
         begin, following = following, min(following + missing, most)
 
 
-def _heights(
-    part: _Part, starts: np.ndarray, remember: Remember, fits: Callable[[float], bool]
-) -> Generator[float, None, np.ndarray | None]:
+def _heights(part: _Part, starts: np.ndarray, remember: Remember, fits: Callable[[float], bool]) -> Steps:
     """Log-likelihoods (n,) of starts (n, n_structural) on the first part of the record; -inf where one failed.
 
     None if the budget ended it.
@@ -234,21 +232,23 @@ def _heights(
     cost = part.share * part.target.new_points(starts)
     if not fits(cost):
         return None
-    runs = part.target.run(starts, remember)
+    runs = yield from part.target.run(starts, remember)
     yield cost
     found = zip(runs.failed, runs.statistics, strict=True)
     return np.array([-np.inf if failed else part.target.fit_noise(each).log_density for failed, each in found])
 
 
-def counted(steps: Generator[float, None, Any], spend: Callable[[float], None]) -> Generator[float, None, Any]:
-    """The steps of a search, and its result; `spend` is told the cost of each step as soon as it is made."""
+def counted(steps: Steps, spend: Callable[[float], None]) -> Steps:
+    """The steps of a search, and its result; `spend` is told the cost of each batch as soon as it is made."""
+    answer = None
     while True:
         try:
-            cost = next(steps)
+            item = steps.send(answer)
         except StopIteration as end:
             return end.value
-        spend(cost)
-        yield cost
+        if not callable(item):
+            spend(item)
+        answer = yield item
 
 
 def _in_order(starts: np.ndarray, heights: np.ndarray, begun: int) -> np.ndarray:
@@ -301,7 +301,7 @@ def _ascend_from(
     standing_for: list[int],
     remember: Remember,
     fits: Callable[[float], bool],
-) -> Generator[float, None, bool]:
+) -> Steps:
     """Ascents from starts, by their numbers, on all parts of the record; returns False if the budget ended them."""
     target, n = parts[-1].target, len(standing_for)
     small = FIRST_DIFFERENCE * np.eye(target.n_structural) if len(parts) > 1 else None
@@ -450,9 +450,10 @@ def find_modes(posterior: Any, starts: int = 6, seed: Any = None, max_simulation
         return spent + simulations <= budget
 
     drawn = draw_starts(target, starts, np.random.default_rng(seed))
+
+    def spend(cost: float) -> None:
+        nonlocal spent
+        spent += cost
+
     search = search_modes(target, drawn, fits=fits, first=starts, remaining=lambda: budget - spent)
-    while True:
-        try:
-            spent += next(search)
-        except StopIteration as end:
-            return end.value
+    return at_once(counted(search, spend))

@@ -11,7 +11,7 @@ with the response R at the structural parameters, the statistics S of the residu
 
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -23,9 +23,10 @@ from ..simulation.model import most_responses
 from .archive import Archive
 from .data_sets import DataSets
 
-__all__ = ["NoiseFit", "Remember", "ResponseTarget", "Runs", "run_at_once"]
+__all__ = ["NoiseFit", "Remember", "ResponseTarget", "Runs", "Steps", "at_once", "nothing_stored"]
 
-Remember = Callable[[str, Callable[[], Sequence[np.ndarray]]], Sequence[np.ndarray]]
+Remember = Callable[..., Sequence[np.ndarray] | None]  # `samplers.tempering.guide.GuideSession.remember`
+Steps = Generator[Callable[[], Any] | float, Any, Any]  # functions to call, and costs of what was called
 
 _HALF_LOG_TWO_PI = 0.5 * float(np.log(2.0 * np.pi))
 _WIDTHS = 7.0, 3.0, 1.0, 0.3, 0.1  # half widths of the grids on which noise parameters are first searched
@@ -65,9 +66,20 @@ class NoiseFit(NamedTuple):
     log_density: float  # log-likelihood plus the log-prior of these coordinates
 
 
-def run_at_once(_: str, compute: Callable[[], Sequence[np.ndarray]]) -> Sequence[np.ndarray]:
+def nothing_stored(_: str, compute: Callable[[], Sequence[np.ndarray]] | None = None) -> Sequence[np.ndarray] | None:
     """`Remember` that stores nothing."""
-    return compute()
+    return None if compute is None else compute()
+
+
+def at_once(steps: Steps) -> Any:
+    """Result of steps whose functions are called here."""
+    answer = None
+    while True:
+        try:
+            item = steps.send(answer)
+        except StopIteration as end:
+            return end.value
+        answer = item() if callable(item) else None
 
 
 class ResponseTarget:
@@ -300,21 +312,25 @@ class ResponseTarget:
         """Number of structural coordinates (n, n_structural) that `run` has not simulated yet."""
         return len({row.tobytes() for row in coords} - self._simulated)
 
-    def run(self, coords: np.ndarray, remember: Remember = run_at_once) -> Runs:
-        """Simulate structural coordinates (n, n_structural)."""
-        self._simulated.update(row.tobytes() for row in coords)
-        return self.run_parameters(self.structural_parameters(coords), coords, remember)
+    def run(
+        self, coords: np.ndarray, remember: Remember = nothing_stored, thetas: np.ndarray | None = None
+    ) -> Generator[Callable[[], Any], Any, Runs]:
+        """Simulate structural coordinates (n, n_structural), whose parameters are `thetas` if given, for the archive.
 
-    def run_parameters(self, thetas: np.ndarray, coords: np.ndarray, remember: Remember = run_at_once) -> Runs:
-        """Simulate structural parameters (n, n_structural), whose coordinates are `coords`; the archive keeps the runs.
-
+        Yields what is to be called, and is sent the result, so that no search stands between a sampler and a model.
         Residuals are rounded to single precision, in which they are stored, so that a resumed run is the same.
         """
+        if thetas is None:
+            self._simulated.update(row.tobytes() for row in coords)
+            thetas = self.structural_parameters(coords)
         text, parts = f"residuals of {self._data.identity}".encode(), []  # files of earlier versions have responses
         for k in range(0, max(len(thetas), 1), self._together):
             some = thetas[k : k + self._together]
             key = hashlib.blake2b(text + some.tobytes(), digest_size=16).hexdigest()
-            residuals, statistics, reasons = remember(key, partial(self._data.simulate, some))
+            if (found := remember(key)) is None:
+                simulated = yield partial(self._data.simulate, some)
+                found = remember(key, lambda simulated=simulated: simulated)
+            residuals, statistics, reasons = found
             self._data.recall(some, statistics, json.loads(reasons.tobytes().decode()))
             failed = ~(np.isfinite(residuals).all(axis=(1, 2)) & np.isfinite(statistics).all(axis=1))
             numbers = np.full(len(failed), -1)
@@ -323,23 +339,31 @@ class ResponseTarget:
             parts.append(Runs(numbers, statistics, failed))
         return Runs(*map(np.concatenate, zip(*parts, strict=True)))
 
-    def derivatives(self, coords: np.ndarray, remember: Remember = run_at_once) -> np.ndarray:
+    def derivatives(
+        self, coords: np.ndarray, remember: Remember = nothing_stored
+    ) -> Generator[Callable[[], Any], Any, np.ndarray]:
         """Derivatives of residuals by coordinates (n, n_structural), as numbers (n, n_structural) in the archive.
 
         They are the model's own derivatives times those of the parameters by the coordinates; in single precision, as
-        residuals.
+        residuals. Yields as `run`.
         """
+        numbers = []
         size = max(1, self._together // self.n_structural)
-        parts = (self._derivatives(coords[k : k + size], remember) for k in range(0, len(coords), size))
-        return np.array([self.archive.add_histories(each) for part in parts for each in part])
+        for k in range(0, len(coords), size):
+            found = yield from self._derivatives(coords[k : k + size], remember)
+            numbers += [self.archive.add_histories(each) for each in found]
+        return np.array(numbers)
 
-    def _derivatives(self, coords: np.ndarray, remember: Remember) -> np.ndarray:
+    def _derivatives(self, coords: np.ndarray, remember: Remember) -> Generator[Callable[[], Any], Any, np.ndarray]:
         n, d = coords.shape
         thetas = self.structural_parameters(coords)
 
         text = f"derivatives of {self.model.fingerprint}".encode()
         key = hashlib.blake2b(text + thetas.tobytes(), digest_size=16).hexdigest()
-        (found,) = remember(key, lambda: [self._data.derivatives(thetas)])
+        if (stored := remember(key)) is None:
+            computed = yield partial(self._data.derivatives, thetas)
+            stored = remember(key, lambda: [computed])
+        (found,) = stored
         moved = coords[:, None] + _MAP_STEP * np.stack([np.eye(d), -np.eye(d)])[:, None]
         ahead, behind = self.structural_parameters(moved.reshape(-1, d)).reshape(2, n, d, d)
         by_coords = np.einsum("nzp,npct->nzct", (ahead - behind) / (2.0 * _MAP_STEP), found.astype(float))

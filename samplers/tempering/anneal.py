@@ -67,8 +67,8 @@ def anneal(
 ) -> Steps:
     """Carry draws of the prior to beta = 1 by moves, recycling or a guide.
 
-    Yields the points as they are now with a report (`samplers.reports`); in the last pair, they are at beta = 1 and
-    equally weighted.
+    Yields the points as they are now with a report (`samplers.reports`), or with a function of a guide's search, whose
+    result is to be sent back; in the last pair, they are at beta = 1 and equally weighted.
     """
     size, rounds = len(population.coords), None
     try:

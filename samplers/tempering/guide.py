@@ -6,7 +6,7 @@ the model. It need not be exact, since every draw is evaluated and weighted.
 """
 
 import copy
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -40,7 +40,7 @@ class GuideSession(NamedTuple):
     remember : callable
         ``remember(key, compute)`` returns the list of arrays that ``compute()`` returns, and stores it in the record
         of the run under `key` (str). A repeated run gets the stored arrays without a call of `compute`. For equal keys,
-        the arrays that were stored first are returned first.
+        the arrays that were stored first are returned first. ``remember(key)`` returns None where nothing is stored.
     fits : callable
         ``fits(n)``: whether n more simulations fit into the limit. To be called before each batch of simulations; if
         False, the guide makes none and returns.
@@ -52,7 +52,7 @@ class GuideSession(NamedTuple):
     """
 
     random: np.random.RandomState
-    remember: Callable[[str, Callable[[], Sequence[np.ndarray]]], list[np.ndarray]]
+    remember: Callable[..., list[np.ndarray] | None]
     fits: Callable[[float], bool]
     remaining: Callable[[], float]
     asynchronous: bool
@@ -64,7 +64,8 @@ class Guide(Protocol):
     `draw`, `log_density` and `refine` are required. A guide may have these members as well:
 
     ``prepare(session)``
-        A generator that makes a costly search before the first draw; each item advances the progress bar.
+        A generator that makes a costly search before the first draw. An item that is a function without arguments is
+        called, and its result is sent back; each other item advances the progress bar.
     ``observe(coords, session)``
         Called with points (n, ndim) directly before they are evaluated, so that a guide can simulate and keep what
         `log_prob_fn` does not return. Requires ``vectorize=True``. In an asynchronous run it is called when they have
@@ -126,7 +127,7 @@ class Guide(Protocol):
     def refine(self, coords: np.ndarray, log_prob: np.ndarray, session: GuideSession, /) -> Iterator[None] | None:
         """Learn from the latest draws (n, ndim) and their log-probabilities (n,), -inf where an evaluation failed.
 
-        May be a generator; each item advances the progress bar. In an asynchronous run, the draws may be from an
+        May be a generator, as `prepare`. In an asynchronous run, the draws may be from an
         earlier density, and the next draws may have been made already.
         """
 
@@ -145,7 +146,7 @@ class AdaptedGuide:
         value, default = getattr(self.guide, name, DEFAULTS[name]), DEFAULTS[name]
         return value if default is None else type(default)(value)
 
-    def prepare(self, session: GuideSession) -> Iterator[None]:
+    def prepare(self, session: GuideSession) -> Generator:
         """The search before the first draw."""
         prepare = getattr(self.guide, "prepare", None)
         yield from () if prepare is None else (prepare(session) or ())
@@ -170,7 +171,7 @@ class AdaptedGuide:
             )
         return values
 
-    def refine(self, coords: np.ndarray, log_prob: np.ndarray, session: GuideSession) -> Iterator[None]:
+    def refine(self, coords: np.ndarray, log_prob: np.ndarray, session: GuideSession) -> Generator:
         """Let the guide learn from the latest draws."""
         yield from self.guide.refine(coords, log_prob, session) or ()
 

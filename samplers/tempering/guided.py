@@ -17,7 +17,8 @@ trials on posteriors with known answers.
 
 import logging
 from collections.abc import Callable, Generator, Sequence
-from typing import NamedTuple
+from contextlib import suppress
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -90,16 +91,10 @@ def lend(
     """A fresh guide with its session; its simulations count from now on."""
     budget.begin(guide)
 
-    def remember_with_count(key: str, compute: Callable) -> list[np.ndarray]:
-        made = False
-
-        def compute_new() -> list[np.ndarray]:
-            nonlocal made
-            made = True
-            return compute()
-
-        arrays = remember(key, compute_new)
-        if made:
+    def remember_with_count(key: str, compute: Callable | None = None) -> list[np.ndarray] | None:
+        arrays = remember(key)
+        if arrays is None and compute is not None:
+            arrays = remember(key, compute)
             budget.note()
         return arrays
 
@@ -230,7 +225,8 @@ def draw_rounds(
     """Let the guide search, then draw, evaluate and refine until a fresh round is reliable.
 
     `population` are draws of the prior, as many as there are walkers, which are not evaluated. Yields them with the
-    effective sample size of all rounds so far, and a tick of the progress bar or a round.
+    effective sample size of all rounds so far, and a tick of the progress bar, a round, or a function of the guide's
+    search, whose result is sent back.
     """
     guide, session, budget = guidance
     size, population = len(population.coords), population._replace(effective_sample_size=0.0)
@@ -242,6 +238,13 @@ def draw_rounds(
 
     def tick(phase: str, finished: bool) -> tuple[Population, GuideTick]:
         return population, GuideTick(phase, budget.simulations, size, finished)
+
+    def asked(steps: Generator, phase: str) -> Generator[tuple[Population, Any], Any, None]:
+        answer = None
+        with suppress(StopIteration):
+            while True:
+                item = steps.send(answer)
+                answer = yield (population, item) if callable(item) else tick(phase, True)
 
     def judge(most: int) -> Generator[tuple[Population, Report], None, RoundsOfGuide | None]:
         """Let draws arrive; returns how the rounds end, or None if another round follows."""
@@ -266,8 +269,7 @@ def draw_rounds(
             most = 0  # submitted draws are part of the result
 
     yield tick("search", False)
-    for _ in guide.prepare(session):
-        yield tick("search", True)
+    yield from asked(guide.prepare(session), "search")
     while True:
         yield tick(f"round {made + len(batches) + 1}", False)
         coords = guide.draw(_next_size(rounds, batches, size, guide), random)
@@ -284,8 +286,8 @@ def draw_rounds(
         parts = [each.take_lesson(guide.learns_from_parts) for each in lessons]
         lessons = [each for each in lessons if not each.learned]
         points, log_prob = (np.concatenate(column) for column in zip(*parts, strict=True))
-        for _ in guide.refine(points, log_prob, session) if len(points) > 0 else ():
-            yield tick(f"after round {made}", True)
+        if len(points) > 0:
+            yield from asked(guide.refine(points, log_prob, session), f"after round {made}")
         reaching = [each for each in rounds if reaches(each, guide.known_density)]
         if len(reaching) < len(rounds) and left_out < MOST_LEFT_OUT:
             logger.info("%d of %d rounds hardly reached a part of the posterior", len(rounds) - len(reaching), made)

@@ -22,7 +22,7 @@ from fe_likelihoods import (
     TruncatedNormal,
     Uniform,
 )
-from fe_likelihoods.emulation.target import ResponseTarget
+from fe_likelihoods.emulation.target import ResponseTarget, at_once
 from samplers import SMCSampler
 
 DT, N = 0.02, 100
@@ -108,7 +108,7 @@ def test_the_likelihood_of_the_target_is_that_of_all_data_sets(make):
     target = ResponseTarget(posterior)
     points = posterior.sample_prior(6, 1)
     coords = target.coordinates(points)
-    runs = target.run_parameters(points[:, : target.n_structural], coords[:, : target.n_structural])
+    runs = at_once(target.run(coords[:, : target.n_structural], thetas=points[:, : target.n_structural]))
     found = target.log_likelihood(runs.statistics, coords[:, target.n_structural :])
     assert found == pytest.approx(posterior.log_likelihood(points), rel=1e-9)
     for number, statistics in zip(runs.numbers, runs.statistics, strict=True):
@@ -123,17 +123,17 @@ def test_a_point_that_fails_in_one_model_is_not_simulated_by_the_later_ones():
     thetas = np.array([[1.0, 0.8], [1.15, 0.8], [0.9, 0.8]])
     stored = []
 
-    def remember(_, compute):
-        stored.append(compute())
-        return stored[-1]
+    def remember(_, compute=None):
+        stored.extend([] if compute is None else [compute()])
+        return None if compute is None else stored[-1]
 
-    runs = target.run_parameters(thetas, target.coordinates(thetas), remember)
+    runs = at_once(target.run(target.coordinates(thetas), remember, thetas))
     assert list(runs.failed) == [False, True, False]
     assert (first.simulations, second.simulations) == (3, 2)
     # a run that goes on knows all of it without a simulation
     again = joint(limits=(1.1, np.inf))
     target = ResponseTarget(again)
-    repeated = target.run_parameters(thetas, target.coordinates(thetas), lambda *_: stored[0])
+    repeated = at_once(target.run(target.coordinates(thetas), lambda *_: stored[0], thetas))
     assert np.array_equal(repeated.statistics, runs.statistics, equal_nan=True)
     assert np.array_equal(again(thetas), posterior(thetas)) and again.likelihood.simulations == 0
     assert again.report()["failure_count"] == 1

@@ -22,7 +22,7 @@ from fe_likelihoods import (
     Uniform,
 )
 from fe_likelihoods.emulation.modes import find_modes
-from fe_likelihoods.emulation.target import ResponseTarget
+from fe_likelihoods.emulation.target import ResponseTarget, at_once
 from samplers import SMCSampler
 
 from .problems import CHANNELS, DT, N_STEPS, TRUTH, free_vibration, noisy
@@ -214,11 +214,11 @@ def test_derivatives_of_residuals_by_coordinates(prior, values):
     rows = slice(2, 4) if prior is None else slice(0, 2)  # of the data with gaps
     d = target.n_structural
     at, step = np.array([[0.3, -0.7, 0.2], [1.2, 0.4, -0.3]])[:, :d], 2e-3
-    found = histories(target, target.derivatives(at))
+    found = histories(target, at_once(target.derivatives(at)))
     assert found.shape == (2, d, rows.stop, N_STEPS)
     for coords, each in zip(at, found, strict=True):
         ahead, behind = (
-            histories(target, target.run(coords + sign * step * np.eye(d)).numbers) for sign in (1.0, -1.0)
+            histories(target, at_once(target.run(coords + sign * step * np.eye(d))).numbers) for sign in (1.0, -1.0)
         )
         expected = (ahead - behind) / (2.0 * step)
         assert_close(each, expected)
@@ -233,9 +233,11 @@ def test_derivatives_at_other_times_than_the_response():
     sigmas = {"sigma_top": HalfNormal(0.01), "sigma_base": HalfNormal(20.0)}
     target = ResponseTarget(Posterior(FELikelihood(model, measured).marginal(sigmas), prior))
     coords, step = np.array([0.3, -0.7]), 2e-3
-    ahead, behind = (histories(target, target.run(coords + sign * step * np.eye(2)).numbers) for sign in (1.0, -1.0))
+    ahead, behind = (
+        histories(target, at_once(target.run(coords + sign * step * np.eye(2))).numbers) for sign in (1.0, -1.0)
+    )
     expected = (ahead - behind) / (2.0 * step)
-    found = histories(target, target.derivatives(coords[None])[0])
+    found = histories(target, at_once(target.derivatives(coords[None]))[0])
     assert found.shape == (2, 2, N_STEPS // 4)
     assert_close(found, expected)
 

@@ -6,7 +6,7 @@ import pytest
 from fe_likelihoods import HalfNormal, LogNormal, TruncatedNormal, Uniform
 from fe_likelihoods.emulation.emulator import TrainingSet, fit_emulator
 from fe_likelihoods.emulation.gaussian_process import predict
-from fe_likelihoods.emulation.target import SCALES, ResponseTarget
+from fe_likelihoods.emulation.target import SCALES, ResponseTarget, at_once
 
 from .problems import vibration
 
@@ -18,7 +18,7 @@ def emulator_of(posterior, n=40, seed=1):
     target = ResponseTarget(posterior)
     centre = target.structural_coordinates(AT[None])[0]
     coords = centre + SCALE * np.random.default_rng(seed).standard_normal((n, 2))
-    target.run(coords)
+    at_once(target.run(coords))
     training = TrainingSet(target.archive.coords, np.arange(len(target.archive)))
     statistics = target.archive.statistics
     slopes = target.slopes(statistics[0], target.fit_noise(statistics[0]).coords)
@@ -29,7 +29,7 @@ def emulator_of(posterior, n=40, seed=1):
 def test_the_likelihood_near_the_training_points(noise):
     target, emulator = emulator_of(vibration(noise))
     coords = target.structural_coordinates(AT[None]) + 0.7 * SCALE * np.random.default_rng(2).standard_normal((20, 2))
-    true = target.run(coords)
+    true = at_once(target.run(coords))
     noises = np.tile(target.fit_noise(true.statistics[0]).coords, (20, 1))
     error = emulator.log_likelihood(target.scaled(np.column_stack([coords, noises])))
     error -= target.log_likelihood(true.statistics, noises)
@@ -43,13 +43,13 @@ def test_near_a_bound_the_emulator_follows_the_response(prior):
     target = ResponseTarget(posterior)
     centre = target.structural_coordinates(np.array([[1.2, 0.05]]))[0]
     covariance = np.diag(np.square([0.01, 0.3]))
-    target.run(centre + np.random.default_rng(4).standard_normal((40, 2)) @ np.sqrt(covariance))
+    at_once(target.run(centre + np.random.default_rng(4).standard_normal((40, 2)) @ np.sqrt(covariance)))
     training = TrainingSet(target.archive.coords, np.arange(len(target.archive)))
     slopes = target.slopes(target.archive.statistics[0], np.zeros(0))
     emulator = fit_emulator(target, training, centre, covariance, np.array([2e-3, 5.0]), slopes)
     coords = target.structural_coordinates(np.array([[1.2, 1e-2], [1.2, 1e-3], [1.203, 1e-6], [1.198, 1e-9]]))
     emulated = emulator.log_likelihood(target.scaled(coords))
-    true = target.log_likelihood(target.run(coords).statistics, np.zeros((4, 0)))
+    true = target.log_likelihood(at_once(target.run(coords)).statistics, np.zeros((4, 0)))
     assert (emulator.squared_distance(target.scaled(coords)) < emulator.reach).all()
     assert np.abs(emulated - true).max() < 0.3
 
