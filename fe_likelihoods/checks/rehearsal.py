@@ -11,49 +11,41 @@ from typing import Any, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from ..emulation.modes import Mode, find_modes
-from ..emulation.target import ResponseTarget
-from ..likelihood.likelihood import FELikelihood
 from ..likelihood.posterior import Posterior
 from ..simulation.model import SimulationBatch, simulate_batch
 from .compared import compare, data_sets_of, draws_to_compare
-from .finding import CARE, WRONG, Finding, by_severity
+from .finding import CARE, WRONG, Finding, by_severity, percent
 from .fit import check_responses, check_supports
 from .screening import check_data, check_gaps
 from .steps import (
+    NO_STEP,
     NOTHING,
-    StepTest,
     check_same_response,
     check_stronger_motion,
-    halve_steps,
+    halved,
     motions_to_replace,
-    not_tested,
     relative_difference,
 )
 
 __all__ = ["ModelCheck", "check_model", "refuse_chance"]
-
-SECONDS = 60.0  # of the search for the best fit
-MOST_SEARCHED = 150  # simulations of this search
 
 
 class ModelCheck(NamedTuple):
     """What `check_model` has found, the most severe finding first."""
 
     findings: tuple[Finding, ...]
-    tests: dict[str, str]  # names of the tests of step and mesh, and what was tested or why it was not
+    steps: dict[str, str]  # what half of step and mesh changes at the mean of the prior, in words, by name
     simulations: int  # number of simulations made
     seconds: float  # per simulation [s]
-    searched: float  # simulations of a search for the best fit from one start; NaN without one
-    best_fit: tuple[Posterior, Mode] | None = None  # of this search; None without a fit, or where data are wrong
 
 
 def check_model(posterior: Posterior, events: Mapping[str, Any] | None = None, *, progress: bool = False) -> ModelCheck:
     """Try the model and the data of a posterior before a run.
 
-    It simulates the mean of the prior twice, under twice the motion and the motion of another event, and draws of the
-    prior, which are compared with the measurements as in `fe_likelihoods.check_fit`. Where time permits (a minute), it
-    searches for the best fit, and halves step and mesh there. `fe_likelihoods.check_data` looks at the data.
+    It simulates the mean of the prior twice, under twice the motion and the motion of another event, with half of step
+    and mesh, and draws of the prior, which are compared with the measurements as in `fe_likelihoods.check_fit`.
+    `fe_likelihoods.check_data` looks at the data. Whether the steps are fine enough is judged after a run
+    (`fe_likelihoods.check_result`), where the precision of the parameters is known.
 
     Parameters
     ----------
@@ -79,6 +71,7 @@ def check_model(posterior: Posterior, events: Mapping[str, Any] | None = None, *
     []
     """
     mean, found, fits, seconds, before = posterior.prior.mean(), list[Finding](), [], 0.0, _made(posterior)
+    steps = dict[str, str]()
     with tqdm(disable=not progress, unit="simulation", desc="check") as bar:
         posterior.when_simulated(bar.update)
 
@@ -109,19 +102,15 @@ def check_model(posterior: Posterior, events: Mapping[str, Any] | None = None, *
                 )
                 # where responses differ by chance, other differences say nothing
                 found += chance or _check_motions(simulate, model, theta, batch.response[0], events or {})
+                if not chance and likelihood.measurements.is_history:
+                    steps |= _halve_steps(simulate, model, theta, batch.response[0], key)
                 found += check_supports(model) + list(check_data(likelihood.measurements, motions_to_replace(model)))
                 found += check_gaps(likelihood.noise)
                 seconds += took
-            best = _BestFit(StepTest([], {}))
-            if isinstance(posterior.likelihood, FELikelihood) and all(each.severity != WRONG for each in found):
-                best = _check_best_fit(simulate, posterior, seconds)
-            of_fit = check_responses(fits)
         finally:
             posterior.when_simulated(None)
-    found += [*best.test.findings, *of_fit, *_check_failures(posterior)]
-    # what the data tell is not known where they are wrong or out of reach
-    known, made = None if of_fit else best.found, made + _made(posterior) - before
-    return ModelCheck(by_severity(found), best.test.tests, made, seconds, best.searched, known)
+    found += [*check_responses(fits), *_check_failures(posterior)]
+    return ModelCheck(by_severity(found), steps, made + _made(posterior) - before, seconds)
 
 
 def _made(posterior: Posterior) -> int:
@@ -186,31 +175,12 @@ def _check_motions(
     return found
 
 
-class _BestFit(NamedTuple):
-    """The test of step and mesh at the best fit, the simulations of the search, and the best fit if it was found."""
-
-    test: StepTest
-    searched: float = np.nan
-    found: tuple[Posterior, Mode] | None = None
-
-
-def _check_best_fit(simulate: Any, posterior: Posterior, seconds: float) -> _BestFit:
-    """The error of step and mesh at the best fit, where a search for it takes a minute at most."""
-    n = len(posterior.likelihood.model.parameter_names)
-    limit = min(MOST_SEARCHED, SECONDS / max(seconds, 1e-6))
-    if limit < 10 * (n + 1):
-        why = f"the test takes about {15 * (n + 1)} simulations of {seconds:.2g} s, in the run"
-        return _BestFit(not_tested(posterior.likelihood, why))
-    try:
-        target = ResponseTarget(posterior)
-        search = find_modes(posterior, starts=1, max_simulations=limit)
-    except (ValueError, np.linalg.LinAlgError) as error:
-        return _BestFit(not_tested(posterior.likelihood, f"no fit was found: {error}"))
-    if not search.modes:
-        return _BestFit(not_tested(posterior.likelihood, "no fit was found"), search.simulations)
-    mode = search.modes[0]
-    factor = np.linalg.cholesky(mode.covariance)
-    around = target.parameters(mode.coords + np.random.default_rng(1).standard_normal((400, len(factor))) @ factor.T)
-    test = halve_steps(posterior, mode.parameters, around.std(axis=0), simulate)
-    # without convergence neither shares nor the cost of a search are known
-    return _BestFit(test, search.simulations, (posterior, mode)) if mode.converged else _BestFit(test)
+def _halve_steps(simulate: Any, model: Any, theta: np.ndarray, response: np.ndarray, key: str) -> dict[str, str]:
+    """What half of each step changes, in words, by name and data set."""
+    found = {name: f"not tested: {why}" for name, why in NO_STEP.items()}
+    for name, what, change, why in halved(model, theta, response, simulate):
+        found[name] = f"not tested: {why}"
+        if not why:
+            share = percent(relative_difference(change, response))
+            found[name] = f"half of {what} changes the response at the mean of the prior by {share}"
+    return {f"{name} ({key})" if key else name: text for name, text in found.items()}

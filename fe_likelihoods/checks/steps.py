@@ -23,6 +23,7 @@ from .finding import CARE, WRONG, Finding
 
 __all__ = [
     "NOTHING",
+    "NO_STEP",
     "StepTest",
     "check_same_response",
     "check_stronger_motion",
@@ -32,6 +33,7 @@ __all__ = [
     "relative_difference",
     "simulations_of_the_test",
     "halve_steps",
+    "halved",
     "under",
 ]
 
@@ -41,6 +43,7 @@ SHIFT, LARGE_SHIFT = 0.5, 2.0
 LARGE_SHARE = 0.1  # of the prior's standard deviation: no shift that is smaller makes a result wrong
 NOTHING = 1e-6  # difference of two responses, relative to their norm, well above the round-off of a long response
 STEP, MESH = "Time step", "Mesh"
+NO_STEP = {STEP: "the model takes neither a motion nor a step that could be halved"}
 
 Simulate = Callable[[Any, np.ndarray], SimulationBatch]
 """Simulates a model at points (n, n_parameters)."""
@@ -72,7 +75,7 @@ def halve_steps(posterior: Posterior, point: np.ndarray, sd: np.ndarray, simulat
     if not has_steps(posterior.likelihood):
         return StepTest([], {})
     prior_sd = np.array([row[3] for row in posterior.prior.table()[1]])
-    parts, changes, left = [], {}, {STEP: "the model takes neither a motion nor a step that could be halved"}
+    parts, changes, left = [], {}, NO_STEP
     for likelihood, columns in posterior.likelihood.parts():
         n = len(likelihood.model.parameter_names)
         theta, at = point[columns], columns[:n]
@@ -82,21 +85,30 @@ def halve_steps(posterior: Posterior, point: np.ndarray, sd: np.ndarray, simulat
         response, slopes = batch.response[0], batch.response[1:] - batch.response[0]
         residuals = likelihood.residuals_of(response)
         parts.append((at, response, slopes, np.sqrt(np.nanmean(np.square(residuals), axis=1))))
-        for what, name, model, every in _finer(likelihood.model):
-            left.pop(name, None)
-            fine = simulate(model, theta[None, :n])
-            if fine.reasons[0]:
-                left[name] = f"with half of {what} the simulation fails ({fine.reasons[0]})"
-                continue
-            change = fine.response[0][:, ::every] - response
-            if relative_difference(change, response) <= NOTHING:
-                left[name] = f"half of {what} changes nothing: the model keeps a step of its own, or its step is exact"
-            changes.setdefault((name, what), {})[len(parts) - 1] = change
+        for name, what, change, why in halved(likelihood.model, theta[:n], response, simulate):
+            left = {key: each for key, each in left.items() if key != name} | ({name: why} if why else {})
+            if change is not None:
+                changes.setdefault((name, what), {})[len(parts) - 1] = change
     found = []
     for (_, what), change in changes.items():
         found += _compare(what, change, parts, sd, prior_sd, posterior.parameter_names)
-    halved = {name: f"{what} was halved at the fit" for name, what in changes}
-    return StepTest(found, halved | {name: f"not tested: {why}" for name, why in left.items()})
+    tested = {name: f"{what} was halved at the fit" for name, what in changes}
+    return StepTest(found, tested | {name: f"not tested: {why}" for name, why in left.items()})
+
+
+def halved(
+    model: Any, theta: np.ndarray, response: np.ndarray, simulate: Simulate
+) -> Iterator[tuple[str, str, np.ndarray | None, str]]:
+    """Name of each step, what is halved, the change of the response (n_channels, n_steps), why this says nothing."""
+    for what, name, finer, every in _finer(model):
+        fine = simulate(finer, theta[None])
+        if fine.reasons[0]:
+            yield name, what, None, f"with half of {what} the simulation fails ({fine.reasons[0]})"
+            continue
+        change = fine.response[0][:, ::every] - response
+        nothing = relative_difference(change, response) <= NOTHING
+        why = f"half of {what} changes nothing: the model keeps a step of its own, or its step is exact"
+        yield name, what, change, why if nothing else ""
 
 
 def check_stronger_motion(model: Any, theta: np.ndarray, response: np.ndarray, simulate: Simulate) -> list[Finding]:

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from ..cache.simulation_cache import SimulationCache
-from ..checks.finding import labelled
+from ..checks.finding import NOTE, labelled
 from ..checks.rehearsal import ModelCheck, check_model
 from ..checks.screening import check_noise_prior, repair_lines, screen
-from ..information.identifiability import of_mode
+from ..information.identifiability import identifiability
 from ..likelihood.posterior import Posterior
 from ..signals.error_measures import rrmse
 from ..units import from_si
@@ -24,6 +24,7 @@ from .runs import CACHE, default_folder, is_free, make_sampler
 __all__ = ["check_job"]
 
 PICTURE_SECONDS = 10.0
+SEARCH_SECONDS, MOST_SEARCHED = 60.0, 150  # of a search for what the data determine, and its simulations
 FEWEST_DRAWS, MOST_DRAWS = 5, 40
 
 
@@ -51,7 +52,7 @@ def check_job(file: Path, picture: Path, say: Callable[[str], None], progress: b
         steps = f"{event.record.n_steps} samples at {event.record.dt:g} s"
         compared = "without measurements" if event.measured is None else "compared with measurements"
         say(f"Event {event.name}: {event.record.name}, {steps}, {compared}")
-    _say_cost(make_problem(job).posterior, job, sampler, checked, say)
+    _say_cost(make_problem(job).posterior, job, sampler, say)
     pictures = _draw(problem, checked.seconds, picture)
     names = ", ".join(map(str, pictures))
     say(f"{names}: the measurements should lie within the band of the simulations at draws of the prior")
@@ -137,30 +138,24 @@ def _say_simulation(
         say(f"At the mean of the prior the error of the response (RRMSE) is {fit}")
     for line in labelled(checked.findings):
         say(line)
-    if checked.best_fit is not None:
-        with suppress(ValueError):  # a parameter that its prior does not let vary there
-            say(f"{of_mode(*checked.best_fit)}")
-    for name, how in checked.tests.items():
+    for name, how in checked.steps.items():
         say(f"{name}: {how}")
+    most = min(MOST_SEARCHED, SEARCH_SECONDS / max(checked.seconds, 1e-6))
+    if most > 10 * n and all(each.severity == NOTE for each in checked.findings):  # of wrong data, nothing is known
+        with suppress(ValueError, np.linalg.LinAlgError):
+            told = identifiability(posterior, max_simulations=most)
+            say(f"{told}")
+            return checked._replace(simulations=checked.simulations + round(told.simulations))
     return checked
 
 
-def _say_cost(posterior: Posterior, job: Job, sampler: Any, checked: ModelCheck, say: Callable[[str], None]) -> None:
+def _say_cost(posterior: Posterior, job: Job, sampler: Any, say: Callable[[str], None]) -> None:
     """Estimate the cost with a posterior whose simulations are not cached."""
     from samplers import estimate_cost
 
     guided, most = job.sampler.guide, job.budget.max_simulations
     estimate = estimate_cost(posterior, sampler.nwalkers, type(sampler), seed=1)
-    if guided and np.isfinite(checked.searched):
-        # later starts often join earlier ones; rough responses take several rounds of draws
-        fewest = 2.0 * checked.searched + sampler.nwalkers
-        say(
-            f"The run uses a guide: a search from one start took {checked.searched:.0f} simulations, so that the run "
-            f"needs at least about {fewest:.0f}, and up to several times as many if the response is rough; "
-            f"{5.0 * fewest:.0f} take {estimate.time_of(5.0 * fewest)}, to which the guide adds its own computations, "
-            "half a minute for 7 parameters"
-        )
-    elif guided:
+    if guided:
         say(
             f"The run uses a guide: how many simulations it needs is not predicted; 500 take "
             f"{estimate.time_of(500)}, to which the guide adds its own computations, half a minute for 7 parameters"
