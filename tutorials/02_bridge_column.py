@@ -48,7 +48,7 @@ plot_section(model).figure.savefig("section.png")
 # draw is simulated by the model itself and weighted, so the result belongs to the model; the number of walkers is the
 # effective sample size that the run shall reach.
 
-sampler = SMCSampler(60, posterior.ndim, posterior, vectorize=True, seed=1, guide=posterior.guide())
+sampler = SMCSampler(50, posterior.ndim, posterior, vectorize=True, seed=1, guide=posterior.guide())
 sampler.run_mcmc(None, 1)
 print(sampler.verdict)
 samples = sampler.get_chain(flat=True)
@@ -88,7 +88,7 @@ plot_hysteresis(model, moments.mean[:5]).savefig("hysteresis.png")
 
 concrete = replace(model.concrete, softening_strain=0.1 * model.concrete.softening_strain)
 brittle = problems.bridge_column(data="short", concrete=concrete)
-other = SMCSampler(60, brittle.ndim, brittle, vectorize=True, seed=1, guide=brittle.guide())
+other = SMCSampler(50, brittle.ndim, brittle, vectorize=True, seed=1, guide=brittle.guide())
 other.run_mcmc(None, 1)
 print(other.verdict)
 comparison = compare_models({"as updated": sampler, "brittle in tension": other})

@@ -82,7 +82,7 @@ figure, panels = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
 for k, (axes, label) in enumerate(zip(panels, ("stiffness", "damping"), strict=True)):
     low, middle, high = np.transpose([np.quantile(each.samples[:, k], [0.05, 0.5, 0.95]) for each in stored.values()])
     axes.errorbar(names, middle, [middle - low, high - middle], fmt="o", capsize=3, label="median and 90 % interval")
-    axes.plot(names, [theta[k] for _, theta, _ in events.values()], "kx", label="truth of the event")
+    axes.plot(names, [theta[k] for _, theta, _ in events.values()], "kx", zorder=3, label="truth of the event")
     axes.set(ylabel=f"{label} [x nominal]", title="each event calibrated alone")
 panels[0].legend()
 figure.savefig("events.png")

@@ -68,6 +68,7 @@ def plot_run(sampler: Any) -> "Figure":
         evidence.axhline(sampler.log_evidence, color=GREY, linewidth=1, linestyle=":", label="result of the run")
     evidence.set_xlabel("evaluations of the log-probability")
     evidence.set_ylabel("log-evidence so far")
+    evidence.ticklabel_format(axis="y", useOffset=False)
     evidence.legend(frameon=False, fontsize="small", loc="best")
     _draw_chain(chain, sampler)
     for axes in (*ladder, points, evidence, chain):
@@ -82,7 +83,7 @@ def _headline(sampler: Any) -> str:
     """Stages, cost and evidence of a run in one line, or how far an unfinished run has come."""
     stages = sampler.ladder
     number = f"{len(stages)} stage{'s' if len(stages) > 1 else ''}"
-    cost = f"{sum(stage.evaluations for stage in stages)} evaluations"
+    cost = f"{sampler.evaluations} evaluations"
     if sampler.ended_at is not None:
         return f"{number}, {cost}, ended by the limit of simulations at beta = {sampler.ended_at:.3g}"
     if stages[-1].beta < 1.0:
