@@ -30,9 +30,9 @@ from numpy.typing import ArrayLike
 from ..checks.finding import labelled
 from ..events.ratios import EventRatios
 from ..prediction.prediction import Prediction
-from ..prediction.reliability import Exceedance, check_level, exceeded, warn_of_missing_error
+from ..prediction.reliability import Exceedance, check_level, estimate, outcomes, warn_of_missing_error
 from ..priors.distributions import Distribution
-from ..text_tables import number
+from ..text_tables import number, text_table
 from ..units import DIMENSIONS, find_unit, from_si
 from .measures import DamageMeasures
 
@@ -148,21 +148,17 @@ class Damage(NamedTuple):
         A probability of 0 or 1 is given with the bound of its interval, others with their Monte Carlo error. Strains
         are given for the place with the largest quantile.
         """
-        events = [event[:23] for event in self.events]
-        rows = [("probability of", events)]
-        for name, each in self.presence.items():
-            rows.append((name, [_stated(*values) for values in zip(*each[1:5], strict=True)]))
+        rows = [("probability of", *self.events)]
+        rows += [(name, *(_stated(*v) for v in zip(*each[1:5], strict=True))) for name, each in self.presence.items()]
+        lines = [text_table(rows)]
         if self.extent:
-            quantiles = "quantiles " + ", ".join(f"{p:g}" for p in self.prediction.probabilities)
-            rows += [("", []), (quantiles, events)]
-        for name, values in self.extent.items():
-            unit = _UNITS.get(name, "1")
-            largest = from_si(values.reshape(*values.shape[:2], -1).max(axis=2), unit)
-            cells = [" ".join(f"{v:.3g}" for v in column) for column in largest.T]
-            rows.append((name + ("" if unit == "1" else f" [{unit}]"), cells))
-        first = max(len(name) for name, _ in rows)
-        width = max([20, *(len(cell) for _, cells in rows for cell in cells)]) + 2
-        lines = [(f"{name:<{first}}" + "".join(f"{c:>{width}}" for c in cells)).rstrip() for name, cells in rows]
+            rows = [("quantiles " + ", ".join(f"{p:g}" for p in self.prediction.probabilities), *self.events)]
+            for name, values in self.extent.items():
+                unit = _UNITS.get(name, "1")
+                largest = from_si(values.reshape(*values.shape[:2], -1).max(axis=2), unit)
+                cells = (" ".join(f"{v:.3g}" for v in column) for column in largest.T)
+                rows.append((name + ("" if unit == "1" else f" [{unit}]"), *cells))
+            lines += ["", text_table(rows)]
         closing = [f"The probabilities contain {self.uncertainty}."]
         closing += [f"{self.failures}."] if self.failures else []
         return "\n".join([*lines, "", *closing, *labelled(self.prediction.findings)])
@@ -287,31 +283,30 @@ def damage(
     names = [state.name for state in states]
     if len(set(names)) != len(names):
         raise ValueError(f"limit states need different names; got {', '.join(names)}")
-    values = measures.split(prediction.values)
+    every, effective = outcomes(prediction)
+    values = measures.split(every)
     errors = _ratios_of_measures(ratios, tuple(values))
-    check_level(level)
-    presence, location = {}, {}
-    settings = len(prediction.collapsed), prediction.effective_sample_size, level, seed
+    presence, location, settings = {}, {}, (effective, check_level(level), seed)
     for state in states:
         if state.measure not in values:
             raise ValueError(
                 f"limit state {state.name!r} is of {state.measure!r}, the measures are {', '.join(values)}; "
                 "damage_measures(measures=...) chooses them"
             )
-        found, limit = values[state.measure], _limit_per_sample(state, prediction, np.random.default_rng(seed))
+        found, limit = values[state.measure], _limits(state, len(every), np.random.default_rng(seed))
         reported = np.asarray(state.limit if np.isscalar(state.limit) else np.mean(limit), dtype=float)
         shown = {"threshold": reported, "unit": DIMENSIONS[find_unit(_UNITS.get(state.measure, "1")).dimension]}
         ratios_of = errors.get(state.measure)
         if found.ndim == 4:
-            at_places = exceeded(found, limit[:, None, None, None], ratios_of, *settings)
-            location[state.name], found = at_places._replace(**shown), found.max(axis=(2, 3))
-        presence[state.name] = exceeded(found, limit[:, None], ratios_of, *settings)._replace(**shown)
+            at_places = estimate(found, limit[:, None, None, None], ratios_of, *settings)
+            location[state.name], found = at_places.exceedance._replace(**shown), found.max(axis=(2, 3))
+        presence[state.name] = estimate(found, limit[:, None], ratios_of, *settings).exceedance._replace(**shown)
     without = [state.name for state in states if state.measure not in errors]
     if without and noise is None:
         guess = "state a guess, such as EventRatios([1.0], prior_sd=0.3, prior_events=10)"
         warn_of_missing_error(f"damage ({', '.join(without)})", guess)
     rng, probabilities = np.random.default_rng(seed), prediction.probabilities
-    quantiles = _extent(values, probabilities, errors, rng) if probabilities else {}
+    quantiles = _extent(measures.split(prediction.values), probabilities, errors, rng) if probabilities else {}
     return Damage(states, presence, location, quantiles, _contents(states, errors), prediction)
 
 
@@ -322,26 +317,18 @@ def _stated(probability: float, error: float, lower: float, upper: float) -> str
     return f"{probability:.3f} +- {error:.3f}"
 
 
-def _limit_per_sample(state: LimitState, prediction: Prediction, rng: np.random.Generator) -> np.ndarray:
-    """Limits of the samples that did not fail, shape (n,) or (1,); of a distribution quantiles in random order."""
-    n = prediction.n_samples + prediction.n_failed
+def _limits(state: LimitState, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Limits of n samples, shape (n,) or (1,); of a distribution quantiles in random order."""
     if isinstance(state.limit, Distribution) and state.limit.bounds[0] >= 0.0:
-        return state.limit.ppf((rng.permutation(prediction.n_samples) + 0.5) / prediction.n_samples)
-    try:
-        limit = np.asarray(state.limit, dtype=float)
-    except (TypeError, ValueError):
-        limit = np.array(np.nan)
-    if (
-        isinstance(state.limit, str)
-        or limit.shape not in ((), (n,))
-        or not np.isfinite(limit).all()
-        or not (limit > 0.0).all()
-    ):
+        return state.limit.ppf((rng.permutation(n) + 0.5) / n)
+    limit = np.asarray(state.limit)
+    known = limit.dtype.kind in "iuf" and limit.shape in ((), (n,)) and ((limit > 0.0) & (limit < np.inf)).all()
+    if not known:
         raise ValueError(
             f"the limit of {state.name!r} must be a positive number, or one for each of the {n} samples, or a "
             f"distribution of positive numbers; got {state.limit!r}"
         )
-    return limit.reshape(1) if limit.ndim == 0 else np.delete(limit, prediction.failed)
+    return limit.reshape(-1)
 
 
 def _ratios_of_measures(ratios: Any, measures: tuple[str, ...]) -> dict[str, EventRatios]:

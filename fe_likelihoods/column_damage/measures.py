@@ -182,64 +182,55 @@ def damage_measures(
         heights, places = _places(model)
         displacement, force, height = "displacement", "base_shear", model.height
         yield_strain = model.steel.fy / model.steel.es
-    channels = {"displacement": displacement, "force": force}
-    if measures is None:
-        chosen = [name for name, kinds in _NEEDED.items() if all(channels[kind] for kind in kinds)]
-        chosen = [name for name in chosen if name != "Park-Ang index" or is_column or park_ang is not None]
-        chosen += STRAIN_MEASURES if is_column else ()
-    else:
-        known = (*_NEEDED, *STRAIN_MEASURES)
-        chosen = [measures] if isinstance(measures, str) else list(measures)
-        if not chosen or len(set(chosen)) != len(chosen) or set(chosen) - set(known):
-            raise ValueError(f"measures must be some of {', '.join(known)}, each once; got {measures!r}")
+    place = {"displacement": displacement, "force": force}
+    structure = [name for name, needed in _NEEDED.items() if all(map(place.get, needed))]
+    if park_ang is None and not is_column:
+        structure = [name for name in structure if name != "Park-Ang index"]
+    known = (*structure, *(STRAIN_MEASURES if is_column else ()))
+    chosen = known if measures is None else (measures,) if isinstance(measures, str) else tuple(measures)
+    if not chosen or len(set(chosen)) != len(chosen) or set(chosen) - set(known):
+        raise ValueError(
+            f"measures must be some of {', '.join(known) or 'none'}, each once; got {measures!r}. Of a model that is "
+            "no RCColumn, name displacement=, force= and, for the index, park_ang=ParkAng(...)"
+        )
     if not set(chosen) & set(STRAIN_MEASURES):
         heights, places = np.zeros(0), ()
-    elif not is_column:
-        raise ValueError(f"{' and '.join(STRAIN_MEASURES)} are measures of an RCColumn; choose other measures=")
-    needed = dict.fromkeys(kind for name in chosen for kind in _NEEDED.get(name, ()))
-    for kind in needed:
-        if not channels[kind]:
-            raise ValueError(f"{', '.join(chosen)} cannot be known without a channel of {kind}: name it, {kind}=...")
+    structure = [name for name in structure if name in chosen]
+    needed = dict.fromkeys(place[kind] for name in structure for kind in _NEEDED[name])
     names = [channel.name for channel in model.channels]
-    required = [*map(channels.get, needed), *(name for each in places for name in each)]
-    if lacking := [name for name in required if name not in names]:
-        help_of_column = (
-            "add them, dataclasses.replace(column, outputs=damage_outputs(column)), or choose other measures="
-        )
+    if lacking := [name for name in (*needed, *(name for each in places for name in each)) if name not in names]:
+        how = "dataclasses.replace(column, outputs=damage_outputs(column))" if is_column else ", ".join(sorted(names))
         raise ValueError(
             f"the model lacks the outputs {', '.join(lacking)} that {', '.join(chosen)} need; "
-            + (help_of_column if is_column else f"its channels are {', '.join(sorted(names))}")
+            + (f"add them, {how}, or choose other measures=" if is_column else f"its channels are {how}")
         )
     if "Park-Ang index" in chosen:
-        if park_ang is None and not is_column:
-            raise ValueError("the Park-Ang index needs its constants: give park_ang=ParkAng(...)")
         park_ang = park_ang_constants(model) if park_ang is None else park_ang
         park_ang.check()
-    mean = MeanOfLast(max(1, round(settle / model.dt)))
+    mean, index = MeanOfLast(max(1, round(settle / model.dt))), functools.partial(_index, constants=park_ang)
     quantities: list[ChannelQuantity] = []
     windows = _windows(getattr(model, "loading" if is_column else "record", None), model.n_steps, model.dt)
     for event, first, stop, rest in windows:
-        so_far, found = slice(0, rest), {}
-        if "peak drift" in chosen:
-            found["peak displacement"] = peak(displacement, slice(first, stop))
-        if "residual drift" in chosen:
-            found["residual displacement"] = ChannelQuantity(displacement, mean, slice(first, rest))
-        if "dissipated energy" in chosen:
-            found["dissipated energy"] = dissipated_energy(force, displacement, so_far)
-        if "Park-Ang index" in chosen:
-            index = functools.partial(_index, constants=park_ang)
-            found["Park-Ang index"] = ChannelQuantity(displacement, index, so_far, (force,), describe=_of_index)
+        so_far = slice(0, rest)
+        found = {
+            "peak drift": peak(displacement, slice(first, stop)),
+            "residual drift": ChannelQuantity(displacement, mean, slice(first, rest)),
+            "dissipated energy": dissipated_energy(force, displacement, so_far),
+            "Park-Ang index": ChannelQuantity(displacement, index, so_far, (force,), describe=_of_index),
+        }
+        found = {name: found[name] for name in structure}
         for z, (left_bar, left, right_bar, right) in zip(heights, places, strict=True):
             for side, bar, surface in (("-", left_bar, left), ("+", right_bar, right)):
-                found[f"bar tension at {z:g} m, {side} side"] = ChannelQuantity(bar, np.max, so_far)
-                found[f"cover compression at {z:g} m, {side} side"] = ChannelQuantity(surface, _compression, so_far)
+                at = f"at {z:g} m, {side} side"
+                found[f"bar tension {at}"] = ChannelQuantity(bar, np.max, so_far)
+                found[f"cover compression {at}"] = ChannelQuantity(surface, _compression, so_far)
         quantities += (
             replace(each, name=f"{name} after {event}", n_steps=int(model.n_steps)) for name, each in found.items()
         )
     return DamageMeasures(
         tuple(quantities),
         tuple(event for event, *_ in windows),
-        tuple(name for name in _NEEDED if name in chosen),
+        tuple(structure),
         heights,
         float(height),
         park_ang if "Park-Ang index" in chosen else None,

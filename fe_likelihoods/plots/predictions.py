@@ -100,9 +100,10 @@ def plot_fragility(fragility: Fragility, label: str = "peak ground acceleration"
     Examples
     --------
     >>> motions = [record.scale(factor) for factor in (0.8, 0.9, 1.0, 1.1, 1.2)]
+    >>> peaks = [propagate(posterior, samples, quantity=peak("displacement"), record=each) for each in motions]
+    >>> strongest = [np.abs(each.acceleration).max() for each in motions]
     >>> ratios = EventRatios([0.93, 1.10, 1.02, 0.99])
-    >>> curve = fragility(posterior, samples, motions, peak("displacement"), 8.0, unit="cm", ratios=ratios)
-    >>> figure = plot_fragility(curve)
+    >>> figure = plot_fragility(fragility(peaks, strongest, 8.0, unit="cm", ratios=ratios))
     """
     import matplotlib.pyplot as plt
 
@@ -110,10 +111,11 @@ def plot_fragility(fragility: Fragility, label: str = "peak ground acceleration"
         return values if unit is None else from_si(values, unit)
 
     figure, axes = plt.subplots(figsize=(6.0, 4.0), layout="constrained")
-    reach = np.stack([fragility.probability - fragility.lower, fragility.upper - fragility.probability])
+    found = fragility.exceedance
+    reach = np.stack([found.probability - found.lower, found.upper - found.probability])
     axes.errorbar(
         shown(fragility.intensity),
-        fragility.probability,
+        found.probability,
         yerr=np.maximum(reach, 0.0),
         fmt="o",
         color=BLUE,

@@ -82,8 +82,9 @@ class Accumulator:
         self.reasons: Counter = Counter()  # samples left out per reason, without durations
         self.shape: tuple[int, ...] | None = None  # of a value; None until it is known
         self._entropy = entropy
-        if quantity.rows is not None:
-            self._allocate((len(quantity.rows), n_steps))
+        shape = quantity.shape if quantity.rows is None else (len(quantity.rows), n_steps)
+        if shape is not None:
+            self._allocate(shape)
 
     def _allocate(self, shape: tuple[int, ...]) -> None:
         """Memory for the values, once their shape is known; ValueError for histories beyond the limit."""

@@ -55,7 +55,8 @@ class Prediction:
     failed : ndarray of int, shape (n_failed,)
         Indices of the samples that are left out, because the simulation failed or the quantity is not finite.
     collapsed : ndarray of int, shape (n_collapsed,)
-        Indices of the failed samples whose structure collapsed. Mean and quantiles are those of the other structures.
+        Indices of the failed samples whose structure collapsed. Mean and quantiles are those of the other structures,
+        NaN if there are none.
     failure_reasons : dict of str to int
         Number of samples left out for each reason, without the durations of the simulations.
     channels : tuple of Channel

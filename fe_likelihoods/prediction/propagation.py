@@ -51,7 +51,7 @@ from .other_channels import predict_channels_of
 from .prediction import Prediction
 from .quantities import Quantity, evaluator
 
-__all__ = ["AllFailed", "check_effective_sample_size", "propagate"]
+__all__ = ["propagate"]
 
 logger = logging.getLogger(__name__)
 
@@ -166,7 +166,7 @@ def propagate(
         range, and channels of `model` whose noise is not known. Later, for a function that returns arrays of different
         shapes.
     SimulationFailed
-        If every simulation fails.
+        If every simulation fails, unless structures collapsed and the quantity is a number (`exceedance` is then 1).
 
     Warns
     -----
@@ -194,7 +194,7 @@ def propagate(
     thetas, sample_noise = split_samples(source, samples, noise, record is not None)
     n = len(thetas)
     probabilities = _probabilities(quantiles)
-    effective = check_effective_sample_size(effective_sample_size, n)
+    effective = _effective_sample_size(effective_sample_size, n)
     if record is not None:
         under_record(source.model, record)  # errors come before the warning about the state
     state = chosen_state(source.model, record, from_state)
@@ -263,21 +263,13 @@ def propagate(
     return predictions if isinstance(quantity, Mapping) else predictions[""]
 
 
-def check_effective_sample_size(effective_sample_size: float | None, n: int) -> float:
+def _effective_sample_size(effective_sample_size: float | None, n: int) -> float:
     """Return the effective sample size, by default `n`; raise ValueError if it is not a positive number."""
     if effective_sample_size is None:
         return n
     if not (np.isfinite(effective_sample_size) and effective_sample_size > 0.0):
         raise ValueError(f"effective_sample_size must be a positive number; got {effective_sample_size!r}")
     return effective_sample_size
-
-
-class AllFailed(SimulationFailed):
-    """No sample is left to predict from; `collapsed` has the indices of those whose structure collapsed."""
-
-    def __init__(self, reason: str, collapsed: np.ndarray) -> None:
-        super().__init__(reason)
-        self.collapsed = collapsed
 
 
 def _prediction(accumulator: Accumulator, probabilities: tuple[float, ...], effective: float, dt: float) -> Prediction:
@@ -287,24 +279,28 @@ def _prediction(accumulator: Accumulator, probabilities: tuple[float, ...], effe
         for samples in (accumulator.failed, accumulator.collapsed)
     )
     frequent = "; ".join(f"{count}: {reason}" for reason, count in accumulator.reasons.most_common(3))
-    if len(failed) == n:
-        raise AllFailed(f"nothing to predict from, all {n} samples failed ({frequent})", collapsed)
+    histories, noise = accumulator.quantity.rows is not None, accumulator.noise
+    alone = len(failed) == n
+    if alone and (histories or accumulator.shape is None or not len(collapsed)):
+        raise SimulationFailed(f"nothing to predict from, all {n} samples failed ({frequent})")
     if len(failed):
         logger.warning("%d of %d samples failed and are left out of the prediction (%s)", len(failed), n, frequent)
     used = np.setdiff1d(np.arange(n), failed, assume_unique=True)
-    effective = effective * len(used) / n
-    histories, noise = accumulator.quantity.rows is not None, accumulator.noise
-    variance = accumulator.moments.variance
+    effective = effective if alone else effective * len(used) / n
+    unknown = np.full(accumulator.shape, np.nan)  # of structures that have all collapsed
+    variance = unknown if alone else accumulator.moments.variance
     error = np.sqrt(variance / effective)
     if histories and noise is not None:
         added = accumulator.noise_variance.mean
         per_step = noise.of_response is not None
         variance = variance + (added if per_step else noise.over_time(added, variance.shape[1]))
     quantiles = quantile_error = np.zeros((0, *accumulator.shape))
-    if probabilities:
+    if probabilities and alone:
+        quantiles = quantile_error = np.array([unknown] * len(probabilities))
+    elif probabilities:
         quantiles, quantile_error = accumulator.quantiles(used, probabilities, effective)
     return Prediction(
-        mean=accumulator.moments.mean,
+        mean=unknown if alone else accumulator.moments.mean,
         variance=variance,
         standard_error=error,
         probabilities=probabilities,

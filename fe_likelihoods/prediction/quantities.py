@@ -105,6 +105,7 @@ class Evaluator(NamedTuple):
     rows: list[int] | None  # whose histories are the quantity, None for others
     function: Callable[[np.ndarray], Any] | None  # of the response (n_channels, n_steps) [SI]
     channels: tuple[Channel, ...]  # of the quantity; empty for a function of the whole response
+    shape: tuple[int, ...] | None = None  # of a number or several; None if it is not known before a response
 
 
 def peak(channel: str, part: slice = slice(None)) -> ChannelQuantity:
@@ -421,7 +422,7 @@ def evaluator(quantity: Quantity, channels: Sequence[Channel], dt: float, n_step
 
     if isinstance(quantity, ChannelQuantity):
         function, channel = number(quantity)
-        return Evaluator(None, function, (channel,))
+        return Evaluator(None, function, (channel,), ())
     if callable(quantity):
         return Evaluator(None, quantity, ())
     if isinstance(quantity, Sequence) and quantity:
@@ -430,7 +431,9 @@ def evaluator(quantity: Quantity, channels: Sequence[Channel], dt: float, n_step
             return Evaluator(rows, None, tuple(channels[k] for k in rows))
         if all(isinstance(each, ChannelQuantity) for each in quantity):
             functions, numbers = zip(*(number(each) for each in quantity), strict=True)
-            return Evaluator(None, lambda response: np.array([f(response) for f in functions]), numbers)
+            return Evaluator(
+                None, lambda response: np.array([f(response) for f in functions]), numbers, (len(numbers),)
+            )
     raise ValueError(
         "quantity must be None, a channel's name, different names, peak(name), several of these, or a function of the "
         f"response (n_channels, n_steps); got {quantity!r}"

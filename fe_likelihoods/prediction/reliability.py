@@ -18,8 +18,8 @@ Biometrika 26(4), 404-413, doi:10.1093/biomet/26.4.404.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -37,12 +37,10 @@ __all__ = [
     "Estimate",
     "Exceedance",
     "check_level",
-    "contents",
     "estimate",
     "exceedance",
-    "exceeded",
-    "threshold_in_si",
-    "unit_of_threshold",
+    "inputs",
+    "outcomes",
     "warn_of_missing_error",
 ]
 
@@ -165,18 +163,66 @@ def exceedance(
     The probability contains the uncertainty of the parameters and the error of the model, from the ratios of 3
     events.
     """
-    prediction = prediction_or_values if isinstance(prediction_or_values, Prediction) else None
-    n_collapsed, has_error, channels = 0, False, ()
+    known, limits, ratios = inputs(prediction_or_values, threshold, unit, ratios, noise, "exceedance")
+    values = known.values
+    if values.ndim > 1 and limits.shape not in ((), values.shape[1:]):
+        raise ValueError(
+            f"expected one threshold, or one for each entry of the quantity, shape {values.shape[1:]}; got shape "
+            f"{limits.shape}"
+        )
+    if ratios is not None and ratios.shape not in ((), values.shape[1:]):
+        raise ValueError(
+            f"expected ratios (n_events, ...) of a quantity of shape {values.shape[1:]}; got {ratios.values.shape}"
+        )
+    if values.ndim == 1 and limits.ndim:
+        values = values.reshape(-1, *(1,) * limits.ndim)
+    settings = known.effective, check_level(level), seed
+    if ratios is None or not ratios.shape:
+        found = estimate(values, limits, ratios, *settings).exceedance
+    else:  # each quantity has ratios of its own
+        rows = np.broadcast_to(limits, values.shape[1:])
+        columns = [
+            estimate(values[:, k], row, ratios.of_quantity(k), *settings).exceedance for k, row in enumerate(rows)
+        ]
+        found = columns[0]._replace(**{name: np.array([getattr(each, name) for each in columns]) for name in _ARRAYS})
+    return found._replace(threshold=limits, uncertainty=known.contents, unit=known.unit)
+
+
+class Known(NamedTuple):
+    """What a probability is estimated from."""
+
+    values: np.ndarray  # (n, ...) of all samples: NaN where the simulation failed, inf where the structure collapsed
+    effective: float  # number of independent samples
+    contents: str  # which uncertainties the probability contains
+    unit: str  # SI unit of the threshold
+
+
+def inputs(
+    given: Prediction | ArrayLike,
+    threshold: ArrayLike,
+    unit: str | None,
+    ratios: EventRatios | None,
+    noise: bool | None,
+    caller: str,
+) -> tuple[Known, np.ndarray, EventRatios | None]:
+    """Values, thresholds [SI] and ratios for an estimate.
+
+    With the name of a `caller`, it warns where there is no model error, or a unit seems to be missing.
+    """
+    prediction = given if isinstance(given, Prediction) else None
+    has_error, channels, said = False, (), ""
     if prediction is not None:
         if prediction.values is None:
             raise ValueError(
-                "exceedance needs the values of the samples, but this prediction has none: propagate with a number as "
+                f"{caller} needs the values of the samples, but this prediction has none: propagate with a number as "
                 "quantity, such as peak(channel)"
             )
-        values, has_error, channels = prediction.values, prediction.noise, prediction.channels
-        effective, n_collapsed = prediction.effective_sample_size, len(prediction.collapsed)
+        (values, effective), has_error = outcomes(prediction), prediction.noise
+        channels, fallen = prediction.channels, len(prediction.collapsed)
+        if fallen:
+            said = f"; {fallen} of {prediction.n_samples + fallen} structures collapsed, which exceed every limit"
     else:
-        values = np.asarray(prediction_or_values, dtype=float)
+        values = np.asarray(given, dtype=float)
         if values.ndim == 0 or len(values) == 0 or not np.isfinite(values).all():
             raise ValueError(f"values must be finite, one row per sample; got {values.size} of shape {values.shape}")
         effective = float(len(values))
@@ -187,132 +233,80 @@ def exceedance(
         )
     if ratios is not None and has_error:
         raise ValueError("ratios contain the error of the model, and the prediction contains it already: leave one")
-    if ratios is None and prediction is not None and noise is None and not has_error:
-        warn_of_missing_error("exceedance", 'propagate with noise="model" and noise in shares of the response')
-    limits = threshold_in_si(threshold, unit, channels)
-    if values.ndim > 1 and limits.shape not in ((), values.shape[1:]):
-        raise ValueError(
-            f"expected one threshold, or one for each entry of the quantity, shape {values.shape[1:]}; got shape "
-            f"{limits.shape}"
-        )
-    check_level(level)
-    if unit is None and len({channel.unit for channel in channels}) == 1 and limits.size:
-        warn(check_unit_of_threshold(limits, values, channels[0]), stacklevel=2)
+    if caller and ratios is None and prediction is not None and noise is None and not has_error:
+        warn_of_missing_error(caller, 'propagate with noise="model" and noise in shares of the response', 4)
+    limits = _threshold_in_si(threshold, unit, channels)
+    finite = values[np.isfinite(values)]
+    if caller and unit is None and len({channel.unit for channel in channels}) == 1 and limits.size and finite.size:
+        warn(check_unit_of_threshold(limits, finite, channels[0]), stacklevel=3)
     if prediction is not None and prediction.ratios is not None:  # exact, not by the draws
         ratios, values = prediction.ratios, prediction.predicted[None]
-    if ratios is not None:
-        if not (limits > 0.0).all():
-            raise ValueError(f"with ratios, thresholds must be positive; got {limits}")
-        if ratios.shape not in ((), values.shape[1:]):
-            raise ValueError(
-                f"expected ratios (n_events, ...) of a quantity of shape {values.shape[1:]}; got {ratios.values.shape}"
-            )
-    if values.ndim == 1 and limits.ndim:
-        values = values.reshape(-1, *(1,) * limits.ndim)
-    settings = n_collapsed, effective, level, seed
-    if ratios is None or not ratios.shape:
-        found = exceeded(values, limits, ratios, *settings)
-    else:  # each quantity has ratios of its own
-        rows = np.broadcast_to(limits, values.shape[1:])
-        columns = [exceeded(values[:, k], rows[k], ratios.of_quantity(k), *settings) for k in range(len(rows))]
-        arrays = {name: np.array([getattr(each, name) for each in columns]) for name in _ARRAYS}
-        found = columns[0]._replace(**arrays)
-    said = contents(has_error, ratios) + found.uncertainty
-    return found._replace(threshold=limits, uncertainty=said, unit=unit_of_threshold(unit, channels))
+    if ratios is not None and not (limits > 0.0).all():
+        raise ValueError(f"with ratios, thresholds must be positive; got {limits}")
+    contains = _contents(has_error, ratios) + said
+    return Known(values, effective, contains, _unit_of_threshold(unit, channels)), limits, ratios
 
 
-def exceeded(
-    values: np.ndarray,
-    limits: np.ndarray,
-    ratios: EventRatios | None,
-    n_collapsed: int,
-    effective: float,
-    level: float,
-    seed: int,
-) -> Exceedance:
-    """Probability that values (n, ...) of samples exceed limits, which are broadcast to them.
+def outcomes(prediction: Prediction) -> tuple[np.ndarray, float]:
+    """Values (n, ...) of all samples, inf where the structure collapsed, NaN where the simulation failed otherwise.
 
-    Further `n_collapsed` samples exceed every limit: a probability without them speaks of the structures that stand.
+    And how many independent samples they are worth.
     """
-    values, limits = np.broadcast_arrays(values, limits)
-    n, total = len(values), len(values) + n_collapsed
-    fallen, effective = np.full((n_collapsed, *values.shape[1:]), np.nan), effective * total / n
-    known, above = np.concatenate([values, fallen]), np.concatenate([limits, np.ones(fallen.shape)])
-    found = estimate(known, above, ratios, np.isnan(known), effective, level, seed)
-    by_events = None
-    if ratios is not None:  # each event is one trial
-        logs = np.log(np.where(values > 0.0, values, 1.0))
-        moved = [values * ratios.of_event(k, logs) > limits for k in range(len(ratios.values))]
-        share = (np.mean(moved, axis=0).sum(axis=0) + n_collapsed) / total
-        by_events = _binomial_interval(share, len(ratios.values), level)[1]
-    said = f"; {n_collapsed} of {total} structures collapsed, which exceed every limit" if n_collapsed else ""
-    return Exceedance(limits[0], *found[:4], effective, said, by_events)
+    used, n = prediction.n_samples, prediction.n_samples + prediction.n_failed
+    found = np.full((n, *prediction.values.shape[1:]), np.nan)
+    found[np.setdiff1d(np.arange(n), prediction.failed, assume_unique=True)] = prediction.values
+    found[prediction.collapsed] = np.inf
+    return found, prediction.effective_sample_size * (n / used if used else 1.0)
 
 
 class Estimate(NamedTuple):
-    """Probability (...) of an exceedance with its Monte Carlo error and interval, and what curves are fitted to."""
+    """Probability of an exceedance, and what curves are fitted to."""
 
-    probability: np.ndarray
-    standard_error: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-    single: np.ndarray  # (n, ...), of each sample
+    exceedance: Exceedance
+    single: np.ndarray  # (n, ...), probability of each sample
     counted: np.ndarray  # (n, ...), 0 for failures that are left out, else 1
     draws: np.ndarray | None  # (n_draws, ...), one per population of events
 
 
 def estimate(
-    values: np.ndarray,
-    limits: np.ndarray,
-    ratios: EventRatios | None,
-    exceeding: np.ndarray,
-    effective: float,
-    level: float,
-    seed: int | None,
+    values: np.ndarray, limits: ArrayLike, ratios: EventRatios | None, effective: float, level: float, seed: int
 ) -> Estimate:
     """Probability that values (n, ...), times a ratio, exceed limits, which are broadcast to them.
 
-    Given the population of the ratios, the probability is a number; its mean over populations is the probability, and
-    its quantiles, over samples and populations, are the interval. Without ratios this is the Clopper-Pearson interval.
-    NaN are failures, which are left out, or count as exceedances where `exceeding`.
+    Infinite values exceed every limit, NaN are failures, which are left out. Given the population of the ratios, the
+    probability is a number; its mean over populations is the probability, and its quantiles, over samples and
+    populations, are the interval. Without ratios this is the Clopper-Pearson interval.
     """
     values, limits = np.broadcast_arrays(values, limits)
-    failed = np.isnan(values)
-    counted = 1.0 - (failed & ~exceeding)
-    known = np.where(failed, np.nanmax(np.where(failed, -np.inf, values), initial=-np.inf), values)
+    counted = 1.0 - np.isnan(values)
+    regular = (values > 0.0) & (values < np.inf)
+    known = np.where(regular, values, 1.0)
+    logs = np.log(known)
 
-    def of_samples(rows: np.ndarray | slice, above: np.ndarray) -> np.ndarray:
-        return np.where(failed[rows], exceeding[rows], above)
+    def above(population: Any, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
+        found = population.probability_above(limits[rows] / known[rows], logs[rows])
+        return np.where(regular[rows], found, values[rows] == np.inf)  # times a ratio, others never exceed
 
-    if ratios is None:
-        single = of_samples(slice(None), known > limits).astype(float)
-    else:
-        single = of_samples(slice(None), _with_ratios(known, limits, ratios.probability_above))
+    single = (values > limits).astype(float) if ratios is None else above(ratios)
     number_of = counted.sum(axis=0)
     share, trials = (single * counted).sum(axis=0) / number_of, effective * number_of / len(values)
     error = np.sqrt((np.square(single - share) * counted).sum(axis=0) / number_of / trials)
     if ratios is None:
-        return Estimate(share, error, *_binomial_interval(share, trials, level), single, counted, None)
+        ends = _binomial_interval(share, trials, level)
+        return Estimate(Exceedance(limits[0], share, error, *ends, effective), single, counted, None)
     rng = np.random.default_rng(seed)
     rows = rng.permutation(np.resize(rng.permutation(len(values)), _DRAWS))  # each population has one of the samples
-    populations = ratios.draw_populations(_DRAWS, rng)
-    draws = of_samples(rows, _with_ratios(known[rows], limits[rows], populations.probability_above))
-    draws = np.where(counted[rows] > 0.0, draws, np.nan)
+    draws = np.where(counted[rows] > 0.0, above(ratios.draw_populations(_DRAWS, rng), rows), np.nan)
     lower, upper = np.nanquantile(draws, [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=0)
     # far in a tail the mean over populations can be above nearly all of their probabilities
-    return Estimate(share, error, np.minimum(lower, share), np.maximum(upper, share), single, counted, draws)
+    ends = np.minimum(lower, share), np.maximum(upper, share)
+    moved = [values * ratios.of_event(k, logs) > limits for k in range(len(ratios.values))]  # each event is one trial
+    by_events = _binomial_interval(np.mean(moved, axis=0).sum(axis=0) / number_of, len(ratios.values), level)[1]
+    found = Exceedance(limits[0], share, error, *ends, effective, upper_by_events=by_events)
+    return Estimate(found, single, counted, draws)
 
 
-def _with_ratios(
-    values: np.ndarray, limits: np.ndarray, probability_above: Callable[[np.ndarray, np.ndarray], np.ndarray]
-) -> np.ndarray:
-    """Probability that values times a ratio exceed positive limits; values that are not positive never do."""
-    positive = values > 0.0
-    known = np.where(positive, values, 1.0)
-    return np.where(positive, probability_above(limits / known, np.log(known)), 0.0)
-
-
-def contents(has_noise: bool, ratios: EventRatios | None) -> str:
+def _contents(has_noise: bool, ratios: EventRatios | None) -> str:
     """Which uncertainties a probability contains, in words."""
     said = "the uncertainty of the parameters"
     if ratios is not None:
@@ -334,7 +328,7 @@ def warn_of_missing_error(caller: str, how: str, stacklevel: int = 3) -> None:
     )
 
 
-def threshold_in_si(threshold: ArrayLike, unit: str | None, channels: Sequence[Channel]) -> np.ndarray:
+def _threshold_in_si(threshold: ArrayLike, unit: str | None, channels: Sequence[Channel]) -> np.ndarray:
     """Return a threshold [SI]; raise ValueError if it is not finite or its unit has another dimension."""
     try:
         limits = np.asarray(threshold, dtype=float)
@@ -353,7 +347,7 @@ def threshold_in_si(threshold: ArrayLike, unit: str | None, channels: Sequence[C
     return np.asarray(to_si(limits, unit, *dimensions))
 
 
-def unit_of_threshold(unit: str | None, channels: Sequence[Channel]) -> str:
+def _unit_of_threshold(unit: str | None, channels: Sequence[Channel]) -> str:
     """SI unit of a threshold that was given in a unit, or for channels; "SI" where the dimension is not known."""
     dimensions = {channel.dimension for channel in channels} or ({find_unit(unit).dimension} if unit else set())
     return DIMENSIONS[dimensions.pop()] if len(dimensions) == 1 else "SI"

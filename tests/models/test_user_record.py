@@ -1,4 +1,4 @@
-"""Models of the user's own code that receive the record: predictions and fragility under other records."""
+"""Models of the user's own code that receive the record: predictions under other records."""
 
 import pickle
 import sys
@@ -15,8 +15,6 @@ from fe_likelihoods import (
     Measurements,
     OpenSeesModel,
     Record,
-    fragility,
-    peak,
     propagate,
 )
 from tests.opensees_column import require_opensees
@@ -62,11 +60,6 @@ def test_function_with_a_record_is_the_built_in_model_under_any_record(record):
         theirs = propagate(builtin, samples, progress=False, **settings)
         np.testing.assert_array_equal(ours.mean, theirs.mean)
         assert ours.dt == theirs.dt
-    records = [record.scale(factor) for factor in (0.5, 1.0, 2.0)]
-    settings = {"quantity": peak("displacement"), "threshold": 0.03, "progress": False}
-    curves = [fragility(each, samples, records, **settings) for each in (model, builtin)]
-    np.testing.assert_array_equal(curves[0].probability, curves[1].probability)
-    assert 0.0 < curves[0].probability.mean() < 1.0
 
 
 def test_response_with_a_longer_step(record):

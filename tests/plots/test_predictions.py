@@ -19,6 +19,7 @@ from fe_likelihoods import (
 )
 from fe_likelihoods.units import G0
 from tests.plots.reading import shows, texts
+from tests.prediction.flexible import strongest, under
 
 
 @pytest.fixture
@@ -75,12 +76,12 @@ def test_channels_of_bands_can_be_chosen(posterior, samples):
 def test_fragility(posterior, record, rng):
     samples = rng.normal(1.0, 0.2, size=(40, 2))
     records = [record.scale(factor) for factor in (0.7, 0.9, 1.0, 1.1, 1.4)]
-    limit = float(np.median(propagate(posterior, samples, quantity=peak("displacement"), progress=False).values))
-    result = fragility(posterior, samples, records, peak("displacement"), limit, progress=False)
+    peaks = under(records, posterior, samples)
+    result = fragility(peaks, strongest(records), float(np.median(peaks[2].values)), noise=False)
     (axes,) = plot_fragility(result).axes
     points, curve = axes.lines
     np.testing.assert_allclose(points.get_xdata(), result.intensity / G0)
-    np.testing.assert_allclose(points.get_ydata(), result.probability)
+    np.testing.assert_allclose(points.get_ydata(), result.exceedance.probability)
     np.testing.assert_allclose(curve.get_ydata(), result.curve.probability(G0 * curve.get_xdata()), atol=1e-12)
     assert shows(axes, axes.lines)
     assert axes.get_xlabel() == "peak ground acceleration [g]"

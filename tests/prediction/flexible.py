@@ -2,12 +2,13 @@
 
 import numpy as np
 
+from fe_likelihoods import peak, propagate
 from fe_likelihoods.signals.channels import Channel
 from fe_likelihoods.signals.records import Record
 from fe_likelihoods.simulation.model import SimulationFailed
 from fe_likelihoods.units import G0
 
-__all__ = ["DISPERSION", "MEDIAN", "Flexible"]
+__all__ = ["DISPERSION", "MEDIAN", "Flexible", "strongest", "under"]
 
 MEDIAN, DISPERSION = 0.4 * G0, 0.35
 
@@ -34,3 +35,14 @@ class Flexible:
         if np.abs(displacement).max() > self.limit:
             raise SimulationFailed(self.reason)
         return displacement[None]
+
+
+def under(records, model, samples, quantity=peak("displacement"), **settings):
+    """Predictions of a number under each record."""
+    settings = {"from_state": "virgin", "progress": False} | settings
+    return [propagate(model, samples, record=each, quantity=quantity, **settings) for each in records]
+
+
+def strongest(records):
+    """Peak acceleration of each record [m/s²]."""
+    return [np.abs(each.acceleration).max() for each in records]

@@ -26,7 +26,7 @@ from fe_likelihoods.priors.distributions import HalfNormal, LogNormal
 from fe_likelihoods.priors.priors import Prior
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record
-from tests.prediction.flexible import DISPERSION, MEDIAN, Flexible
+from tests.prediction.flexible import DISPERSION, MEDIAN, Flexible, strongest, under
 from tests.prediction.test_new_event import Amplified, hierarchy  # noqa: F401  a fixture
 
 LOGS = np.array([0.1, -0.05, 0.2, 0.0])
@@ -127,7 +127,7 @@ def test_intervals_contain_their_own_probability(hierarchy, record, rng):  # noq
         assert found.upper - found.lower == pytest.approx(1.0 - 0.025 ** (1.0 / 200.0), rel=1e-6)
     model, samples = Flexible(record), rng.normal(0.0, DISPERSION, size=(200, 1))
     records = [record.scale(MEDIAN * k) for k in (0.05, 0.3, 1.0, 3.0, 20.0)]
-    curve = fragility(model, samples, records, peak("displacement"), 0.1, ratios=few, seed=1, progress=False)
+    curve = fragility(under(records, model, samples), strongest(records), 0.1, ratios=few, seed=1).exceedance
     assert np.all(curve.lower <= curve.probability) and np.all(curve.probability <= curve.upper)
 
 
@@ -163,36 +163,6 @@ def test_what_the_events_tell_holds_for_any_tail_of_the_ratios(degrees):
     assert np.mean(normal) > 0.9 if degrees == 50.0 else np.mean(normal) < 0.9
 
 
-def test_fragility_of_a_hierarchy_is_compared_with_all_its_events(wave, rng):
-    events, prior = {"weak": 0.2, "strong": 2.0}, Prior({"gain": LogNormal(1.0, 0.5)})
-    posteriors = {name: with_noise(wave.with_record(wave.record.scale(k)), "si") for name, k in events.items()}
-    tests = {
-        name: StoredPosterior(
-            {"gain": np.exp(0.05 * rng.standard_normal(200))}, prior, measurements=each.likelihood.measurements
-        )
-        for name, each in posteriors.items()
-    }
-    population = HierarchicalPosterior(tests, {"gain": Varying(LogNormal(1.0, 0.5), HalfNormal(0.1))})
-    hierarchy = Hierarchy(population, [1.0, 0.05] * np.exp(0.01 * rng.standard_normal((50, 2))))  # noqa: F811
-    options = {"ratios": event_ratios(hierarchy, posteriors, peak("top")), "seed": 1, "progress": False}
-
-    def said(samples, strength, **more):
-        with warnings.catch_warnings(record=True) as found:
-            warnings.simplefilter("always")
-            records = [wave.record.scale(strength * k) for k in (0.5, 1.0)]
-            fragility(posteriors["weak"], samples, records, peak("top"), 1.0, **options, **more)
-        return [str(each.message) for each in found if "predicted peaks" in str(each.message)]
-
-    assert not said(hierarchy, 2.0)  # ten times the weak event, but as the strong one
-    (beyond,) = said(hierarchy, 20.0)
-    assert "10 times the largest" in beyond and "Hierarchy" not in beyond
-    assert said(hierarchy, 2.0, calibrated=[posteriors["weak"].likelihood.measurements])
-    with pytest.raises(ValueError, match="draws of a Hierarchy and ratios are correlated"):
-        fragility(posteriors["weak"], hierarchy, [wave.record], peak("top"), 1.0, ratios=RATIOS)
-    (single,) = said(rng.normal(1.0, 0.05, size=(50, 1)), 2.0)
-    assert "vary between events (in Python, Hierarchy)" in single
-
-
 def test_each_record_has_the_scatter_that_it_makes_of_the_parameters(wave, rng):
     """Fragility of a population is the probability of each new event; near a resonance it is wider than the mean."""
     posteriors = {
@@ -206,10 +176,10 @@ def test_each_record_has_the_scatter_that_it_makes_of_the_parameters(wave, rng):
     ratios = event_ratios(known, posteriors, **given)
     records, model = [wave.record.scale(k) for k in (0.8, 1.0)], Sharp(wave.record)
     options = {"seed": 1, "progress": False}
-    found = fragility(model, known, records, peak("top"), 0.9, ratios=ratios, **options)
-    for k, record in enumerate(records):
-        new = predict_new_event(known, posteriors, record, model=model, **given, **options)
-        assert found.probability[k] == pytest.approx(float(exceedance(new, 0.9).probability), rel=1e-9)
+    predicted = [predict_new_event(known, posteriors, each, model=model, **given, **options) for each in records]
+    found = fragility(predicted, strongest(records), 0.9)
+    for k, new in enumerate(predicted):
+        assert found.exceedance.probability[k] == float(exceedance(new, 0.9).probability)
         assert new.ratios.new_sd == pytest.approx(np.sqrt(0.3**2 + ratios.remainder), rel=0.05)
         assert new.ratios.new_sd > 2.0 * ratios.new_sd  # control: the mean of the calibrated events
 
@@ -272,72 +242,44 @@ def test_fragility_has_the_error_of_the_model_where_it_is_known(wave, rng):
     posterior = with_noise(wave, "measured")
     samples = np.stack([np.exp(0.02 * rng.standard_normal(300)), 0.3 * np.exp(0.05 * rng.standard_normal(300))], axis=1)
     records = [wave.record.scale(k) for k in (0.7, 0.85, 1.0, 1.15, 1.4)]
-    arguments = (records, peak("top"), float(np.abs(wave.shape).max()))
+    limit, options = float(np.abs(wave.shape).max()), {"quantity": peak("top"), "seed": 1}
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        default = fragility(posterior, samples, *arguments, seed=1, progress=False)
-        named = fragility(posterior, samples, *arguments, noise="model", seed=1, progress=False)
-        parameters = fragility(posterior, samples, *arguments, noise=False, progress=False)
-    np.testing.assert_array_equal(default.probability, named.probability)
-    assert 0.1 < default.curve.dispersion < 0.4
-    assert parameters.probability[[0, 1, 3, 4]].tolist() == [0.0, 0.0, 1.0, 1.0]
-    assert default.uncertainty.endswith("the error of the model, from the noise of the calibration")
-    with pytest.warns(UserWarning, match="fragility: the probabilities leave the error of the model out"):
-        structural = fragility(posterior, samples[:, :1], *arguments, progress=False)
-    np.testing.assert_array_equal(structural.probability, parameters.probability)
-    gaussian = with_noise(wave, "si")
-    with pytest.warns(UserWarning, match="ratios=EventRatios"):
-        fragility(gaussian, samples, *arguments, progress=False)
-    with pytest.warns(UserWarning, match="predicted peaks are outside"):
-        far = [wave.record.scale(k) for k in (4.0, 5.0)]
-        fragility(gaussian, samples, far, *arguments[1:], noise=True, progress=False)
+        found = fragility(under(records, posterior, samples, noise="model", **options), strongest(records), limit)
+    plain = under(records, posterior, samples, **options)
+    with pytest.warns(UserWarning, match="fragility: the probabilities leave the error of the model out") as told:
+        parameters = fragility(plain, strongest(records), limit)
+    assert len(told) == 1 and told[0].filename == __file__
+    assert 0.1 < found.curve.dispersion < 0.4
+    assert parameters.exceedance.probability[[0, 1, 3, 4]].tolist() == [0.0, 0.0, 1.0, 1.0]
+    assert found.exceedance.uncertainty.endswith("the error of the model, from the noise of the calibration")
 
 
 def test_fragility_with_ratios_is_that_of_the_closed_form(record, rng):
     samples = rng.normal(0.0, DISPERSION, size=(2000, 1))
     records = [record.scale(MEDIAN * k) for k in (0.4, 0.7, 1.0, 1.5, 2.5)]
     certain = EventRatios(np.exp([0.2]), prior_sd=0.3, prior_events=1e8)  # a known spread and an unknown mean
-    options = dict(ratios=certain, level=0.5, seed=1, progress=False)
-    found = fragility(Flexible(record), samples, records, peak("displacement"), 0.1, **options)
+    options = dict(ratios=certain, level=0.5, seed=1)
+    predictions = under(records, Flexible(record), samples)
+    curve, found = (each := fragility(predictions, strongest(records), 0.1, **options)).curve, each.exceedance
     spread = np.sqrt(DISPERSION**2 + 2.0 * 0.3**2)
     exact = stats.norm.cdf((np.log([0.4, 0.7, 1.0, 1.5, 2.5]) + 0.2) / spread)
     assert np.all(np.abs(found.probability - exact) < 4.0 * found.standard_error)
-    assert found.curve.dispersion == pytest.approx(spread, rel=0.05)
-    assert found.curve.median == pytest.approx(MEDIAN * np.exp(-0.2), rel=0.05)
+    assert curve.dispersion == pytest.approx(spread, rel=0.05)
+    assert curve.median == pytest.approx(MEDIAN * np.exp(-0.2), rel=0.05)
     # Draws: samples and means of the ratio are unknown, the spread between events is not.
     z = (np.log(1.5) + 0.2 + np.hypot(DISPERSION, 0.3) * stats.norm.ppf([0.25, 0.75])) / 0.3
     np.testing.assert_allclose([found.lower[3], found.upper[3]], special.ndtr(z), atol=0.05)
-    single = fragility(Flexible(record), samples, records[2:3], peak("displacement"), 0.1, **options)
-    assert single.probability[0] == pytest.approx(found.probability[2], rel=1e-12)
-    one = exceedance(
-        propagate(Flexible(record), samples, quantity=peak("displacement"), record=records[2], progress=False),
-        0.1,
-        ratios=certain,
-    )
-    assert float(one.probability) == pytest.approx(found.probability[2], rel=1e-12)
+    assert float(exceedance(predictions[2], 0.1, ratios=certain).probability) == found.probability[2]
 
 
-def test_failures_and_what_cannot_be_used(record, rng):
-    samples = rng.normal(0.0, DISPERSION, size=(200, 1))
-    records = [record.scale(MEDIAN * k) for k in (0.5, 1.0, 2.0)]
-    model = Flexible(record, limit=0.15)
-    options = dict(ratios=RATIOS, seed=1, progress=False)
-    collapsing = Flexible(record, 0.15, "collapse")
-    counted = fragility(collapsing, samples, records, peak("displacement"), 0.1, **options)
-    left_out = fragility(model, samples, records, peak("displacement"), 0.1, **options)
-    assert counted.n_collapsed[2] > 50 and np.array_equal(counted.n_collapsed, left_out.n_failed)
-    assert counted.probability[2] > left_out.probability[2] + 0.05
-    assert np.all(left_out.lower < left_out.probability) and np.all(left_out.probability < left_out.upper)
-    with pytest.raises(ValueError, match="ratios contain the error of the model already"):
-        fragility(model, samples, records, peak("displacement"), 0.1, ratios=RATIOS, noise=True)
-    with pytest.raises(ValueError, match="those of one quantity"):
-        fragility(model, samples, records, peak("displacement"), 0.1, ratios=EventRatios([[1.0, 1.0]] * 2))
-    with pytest.raises(ValueError, match="positive threshold"):
-        fragility(model, samples, records, peak("displacement"), -0.1, ratios=RATIOS)
+def test_what_cannot_be_used_with_ratios_is_refused(record):
     with pytest.raises(ValueError, match="thresholds must be positive"):
         exceedance([1.0, 2.0], 0.0, ratios=RATIOS)
     with pytest.raises(ValueError, match=r"ratios \(n_events, ...\) of a quantity of shape \(\)"):
         exceedance([1.0, 2.0], 1.0, ratios=EventRatios([[1.0, 1.0]] * 2))
-    prediction = propagate(Flexible(record), samples, quantity=peak("displacement"), progress=False)
+    (prediction,) = under([record], Flexible(record), np.zeros((3, 1)))
     with pytest.raises(ValueError, match="the prediction contains one"):
         exceedance(replace(prediction, noise=True), 0.1, noise=False)
+    with pytest.raises(ValueError, match="contain the error of the model, and the prediction contains it already"):
+        exceedance(replace(prediction, noise=True), 0.1, ratios=RATIOS)

@@ -17,7 +17,6 @@ from fe_likelihoods import (
     Record,
     ShearFrame,
     average_predictions,
-    fragility,
     peak,
     propagate,
 )
@@ -77,9 +76,6 @@ def test_default_is_named_in_a_warning_at_the_line_of_the_user(record):
     with pytest.warns(UserWarning, match='Slip may depend .* virgin structure.*from_state="end"') as caught:
         prediction = propagate(model, samples, record=record.scale(2.0), progress=False)
     assert prediction.from_state == "virgin" and caught[0].filename == __file__
-    with pytest.warns(UserWarning, match="virgin structure") as caught:
-        result = fragility(model, samples, [record, record.scale(2.0)], peak("slip"), 1.0, noise=False, progress=False)
-    assert result.from_state == "virgin" and len(caught) == 1 and caught[0].filename == __file__
 
 
 def test_no_warning_before_an_error(record):
@@ -88,8 +84,6 @@ def test_no_warning_before_an_error(record):
         warnings.simplefilter("error")
         with pytest.raises(ValueError, match="has one excitation, which its code contains"):
             propagate(model, np.ones((2, 1)), record=record, progress=False)
-        with pytest.raises(ValueError, match="has one excitation, which its code contains"):
-            fragility(model, np.ones((2, 1)), [record], peak("slip"), 1.0, noise=False, progress=False)
 
 
 def test_no_warning_without_memory_or_without_a_record(record):
@@ -99,17 +93,6 @@ def test_no_warning_without_memory_or_without_a_record(record):
         assert propagate(oscillator, samples, record=record, progress=False).from_state == "virgin"
         propagate(Slip(record), np.array([[0.1]]), progress=False)
         propagate(Slip(record), np.array([[0.1]]), record=record, from_state="virgin", progress=False)
-
-
-def test_fragility_from_the_end(record):
-    model, samples = Slip(record), np.linspace(0.1, 0.6, 40)[:, None]
-    records = [record.scale(factor) for factor in (0.2, 0.6, 1.0, 1.4)]
-    settings = {"quantity": peak("slip"), "threshold": 14.0, "progress": False}
-    end = fragility(model, samples, records, from_state="end", rest=0.5, **settings)
-    virgin = fragility(model, samples, records, from_state="virgin", **settings)
-    expected = [np.mean([last(model, each, 0.5, theta).max() > 14.0 for theta in samples]) for each in records]
-    np.testing.assert_allclose(end.probability, expected)
-    assert end.from_state == "end" and (end.probability > virgin.probability).all()
 
 
 def test_the_column_is_cracked_by_the_first_record(eq1):

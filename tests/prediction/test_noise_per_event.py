@@ -10,8 +10,6 @@ from fe_likelihoods import (
     LinearOscillator,
     Measurements,
     Record,
-    fragility,
-    peak,
     propagate,
 )
 
@@ -62,11 +60,6 @@ def test_another_record_has_the_levels_of_a_named_event(likelihood, samples):
         propagate(likelihood, samples, noise="EQ3", **settings)
     with pytest.raises(ValueError, match="channels displacement were not measured in 'EQ2'"):
         propagate(likelihood, samples, noise="EQ2", **settings)
-    records = [settings["record"].scale(factor) for factor in (0.5, 1.0)]
-    limits = {"quantity": peak("acceleration"), "threshold": 1.0, "from_state": "virgin", "progress": False}
-    assert fragility(likelihood, samples, records, noise="EQ1", **limits).probability.shape == (2,)
-    with pytest.raises(ValueError, match="noise= one of"):
-        fragility(likelihood, samples, records, noise=True, **limits)
 
 
 def test_refusals(likelihood, samples):

@@ -15,10 +15,10 @@ from fe_likelihoods import (
     propagate,
 )
 from fe_likelihoods.checks.finding import CARE, Finding
-from fe_likelihoods.prediction.fragility_curve import fit_fragility
+from fe_likelihoods.prediction.fragility import fit_fragility
 from fe_likelihoods.prediction.held_out import HeldOutScore, HeldOutScores
 from fe_likelihoods.prediction.score_tables import score_values
-from tests.prediction.flexible import Flexible
+from tests.prediction.flexible import Flexible, strongest, under
 
 RECORD = Record("base", 0.1, np.sin(np.arange(40.0)))
 RATIOS = EventRatios([0.8, 1.0, 1.25])
@@ -70,23 +70,15 @@ def test_exceedance_and_fragility(predicted):
     assert cells(str(exceedance([0.1, 0.2], 0.15, noise=False)), 0)[0] == "threshold [SI]"
     assert cells(str(exceedance([0.1, 0.2], 15.0, unit="cm", noise=False)), 0)[0] == "threshold [m]"
     records = [RECORD.scale(factor) for factor in (0.5, 1.0, 2.0)]
-    curve = fragility(
-        Flexible(RECORD),
-        np.linspace(-0.5, 0.5, 41)[:, None],
-        records,
-        peak("displacement"),
-        2.0,
-        unit="cm",
-        ratios=RATIOS,
-        seed=1,
-        progress=False,
-    )
+    predictions = under(records, Flexible(RECORD), np.linspace(-0.5, 0.5, 41)[:, None])
+    curve = fragility(predictions, strongest(records), 2.0, unit="cm", ratios=RATIOS, seed=1)
     text = str(curve)
-    assert text.startswith("Probability to exceed 0.02 m, from the state 'virgin'")
-    assert cells(text, 1)[1] == "intensity [m/s2]"
-    assert [float(cells(text, row)[2]) for row in (2, 3, 4)] == pytest.approx(list(curve.probability), rel=5e-3)
+    assert text.startswith("Probability to exceed 0.02 m\n") and cells(text, 1)[0] == "intensity"
+    assert [float(cells(text, row)[1]) for row in (2, 3, 4)] == pytest.approx(
+        list(curve.exceedance.probability), rel=5e-3
+    )
     assert f"lognormal fragility curve: median {curve.curve.median:.3g}" in text and "array" not in text
-    assert " m/s2, dispersion" in str(curve.curve) and "SI" not in text
+    assert text.endswith(f"The probabilities contain {curve.exceedance.uncertainty}.")
     alone = str(fit_fragility([1.0, 2.0, 3.0], [1, 5, 9], [10, 10, 10]))
     assert alone.count("+-") == 0 and "SI" not in alone
 
