@@ -1,13 +1,13 @@
 """Figure of prediction scores: calibration, coverage with its error, and sharpness beside it.
 
 A single share of samples in a band says little. The figure shows where measured values are in the predicted
-distributions (histogram of the probability integral transform, PIT), the coverage of all and of strong response,
-and the cost: the band's width, and the interval score, which adds a penalty for every value outside it.
+distributions (histogram of the probability integral transform, PIT), the coverage, and the cost: the band's width, and
+the interval score, which adds a penalty for every value outside it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,14 +19,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from ..prediction.score_tables import HistoryScores, QuantityScores
+    from ..prediction.scores import HistoryScores, QuantityScores
 
 __all__ = ["plot_scores"]
 
-_PARTS = {"all": "coverage", "strong part": "coverage_strong"}
 _BAND = 0.9  # probability of the bands for calibrated predictions
 _BINS = 10
-_SPAN = 0.1  # of coverages below the level that is shown at least
 _FEWEST = 3  # events whose scatter is drawn as standard errors
 
 
@@ -45,10 +43,10 @@ def plot_scores(
     matplotlib Figure
         Three axes. Left: shares of the PIT in equal parts of 0 to 1 (ten for histories), with the band that contains
         90 % of the shares of calibrated predictions (binomial, for the number of independent samples), and standard
-        errors of their mean between histories for three events or more. Histories: coverage of all samples and of the
-        strong part, with its standard error between events for three events or more, else, for all samples, binomial
-        for the number of independent ones; and the interval score of each channel, which is the width of the band and
-        a penalty, as multiples of the root mean square of the measured channel. Numbers: median, 50 % and outer
+        errors of their mean between histories for three events or more. Histories: coverage of each channel, with its
+        standard error between events for three events or more, else binomial for the number of independent samples; and
+        the interval score, which is the width of the band and a penalty, as multiples of the root mean square of the
+        measured channel. Numbers: median, 50 % and outer
         interval divided by the measured value, in the order of the events, and the shares of measured values in the
         intervals, with the mean width and score of the outer ones.
 
@@ -98,53 +96,32 @@ def _history_axes(axes: np.ndarray, events: Mapping[str, HistoryScores]) -> None
         axes[0].errorbar(at, known.mean(axis=0), error, fmt="none", color=ORANGE, linewidth=1.2, label="between events")
     _add_room_for_legend(axes[0])
 
-    names = list(dict.fromkeys(channel.name for each in events.values() for channel in each.channels))
-    for k, name in enumerate(names):
-        coverage, errors = _coverage_of(name, list(events.values()))
-        at = np.arange(len(_PARTS)) + 0.12 * (k - 0.5 * (len(names) - 1))
-        axes[1].errorbar(at, coverage, errors, fmt="o", markersize=4, linewidth=1, color=_colour(k), label=name)
-    axes[1].axhline(level, color=GREY, linewidth=0.8)
-    axes[1].set_xticks(range(len(_PARTS)), _PARTS)
-    axes[1].set_xlabel("samples")
-    axes[1].set_ylabel(f"share in the {level:.0%} band [-]")
+    found: dict[str, list[tuple[float, ...]]] = {}  # of each channel: coverage, independent samples, width, penalty
+    for each in events.values():
+        penalty = (each.interval_score - each.width) / each.rms
+        columns = each.coverage, each.effective_samples, each.width / each.rms, penalty
+        for channel, *row in zip(each.channels, *columns, strict=True):
+            found.setdefault(channel.name, []).append(row)
+    for place, rows in enumerate(found.values()):
+        share, worth, width, penalty = np.transpose(rows)
+        error = np.sqrt(level * (1.0 - level) * np.sum(1.0 / np.maximum(worth, 1.0))) / len(rows)
+        error = share.std(ddof=1) / np.sqrt(len(rows)) if len(rows) >= _FEWEST else error
+        axes[1].errorbar(share.mean(), place, xerr=error, fmt="o", markersize=4, linewidth=1, color=BLUE)
+        text = ("width", "penalty of values outside") if place == 0 else (None, None)
+        axes[2].barh(place, width.mean(), 0.6, color=BLUE, alpha=0.6, label=text[0])
+        axes[2].barh(place, penalty.mean(), 0.6, width.mean(), color=ORANGE, label=text[1])
+    axes[1].axvline(level, color=GREY, linewidth=0.8)
+    axes[1].set_xlabel(f"share in the {level:.0%} band [-]")
     axes[1].set_title("coverage", fontsize="medium")
-    axes[1].set_ylim(min(level - _SPAN, axes[1].dataLim.ymin - 0.02), 1.03)
-    if len(names) > 1:
-        axes[1].legend(
-            frameon=False, fontsize="small", ncols=4, loc="upper center", bbox_to_anchor=(0.5, -0.2), columnspacing=1.0
-        )
-
-    widths, penalties = np.transpose([_sharpness_of(name, list(events.values())) for name in names])
-    axes[2].barh(names, widths, 0.6, color=BLUE, alpha=0.6, label="width")
-    axes[2].barh(names, penalties, 0.6, widths, color=ORANGE, label="penalty of values outside")
-    axes[2].set_ylim(len(names) - 0.4, -0.6)
+    axes[1].set_xlim(None, 1.03)
     axes[2].set_xlabel("interval score / RMS of the measured channel [-]")
     axes[2].set_title(f"sharpness: score of the {level:.0%} band", fontsize="medium")
     axes[2].legend(frameon=False, fontsize="small", ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.2))
+    for each in axes[1:]:
+        each.set_yticks(range(len(found)), found)
+        each.set_ylim(len(found) - 0.4, -0.6)
     for each in axes:
         each.grid(alpha=0.25)
-
-
-def _sharpness_of(name: str, events: Sequence[HistoryScores]) -> tuple[float, float]:
-    """Mean width and mean penalty of a channel, whose sum is the interval score, over its root mean square."""
-    found = [
-        (each.width[k] / each.rms[k], (each.interval_score[k] - each.width[k]) / each.rms[k])
-        for each in events
-        for k, channel in enumerate(each.channels)
-        if channel.name == name
-    ]
-    return tuple(np.nanmean(found, axis=0).tolist())
-
-
-def _coverage_of(name: str, events: Sequence[HistoryScores]) -> tuple[np.ndarray, np.ndarray]:
-    """Mean coverage (2,) of a channel, of all samples and of the strong part, and its standard errors."""
-    found = [(each, k) for each in events for k, channel in enumerate(each.channels) if channel.name == name]
-    shares = np.array([[getattr(each, part)[k] for part in _PARTS.values()] for each, k in found])
-    errors = shares.std(axis=0, ddof=1) / np.sqrt(len(found)) if len(found) >= _FEWEST else np.full(2, np.nan)
-    if len(found) < _FEWEST:
-        worth, level = np.array([each.effective_samples[k] for each, k in found]), events[0].level
-        errors[0] = np.sqrt(level * (1.0 - level) * np.sum(1.0 / np.maximum(worth, 1.0))) / len(found)
-    return shares.mean(axis=0), errors
 
 
 def _number_axes(axes: np.ndarray, events: Mapping[str, QuantityScores]) -> None:
@@ -230,7 +207,3 @@ def _chance(n: int, probability: float) -> tuple[float, float]:
 
     low, high = binom.ppf([0.5 - 0.5 * _BAND, 0.5 + 0.5 * _BAND], n, probability)
     return low / n, high / n
-
-
-def _colour(k: int) -> str:
-    return (BLUE, ORANGE, GREY, "#3f8f5b", "#a23b72", "#6b4ba1")[k % 6]

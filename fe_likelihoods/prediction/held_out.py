@@ -12,8 +12,7 @@ from ..units import from_si
 from .new_event import predict_new_event
 from .prediction import Prediction
 from .quantities import Quantity
-from .score_tables import HistoryScores, QuantityScores
-from .scores import share_within
+from .scores import HistoryScores, QuantityScores, share_within
 
 __all__ = ["HeldOutScore", "HeldOutScores", "LeftOutTests", "leave_one_out"]
 
@@ -42,7 +41,7 @@ class HeldOutScore(NamedTuple):
                 found[f"interval score of {channel.name} [{channel.unit}]"] = number(
                     from_si(scores.interval_score[k], channel.unit)
                 )
-                found[f"strong part of {channel.name} in band"] = f"{scores.coverage_strong[k]:.1%}"
+                found[f"{channel.name} in band"] = f"{scores.coverage[k]:.1%}"
         return found | {"log density": number(self.log_density, 5)}
 
     def __str__(self) -> str:

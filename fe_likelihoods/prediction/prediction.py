@@ -14,7 +14,7 @@ from ..signals.comparison import Comparison, compare_with
 from ..text_tables import number, text_table
 from ..units import find_unit
 from .quantities import measured_quantity
-from .score_tables import HistoryScores, QuantityScores, score_histories, score_values
+from .scores import HistoryScores, QuantityScores, score_histories, score_values
 
 if TYPE_CHECKING:
     import xarray

@@ -8,8 +8,7 @@ import numpy as np
 from ..checks.finding import Finding
 from ..checks.transfer import check_failed_samples
 from ..prediction.prediction import Prediction
-from ..prediction.score_tables import HistoryScores, QuantityScores, central_interval
-from ..prediction.scores import share_within
+from ..prediction.scores import HistoryScores, QuantityScores, central_interval, share_within
 from ..signals.channels import Measurements
 from ..simulation.model import SimulationFailed
 from ..units import from_si
@@ -150,12 +149,9 @@ def _sentence(
     for scores in histories:
         shares = ", ".join(
             f"{_percent(share)} of {channel.name}"
-            for channel, share in zip(scores.channels, scores.coverage_strong, strict=True)
-            if np.isfinite(share)
+            for channel, share in zip(scores.channels, scores.coverage, strict=True)
         )
-        text += f" In the strong part, the {_percent(LEVEL)} band contains {shares}." if shares else ""
-        unknown = [c.name for c, share in zip(scores.channels, scores.coverage_strong, strict=True) if np.isnan(share)]
-        text += f" In the strong part, no sample of {', '.join(unknown)} can be compared." if unknown else ""
+        text += f" The {_percent(LEVEL)} band contains {shares}."
     if not first.noise:
         text += " A band without noise is that of the response, and contains fewer measurements."
     return text

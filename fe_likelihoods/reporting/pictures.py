@@ -15,7 +15,7 @@ from ..checks.run import FinishedRun
 from ..plots.fits import plot_fit
 from ..plots.without_time import plot_modes, plot_points
 from ..prediction.prediction import Prediction
-from ..prediction.score_tables import HistoryScores, QuantityScores
+from ..prediction.scores import HistoryScores, QuantityScores
 from .other_events import OtherEvent
 
 if TYPE_CHECKING:

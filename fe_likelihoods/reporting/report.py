@@ -17,7 +17,7 @@ from ..checks.run import FinishedRun, read_run
 from ..checks.table import ParameterRow
 from ..information.identifiability import of_samples
 from ..prediction.prediction import Prediction
-from ..prediction.score_tables import HistoryScores, QuantityScores
+from ..prediction.scores import HistoryScores, QuantityScores
 from ..signals.channels import Measurements
 from ..simulation.model import SimulationFailed
 from ..units import from_si

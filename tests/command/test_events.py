@@ -95,7 +95,7 @@ def test_events_are_predicted_and_scored(finished, run_once):
         assert [float(cells[2]), float(cells[5])] == pytest.approx(shown, rel=6e-3)
         assert cells[6].startswith("within") == (0.05 <= float(row["pit"]) <= 0.95)
     assert all(row[5:7] == ["–", "not known"] for row in numbers[2:])
-    histories = next(table for table in report.tables if table[0][-1] == "In its strong part")[1:]
+    histories = next(table for table in report.tables if table[0][-1] == "In the 90 % band")[1:]
     assert [row[0] for row in histories] == ["weaker", "weaker"]
     assert sum(alt.startswith("Predicted histories") and "in the event" in alt for _, alt in report.images) == 2
     assert "predicted peaks are outside" not in report.text or any(

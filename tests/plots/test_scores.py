@@ -7,7 +7,7 @@ from matplotlib.text import Text
 from scipy import stats
 
 from fe_likelihoods.plots.scores import plot_scores
-from fe_likelihoods.prediction.score_tables import score_histories, score_values
+from fe_likelihoods.prediction.scores import score_histories, score_values
 from fe_likelihoods.signals.channels import Channel
 
 CHANNELS = (Channel("deck", "absolute acceleration", "g"), Channel("drift", "relative displacement", "mm"))
@@ -56,27 +56,27 @@ def test_correlated_errors_widen_the_band_of_chance_and_the_errors_of_the_covera
     assert ends[1] > 2.0 * ends[0]
     drawn = plot_scores(white).axes[1].containers[0][2][0].get_segments()[0]
     expected = np.sqrt(0.9 * 0.1 / white.effective_samples[0])
-    assert 0.5 * np.ptp(drawn[:, 1]) == pytest.approx(expected, rel=1e-3)
+    assert 0.5 * np.ptp(drawn[:, 0]) == pytest.approx(expected, rel=1e-3)
     plt.close("all")
 
 
 def test_bars_show_width_and_penalty_in_multiples_of_the_rms(rng):
     one, other = histories(rng), histories(rng, factor=0.5)
     axes = plot_scores({"one": one, "other": other}).axes[2]
-    ends = [patch.get_x() + patch.get_width() for patch in axes.patches]  # of both channels, widths first
-    np.testing.assert_allclose(ends[:2], np.mean([each.width / each.rms for each in (one, other)], axis=0))
-    np.testing.assert_allclose(ends[2:], np.mean([each.interval_score / each.rms for each in (one, other)], axis=0))
+    ends = [patch.get_x() + patch.get_width() for patch in axes.patches]  # of both channels, width and penalty
+    np.testing.assert_allclose(ends[::2], np.mean([each.width / each.rms for each in (one, other)], axis=0))
+    np.testing.assert_allclose(ends[1::2], np.mean([each.interval_score / each.rms for each in (one, other)], axis=0))
     plt.close("all")
 
 
 def test_coverage_of_several_events_has_the_error_between_events(rng):
     events = {f"EQ{k}": histories(rng, factor) for k, factor in enumerate((0.5, 1.0, 2.0))}
     axes = plot_scores(events).axes[1]
-    each = np.array([(scores.coverage[0], scores.coverage_strong[0]) for scores in events.values()])
-    center, lengths = axes.containers[0][0].get_ydata(), axes.containers[0][2][0].get_segments()
-    np.testing.assert_allclose(center, each.mean(axis=0))
-    half = [0.5 * (segment[1, 1] - segment[0, 1]) for segment in lengths]
-    np.testing.assert_allclose(half, each.std(axis=0, ddof=1) / np.sqrt(3))
+    each = np.array([scores.coverage for scores in events.values()])
+    for k, drawn in enumerate(axes.containers):
+        (segment,) = drawn[2][0].get_segments()
+        assert drawn[0].get_xdata()[0] == pytest.approx(each[:, k].mean())
+        assert 0.5 * np.ptp(segment[:, 0]) == pytest.approx(each[:, k].std(ddof=1) / np.sqrt(3))
     plt.close("all")
 
 

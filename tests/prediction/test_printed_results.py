@@ -17,7 +17,7 @@ from fe_likelihoods import (
 from fe_likelihoods.checks.finding import CARE, Finding
 from fe_likelihoods.prediction.fragility import fit_fragility
 from fe_likelihoods.prediction.held_out import HeldOutScore, HeldOutScores
-from fe_likelihoods.prediction.score_tables import score_values
+from fe_likelihoods.prediction.scores import score_values
 from tests.prediction.flexible import Flexible, strongest, under
 
 RECORD = Record("base", 0.1, np.sin(np.arange(40.0)))

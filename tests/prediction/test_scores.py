@@ -11,13 +11,13 @@ from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.prediction.propagation import propagate
 from fe_likelihoods.prediction.quantities import final_value, peak, rms
-from fe_likelihoods.prediction.score_tables import score_values, strong_part
 from fe_likelihoods.prediction.scores import (
     crps_normal,
     crps_samples,
     interval_score,
     pit_normal,
     pit_samples,
+    score_values,
     share_within,
 )
 from fe_likelihoods.priors.distributions import HalfNormal, TruncatedNormal
@@ -102,13 +102,6 @@ def test_share_within_leaves_missing_values_out_and_refuses_others():
             share_within(bad, 0.9)
 
 
-def test_strong_part():
-    time = np.arange(1000) * 0.01
-    history = np.where(np.abs(time - 5.0) < 2.0, 2.0, 0.01) * np.sin(2.0 * np.pi * 5.0 * time)
-    strong = strong_part(history)
-    assert time[strong][0] == pytest.approx(3.2, abs=0.06) and time[strong][-1] == pytest.approx(6.8, abs=0.06)
-
-
 @pytest.fixture
 def oscillator(record):
     return LinearOscillator(record)
@@ -167,7 +160,7 @@ def test_the_true_noise_scores_best_and_covers_every_level(rng):
             getattr(right, name) < getattr(wide, name)
         ).all()
     error = 4.0 * np.sqrt(0.09 / 300)
-    assert (np.abs(right.coverage - 0.9) < error).all() and (np.abs(right.coverage_strong - 0.9) < error).all()
+    assert (np.abs(right.coverage - 0.9) < error).all()
     assert (narrow.coverage < 0.6).all() and (wide.coverage > 0.98).all()
     assert (np.abs(right.pit - 0.1) < 4.0 * np.sqrt(0.09 / 3000)).all()
     assert (narrow.pit[:, [0, -1]] > 0.2).all() and (wide.pit[:, 4:6] > 0.15).all()

@@ -50,11 +50,11 @@ def test_events_have_tables_sentences_and_figures(vibrating, tmp_path):
         in page.text
     )
     assert "There are no measurements to compare with" in page.text
-    histories = next(table for table in page.tables if table[0][-1] == "In its strong part")[1:]
+    histories = next(table for table in page.tables if table[0][-1] == "In the 90 % band")[1:]
     scores = events["larger"]["histories"].score(measured["larger"])
     assert [row[0] for row in histories] == ["same", "larger"]
     assert float(histories[1][5]) == pytest.approx(1e3 * scores.interval_score[0], rel=5e-3)
-    assert histories[1][8] == f"{100 * scores.coverage_strong[0]:.3g} %"
+    assert histories[1][7] == f"{100 * scores.coverage[0]:.3g} %"
     drawn = [alt for _, alt in page.images]
     assert sum("in the event" in alt for alt in drawn) == 3
     assert "Predicted intervals by measured values of same, larger." in drawn
