@@ -3,26 +3,22 @@
 import logging
 import math
 import warnings
-from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..checks.finding import FindingWarning, labelled
+from ..checks.finding import FindingWarning
 from ..likelihood.likelihood import FELikelihood
 from ..noise.protocol import follows_response
 from ..prediction.prediction import Prediction
-from ..reporting.other_events import OtherEvent, describe_event
 from ..signals.channels import Measurements
 from ..signals.records import Record
 from ..simulation.model import SimulationFailed
 from .data import read_base_motion, read_measured, reduce_data
 from .job import Job
 from .models import Problem
-from .results import write_csv
 
-__all__ = ["Event", "describe_events", "predict_events", "predict_quietly", "read_events", "write_events"]
+__all__ = ["Event", "predict_events", "predict_quietly", "read_events"]
 
 logger = logging.getLogger(__name__)
 
@@ -132,57 +128,3 @@ def _predict_event(
         more = options | {"record": event.record, "quantity": some, "noise": noise, "progress": progress}
         found |= predict_quietly(job, problem, samples, **more)
     return found
-
-
-def describe_events(
-    events: tuple[Event, ...], predictions: Mapping[str, dict[str, Prediction] | SimulationFailed]
-) -> tuple[OtherEvent, ...]:
-    """Numbers, scores and sentences of the events, including events whose simulations have all failed."""
-    return tuple(
-        describe_event(event.name, predictions[event.name], event.measured)
-        for event in events
-        if event.name in predictions
-    )
-
-
-def write_events(folder: Path, events: tuple[Event, ...], described: tuple[OtherEvent, ...]) -> tuple[str, ...]:
-    """Write ``event-NAME.txt``, ``.csv`` and ``.png`` of each event that has a prediction; returns their names.
-
-    The events were described by `describe_events`.
-    """
-    files: list[str] = []
-    by_name = {event.name: event for event in events}
-    for found in described:
-        if not found.predictions:
-            continue
-        names = tuple(f"event-{found.name}.{ending}" for ending in ("txt", "csv", "png"))
-        _write_event([folder / name for name in names], by_name[found.name], found)
-        files += names
-    return tuple(files)
-
-
-def _write_event(paths: list[Path], event: Event, found: OtherEvent) -> None:
-    from ..plots.predictions import plot_bands
-    from ..reporting.pictures import save_picture
-    from ..text_tables import text_table
-
-    steps = f"{event.record.n_steps} samples at {event.record.dt:g} s"
-    lines = [f"Event {event.name}: {event.record.name}, {steps}", found.sentence]
-    lines += labelled(found.findings)
-    if found.values:
-        lines += ["", "Peaks against the measurements", *map(str, found.values)]
-    else:
-        rows = [(row.name, row.unit, *(f"{value:.3g}" for value in (row.median, *row.ends))) for row in found.numbers]
-        lines += ["", "Peaks", text_table([("quantity", "unit", "median", "5 %", "95 %"), *rows])]
-    if found.histories:
-        lines += ["", "Histories against the measurements", *map(str, found.histories)]
-    paths[0].write_text("\n".join(lines) + "\n", encoding="utf-8")
-    rows = []
-    for channel, row in zip(found.predictions["peaks"].channels, found.numbers, strict=True):
-        values = {"q05": row.ends[0], "q25": row.quartiles[0], "median": row.median}
-        values |= {"q75": row.quartiles[1], "q95": row.ends[1]}
-        if event.measured is not None:
-            values |= {"measured": row.measured, "pit": row.pit}
-        rows.append({"channel": channel.name, "unit": row.unit} | values)
-    write_csv(paths[1], rows)
-    save_picture(plot_bands(found.predictions["histories"], event.measured), paths[2])

@@ -11,7 +11,7 @@ import functools
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, get_type_hints
+from typing import Any, NamedTuple
 
 from ..signals.tables import is_clock
 from ..units import DIMENSIONS, to_si
@@ -45,19 +45,20 @@ class Key(NamedTuple):
     required: bool = False  # whether it has no default
 
 
-def key(meaning: str, default: Any = None) -> Any:
+def key(kind: str, meaning: str, default: Any = None) -> Any:
     """A field of a section; without a default (None) it may be left out, and ``...`` means that it may not."""
-    return dataclasses.field(metadata={"meaning": meaning}, **({} if default is ... else {"default": default}))
+    given = {} if default is ... else {"default": default}
+    return dataclasses.field(metadata={"kind": kind, "meaning": meaning}, **given)
 
 
 @functools.cache
 def keys_of(section: type) -> tuple[Key, ...]:
-    """Keys of a section: kinds from the annotations of its fields, meanings with defaults as TOML writes them."""
-    kinds, found = get_type_hints(section, include_extras=True), []
+    """Keys of a section, from its fields; the meanings have the defaults as TOML writes them."""
+    found = []
     for each in sorted(dataclasses.fields(section), key=lambda each: each.name in getattr(section, "READING", ())):
         required = each.default is dataclasses.MISSING
         given = "" if required or each.default is None else f" ({_as_toml(each.default)})"
-        found.append(Key(each.name, kinds[each.name].__metadata__[0], each.metadata["meaning"] + given, required))
+        found.append(Key(each.name, each.metadata["kind"], each.metadata["meaning"] + given, required))
     return tuple(found)
 
 

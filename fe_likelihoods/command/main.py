@@ -96,11 +96,10 @@ def main(ctx: click.Context, debug: bool) -> None:
 @main.command()
 @click.argument("file", type=_FILE)
 @click.option("--out", type=_FILE, help="Folder of the run.", show_default="results-NAME for NAME.toml")
-@click.option("--resume", is_flag=True, help="Continue the run in the folder; an error if there is none.")
 @click.option("--overwrite", is_flag=True, help="Delete the run in the folder and start again.")
 @click.option("--quiet", is_flag=True, help="Show no progress bars.")
 @click.pass_context
-def run(ctx: click.Context, file: Path, out: Path | None, resume: bool, overwrite: bool, quiet: bool) -> None:
+def run(ctx: click.Context, file: Path, out: Path | None, overwrite: bool, quiet: bool) -> None:
     """Sample the posterior that FILE (TOML) describes; write report, tables and samples to a folder.
 
     The same command continues a run that was killed. A folder with a run of other settings is refused; [budget],
@@ -110,10 +109,8 @@ def run(ctx: click.Context, file: Path, out: Path | None, resume: bool, overwrit
 
     folder = out or default_folder(file)
     again = shlex.join(["fe-likelihoods", "run", str(file), *([] if out is None else ["--out", str(out)])])
-    if resume and overwrite:
-        raise click.UsageError("--resume continues the run and --overwrite deletes it: give one of them")
     ctx.obj["interrupted"] = f"Interrupted. What was computed is kept in {folder}/; go on with: {again}"
-    outcome = run_job(file, out, resume, overwrite, progress=not quiet)
+    outcome = run_job(file, out, overwrite, progress=not quiet)
     _show(outcome)
     ctx.exit(0 if outcome.usable else NOT_USABLE)
 

@@ -14,9 +14,10 @@ from ..checks.run import FinishedRun
 from ..checks.table import moments_of
 from ..likelihood.likelihood import FELikelihood
 from ..prediction.prediction import Prediction
+from ..reporting.other_events import OtherEvent
 from ..signals.error_measures import rrmse
 
-__all__ = ["names_of", "write_csv", "write_samples", "write_tables"]
+__all__ = ["names_of", "write_events", "write_samples", "write_tables"]
 
 
 def write_tables(folder: Path, run: FinishedRun, judged: JudgedRun, agreement: str = "") -> tuple[str, ...]:
@@ -53,11 +54,11 @@ def write_tables(folder: Path, run: FinishedRun, judged: JudgedRun, agreement: s
     nominal = [parameter.shown(parameter.nominal) for parameter in run.parameters]
     values = (labels, moments.mean, errors, moments.sd, of_sd, moments.cv, low, median, high, nominal)
     rows = [dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True)]
-    write_csv(folder / "summary.csv", rows)
+    _write_csv(folder / "summary.csv", rows)
     files = ["summary.txt", "summary.csv", "stages.txt"]
     for key, (rows, _) in fits.items():
         name = f"fit-{key}.csv" if key else "fit.csv"
-        write_csv(folder / name, rows)
+        _write_csv(folder / name, rows)
         files.append(name)
     (folder / "stages.txt").write_text(ladder_table(run.sampler) + "\n", encoding="utf-8")
     return tuple(files)
@@ -113,12 +114,26 @@ def _modes(fit: ModalFit) -> Table:
     return rows or [{"mode": ""}], lines
 
 
-def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
+def _write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
     """Write rows with the same keys as a CSV file with a header."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, rows[0])
         writer.writeheader()
         writer.writerows(rows)
+
+
+def write_events(folder: Path, events: Sequence[OtherEvent]) -> tuple[str, ...]:
+    """Write the predicted numbers of all events to ``events.csv``, in the units of the report; returns its name."""
+    rows = []
+    for event in events:
+        for row in event.numbers:
+            (q25, q75), (q05, q95) = row.quartiles, row.ends
+            values = {"q05": q05, "q25": q25, "median": row.median, "q75": q75, "q95": q95}
+            known = {"measured": row.measured, "pit": row.pit} if np.isfinite(row.pit) else {"measured": "", "pit": ""}
+            rows.append({"event": event.name, "quantity": row.name, "unit": row.unit} | values | known)
+    if rows:
+        _write_csv(folder / "events.csv", rows)
+    return ("events.csv",) if rows else ()
 
 
 def write_samples(

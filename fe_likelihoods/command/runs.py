@@ -22,10 +22,11 @@ from ..checks.rehearsal import refuse_chance
 from ..checks.result import judge_run
 from ..checks.run import read_run
 from ..prediction.prediction import Prediction
-from .events import Event, describe_events, predict_events, predict_quietly, read_events, write_events
+from ..reporting.other_events import describe_event
+from .events import Event, predict_events, predict_quietly, read_events
 from .job import Job, parse_job, read_job
 from .models import Problem, make_problem, runs_code_of_user
-from .results import write_samples, write_tables
+from .results import write_events, write_samples, write_tables
 
 __all__ = ["CACHE", "Outcome", "default_folder", "is_free", "make_sampler", "report_run", "run_job"]
 
@@ -82,12 +83,10 @@ def make_sampler(job: Job, problem: Problem, backend: Any = None, chain: int = 0
         raise ValueError(f"{where} {error}") from error
 
 
-def run_job(
-    file: Path, folder: Path | None = None, resume: bool = False, overwrite: bool = False, progress: bool = True
-) -> Outcome:
+def run_job(file: Path, folder: Path | None = None, overwrite: bool = False, progress: bool = True) -> Outcome:
     """Start or continue the run of a TOML file in a folder (default: `default_folder`), and write its results.
 
-    With `resume` no new run is started; `overwrite` deletes the run that the folder contains. ValueError if anything in
+    With `overwrite` the run that the folder contains is deleted. ValueError if anything in
     the file is wrong, the folder contains the run of other settings, or a model of the user is not repeatable.
     """
     job = read_job(file)
@@ -95,7 +94,7 @@ def run_job(
     tried = make_problem(job)
     make_sampler(job, tried)  # before the folder is touched
     events = read_events(job, tried)
-    _prepare(job, folder, getattr(tried.posterior, "fingerprint", None), resume, overwrite)
+    _prepare(job, folder, getattr(tried.posterior, "fingerprint", None), overwrite)
     problem = make_problem(job, SimulationCache(folder / CACHE) if job.budget.cache else None)
     if runs_code_of_user(job) and not (folder / CHAIN).exists():
         refuse_chance(problem.posterior)
@@ -202,9 +201,8 @@ def _write(
     drawn = _drawn(job, problem, sampler)
     prediction = _predict(job, problem, drawn, progress)
     predicted = predict_events(job, events, problem, drawn, progress)
-    described = describe_events(events, predicted)
-    pictures = write_events(folder, events, described)
     measured = {event.name: event.measured for event in events if event.name in predicted and event.measured}
+    described = [describe_event(name, each, measured.get(name)) for name, each in predicted.items()]
     judged = judge_run(run)
     judgement = judged.judgement
     samples, agreement = write_samples(folder, run, samplers, prediction, job.prediction.draws, judgement)
@@ -214,10 +212,10 @@ def _write(
     sources = {"": judgement.findings, "prediction: ": () if prediction is None else prediction.findings}
     sources |= {f"event {each.name}: ": each.findings for each in described}
     said = tuple(f"{title}{each}" for title, found in sources.items() for each in found if each.severity != NOTE)
-    return (page.name, *tables, samples, *pictures), said, judgement.status != "do not use"
+    return (page.name, *tables, samples, *write_events(folder, described)), said, judgement.status != "do not use"
 
 
-def _prepare(job: Job, folder: Path, fingerprint: str | None, resume: bool, overwrite: bool) -> None:
+def _prepare(job: Job, folder: Path, fingerprint: str | None, overwrite: bool) -> None:
     """Make the folder, or check that it contains a run of the same settings and of the posterior with a fingerprint."""
     settings = folder / SETTINGS
     if overwrite and settings.is_file():
@@ -238,8 +236,6 @@ def _prepare(job: Job, folder: Path, fingerprint: str | None, resume: bool, over
                 f"{folder} contains a run with other data or another model, of {stored['file']}. Give another folder "
                 "with --out, or delete that run with --overwrite"
             )
-    elif resume:
-        raise ValueError(f"{folder} contains no run to resume; leave out --resume to start one")
     elif not is_free(folder):
         raise ValueError(f"{folder} exists and is not the folder of a run; give another one with --out")
     try:

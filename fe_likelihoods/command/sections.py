@@ -1,6 +1,6 @@
 """Sections of the TOML file that describes an update: frozen dataclasses, whose fields are the keys.
 
-The annotation of a field is the kind of its key, and `fe_likelihoods.command.keys.key` states meaning and default.
+`fe_likelihoods.command.keys.key` states kind, meaning and default of each.
 Keys that are arguments of a class or function have the type, unit and meaning that its docstring states, read from its
 source, so that they are there with the option -OO of Python too.
 """
@@ -12,7 +12,7 @@ import inspect
 import re
 import textwrap
 from dataclasses import dataclass, fields
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
 from ..models.executable import ExecutableModel
 from ..models.function import FunctionModel
@@ -91,16 +91,9 @@ def _arguments(owner: Any, names: str = "", *, without: str = "", required: str 
     )
 
 
-Text, Texts, TextTable = Annotated[Any, "text"], Annotated[Any, "texts"], Annotated[Any, "table of texts"]
-Whole, Wholes = Annotated[Any, "whole number"], Annotated[Any, "whole numbers"]
-Size, Count = Annotated[Any, "whole number >= 0"], Annotated[Any, "whole number >= 1"]
-Number, Errors = Annotated[Any, "number"], Annotated[Any, "number or numbers"]
-Matrix = Annotated[Any, "matrix"]
-Switch, Time, Clock = Annotated[Any, "yes or no"], Annotated[Any, "time"], Annotated[Any, CLOCK]
-Columns, Quantities = Annotated[Any, "table of texts or numbers"], Annotated[Any, "table of quantities"]
-Missing, Points = Annotated[Any, "numbers and times"], Annotated[Any, "points by name"]
-Bundled = Annotated[Any, "one of column-short, column-eq1, column-eq1-eq2, bridge-twin, bridge-means"]
-TextOrNumbers, Probabilities = Annotated[Any, "text or numbers"], Annotated[Any, "probabilities"]
+def _argument(owner: Any, name: str, kind: str) -> Any:
+    """A field of a section that is an argument of a class or function."""
+    return key(kind, _documented(owner)[name].meaning)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,11 +112,11 @@ class Table(Section):
 
     READING: ClassVar = ("time", "time_unit", "dt", "skip", "resample")
 
-    time: Text = key(_documented(read_record)["time"].meaning)
-    time_unit: Text = key(_documented(read_record)["time_unit"].meaning)
-    dt: Time = key(_documented(read_record)["dt"].meaning)
-    skip: Size = key(_documented(read_record)["skip"].meaning)
-    resample: Time = key(_documented(read_record)["resample"].meaning)
+    time: Any = _argument(read_record, "time", "text")
+    time_unit: Any = _argument(read_record, "time_unit", "text")
+    dt: Any = _argument(read_record, "dt", "time")
+    skip: Any = _argument(read_record, "skip", "whole number >= 0")
+    resample: Any = _argument(read_record, "resample", "time")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,144 +126,168 @@ class Motion(Table):
     supports: ClassVar = None
     every: ClassVar = 1
 
-    file: Text = key(
-        "Acceleration of the base: AT2, V1, V2, SMC, GeoNet, K-NET, ESM, miniSEED, SAC, CSV, Excel, or a data set (.h5)"
+    file: Any = key(
+        "text",
+        "Acceleration of the base: AT2, V1, V2, SMC, GeoNet, K-NET, ESM, miniSEED, SAC, CSV, Excel, a data set (.h5)",
     )
-    bundled: Bundled = key("A bundled synthetic motion, instead of a file")
-    column: Text = key("Column of a CSV file or workbook, component (GeoNet), or file in an archive (V2)")
-    channel: Whole = key("Channel of a V2 file")
-    units: Text = key("Unit of the acceleration, if the file does not state it")
-    scale: Number = key("Factor by which the record is multiplied; -1 for a reversed sensor")
-    duration: Time = key("Length of the first part that is used")
+    bundled: Any = key(
+        "one of column-short, column-eq1, column-eq1-eq2, bridge-twin, bridge-means",
+        "A bundled synthetic motion, instead of a file",
+    )
+    column: Any = key("text", "Column of a CSV file or workbook, component (GeoNet), or file in an archive (V2)")
+    channel: Any = key("whole number", "Channel of a V2 file")
+    units: Any = key("text", "Unit of the acceleration, if the file does not state it")
+    scale: Any = key("number", "Factor by which the record is multiplied; -1 for a reversed sensor")
+    duration: Any = key("time", "Length of the first part that is used")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration(Motion):
     """``[record]``."""
 
-    supports: Texts = key(
+    supports: Any = key(
+        "texts",
         'Motions of several supports instead of file, as "file.csv" or "file.csv:column"; of a bridge deck the base of '
-        "the column, the first end and the second end"
+        "the column, the first end and the second end",
     )
-    every: Count = key("Keep every n-th sample: a faster simulation with a longer step", 1)
+    every: Any = key("whole number >= 1", "Keep every n-th sample: a faster simulation with a longer step", 1)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Event(Motion):
     """``[events.NAME]``, which is predicted after the run."""
 
-    measured: Text = key("Measured response in this event, to be compared: a file as in [measurements]")
-    zero: Clock = key("Time in this file at which the base motion begins; by default as in [measurements]")
-    from_state: Annotated[Any, "one of virgin, end"] = key("End: begin with the state after the record", "virgin")
-    rest: Time = key('Pause before the motion, for "end"; 10 s by default')
+    measured: Any = key("text", "Measured response in this event, to be compared: a file as in [measurements]")
+    zero: Any = key(CLOCK, "Time in this file at which the base motion begins; by default as in [measurements]")
+    from_state: Any = key("one of virgin, end", "End: begin with the state after the record", "virgin")
+    rest: Any = key("time", 'Pause before the motion, for "end"; 10 s by default')
 
 
 @dataclass(frozen=True, kw_only=True)
 class Measured(Table):
     """``[measurements]``."""
 
-    file: Text = key("Measured response: CSV, Excel, V2 and other files as in [record], or a data set (.h5)")
-    bundled: Bundled = key("Bundled synthetic measurements, instead of a file")
-    columns: Columns = key("Channel = name of its column in the file, or number in a V2 file")
-    units: TextTable = key("Channel = unit, if the file does not state it")
-    reversed: Texts = key("Channels whose sensor counts the other way round: they are multiplied by -1")
-    channels: Texts = key("Channels to use; by default all")
-    zero: Clock = key("Time in the file at which the base motion begins")
-    missing: Missing = key(
-        "Numbers that stand for missing samples, and times [first, last] that are left out, with the name of a channel "
-        "before them for this one alone [s after zero]"
+    file: Any = key("text", "Measured response: CSV, Excel, V2 and other files as in [record], or a data set (.h5)")
+    bundled: Any = key(
+        "one of column-short, column-eq1, column-eq1-eq2, bridge-twin, bridge-means",
+        "Bundled synthetic measurements, instead of a file",
     )
-    baseline: Points = key("Channel = points [time, value] of an offset or a drift that is subtracted")
+    columns: Any = key("table of texts or numbers", "Channel = name of its column in the file, or number in a V2 file")
+    units: Any = key("table of texts", "Channel = unit, if the file does not state it")
+    reversed: Any = key("texts", "Channels whose sensor counts the other way round: they are multiplied by -1")
+    channels: Any = key("texts", "Channels to use; by default all")
+    zero: Any = key(CLOCK, "Time in the file at which the base motion begins")
+    missing: Any = key(
+        "numbers and times",
+        "Numbers that stand for missing samples, and times [first, last] that are left out, with the name of a channel "
+        "before them for this one alone [s after zero]",
+    )
+    baseline: Any = key("points by name", "Channel = points [time, value] of an offset or a drift that is subtracted")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Modes(Section):
     """``[modes]``."""
 
-    file: Text = key("Identified modes, alone or beside other data: CSV, Excel or MATLAB (`read_modal_data`)", ...)
-    unit: Text = key('Unit of the frequencies, if the file does not state it: "Hz" or "rad/s"')
-    columns: TextTable = key("Sensor of the model = name of its column; by default the column of this name")
-    variables: TextTable = key("Of a MATLAB file: frequencies, shapes and damping = names of the variables")
-    modes: Wholes = key("Numbers of the modes to compare; by default all but those held out")
-    held_out: Wholes = key("Numbers of modes that are not compared, but predicted and shown beside the measured ones")
-    mean: Switch = key("Take the mean of several identifications, and their scatter as the errors", False)
-    frequency_cv: Errors = key("Known coefficient of variation of the frequencies, such as 0.005, or one per mode")
-    covariance: Matrix = key("Known covariance of the compared frequencies [Hz²], instead of frequency_cv")
-    temperatures: Errors = key(
-        "Temperature of each identification [°C], if the file does not state it; adds the parameter temperature_slope"
+    file: Any = key(
+        "text", "Identified modes, alone or beside other data: CSV, Excel or MATLAB (`read_modal_data`)", ...
     )
-    shape_error: Errors = key("Known standard deviation of a component of a shape with a norm of 1, such as 0.02")
-    unknown_errors: Annotated[Any, "one of common, mode"] = key(
+    unit: Any = key("text", 'Unit of the frequencies, if the file does not state it: "Hz" or "rad/s"')
+    columns: Any = key("table of texts", "Sensor of the model = name of its column; by default the column of this name")
+    variables: Any = key("table of texts", "Of a MATLAB file: frequencies, shapes and damping = names of the variables")
+    modes: Any = key("whole numbers", "Numbers of the modes to compare; by default all but those held out")
+    held_out: Any = key(
+        "whole numbers", "Numbers of modes that are not compared, but predicted and shown beside the measured ones"
+    )
+    mean: Any = key("yes or no", "Take the mean of several identifications, and their scatter as the errors", False)
+    frequency_cv: Any = key(
+        "number or numbers", "Known coefficient of variation of the frequencies, such as 0.005, or one per mode"
+    )
+    covariance: Any = key("matrix", "Known covariance of the compared frequencies [Hz²], instead of frequency_cv")
+    temperatures: Any = key(
+        "number or numbers",
+        "Temperature of each identification [°C], if the file does not state it; adds the parameter temperature_slope",
+    )
+    shape_error: Any = key(
+        "number or numbers", "Known standard deviation of a component of a shape with a norm of 1, such as 0.02"
+    )
+    unknown_errors: Any = key(
+        "one of common, mode",
         "Parameters frequency_error and shape_error, of all modes or of each, are added to the known errors; by "
-        "default where no error is known"
+        "default where no error is known",
     )
-    student_t: Number = key("Degrees of freedom of Student-t errors, such as 4, for wrong identifications")
-    n_modes: Count = key("Modes that the model computes (twice as many as were measured)")
-    close: Number = key("Frequencies that differ by less than this share are compared as a plane of shapes (0.02)")
+    student_t: Any = key("number", "Degrees of freedom of Student-t errors, such as 4, for wrong identifications")
+    n_modes: Any = key("whole number >= 1", "Modes that the model computes (twice as many as were measured)")
+    close: Any = key(
+        "number", "Frequencies that differ by less than this share are compared as a plane of shapes (0.02)"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
 class LoadTest(Section):
     """``[load_test]``."""
 
-    file: Text = key("Load test, alone or beside other data: CSV or Excel with a line for each load case", ...)
-    columns: TextTable = key("Channel = name of its column; by default the column of this name")
-    units: TextTable = key("Channel = unit, if the file does not state it")
-    cases: Text = key("Column with the names of the load cases, or with positions; by default the first one")
-    errors: Quantities = key('Channel = known standard deviation of its sensor, such as "0.1 mm"')
+    file: Any = key("text", "Load test, alone or beside other data: CSV or Excel with a line for each load case", ...)
+    columns: Any = key("table of texts", "Channel = name of its column; by default the column of this name")
+    units: Any = key("table of texts", "Channel = unit, if the file does not state it")
+    cases: Any = key("text", "Column with the names of the load cases, or with positions; by default the first one")
+    errors: Any = key("table of quantities", 'Channel = known standard deviation of its sensor, such as "0.1 mm"')
 
 
 @dataclass(frozen=True, kw_only=True)
 class Noise(Section):
     """``[noise]``."""
 
-    kind: Annotated[Any, "one of gaussian, autoregressive"] = key(
+    kind: Any = key(
+        "one of gaussian, autoregressive",
         "Autoregressive: each error depends on the one before, with a correlation per channel; takes sensor only",
         "gaussian",
     )
-    groups: TextOrNumbers = key(_documented(GaussianNoise)["groups"].meaning)
-    level: Text = key(_documented(GaussianNoise)["level"].meaning)
-    sensor: Quantities = key(_documented(GaussianNoise)["sensor"].meaning)
-    window: Time = key(_documented(GaussianNoise)["window"].meaning)
-    local: Number = key(_documented(GaussianNoise)["local"].meaning)
-    marginal: Switch = key("Integrate the levels out; for levels in SI units without bands and sensor", False)
+    groups: Any = _argument(GaussianNoise, "groups", "text or numbers")
+    level: Any = _argument(GaussianNoise, "level", "text")
+    sensor: Any = _argument(GaussianNoise, "sensor", "table of quantities")
+    window: Any = _argument(GaussianNoise, "window", "time")
+    local: Any = _argument(GaussianNoise, "local", "number")
+    marginal: Any = key("yes or no", "Integrate the levels out; for levels in SI units without bands and sensor", False)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sampler(Section):
     """``[sampler]``."""
 
-    kind: Annotated[Any, "one of smc, tmcmc"] = key("Sampler", "smc")
-    walkers: Count = key("Number of walkers", 500)
-    steps: Count = key("Sweeps at beta = 1, each of which stores all walkers", 4)
-    seed: Size = key("Seed", 1)
-    chains: Count = key(
-        "Independent runs with successive seeds, which r_hat compares; tables and report are of the first", 1
+    kind: Any = key("one of smc, tmcmc", "Sampler", "smc")
+    walkers: Any = key("whole number >= 1", "Number of walkers", 500)
+    steps: Any = key("whole number >= 1", "Sweeps at beta = 1, each of which stores all walkers", 4)
+    seed: Any = key("whole number >= 0", "Seed", 1)
+    chains: Any = key(
+        "whole number >= 1",
+        "Independent runs with successive seeds, which r_hat compares; tables and report are of the first",
+        1,
     )
-    guide: Switch = key("Find the posterior from the responses, with hundreds of simulations", False)
-    recycle: Switch = key("Reuse every evaluated point; by default with 150 walkers or more")
-    ess_ratio: Number = key("Share of effective walkers wanted at each stage, without recycling")
-    min_moves: Whole = key("Fewest sweeps per stage")
-    max_moves: Count = key("Most sweeps per stage")
-    max_failure_share: Number = key("Share of failed evaluations at which the run stops (0.5)")
+    guide: Any = key("yes or no", "Find the posterior from the responses, with hundreds of simulations", False)
+    recycle: Any = key("yes or no", "Reuse every evaluated point; by default with 150 walkers or more")
+    ess_ratio: Any = key("number", "Share of effective walkers wanted at each stage, without recycling")
+    min_moves: Any = key("whole number", "Fewest sweeps per stage")
+    max_moves: Any = key("whole number >= 1", "Most sweeps per stage")
+    max_failure_share: Any = key("number", "Share of failed evaluations at which the run stops (0.5)")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Budget(Section):
     """``[budget]``."""
 
-    max_simulations: Count = key("Most simulations; the run can be continued with more")
-    workers: Count = key("Processes, for a model of your own (1); built-in models use all cores")
-    cache: Switch = key("Keep every simulation in a file of the folder", True)
+    max_simulations: Any = key("whole number >= 1", "Most simulations; the run can be continued with more")
+    workers: Any = key("whole number >= 1", "Processes, for a model of your own (1); built-in models use all cores")
+    cache: Any = key("yes or no", "Keep every simulation in a file of the folder", True)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Predictions(Section):
     """``[prediction]``."""
 
-    draws: Size = key("Draws of the posterior whose response is predicted; 0 for none", 100)
-    noise: Switch = key("Predict measurements, with their noise; by default only in events with measurements")
-    quantiles: Probabilities = key("Probabilities of the quantiles", (0.05, 0.5, 0.95))
+    draws: Any = key("whole number >= 0", "Draws of the posterior whose response is predicted; 0 for none", 100)
+    noise: Any = key("yes or no", "Predict measurements, with their noise; by default only in events with measurements")
+    quantiles: Any = key("probabilities", "Probabilities of the quantiles", (0.05, 0.5, 0.95))
 
 
 SECTIONS: dict[str, type[Section]] = {

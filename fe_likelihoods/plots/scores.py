@@ -113,8 +113,8 @@ def _history_axes(axes: np.ndarray, events: Mapping[str, HistoryScores]) -> None
     axes[1].axvline(level, color=GREY, linewidth=0.8)
     axes[1].set_xlabel(f"share in the {level:.0%} band [-]")
     axes[1].set_title("coverage", fontsize="medium")
-    axes[1].set_xlim(None, 1.03)
-    axes[2].set_xlabel("interval score / RMS of the measured channel [-]")
+    axes[1].set_xlim(min(level - 0.1, axes[1].dataLim.xmin - 0.02), 1.03)
+    axes[2].set_xlabel("interval score / RMS measured [-]")
     axes[2].set_title(f"sharpness: score of the {level:.0%} band", fontsize="medium")
     axes[2].legend(frameon=False, fontsize="small", ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.2))
     for each in axes[1:]:

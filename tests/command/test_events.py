@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import LinearOscillator, SimulationCache, SimulationFailed, from_si, propagate
-from fe_likelihoods.command.events import describe_events, predict_events, read_events, write_events
+from fe_likelihoods.command.events import predict_events, read_events
 from fe_likelihoods.command.job import read_job
 from fe_likelihoods.command.models import make_problem
 from fe_likelihoods.models import linear_oscillator
-from fe_likelihoods.prediction.prediction import Prediction
 from fe_likelihoods.prediction.quantities import peak
 from fe_likelihoods.signals.read import read_record
 from tests.command.test_command import OSCILLATOR, call, folder, write_oscillator  # noqa: F401
@@ -67,30 +66,23 @@ def finished(run_once, folder):  # noqa: F811
 
 def test_events_are_predicted_and_scored(finished, run_once):
     events, said = finished, run_once[1]
-    assert "event-weaker.txt, event-weaker.csv, event-weaker.png, event-after.txt" in said
-    with open("r/event-weaker.csv", newline="") as file:
-        rows = {row["channel"]: row for row in csv.DictReader(file)}
+    assert "events.csv" in said
+    with open("r/events.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
     record = read_record("base.csv").scale(0.5)
     peaks = np.abs(LinearOscillator(record, 0.8).simulate([1.1, 0.9])).max(axis=1)
-    for largest, row in zip(peaks, rows.values(), strict=True):
+    assert [row["event"] for row in rows] == ["weaker", "weaker", "after", "after"]
+    for largest, row in zip(peaks, rows[:2], strict=True):
         peak = from_si(largest, row["unit"])
         assert float(row["measured"]) == pytest.approx(peak)
         assert float(row["median"]) == pytest.approx(peak, rel=0.1)
-        assert float(row["q05"]) <= float(row["median"]) <= float(row["q95"])
-    text = (events / "r" / "event-weaker.txt").read_text()
-    told = [line for line in text.splitlines() if line.startswith("CAUTION: ")]
-    assert told and all(f"CAUTION: event weaker: {line.removeprefix('CAUTION: ')}" in said for line in told)
-    assert "interval score" in text and "CRPS" in text and "with the noise" in text
-    assert "without the noise" in (events / "r" / "event-after.txt").read_text()
-    assert "measurements" not in (events / "r" / "event-after.txt").read_text().splitlines()[-1]
-    assert (events / "r" / "event-after.png").stat().st_size > 10_000
+        assert float(row["q05"]) <= float(row["q25"]) <= float(row["median"]) <= float(row["q75"]) <= float(row["q95"])
+    assert rows[2]["measured"] == rows[2]["pit"] == ""
 
     report = read_page(events / "r" / "report.html")
     numbers = next(table for table in report.tables if table[0][1:3] == ["Quantity", "Median"])[1:]
-    assert [row[:2] for row in numbers] == [
-        [name, f"peak of {row['channel']} [{row['unit']}]"] for name in ("weaker", "after") for row in rows.values()
-    ]
-    for cells, row in zip(numbers, rows.values(), strict=False):
+    assert [row[:2] for row in numbers] == [[row["event"], f"{row['quantity']} [{row['unit']}]"] for row in rows]
+    for cells, row in zip(numbers, rows[:2], strict=False):
         shown = [float(row[key]) for key in ("median", "measured")]
         assert [float(cells[2]), float(cells[5])] == pytest.approx(shown, rel=6e-3)
         assert cells[6].startswith("within") == (0.05 <= float(row["pit"]) <= 0.95)
@@ -98,22 +90,22 @@ def test_events_are_predicted_and_scored(finished, run_once):
     histories = next(table for table in report.tables if table[0][-1] == "In the 90 % band")[1:]
     assert [row[0] for row in histories] == ["weaker", "weaker"]
     assert sum(alt.startswith("Predicted histories") and "in the event" in alt for _, alt in report.images) == 2
-    assert "predicted peaks are outside" not in report.text or any(
-        title.startswith("weaker: ") for title in report.notes
-    )
-    assert "The motion meets the structure before any other event" in text
+    told = [title.removeprefix("weaker: ") for title in report.notes if title.startswith("weaker: ")]
+    assert told and all(f"CAUTION: event weaker: {title}" in said for title in told)
+    for text in ("with the noise", "without the noise", "The motion meets the structure before any other event"):
+        assert text in report.text
 
 
 @pytest.mark.slow
 def test_report_makes_events_again_without_simulations(finished, monkeypatch):
-    first = (finished / "r" / "event-after.csv").read_text()
+    first = (finished / "r" / "events.csv").read_text()
     simulated, one = [], linear_oscillator.respond
     monkeypatch.setattr(linear_oscillator, "respond", lambda *args: simulated.append(args) or one(*args))
     for most in (19, 4):  # at first some rows of the file are verified; samples that were in memory alone are stored
         simulated.clear()
-        (finished / "r" / "event-after.csv").unlink()
+        (finished / "r" / "events.csv").unlink()
         said = call("report", "r")
-        assert "event-after.csv" in said and (finished / "r" / "event-after.csv").read_text() == first
+        assert "events.csv" in said and (finished / "r" / "events.csv").read_text() == first
         assert 0 < len(simulated) <= most  # none of the 20 of each event or of the 20 samples: the mean, for checks
 
 
@@ -125,7 +117,7 @@ def test_an_event_is_added_to_a_finished_run_without_new_samples(events):
     (events / "oscillator.toml").write_text(SETTINGS + EVENTS)
     call("run", "oscillator.toml", "--out", "r", "--quiet")
     assert SimulationCache("r/simulations.sqlite").info().simulations == stored
-    assert (events / "r" / "event-weaker.csv").is_file()
+    assert (events / "r" / "events.csv").is_file()
 
 
 def test_warnings_of_the_model_are_given_and_findings_are_not(events, monkeypatch):
@@ -158,7 +150,7 @@ def test_an_event_whose_simulations_all_fail_is_named_in_the_report(events, monk
 
     monkeypatch.setattr(LinearOscillator, "simulate", simulate)
     said = call("run", "oscillator.toml", "--out", "r", "--quiet")
-    assert "CAUTION: event weaker: No prediction: All simulations failed" in said and "event-weaker.txt" not in said
+    assert "CAUTION: event weaker: No prediction: All simulations failed" in said
     report = read_page(events / "r" / "report.html")
     assert (
         "All simulations failed" in report.notes["weaker: No prediction"]
@@ -169,23 +161,18 @@ def test_an_event_whose_simulations_all_fail_is_named_in_the_report(events, monk
     assert {row[0] for row in numbers} == {"after"}
 
 
-def test_the_prediction_is_that_of_propagate(events, monkeypatch):
+def test_the_prediction_is_that_of_propagate(events):
     job = read_job("oscillator.toml")
     problem = make_problem(job)
     samples = problem.posterior.sample_prior(12, 1)
     found = read_events(job, problem)
     assert [event.name for event in found] == ["weaker", "after"]
     predicted = predict_events(job, found, problem, samples, False)
-    described = describe_events(found, predicted)
-    monkeypatch.setattr(Prediction, "score", lambda *_: pytest.fail("scored twice"))
-    write_events(events, found, described)
     for event in found:
         noise = event.measured is not None
         options = {"record": event.record, "seed": 1, "noise": noise, "progress": False} | event.options
         expected = propagate(problem.posterior, samples, quantity=peak("displacement"), **options)
-        with open(f"event-{event.name}.csv", newline="") as file:
-            row = list(csv.DictReader(file))[1]
-        assert float(row["median"]) == pytest.approx(from_si(expected.quantile(0.5), row["unit"]), rel=1e-12)
+        assert predicted[event.name]["peaks"].quantile(0.5)[1] == pytest.approx(expected.quantile(0.5), rel=1e-12)
 
 
 def test_peaks_with_a_noise_in_shares_have_the_error_of_the_model(events, monkeypatch):
@@ -257,6 +244,6 @@ def test_measurements_that_end_between_two_steps_of_the_model_are_scored(events)
     text = (SETTINGS + EVENTS).replace('file = "base.csv"\n[measure', 'file = "base.csv"\nevery = 2\n[measure')
     (events / "oscillator.toml").write_text(text)
     said = call("run", "oscillator.toml", "--out", "r", "--quiet")
-    told = (events / "r" / "event-weaker.txt").read_text()
-    assert "no scores" not in said + told and "Histories against the measurements" in told
-    assert "150 samples at 0.04 s" in told
+    report = read_page(events / "r" / "report.html")
+    assert "no scores" not in said + report.text.lower()
+    assert any(table[0][-1] == "In the 90 % band" for table in report.tables)

@@ -99,10 +99,10 @@ def test_a_killed_prediction_of_an_event_repeats_nothing(folder):
     killed.kill()
     killed.communicate()
     before = len(simulated.read_text().splitlines())
-    assert before < 10 and not (folder / "r" / "event-second.csv").exists()
+    assert before < 10 and not (folder / "r" / "events.csv").exists()
     again = start("r", "own.toml")
     assert again.wait(timeout=500) == 0, again.communicate()
     lines = simulated.read_text().splitlines()
     assert len(set(lines)) == 10
     assert len(lines) <= 10 + 1 + 2, lines  # the one that was killed, and two that are verified
-    assert (folder / "r" / "event-second.csv").exists()
+    assert (folder / "r" / "events.csv").exists()
