@@ -20,7 +20,6 @@ __all__ = [
     "Simulated",
     "VerifyingRun",
     "difference_in_words",
-    "difference_of",
     "largest_difference",
     "observed",
     "response_tolerance",
@@ -41,7 +40,6 @@ class VerifyingRun:
     statistic: Statistic | None  # that is stored; None: sums of squares
     n_numbers: int  # length of the statistic
     tolerance: float | None = None  # as for `SimulationCache`
-    has_no_label: bool = False  # the file was read and has no label of the model
 
     @cached_property
     def fingerprint(self) -> str:
@@ -66,9 +64,9 @@ class Simulated(NamedTuple):
 
 
 @contextmanager
-def observed(label: ModelLabel | None, pool: Any) -> Iterator[None]:
+def observed(label: ModelLabel, pool: Any) -> Iterator[None]:
     """Add what the simulations in a ``with`` block open to the label, if it observes simulations."""
-    if label is None or not label.observes:
+    if not label.observes:
         yield
         return
     with observing() as observer:
@@ -76,8 +74,8 @@ def observed(label: ModelLabel | None, pool: Any) -> Iterator[None]:
     label.add(observer.result(label.known) if pool is None else Opened(observer.noted))
 
 
-def simulate_again(run: VerifyingRun, thetas: np.ndarray, label: ModelLabel | None = None) -> list[Simulated]:
-    """New simulations; if the model's label is given, what they open is added to it."""
+def simulate_again(run: VerifyingRun, thetas: np.ndarray, label: ModelLabel) -> list[Simulated]:
+    """New simulations; what they open is added to the model's label."""
     rows = []
     size = most_responses(run.model)
     for start in range(0, len(thetas), size):
@@ -96,37 +94,27 @@ def simulate_again(run: VerifyingRun, thetas: np.ndarray, label: ModelLabel | No
 def response_tolerance(model: Model) -> float:
     """Accepted relative difference between two responses of a model with the same parameters.
 
-    It is the model's attribute ``response_tolerance``: zero for the compiled models of this library, which repeat to
-    the last bit on the same processor. Without the attribute, and for user subclasses that do not define it, it is
-    1e-9, because sums over several threads may differ in their last digits.
+    It is zero for the compiled models of this library, which repeat to the last bit on the same processor, and 1e-9 for
+    models of the user, because sums over several threads may differ in their last digits.
     """
-    cls = type(model)
-    if is_of_user(cls.__module__) and "response_tolerance" not in getattr(model, "__dict__", {}):
-        defined = next((base for base in cls.__mro__ if "response_tolerance" in vars(base)), None)
-        if defined is not None and not is_of_user(defined.__module__):
-            return DEFAULT_TOLERANCE
-    return float(getattr(model, "response_tolerance", DEFAULT_TOLERANCE))
-
-
-def difference_of(stored: np.ndarray, new: Simulated, run: VerifyingRun, tolerance: float) -> tuple[int, float] | None:
-    """Index and size of the largest difference beyond a tolerance, see `largest_difference`; None without any."""
-    return largest_difference(stored, new.misfit, new.norm, tolerance, needs_response(run.statistic))
+    of_user = is_of_user(type(model).__module__)
+    return DEFAULT_TOLERANCE if of_user else float(getattr(model, "response_tolerance", DEFAULT_TOLERANCE))
 
 
 def difference_in_words(
-    earlier: np.ndarray, reason: str, new: Simulated, run: VerifyingRun, tolerance: float, origin: str
+    earlier: np.ndarray, reason: str, new: Simulated, run: VerifyingRun, tolerance: float
 ) -> tuple[str, float]:
     """How a simulation differs from an earlier one, in words and relative to the response norm; empty if it agrees."""
     if reason or new.reason:
         was, now = (f"failed ({text})" if text else "succeeded" for text in (reason, new.reason))
         return ("" if reason and new.reason else f"it {was}; simulated again, it {now}"), 0.0
-    found = difference_of(earlier, new, run, tolerance)
+    found = largest_difference(earlier, new.misfit, new.norm, tolerance, needs_response(run.statistic))
     if found is None:
         return "", 0.0
     index, change = found
     names = [channel.name for channel in run.model.channels]
     what = "sum of squared residuals" if index < len(names) else f"statistic {index}"
-    values = f"{origin} {earlier[index]:.17g}, simulated again {new.misfit[index]:.17g}"
+    values = f"stored {earlier[index]:.17g}, simulated again {new.misfit[index]:.17g}"
     return f"channel {names[index % len(names)]!r}, {what}: {values}", change
 
 

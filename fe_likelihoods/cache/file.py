@@ -32,7 +32,7 @@ __all__ = ["APPLICATION_ID", "SCHEMA_VERSION", "CacheFile"]
 logger = logging.getLogger(__name__)
 
 APPLICATION_ID = 0x46454C43  # "FELC"
-SCHEMA_VERSION = 5
+SCHEMA_VERSION = 6
 CHECK_SECONDS = 2.0  # limit for the integrity check on opening; each row has a checksum
 SQLITE_SIGNATURE = b"SQLite format 3\0"
 ID_START = 68  # place of the application id in SQLite's header [bytes]

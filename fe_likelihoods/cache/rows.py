@@ -43,8 +43,8 @@ LAYOUT = (
     "CREATE INDEX row_generations ON rows (source, generation)",
     "CREATE INDEX response_sizes ON rows (size) WHERE size > 0",  # for their sum without reading the responses
     # labels of models, and the generation of each label
-    "CREATE TABLE labels (id INTEGER PRIMARY KEY, source INTEGER NOT NULL, code BLOB NOT NULL, files BLOB NOT NULL, "
-    "generation INTEGER NOT NULL, compared INTEGER NOT NULL, crc INTEGER NOT NULL)",
+    "CREATE TABLE labels (source INTEGER NOT NULL, code BLOB NOT NULL, files BLOB NOT NULL, "
+    "generation INTEGER NOT NULL, crc INTEGER NOT NULL, UNIQUE (source, code, files))",
 )
 COLUMNS = "key, source, generation, theta, value, reason, time_limit, seconds, cpu, session, crc, size"
 STORE = (

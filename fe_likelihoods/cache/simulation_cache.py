@@ -12,8 +12,6 @@ A cache never makes a run fail. A row that does not match its checksum is simula
 aside, and while the file cannot be written, rows wait in memory.
 """
 
-import contextlib
-import functools
 import logging
 import math
 import os
@@ -42,13 +40,12 @@ from .rows import (
     transaction,
 )
 
-__all__ = ["CacheInfo", "SimulationCache", "rows_to_compare"]
+__all__ = ["CacheInfo", "SimulationCache"]
 
 logger = logging.getLogger(__name__)
 
 MAX_WAITING_ROWS = 100_000  # rows kept in memory while the file cannot be written
 MAX_CANDIDATES = 5000  # rows from which the rows to compare are chosen
-CONFIDENCE = 0.95
 TIMEOUT = 30.0  # how long to wait for another writer [s]
 
 _repeated: set[tuple[str, str]] = set()  # remarks by file and model, in this process
@@ -64,28 +61,6 @@ class CacheInfo(NamedTuple):
     response_bytes: int  # of the stored responses [bytes]
     seconds: float  # wall time of the stored simulations [s]
     file_bytes: int  # without its write-ahead log [bytes]
-
-
-@functools.lru_cache(typed=True)
-def rows_to_compare(verify: bool | int | str) -> int:
-    """Number of rows that are simulated again before rows of an unknown label are used.
-
-    `verify` is as for `SimulationCache`. A share such as "5 %" stands for the number of rows that detect a change in
-    5 % of the parameter space with a probability of 95 %. ValueError for anything else.
-    """
-    if isinstance(verify, bool):
-        return rows_to_compare("5 %") if verify else 0
-    if isinstance(verify, int | np.integer) and verify >= 1:
-        return int(verify)
-    if isinstance(verify, str) and verify.rstrip().endswith("%"):
-        with contextlib.suppress(ValueError):
-            share = float(verify.rstrip()[:-1]) / 100.0
-            if 0.0 < share < 1.0:
-                return math.ceil(math.log(1.0 - CONFIDENCE) / math.log(1.0 - share))
-    raise ValueError(
-        "SimulationCache: verify must be True, False, a number of rows of 1 or more, or a share of the space like "
-        f"'5 %'; got {verify!r}"
-    )
 
 
 class SimulationCache:
@@ -108,15 +83,14 @@ class SimulationCache:
     max_response_bytes : int
         Largest size of all stored responses [bytes], at 8 bytes per channel and sample. The oldest are evicted; the
         first time, a message at level INFO.
-    verify : bool, int or str
-        How many stored rows are simulated again before other rows are used (`fe_likelihoods.cache.verification`). If
-        the model's label is known: two rows per process, and one of every 100. If it is unknown, because code, a file
-        or a package has changed: enough rows to detect a change in 5 % of the parameter space with a probability of
-        95 % (59 rows, or all rows). Give another share, such as "2 %", or a number of rows; False for no rows.
+    verify : bool
+        Whether some stored rows are simulated again before other rows are used (`fe_likelihoods.cache.verification`).
+        If the model's label is known: two rows per process, and one of every 100. If it is unknown, because code, a
+        file or a package has changed: 59 rows, which detect a change in 5 % of the parameter space with a probability
+        of 95 %.
     tolerance : float, optional
-        Accepted difference between a stored and a new response, relative to the response norm. By default the model's
-        attribute ``response_tolerance``: 0 for the compiled models of this library on the same processor, 1e-9 on
-        another processor and for other models.
+        Accepted difference between a stored and a new response, relative to the response norm. By default 0 for the
+        compiled models of this library on the same processor, 1e-9 on another processor and for other models.
 
     Attributes
     ----------
@@ -152,7 +126,7 @@ class SimulationCache:
         *,
         responses: bool = False,
         max_response_bytes: int = 2**30,
-        verify: bool | int | str = True,
+        verify: bool = True,
         tolerance: float | None = None,
     ) -> None:
         if not isinstance(path, str | os.PathLike):
@@ -162,9 +136,8 @@ class SimulationCache:
             raise ValueError(f"SimulationCache: max_response_bytes must be a whole number of 1 or more; got {most!r}")
         if tolerance is not None and not 0.0 <= tolerance < np.inf:
             raise ValueError(f"SimulationCache: tolerance must be a number of 0 or more, or None; got {tolerance!r}")
-        rows_to_compare(verify)  # refuses an impossible value
         self.max_response_bytes, self.responses = int(max_response_bytes), bool(responses)
-        self.verify, self.tolerance = verify, tolerance
+        self.verify, self.tolerance = bool(verify), tolerance
         self._begin(CacheFile(path, TIMEOUT))
         self.file.check()
 
@@ -340,7 +313,7 @@ class SimulationCache:
             raise ValueError(f"{path} is the cache itself; give another file")
         other.close()
         before = self.info().simulations
-        tables = ("rows", COLUMNS), ("labels", "id, source, code, files, generation, compared, crc")
+        tables = ("rows", COLUMNS), ("labels", "source, code, files, generation, crc")
 
         def insert(connection: sqlite3.Connection) -> None:
             connection.execute("ATTACH ? AS other", (str(other.path),))

@@ -1,62 +1,66 @@
-"""Verification of a cache: stored simulations are run again and compared before they are trusted.
+"""Which stored simulations are those of a model: some are run again and compared before the others are used.
 
 Code and files cannot prove that the model with a declared identity still computes the same results. The model's label
-(`fe_likelihoods.simulation.label`) decides how many rows are compared; numbers and powers: ``docs/parallel.rst``.
+(`fe_likelihoods.simulation.label`) decides how many rows are compared; numbers and powers: ``docs/parallel.rst``. Rows
+belong to a generation, the simulations of one state of a model; the file says to which generation a label belongs.
 
-* The label is known in the file: the row stored last and a random one before the first row is used in a process, and a
-  random one of every 100 rows used. A difference is an error, `StaleCache`.
-* The label is unknown: enough rows, chosen to cover the parameter space. If all agree, the label is added to the rows'
-  generation (adoption). If one differs, a new generation begins: the earlier rows stay in the file and are not used.
+* The label is known: the row stored last and a random one before the first row is used in a process, and a random one
+  of every 100 rows used. A difference is an error, `StaleCache`.
+* The label is unknown: `ROWS` rows that cover the parameter space. If all agree, the label is added to their generation
+  (adoption). If one differs, or there are fewer rows, so that repeating them would save nothing, a new generation
+  begins: the earlier rows stay in the file and are not used.
 
 Failures are compared only if there is no successful simulation, since a changed model often fails at the same points.
-A likelihood, those derived from it and their copies share their verified and stored rows (`Trust`).
 """
 
+import json
 import logging
+import os
 import secrets
+import threading
 import time
+import zlib
+from collections import OrderedDict
 from collections.abc import Iterable, Iterator
+from hashlib import blake2b
 from itertools import islice
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..simulation.faults import TransientReason
-from ..simulation.label import ModelLabel
+from ..simulation.files import Opened
+from ..simulation.label import ModelLabel, cpu_name
 from ..simulation.local_pool import LocalPool
 from ..simulation.model import Model, SimulationBatch, misfit_of_responses
 from .comparison import DEFAULT_TOLERANCE, Simulated, VerifyingRun, difference_in_words, simulate_again
-from .labels import Trust, labels_of, trust_of
 from .rows import CachedRows, Place, Row, pack_rows, reason_of, source_number
-from .simulation_cache import SimulationCache, rows_to_compare
+from .simulation_cache import SimulationCache
 
-__all__ = ["StaleCache", "VerifiedCache", "choose_rows"]
+__all__ = ["ROWS", "StaleCache", "Trust", "VerifiedCache", "choose_rows"]
 
 logger = logging.getLogger(__name__)
 
+ROWS = 59  # find a change of 5 % of the space with 95 %: 0.95 ** 59 < 0.05
 FIRST_ROWS = 2  # rows verified before the first row is used, if the label is known
 ROWS_PER_VERIFICATION = 100
-FIRST_COMPARED = 3  # rows in the first batch of a search; each further batch has four times as many
+FIRST_COMPARED = 3  # rows in the first batch of a comparison; each further batch has three times as many as were equal
 MAX_ATTEMPTS = 4  # simulations that may fail for other reasons than the model
 LARGEST_ROUNDING = 1e-4  # largest relative response difference that may come from rounding and iterations
+MAX_TRUSTS = 32
+DIFFER = "stored simulations of this %s differ from new ones; they stay in the file and are not used"
 CHANGED = (
-    "Something has changed that neither its declared identity nor its label contains. Delete its rows with "
-    "likelihood.simulator.cache.forget(*likelihood.simulator.cache_keys), or give the model a new version= "
-    "(or depends_on=)"
+    "Something has changed that neither its declared identity nor its label contains, or the model does not repeat its "
+    "results. Delete its rows with likelihood.simulator.cache.forget(*likelihood.simulator.cache_keys), or give the "
+    "model a new version= (or depends_on=)"
 )
-_NOT_REPEATABLE = (
-    "The model is not repeatable: one more simulation at this point differs from the new one ({}). Make it depend on "
-    "its parameters alone, for example with a fixed seed"
-)
-PAUSE_SECONDS = 60.0  # in which rows are used without verification if no new simulation ends
-PAUSE_RATIO = 20.0  # shortest pause, relative to the duration of these simulations
 
 
 class StaleCache(ValueError):
     """A stored simulation differs from a new one with the same parameters. The message says what to do.
 
-    It is raised again, for any row, as long as this simulation is stored and the model is the same object. Samplers
-    stop (`ends_run`), since no point can be evaluated any more. `theta` (n_structural,) are the parameters.
+    It is raised again, for any row, as long as rows are stored. Samplers stop (`ends_run`), since no point can be
+    evaluated any more. `theta` (n_structural,) are the parameters.
     """
 
     ends_run = True
@@ -67,6 +71,59 @@ class StaleCache(ValueError):
 
     def __reduce__(self) -> tuple:
         return type(self), (str(self), self.theta)
+
+
+class Trust:
+    """The label of a model, and which rows of a file this process trusts; all likelihoods with the same `key` share it.
+
+    `generations` and `written` labels are by the source number of the model; `left` has the rows that may be used until
+    the next verification, by fingerprint and whether any row is a success; `used` counts rows. Rows with the number of
+    the `session` were stored here and need no verification. `stale` is the error of a row that differed; `is_blocked`
+    says that rows could not be compared, since no simulation ended.
+    """
+
+    _known: "OrderedDict[str, Trust]" = OrderedDict()  # of this process, the most recently used last
+
+    def __init__(self, label: ModelLabel, key: str) -> None:
+        self.label, self.key = label, key
+        self.generations: dict[int, int] = {}
+        self.written: dict[int, tuple] = {}
+        self.is_blocked = False
+        self._lock, self._owner = threading.RLock(), os.getpid()
+        self.start_again()
+
+    @classmethod
+    def of(cls, label: ModelLabel, key: str) -> "Trust":
+        """The object of this process with a key; a new one the first time."""
+        trust = cls._known[key] = cls._known.pop(key, None) or cls(label, key)
+        while len(cls._known) > MAX_TRUSTS:
+            cls._known.popitem(last=False)
+        return trust
+
+    def __reduce__(self) -> tuple:
+        return Trust.of, (self.label, self.key)
+
+    @property
+    def lock(self) -> threading.RLock:
+        """Lock of this process; replaced after a fork, when another thread of the parent may have held it."""
+        if self._owner != os.getpid():
+            self._lock, self._owner, self.session = threading.RLock(), os.getpid(), secrets.randbits(62)
+        return self._lock
+
+    def start_again(self) -> None:
+        """Verify all rows again, including rows that this process has stored."""
+        self.left: dict[tuple[str, bool], int] = {}
+        self.used = 0
+        self.stale: StaleCache | None = None
+        self.session = secrets.randbits(62)
+
+    def due(self, kind: tuple[str, bool], n: int) -> int:
+        """Number of rows to verify when n rows are used."""
+        due = 0 if kind in self.left else 1 if self.left else FIRST_ROWS  # others of the same code were verified
+        left = self.left.get(kind, ROWS_PER_VERIFICATION) - n
+        more = max(0, -left // ROWS_PER_VERIFICATION + 1)
+        self.left[kind], self.used = left + more * ROWS_PER_VERIFICATION, self.used + n
+        return due + more
 
 
 class _Comparison(NamedTuple):
@@ -81,23 +138,20 @@ class _Comparison(NamedTuple):
 class VerifiedCache:
     """A `SimulationCache` whose rows are verified before they are used.
 
-    Its settings `verify` and `tolerance` apply. `model` and `label` are those in whose state the likelihood was made;
-    simulations run in `pool`. Counted are rows that were `compared`, `unverified` ones whose new simulation was stopped
-    (not by the model), and the wall time, `seconds`. Likelihoods of a process with equal built-in models and one file
-    verify rows once, and so do derived likelihoods and copies; another process verifies them again.
+    `model` and `label` are those in whose state the likelihood was made. Counted are rows that were `compared`,
+    `unverified` ones whose new simulation was stopped (not by the model), and the wall time, `seconds`. Likelihoods of
+    a process with equal built-in models and one file verify rows once, and so do derived likelihoods and copies;
+    another process verifies them again.
     """
 
-    def __init__(self, cache: SimulationCache, pool: Any, label: ModelLabel, model: Model) -> None:
+    def __init__(self, cache: SimulationCache, label: ModelLabel, model: Model) -> None:
         # user code may depend on what no label contains: there, each model object is verified
         same = cache.path, cache.file.identity, cache.verify, label.code, model.fingerprint
-        key = secrets.token_hex(16) if label.observes else repr(same)
-        is_local = pool is None or isinstance(pool, LocalPool)
-        self._set_up(cache, trust_of(label, is_local, f"{key} {is_local}"))
+        self._set_up(cache, Trust.of(label, secrets.token_hex(16) if label.observes else repr(same)))
 
     def _set_up(self, cache: SimulationCache, trust: Trust) -> None:
         self.cache, self._trust = cache, trust
         self.compared, self.unverified, self.seconds = 0, 0, 0.0
-        self._model: Any = None  # model of the last look-up in this process
         self._random = np.random.default_rng()  # separate, so that the user's random numbers do not change
 
     def __getstate__(self) -> tuple:
@@ -129,16 +183,15 @@ class VerifiedCache:
         run: VerifyingRun,
     ) -> None:
         """Store simulations under the model's label: statistics and responses, if given, and failures of the model."""
-        trust = self._trust
+        trust, source = self._trust, source_number(run.fingerprint)
         with trust.lock:
-            stored = trust.find(self.cache.file, run)
-            if stored is None:
-                if not trust.generations and time.monotonic() < trust.pause_ends:  # it is not known which rows agree
-                    return
-                trust.begin(self.cache.file, run.fingerprint, set())
-                stored = trust.find(self.cache.file, run)
-            trust.save(self.cache.file)
-            place = Place(stored.generation, trust.cpu, trust.session)
+            is_blocked = trust.is_blocked
+            trust.is_blocked = is_blocked and all(isinstance(reason, TransientReason) for reason in reasons)
+            generation = trust.generations.get(source) or self._known_generation(source)
+            if generation is None and is_blocked:  # it is not known which rows agree
+                return
+            generation = self._use(source, generation or self._new_generation([]))
+            place = Place(generation, _cpu(run), trust.session)
         rows = []
         if misfit is not None:
             rows += pack_rows(fingerprint, thetas, misfit, reasons, seconds, place)
@@ -152,7 +205,7 @@ class VerifiedCache:
 
     def discard(self, thetas: np.ndarray, *fingerprints: str) -> None:
         """Delete rows that were stored here."""
-        for generation in {each.generation for each in self._trust.stored.values()}:
+        for generation in set(self._trust.generations.values()):
             self.cache.discard(thetas, *fingerprints, generation=generation)
 
     # look-ups ---------------------------------------------------------------------------------------------------------
@@ -177,68 +230,93 @@ class VerifiedCache:
     def _look_up(
         self, fingerprint: str, thetas: np.ndarray, run: VerifyingRun, width: int, limit: float | None
     ) -> CachedRows:
-        trust = self._trust
-        if self._model is not None and run.model is not self._model:  # another model object was set
-            with trust.lock:
-                trust.start_again()
-        self._model = run.model
+        trust, source = self._trust, source_number(run.fingerprint)
         while True:
             with trust.lock:
-                generation = trust.generations.get(fingerprint) or self._find(fingerprint, run, width)
-                if generation is None:
-                    return CachedRows([None] * len(thetas), width)
-                trust.generations[fingerprint] = generation
+                generation = trust.generations.get(source) or self._find(source, fingerprint, run, width)
+            if generation is None:
+                return CachedRows([None] * len(thetas), width)
             rows = self.cache.look_up(fingerprint, thetas, width, generation, limit)
             if not self.cache.verify or self._verify(fingerprint, rows.rows, generation, run, width):
                 return rows
 
-    def _find(self, fingerprint: str, run: VerifyingRun, width: int) -> int | None:
+    # generations ------------------------------------------------------------------------------------------------------
+
+    def _find(self, source: int, fingerprint: str, run: VerifyingRun, width: int) -> int | None:
         """The generation of a known label, or one that new simulations agree with, or a new one; None: cannot tell."""
-        trust, cache, n = self._trust, self.cache, rows_to_compare(self.cache.verify)
-        stored, source = trust.find(cache.file, run), source_number(run.fingerprint)
-        before = 0 if stored is None else stored.compared
-        if stored is not None and before >= n:
-            return stored.generation
-        generations = cache.generations_of(fingerprint) if stored is None else [stored.generation]
-        if not n and generations:
-            trust.put(cache.file, {source}, generations[0], 0)
-            return generations[0]
-        rows = {each: cache.candidates(fingerprint, each, width) for each in generations}
-        rows = {each: found for each, found in rows.items() if min(n, len(found)) > before}
-        if not rows or time.monotonic() < trust.pause_ends:
-            return None if stored is None or rows else stored.generation
-        self._say_if(
-            stored is None,
-            "the code, a file, a package or the machine of this %s is not that of its stored simulations; up to %d of "
-            "them are simulated again, to see whether they can be used",
-            *(type(run.model).__name__, min(n, len(next(iter(rows.values()))))),
+        trust, cache = self._trust, self.cache
+        generation = self._known_generation(source) or next(iter(trust.generations.values()), None)
+        if generation is None and not trust.is_blocked and (stored := cache.generations_of(fingerprint)):
+            generation = self._adopted(stored, fingerprint, run, width) if cache.verify else stored[0]
+        return generation and self._use(source, generation)
+
+    def _adopted(self, stored: list[int], fingerprint: str, run: VerifyingRun, width: int) -> int | None:
+        """The generation that new simulations agree with, else a new one; None if no simulation ends."""
+        cache, name = self.cache, type(run.model).__name__
+        candidates = {generation: cache.candidates(fingerprint, generation, width) for generation in stored}
+        candidates = {generation: rows for generation, rows in candidates.items() if len(rows) >= ROWS}
+        self._say(
+            "the code, a file, a package or the machine of this %s is not that of its stored simulations; "
+            + (
+                "%d of them are simulated again, to see whether they can be used"
+                if candidates
+                else "they are fewer than %d, stay in the file, and are not used"
+            ),
+            *(name, ROWS),
         )
-        start = time.monotonic()
-        for generation, found in rows.items():
-            chosen = choose_rows(found, n - before, self._random)
-            result = self._compare(cache.rows_of(chosen), len(chosen), FIRST_COMPARED, run)
-            if result.row is not None:
+        for generation, rows in candidates.items():
+            found = self._compare(cache.rows_of(choose_rows(rows, ROWS, self._random)), ROWS, run)
+            if found.row is not None:
                 continue
-            if result.compared < len(chosen) / 2:
-                self._pause(start)
+            if found.compared < ROWS / 2:
+                self._trust.is_blocked = True
                 return None
-            trust.put(cache.file, {source}, generation, before + result.compared)
-            trust.verified[fingerprint, True] += result.compared
-            text = "%d stored simulations of this %s agree with new ones: all are used"
-            self._say_if(stored is None, text, result.compared, type(run.model).__name__)
+            self._trust.left[fingerprint, True] = ROWS_PER_VERIFICATION * found.compared
+            self._say("%d stored simulations of this %s agree with new ones: all are used", found.compared, name)
             return generation
-        self._begin(fingerprint, run)
-        return trust.stored[source].generation
+        if candidates:
+            self._say(DIFFER, name)
+        return self._new_generation(stored)
 
-    def _begin(self, fingerprint: str, run: VerifyingRun) -> None:
-        used = {*self.cache.generations_of(fingerprint), *self.cache.generations_of(run.fingerprint)}
-        self._trust.begin(self.cache.file, run.fingerprint, used)
-        text = "stored simulations of this %s differ from new ones; they stay in the file and are not used"
-        self._say_if(True, text, type(run.model).__name__)
+    def _known_generation(self, source: int) -> int | None:
+        """The generation of the label with the present contents of the files that simulations opened; None if unknown.
 
-    def _say_if(self, condition: bool, text: str, *values: Any) -> None:
-        if condition:
-            logger.warning(f"%s: {text}", self.cache.path, *values)
+        Files that belong to other labels of the model count from now on.
+        """
+        label = self.label
+        query = "SELECT source, code, files, generation, crc FROM labels WHERE source = ? ORDER BY rowid"
+        rows = [row for row in self.cache.file.select(query, (source,)) if row[4] == zlib.crc32(repr(row[:4]).encode())]
+        for row in rows:
+            label.add(Opened(json.loads(row[2])).read_again(), here=False)
+        known = None
+        for row in rows:
+            files = json.loads(row[2])
+            if row[1] == label.code.encode() and Opened(files).read_again().files == files:
+                self._trust.written[source], known = row, row[3]
+        return known
+
+    def _new_generation(self, used: Iterable[int]) -> int:
+        """The generation that another process has begun under the same label, unless its rows differ."""
+        text = f"{self.label.code} {sorted(self.label.opened.items().items())}".encode()
+        generation = int.from_bytes(blake2b(text, digest_size=8).digest()) >> 2 | 1
+        return secrets.randbits(62) | 1 if generation in used else generation
+
+    def _use(self, source: int, generation: int) -> int:
+        """Store to which generation the label belongs, with the files that simulations have opened by now."""
+        label, trust = self.label, self._trust
+        trust.generations[source] = generation
+        row = source, label.code.encode(), json.dumps(label.opened.files, sort_keys=True).encode(), generation
+        row = *row, zlib.crc32(repr(row).encode())
+        before, trust.written[source] = trust.written.get(source), row
+        if before != row:
+            self.cache.file.write(
+                ("DELETE FROM labels WHERE source = ? AND code = ? AND files = ?", [before[:3]] if before else []),
+                ("INSERT OR REPLACE INTO labels (source, code, files, generation, crc) VALUES (?, ?, ?, ?, ?)", [row]),
+            )
+        return generation
+
+    def _say(self, text: str, *values: Any) -> None:
+        logger.warning(f"%s: {text}", self.cache.path, *values)
 
     # comparisons ------------------------------------------------------------------------------------------------------
 
@@ -251,34 +329,26 @@ class VerifiedCache:
                 return True
             if trust.stale is not None:
                 raise StaleCache(str(trust.stale), trust.stale.theta)
-            if time.monotonic() < trust.pause_ends:
+            if trust.is_blocked:
                 return True
             succeeded, latest = [row for row in others if not row.reason], None
-            if not trust.served[fingerprint, True] or not succeeded:
+            if (fingerprint, True) not in trust.left or not succeeded:
                 latest = self.cache.latest_success(fingerprint, generation, width)
                 latest = None if latest is None or latest.session == trust.session else latest
             # failures alone do not verify successful rows, which may be used later
-            kind = fingerprint, bool(latest or succeeded or trust.served[fingerprint, True])
-            # one row suffices for responses and shorter records if other rows of the same code were verified
-            trust.verified.setdefault(kind, -1 if trust.served else -FIRST_ROWS)
-            served = trust.served[kind] + len(others)
-            due = served // ROWS_PER_VERIFICATION - trust.verified[kind]
-            if due > 0:
-                start = time.monotonic()
-                result = self._compare(self._in_order(latest, others), due, due, run)
-                if result.row is not None:
-                    return self._use_no_rows(result.row, result.new, fingerprint, generation, run)
-                n = len(result.stopped)
+            used, kind = trust.used, (fingerprint, bool(latest or succeeded))
+            due = trust.due(kind, len(others))
+            found = self._compare(self._in_order(latest, others), due, run)
+            if found.row is not None:
+                return self._use_no_rows(found.row, found.new, used, generation, run)
+            if found.stopped:
+                if not found.compared:
+                    trust.is_blocked = True
+                    del trust.left[kind]
+                n, total = len(found.stopped), len(found.stopped) + found.compared
                 text = "%d of %d stored simulations could not be verified, because the new simulation was stopped (%s)"
-                if not result.compared:
-                    text += ". Rows are used without verification for a while"
-                    self._pause(start)
-                self._say_if(n > 0, text, n, n + result.compared, *result.stopped[:1])
-                if not result.compared:
-                    return True
-                # rows that are due and that nobody has requested are not compared later
-                trust.verified[kind] = max(trust.verified[kind] + result.compared, served // ROWS_PER_VERIFICATION)
-            trust.served[kind] = served
+                text += ". Rows are used without verification until one ends" if trust.is_blocked else ""
+                self._say(text, n, total, found.stopped[0])
             return True
 
     def _in_order(self, latest: Row | None, rows: list[Row]) -> Iterator[Row]:
@@ -288,38 +358,29 @@ class VerifiedCache:
         shuffled = [rows[place] for place in self._random.permutation(len(rows))]
         yield from (row for row in sorted(shuffled, key=lambda row: bool(row.reason)) if row != latest)
 
-    def _compare(self, rows: Iterable[Row], n: int, size: int, run: VerifyingRun) -> _Comparison:
-        """Simulate rows again, in batches of `size` and more, until n are compared, one differs, or too many stop."""
+    def _compare(self, rows: Iterable[Row], n: int, run: VerifyingRun) -> _Comparison:
+        """Simulate rows again, in growing batches, until n are compared, one differs, or too many stop."""
         rows, compared, stopped = iter(rows), 0, []
         while compared < n and len(stopped) < max(MAX_ATTEMPTS, compared):
-            chosen = list(islice(rows, min(size, n - compared)))
+            chosen = list(islice(rows, min(max(FIRST_COMPARED, 3 * compared), n - compared)))
             if not chosen:
                 break
-            size *= 4
             thetas = np.array([np.frombuffer(row.theta, dtype="<f8") for row in chosen])
-            for row, new in zip(chosen, self._simulate(thetas, run), strict=True):
-                if isinstance(new.reason, TransientReason):
-                    stopped.append(new.reason)
-                elif self._difference(row, new, run)[0]:
-                    return _Comparison(compared, stopped, row, new)
+            start = time.perf_counter()
+            new = simulate_again(run, thetas, self.label)
+            if run.pool is None and self.label.observes:
+                self.label.has_changed_itself(self.label.changed(run.model))
+            self.seconds += time.perf_counter() - start
+            self.compared += len(new)
+            for row, each in zip(chosen, new, strict=True):
+                if isinstance(each.reason, TransientReason):
+                    stopped.append(each.reason)
+                    self.compared, self.unverified = self.compared - 1, self.unverified + 1
+                elif self._difference(row, each, run)[0]:
+                    return _Comparison(compared, stopped, row, each)
                 else:
                     compared += 1
         return _Comparison(compared, stopped)
-
-    def _simulate(self, thetas: np.ndarray, run: VerifyingRun) -> list[Simulated]:
-        start, label = time.perf_counter(), self.label
-        new = simulate_again(run, thetas, label)
-        if run.pool is None and label.observes:
-            label.has_changed_itself(label.changed(run.model))
-        self.seconds += time.perf_counter() - start
-        stopped = sum(isinstance(each.reason, TransientReason) for each in new)
-        self.compared, self.unverified = self.compared + len(new) - stopped, self.unverified + stopped
-        return new
-
-    def _pause(self, start: float) -> None:
-        """Compare nothing for a while, because no new simulation has ended since `start` [s]."""
-        now = time.monotonic()
-        self._trust.pause_ends = now + max(PAUSE_SECONDS, PAUSE_RATIO * (now - start))
 
     def _difference(self, row: Row, new: Simulated, run: VerifyingRun) -> tuple[str, float]:
         """How a simulation differs from a stored one, as `difference_in_words`.
@@ -330,41 +391,41 @@ class VerifiedCache:
         if not reason and row.size is not None:  # a response
             batch = SimulationBatch(misfit.reshape(1, len(run.model.channels), -1), [""])
             (misfit,), (reason,) = misfit_of_responses(run.model, batch, run.measured, run.statistic)
-        other = run.tolerance is None and not row.cpu == self._trust.cpu != 0
-        tolerance = max(run.accepted, DEFAULT_TOLERANCE if other else 0.0)
-        return difference_in_words(misfit, reason, new, run, tolerance, "stored")
+        other = run.tolerance is None and not row.cpu == _cpu(run) != 0
+        return difference_in_words(misfit, reason, new, run, max(run.accepted, DEFAULT_TOLERANCE if other else 0.0))
 
-    def _use_no_rows(self, row: Row, new: Simulated, fingerprint: str, generation: int, run: VerifyingRun) -> bool:
+    def _use_no_rows(self, row: Row, new: Simulated, used: int, generation: int, run: VerifyingRun) -> bool:
         """Begin a new generation, if the label was adopted and no row was used; False. `StaleCache` otherwise."""
         trust, theta = self._trust, np.frombuffer(row.theta, dtype="<f8")
-        difference, change = self._difference(row, new, run)
-        (once_more,) = simulate_again(run, theta[None])
-        scatter, spread = "", 0.0
-        if not isinstance(once_more.reason, TransientReason):
-            scatter, spread = difference_in_words(new.misfit, new.reason, once_more, run, run.accepted, "first")
-        served = trust.served.total()
         trust.start_again()
-        labels = labels_of(self.cache.file, source_number(run.fingerprint))
-        if not scatter and sum(each.generation == generation for each in labels) > 1:
-            # the label was adopted, but the model has changed in a part of the space where no row was compared
-            self._begin(fingerprint, run)
-            if not served:
+        query = "SELECT count(*) FROM labels WHERE source = ? AND generation = ?"
+        source, difference = source_number(run.fingerprint), self._difference(row, new, run)
+        if self.cache.file.select(query, (source, generation)) > [(1,)]:
+            # the model has changed in a part of the space where no row was compared, or by what no label contains
+            trust.generations.clear()
+            self._use(source, self._new_generation([generation]))
+            self._say(DIFFER, type(run.model).__name__)
+            if not used:
                 return False
         point = ", ".join(f"{n} = {value:.17g}" for n, value in zip(run.model.parameter_names, theta, strict=True))
         text = f"{self.cache.path}: a stored simulation is not that of this {type(run.model).__name__}. At {point}: "
-        text += f"{difference}. {_NOT_REPEATABLE.format(scatter) if scatter else CHANGED}"
-        if served:
-            text += f", and discard this run, which has used {served} rows"
-        if row.reason and not scatter:
+        text += f"{difference[0]}. {CHANGED}"
+        if used:
+            text += f", and discard this run, which has used {used} rows"
+        if row.reason:
             text += ". Also do so if failures depend on anything but the parameters, such as a licence"
-        accepted = 10.0 * spread if scatter else 2.0 * change  # of a model that is not exactly repeatable
-        if spread or (0.0 < change < LARGEST_ROUNDING and not scatter):
+        if 0.0 < difference[1] < LARGEST_ROUNDING:
             text += (
                 ". If such a difference comes from rounding, for example on another machine, accept differences of "
-                f"this size, with SimulationCache(path, tolerance={accepted:.1e})"
+                f"this size, with SimulationCache(path, tolerance={2.0 * difference[1]:.1e})"
             )
         trust.stale = StaleCache(text, theta)
         raise trust.stale
+
+
+def _cpu(run: VerifyingRun) -> int:
+    """Number of the processor; 0 if simulations run on other machines."""
+    return zlib.crc32(cpu_name().encode()) if run.pool is None or isinstance(run.pool, LocalPool) else 0
 
 
 # coverage of the space ------------------------------------------------------------------------------------------------
@@ -377,13 +438,11 @@ def choose_rows(rows: list[tuple[bytes, bytes]], n: int, rng: np.random.Generato
     change that concerns a share p of the rows is then missed with a probability of at most (1 - p)^n, as with n random
     rows, and less if the changed part is connected. Returns keys in random order.
     """
-    keys = [key for key, _ in rows]
-    if len(rows) > n > 0:
-        thetas = np.frombuffer(b"".join([theta for _, theta in rows]), dtype="<f8").reshape(len(rows), -1)
-        scale = np.ptp(thetas, axis=0)
-        thetas = (thetas - thetas.min(axis=0)) / np.where(scale > 0.0, scale, 1.0)
-        keys = [keys[rng.choice(cell)] for cell in _cells(np.arange(len(rows)), thetas, n, rng)]
-    return [keys[place] for place in rng.permutation(len(keys))] if n > 0 else []
+    thetas = np.frombuffer(b"".join([theta for _, theta in rows]), dtype="<f8").reshape(len(rows), -1)
+    scale = np.ptp(thetas, axis=0)
+    thetas = (thetas - thetas.min(axis=0)) / np.where(scale > 0.0, scale, 1.0)
+    chosen = [rows[rng.choice(cell)][0] for cell in _cells(np.arange(len(rows)), thetas, n, rng)]
+    return [chosen[place] for place in rng.permutation(n)]
 
 
 def _cells(rows: np.ndarray, thetas: np.ndarray, n: int, rng: np.random.Generator) -> list[np.ndarray]:

@@ -1,19 +1,18 @@
 """The model of a simulator: whether it is still the same, and which stored simulations are its own.
 
 Results from two states of a model must not be mixed, as when a value is set between two batches or a file is edited. So
-fingerprint, code, values and opened files are compared before and after simulations, in about 1 % of the time. User
-code may change values itself, such as a counter. Therefore a difference alone is no error: the first and the latest
-simulation are repeated, and the model counts as unchanged if the results are the same.
+fingerprint, code, values and opened files are compared after simulations, in about 1 % of the time. User code may
+change values itself, such as a counter. Therefore a difference alone is no error: the first and the latest simulation
+are repeated, and the model counts as unchanged if the results are the same.
 """
 
 import os
 import time
-from collections.abc import Callable, Collection, Mapping
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 
-from ..cache.comparison import VerifyingRun, difference_of, simulate_again
+from ..cache.comparison import VerifyingRun, difference_in_words, simulate_again
 from ..cache.simulation_cache import SimulationCache
 from ..cache.verification import VerifiedCache
 from ..noise.statistics import Statistic
@@ -39,13 +38,13 @@ class CheckedModel:
     comparison.
     """
 
-    def __init__(self, model: Model, statistic: Statistic | None, cache: SimulationCache | None, pool: Any) -> None:
-        self._set_up(model, statistic, cache, pool)
+    def __init__(self, model: Model, statistic: Statistic | None, cache: SimulationCache | None) -> None:
+        self._set_up(model, statistic, cache)
 
-    def _set_up(self, model: Model, statistic: Statistic | None, cache: SimulationCache | None, pool: Any) -> None:
+    def _set_up(self, model: Model, statistic: Statistic | None, cache: SimulationCache | None) -> None:
         self._label = ModelLabel(model, statistic)
-        self.rows = None if cache is None else VerifiedCache(cache, pool, self._label, model)
-        self._known = self.label.items | self.label.opened.items() | {_FINGERPRINT: model.fingerprint}
+        self.rows = None if cache is None else VerifiedCache(cache, self._label, model)
+        self._known: dict[str, str | None] = self.label.items | {_FINGERPRINT: model.fingerprint}
         self._repeated = 0
         self._begin()
 
@@ -53,8 +52,7 @@ class CheckedModel:
         self.has_results = False
         self.unchecked: list[np.ndarray] = []
         self._points: list[tuple[np.ndarray, np.ndarray]] = []  # first and latest success: parameters, statistics
-        self._not_before, self._last_seconds, self._is_due = -np.inf, np.inf, False
-        self._seconds = 0.0  # of simulations since the last comparison
+        self._not_before = 0.0  # time of the next comparison [s]
         self._was_sent = False  # from another process, by a pool whose workers import the code
 
     def __getstate__(self) -> tuple:
@@ -80,84 +78,65 @@ class CheckedModel:
         if self.rows is not None and other.rows is not None:
             self.rows.share_trust(other.rows)
 
-    def before(self, run: VerifyingRun, earlier: Callable[[], list]) -> None:
-        """Compare the model before simulations, unless the last comparison was too recent.
+    def before(self, run: VerifyingRun) -> None:
+        """Label the model as it is now, if nothing was simulated or used yet.
 
-        `earlier` returns a known simulation, parameters and statistics, to repeat if this process has run none. Raises
-        `ChangedModel`; the simulations at `unchecked` may be from before or after the change.
+        Raises `ChangedModel` if this object was pickled in another process, where the code has other values.
         """
-        if not self._points and not self.has_results:
-            start, changed = time.monotonic(), self._changed(run.model, run.fingerprint)
-            self._renew(changed)
-            if not changed.keys() <= self.label.changing:  # nothing was used yet: the model is labelled as it is now
-                self._require_what_was_sent(run.model, changed)
-                self._set_up(run.model, run.statistic, None if self.rows is None else self.rows.cache, run.pool)
-            self._is_due, self._last_seconds = True, time.monotonic() - start
+        if self._points or self.has_results:
             return
-        self._points = self._points or earlier()
-        self._is_due = time.monotonic() >= self._not_before
-        if self._is_due:
-            self._require_same(run, run.fingerprint)
-            pause = max(0.0, 2.0 * self._last_seconds - _NO_TIME) / _SHARE_OF_TIME
-            self._not_before = time.monotonic() + pause
-
-    def after(
-        self, run: VerifyingRun, thetas: np.ndarray, misfit: np.ndarray, reasons: list[str], seconds: float, last: bool
-    ) -> bool:
-        """Compare the model after simulations, if `before` did and, with a pool, they took long; whether it compared.
-
-        Not while others run (`last` is false). `seconds` is the wall time. Raises `ChangedModel`, as `before`.
-        """
-        self.unchecked.append(thetas)
-        self._seconds += seconds
-        here = run.pool is None
-        due = self._is_due and last and (here or _SHARE_OF_TIME * self._seconds >= self._last_seconds)
-        succeeded = [row for row, reason in enumerate(reasons) if not reason]
-        points = [(thetas[row].copy(), misfit[row].copy()) for row in succeeded[:1] + succeeded[-1:]]
-        if not here and not self._points:
-            self._points = points  # threads share the model, which may have changed itself: these can be repeated
-        if due and (here or self._points):
-            self._require_same(run, run.model.fingerprint, simulated_here=here)
-        if points and (not self.unchecked or not self._points):
-            self._points = [(self._points or points)[0], points[-1]]
-        return due
-
-    def _require_what_was_sent(self, model: Model, changed: Collection[str]) -> None:
-        """Raise `ChangedModel` if this object was pickled in another process, where the code has other values."""
-        found = sorted(name for name in set(changed) - self.label.changing if not name.startswith(_OF_A_PROCESS))
+        changed = self._changed(run) - self.label.changing
+        found = sorted(name for name in changed if not name.startswith(_OF_A_PROCESS))
         if self._was_sent and found:
             raise ChangedModel(
-                f"the {type(model).__name__} in this process is not the one that was sent ({', '.join(found[:3])} "
+                f"the {type(run.model).__name__} in this process is not the one that was sent ({', '.join(found[:3])} "
                 "differ): a module that is imported here has other contents or values than where the likelihood was "
                 "made. Give the pool to the likelihood, FELikelihood(..., pool=...), which sends code and values, or "
                 "make a new likelihood"
             )
-
-    def _changed(self, model: Model, fingerprint: str) -> dict[str, str | None]:
-        """Present digests of what has changed, None if it is gone; a file counts from when a simulation opened it."""
-        known = self.label.opened.items() | self._known
-        now = self.label.present(model) | {_FINGERPRINT: fingerprint}
-        return {name: now.get(name) for name in known.keys() | now.keys() if known.get(name) != now.get(name)}
-
-    def _renew(self, changed: Mapping[str, str | None]) -> None:
-        # the same objects where nothing has changed, so that pickles stay small
-        self._known = {name: digest for name, digest in (self._known | changed).items() if digest is not None}
-
-    def _require_same(self, run: VerifyingRun, fingerprint: str, simulated_here: bool = False) -> None:
-        """Raise `ChangedModel` if the model has changed, except for values that it changes itself."""
-        start, changed = time.monotonic(), self._changed(run.model, fingerprint)
-        self._last_seconds = time.monotonic() - start
         if changed:
-            usual = changed.keys() <= self.label.changing
-            if usual and self._points and sum(map(len, self.unchecked)) < _ROWS_PER_REPETITION:
+            self._set_up(run.model, run.statistic, None if self.rows is None else self.rows.cache)
+
+    def after(
+        self,
+        run: VerifyingRun,
+        thetas: np.ndarray,
+        misfit: np.ndarray,
+        reasons: list[str],
+        earlier: Callable[[], list[tuple[np.ndarray, np.ndarray]]],
+    ) -> None:
+        """Compare the model after simulations, unless the last comparison was too recent.
+
+        `earlier` returns a known simulation, parameters and statistics, to repeat if this object has seen none. Raises
+        `ChangedModel`; the simulations at `unchecked` may be from before or after the change.
+        """
+        self.unchecked.append(thetas)
+        succeeded = [row for row, reason in enumerate(reasons) if not reason]
+        points = [(thetas[row].copy(), misfit[row].copy()) for row in succeeded[:1] + succeeded[-1:]]
+        known = self._points or earlier()
+        self._points = (known or points)[:1] + points[-1:]
+        if self._points and time.monotonic() >= self._not_before:
+            start = time.monotonic()
+            self._require_same(run, is_first=not known and run.pool is None)
+            now = time.monotonic()
+            self._not_before = now + max(0.0, now - start - _NO_TIME) / _SHARE_OF_TIME
+
+    def _changed(self, run: VerifyingRun) -> set[str]:
+        """Names of what has changed; a file counts from when a simulation opened it."""
+        known = self.label.opened.items() | self._known
+        now = self.label.present(run.model) | {_FINGERPRINT: run.model.fingerprint}
+        return {name for name in known.keys() | now.keys() if known.get(name) != now.get(name)}
+
+    def _require_same(self, run: VerifyingRun, is_first: bool) -> None:
+        """Raise `ChangedModel` if the model has changed, except for values that it changes itself, as the first may."""
+        changed = self._changed(run)
+        if changed:
+            if changed <= self.label.changing and sum(map(len, self.unchecked)) < _ROWS_PER_REPETITION:
                 return
-            same = _FINGERPRINT not in changed
-            if same:  # the first simulation here may have changed values that it uses
-                same = self._repeat(run) if self._points else usual or simulated_here
-            if not same:
+            is_other = _FINGERPRINT in changed
+            if is_other or not (is_first or self._repeats(run)):
                 why = f"different: {', '.join(sorted(changed)[:3])}"
-                if self._points and _FINGERPRINT not in changed:
-                    why += ", and an earlier simulation gives another result"
+                why += "" if is_other else ", and an earlier simulation gives another result"
                 raise ChangedModel(
                     f"the {type(run.model).__name__} has changed since the likelihood was made ({why}): "
                     "a value or file that it uses was changed, or another model was set. Its simulations cannot be "
@@ -165,23 +144,23 @@ class CheckedModel:
                     "to be a parameter"
                 )
             self.label.has_changed_itself(changed)
-            self._renew(self._changed(run.model, run.model.fingerprint))
+            now = self.label.present(run.model)
+            # the same objects where nothing has changed, so that pickles stay small
+            self._known |= {name: now.get(name) for name in changed}
         self.unchecked.clear()
-        self._last_seconds, self._seconds = time.monotonic() - start, 0.0
 
-    def _repeat(self, run: VerifyingRun) -> bool:
+    def _repeats(self, run: VerifyingRun) -> bool:
         """Whether the repeated simulations give the earlier results, or the model is not repeatable."""
         thetas = np.array([theta for theta, _ in self._points])
 
         def same_as(earlier: list[np.ndarray]) -> tuple[bool, list[np.ndarray]]:
-            new = simulate_again(run, thetas)
+            new = simulate_again(run, thetas, self.label)
             self._repeated += len(thetas)
-            pairs = zip(earlier, new, strict=True)
-            agree = (
-                isinstance(n.reason, TransientReason) or not (n.reason or difference_of(e, n, run, run.accepted))
-                for e, n in pairs
-            )
-            return all(agree), [each.misfit for each in new]
+            return all(
+                isinstance(each.reason, TransientReason)
+                or not difference_in_words(before, "", each, run, run.accepted)[0]
+                for before, each in zip(earlier, new, strict=True)
+            ), [each.misfit for each in new]
 
         same, repeated = same_as([misfit for _, misfit in self._points])
         return same or not same_as(repeated)[0]

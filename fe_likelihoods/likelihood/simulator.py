@@ -158,7 +158,7 @@ class Simulator:
         self.pool = as_executor(pool, model)
         self.cache = cache if cache is None or isinstance(cache, SimulationCache) else SimulationCache(cache)
         self.memory_cache, self.response_memory = MemoryCache(memory_rows), ResponseMemory(memory_bytes)
-        self._checked = CheckedModel(model, statistic, self.cache, self.pool)
+        self._checked = CheckedModel(model, statistic, self.cache)
         self._key = self.simulation_key
         self.chunk_size = 1
         self.simulations = self.cache_hits = self.disk_hits = 0
@@ -559,8 +559,7 @@ class Simulator:
         if self.when_simulated is not None:
             self.when_simulated(len(thetas))
         run = request.run if request.run.model is self.model else self._run  # the model may have been replaced
-        last = self._in_pool is None or not self._running.simulations
-        self._drop_if_changed(self._checked.after, run, thetas, statistics, reasons, seconds, last)
+        self._drop_if_changed(self._checked.after, run, thetas, statistics, reasons, self._earlier_point)
         self._checked.has_results = True
         self.memory_cache.store(keys, statistics, reasons)
         if full:
@@ -587,7 +586,7 @@ class Simulator:
     def _check_before(self, run: VerifyingRun) -> None:
         """Check failures and the model before simulations, not after them, so that finished simulations are stored."""
         self.check_failures()
-        self._drop_if_changed(self._checked.before, run, self._earlier_point)
+        self._drop_if_changed(self._checked.before, run)
 
     def _earlier_point(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Parameters and statistics of a successful simulation in memory, if there is one, to be run again."""

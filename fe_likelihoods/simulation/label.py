@@ -72,8 +72,7 @@ _OF_CLASSES = {
 _DATA = (int, float, complex, str, bytes, list, dict, set, np.ndarray)  # class attributes that running code may change
 _OF_SHELLS = {"_", "PWD", "OLDPWD", "SHLVL"}  # changes are irrelevant for simulations
 _PARTS = {"function", "class", "output", "statistic", "library", "python"}
-_first: dict[str, str] = {}  # first digests of values that running code changes
-_opened: dict[str, Opened] = {}  # by code, in this process
+_first: dict[str, tuple[Any, str]] = {}  # first digests of values that running code changes, and the import they are of
 _sources: dict[str, tuple[types.ModuleType, Any, str, frozenset[str]]] = {}  # by name: module, its spec, digest, words
 
 
@@ -88,11 +87,10 @@ class ModelLabel:
 
     def __init__(self, model: Any, statistic: Any = None) -> None:
         self._statistic = statistic
-        now = self._present(model)
-        self.items = now | {name: digest for name, digest in _first.items() if name in now}
+        self.items = self._present(model)
+        self.items |= {name: _first[name][1] for name in self.changing}
         self.observes = _has_user_code(model) or (statistic is not None and _defined_by_user(statistic))
-        # only the first simulation of a process imports a module, so the files it opened belong to later labels too
-        self.opened, self._was_observed = _opened.get(self.code, Opened({})).read_again(), False
+        self.opened, self._was_observed = Opened({}), False
 
     @property
     def code(self) -> str:
@@ -117,7 +115,6 @@ class ModelLabel:
         self._was_observed = self._was_observed or (here and opened is not None)
         if opened is not None and not opened.files.keys() <= self.opened.files.keys():
             self.opened = opened | self.opened
-            _opened[self.code] = self.opened
 
     def present(self, model: Any) -> dict[str, str]:
         """The items of a model in its present state, and of the files that simulations opened."""
@@ -129,14 +126,14 @@ class ModelLabel:
         return {name for name in known.keys() | now.keys() if known.get(name) != now.get(name)}
 
     def has_changed_itself(self, names: Iterable[str]) -> None:
-        """Record that simulations change some items; later labels of this process keep their first digests."""
-        for name in self.items.keys() & set(names) - _PARTS:
-            _first.setdefault(name, self.items[name])
+        """Record that simulations change some items; later labels of the same import keep their first digests."""
+        for name in self.items.keys() & set(names) - _PARTS - self.changing:
+            _first[name] = _import_of(name), self.items[name]
 
     @property
     def changing(self) -> set[str]:
         """Names of items that simulations of this process have changed."""
-        return self.items.keys() & _first.keys()
+        return {name for name in self.items.keys() & _first.keys() if _first[name][0] is _import_of(name)}
 
     def _present(self, model: Any) -> dict[str, str]:
         parts: dict[str, Any] = model.code_parts() if hasattr(model, "code_parts") else {}
@@ -150,7 +147,8 @@ class ModelLabel:
 def _parts_of(model: Any) -> dict[str, Any]:
     """User class and attributes of an object, without the time limit, which changes no response."""
     kind = type(model)
-    attributes = {f"{kind.__qualname__}().{name}": value for name, value in _state(model) if name != "time_limit"}
+    name = f"{_name_of(kind.__module__)}.{kind.__qualname__}()"
+    attributes = {f"{name}.{each}": value for each, value in _state(model) if each != "time_limit"}
     return {"class": kind} | attributes
 
 
@@ -375,6 +373,15 @@ def _attribute(value: Any, name: str) -> Any:
         return object.__getattribute__(value, name)
     except (AttributeError, ValueError):  # an empty cell raises ValueError
         return None
+
+
+def _import_of(name: str) -> Any:
+    """What identifies the import of the module with a named item: its ``__spec__``, which a reload replaces."""
+    module = sys.modules.get(name)
+    while module is None and name:
+        name = name.rpartition(".")[0]
+        module = sys.modules.get(name)
+    return getattr(module, "__spec__", None)
 
 
 def _source(module: types.ModuleType) -> tuple[str, frozenset[str]]:

@@ -25,7 +25,7 @@ from fe_likelihoods.simulation.model import misfit_batch, misfit_of_responses, s
 from samplers import SMCSampler
 from tests.cache.stored import store_outcomes, stored_outcomes
 from tests.faults import treacherous as bad
-from tests.faults.treacherous import CHANNELS, DT, N_STEPS, Treacherous, line
+from tests.faults.treacherous import CHANNELS, DT, N_STEPS, Hidden, Treacherous, line
 
 NAMES = ("offset", "slope")
 THETAS = np.array([[0.2, 0.1], [0.4, 0.1], [0.6, 0.1]])
@@ -35,6 +35,7 @@ class Faulty(Treacherous):
     """Counts its runs; fails at the second of `THETAS` with an exception, if it is given one."""
 
     fingerprint = "faulty"
+    error = Hidden()
 
     def __init__(self, error=None, time_limit=None):
         self.error, self.time_limit, self.runs = error, time_limit, 0

@@ -3,7 +3,9 @@
 import ctypes
 import os
 import signal
+import sys
 import time
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -59,6 +61,22 @@ class Treacherous:
 
     def simulate(self, theta: np.ndarray) -> np.ndarray:
         return treacherous(theta)
+
+
+class Hidden:
+    """An attribute that no label contains: its values are where the code of a model does not name them."""
+
+    def __set_name__(self, owner, name):
+        self.name = name
+
+    def __get__(self, model, owner):
+        return vars(sys)["hidden of tests"][model][self.name]
+
+    def __set__(self, model, value):
+        vars(sys)["hidden of tests"].setdefault(model, {})[self.name] = value
+
+
+vars(sys).setdefault("hidden of tests", weakref.WeakKeyDictionary())
 
 
 class Announced(Treacherous):
