@@ -28,7 +28,7 @@ LONGEST_LAG, LONGEST_SHARE = 5.0, 0.2  # [s], and as a share of the record
 MOST_VALUES = 2**24  # of responses that are compared at once
 MOST_FAULTS = 4  # that are found one after the other
 SAME_UNITS = 1.25  # ratio of a factor to one between units, up to which it is named after them
-EQUALLY_NEAR, NEAR_ENOUGH = 0.01, 0.03  # differences of logarithms of ratios that are named together
+NEAR_ENOUGH = 0.03  # difference of logarithms of ratios that are named together
 
 
 class Fault(NamedTuple):
@@ -88,22 +88,21 @@ def find_faults(measurements: Measurements, responses: np.ndarray) -> tuple[Faul
     return tuple(found)
 
 
-def describe_unit(factor: float, dimension: str) -> str:
+def describe_unit(factor: float, dimension: str, unit: str = "") -> str:
     """Units whose ratio is about a factor or its inverse, in words; empty if there are none.
 
-    Ratios to the SI unit of the channel's dimension come first. Then come ratios of its other units, and those of the
-    base motion to m/s2 and g.
+    One of the two is the SI unit or the `unit` of the channel, or they are m/s2 and g of the base motion.
     """
-    near: dict[bool, dict[str, float]] = {True: {}, False: {}}
-    for of in dict.fromkeys((dimension, "acceleration")):
-        bases, units = (DIMENSIONS[of], "g"), [unit for unit in UNITS.values() if unit.dimension == of]
-        for one, other in combinations(sorted(units, key=lambda u: (u.name != bases[0], u.name != "g")), 2):
-            apart = abs(abs(math.log(one.factor / other.factor)) - abs(math.log(factor)))
-            if apart < math.log(SAME_UNITS) and (of == dimension or one.name in bases):
-                words = f"{one.name} and {other.name}{'' if of == dimension else ' of the base motion'}"
-                near[of == dimension and one.name in bases][words] = apart
-    chosen, margin = (near[True], EQUALLY_NEAR) if near[True] else (near[False], NEAR_ENOUGH)
-    return " or ".join(words for words, apart in chosen.items() if apart < min(chosen.values()) + margin)
+    bases, near = (unit, DIMENSIONS[dimension]), dict[str, float]()
+    units = sorted((each for each in UNITS.values() if each.dimension == dimension), key=lambda u: u.name not in bases)
+    ratios = {9.80665: "m/s2 and g of the base motion"} if dimension != "acceleration" else {}
+    for one, other in combinations(units, 2):
+        if one.name in bases:  # of two names of a unit, the first
+            ratios.setdefault(one.factor / other.factor, f"{one.name} and {other.name}")
+    for ratio, words in ratios.items():
+        apart = abs(abs(math.log(ratio)) - abs(math.log(factor)))
+        near |= {words: apart} if apart < math.log(SAME_UNITS) else {}
+    return " or ".join(words for words, apart in near.items() if apart < min(near.values()) + NEAR_ENOUGH)
 
 
 def _is_factor(value: float) -> bool:

@@ -47,7 +47,8 @@ FAULTS = {
     "factor": (
         "A {what} may be wrong",
         "{where}: measured values are {value} times the computed ones{units}{better}.",
-        "Correct the unit or gain of the channel, or of the base motion. A model of your own must return SI units.",
+        "Look up unit and gain of the channel and of the base motion, and correct the wrong one; a model of your own "
+        "must return SI units.",
     ),
     "sign": (
         "A sign may be wrong",
@@ -56,17 +57,21 @@ FAULTS = {
     ),
     "swap": (
         "Channels may be swapped",
-        "{where}: these channels may be exchanged{better}.",
-        "Exchange their columns, if the places of the sensors say so.",
+        "{where}: each measurement resembles the computed response of the other{better}.",
+        "Look up which cable belongs to which place; if they were exchanged, exchange the columns.",
     ),
     "lag": (
         "Clocks may differ",
         "{where}: measured values are {value} s {late} than the computed ones{better}.",
-        "Check the clocks of sensors and motions, and when the motion begins (zero in [measurements]); see `align`.",
+        "Check the clocks of sensors and motions, and when the motion begins (`zero` in [measurements], or "
+        "measurements.shift); a lag that stays unknown can be a parameter (`Sensor`).",
     ),
 }
 """Kind, text and action of each fault of data."""
-PLACES = "Check units, signs, clocks and the place of the sensor in the model; or the model lacks what moves it."
+PLACES = (
+    "Check that it is the right column, its unit, sign and clock, and the place of the sensor in the model; if all "
+    "of them are right, the model lacks what moves it."
+)
 
 
 def check_fit(posterior: Posterior, samples: Any = None) -> tuple[Finding, ...]:
@@ -141,8 +146,8 @@ def check_faults(fit: Fit) -> list[Finding]:
 
 
 def _of_a_fault(fit: Fit, fault: Fault, severity: str, how: str = "") -> Finding:
-    dimensions = sorted({each.dimension for each in fit.measurements.channels if each.name in fault.names})
-    near = [describe_unit(fault.value, each) for each in dimensions] if fault.kind == "factor" else []
+    of_fault = [each for each in fit.measurements.channels if each.name in fault.names]
+    near = [describe_unit(fault.value, c.dimension, c.unit) for c in of_fault] if fault.kind == "factor" else []
     units = " or ".join(filter(None, dict.fromkeys(near)))
     words = {
         "where": fit.where(*fault.names),
@@ -166,7 +171,7 @@ def check_supports(model: Any) -> list[Finding]:
     found, unknown = [], getattr(model, "inputs", ())  # whose gains are parameters of a `SensedModel`
     apart = supports_apart(support_gains([each.acceleration for each in motions], motions[0].dt))
     for k, gain in ((k, gain) for k, gain in apart.items() if k not in unknown):
-        unit = describe_unit(abs(gain), "acceleration")
+        unit = describe_unit(abs(gain), "acceleration", "g")
         kind = "A sign may be wrong" if gain < 0.0 else "A unit may be wrong" if unit else "A gain may be wrong"
         near = f", about the ratio of {unit}" if unit and gain > 0.0 else ""
         text = f"Where it is slow, the motion {motions[k].name} is {gain:.2g} times that of the other supports{near}."
@@ -187,10 +192,13 @@ def _check_offset(fit: Fit) -> list[Finding]:
     if not large:
         return []
     text = (
-        f"What the fit leaves of {fit.where(*large)} is mostly a parabola, with {percent(max(large.values()))} of the "
-        "power; the noise takes it for scatter."
+        f"What the fit leaves of {fit.where(*large)} is {percent(max(large.values()))} of its power one slow parabola "
+        "over the whole record, which no vibration makes, and which the noise takes for scatter."
     )
-    action = "Correct the baseline of the measurement, or let the model have the residual displacement."
+    action = (
+        "Correct the baseline (`baseline` in [measurements]); if the structure did keep a displacement, the model must "
+        "have it."
+    )
     return [Finding("A measurement may have an offset or a drift", CARE, text, action, large)]
 
 
@@ -218,7 +226,7 @@ def check_errors(fits: Sequence[Fit]) -> list[Finding]:
         (
             useless,
             "The model does not follow the measurements",
-            "After the update, the model explains less than half of the power of {} (error, RRMSE).",
+            "The update leaves more than half of the power unexplained: the error (RRMSE) of {}; 71 % is half.",
             PLACES,
         ),
         (poor, "A channel is hardly reproduced", "After the update, the error (RRMSE) is still large: {}.", PLACES),
@@ -301,7 +309,7 @@ def check_parameters(rows: Sequence[ParameterRow], limits: Container[str] = ()) 
     at = [f"{label} at {bound:.4g}" for name, (label, bound, _) in edges(rows).items() if name not in limits]
     if at:
         text = f"The posterior reaches the edge of its prior: {listed(at)}. The bound, not the data, ends it there."
-        action = "Widen the prior, and ask what the parameter makes up for in the model."
+        action = "If no other finding explains it, widen the prior; else the parameter makes up for that fault."
         found.append(Finding("At the edge of the prior", CARE, text, action))
     if flat:
         text = f"The posterior of {listed(flat)} is nearly as wide as its prior: these data say little about it."

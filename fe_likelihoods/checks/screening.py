@@ -177,7 +177,7 @@ def check_sensors(channels: Sequence[Screened]) -> list[Finding]:
     for channel, fault in ((each, fault) for each in channels for fault in each.faults):
         only = channel._replace(faults=(fault,))
         places = [first if first == last else f"{first} to {last}" for first, last in only.missing()]
-        more = f" and {len(places) - MOST_PLACES} more places" if len(places) > MOST_PLACES else ""
+        more = f" and at {len(places) - MOST_PLACES} more" if len(places) > MOST_PLACES else ""
         level = " to ".join(f"{value:.3g}" for value in fault.level[:: max(len(fault.level) - 1, 1)])
         kind, text = _FAULTS[fault.kind]
         text = text.format(

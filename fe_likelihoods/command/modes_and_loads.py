@@ -33,8 +33,13 @@ def read_modes(job: Job) -> tuple[ModalData, ModalData | None]:
     data = replace(data, **given.given("temperatures"))
     data = data.mean() if given.mean else data
     errors = given.given("frequency_cv", "covariance", "shape_error")
-    known = {name: value for name, value in errors.items() if isinstance(value, float)}  # of every mode
-    held_out = None if given.held_out is None else replace(data.select(given.held_out), **known)
+    every = {  # errors of all modes of the file, which those held out have as well
+        name: errors.pop(name)
+        for name in ("frequency_cv", "shape_error")
+        if name in errors and "covariance" not in errors and np.size(errors[name]) in (1, data.n_modes)
+    }
+    data = replace(data, **every)
+    held_out = None if given.held_out is None else data.select(given.held_out)
     if both := set(given.held_out or ()) & set(given.modes or ()):
         raise ValueError(f"held_out: the modes {sorted(both)} are in modes too: leave them out of one of them")
     compared = given.modes or [each for each in data.mode_numbers if each not in (given.held_out or ())]

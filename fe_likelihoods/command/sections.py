@@ -201,7 +201,8 @@ class Modes(Section):
     )
     mean: Any = key("yes or no", "Take the mean of several identifications, and their scatter as the errors", False)
     frequency_cv: Any = key(
-        "number or numbers", "Known coefficient of variation of the frequencies, such as 0.005, or one per mode"
+        "number or numbers",
+        "Known coefficient of variation of the frequencies, such as 0.005, or one per mode of the file",
     )
     covariance: Any = key("matrix", "Known covariance of the compared frequencies [Hz²], instead of frequency_cv")
     temperatures: Any = key(

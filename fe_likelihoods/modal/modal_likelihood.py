@@ -226,14 +226,17 @@ class PredictedModes(NamedTuple):
         """The same computed modes beside other measured ones; nothing is simulated."""
         return self.of(PairedModes(self.paired.model, data, self.paired.close), self.computed, self.unknown)
 
-    def interval(self, level: float = 0.9) -> np.ndarray:
-        """Central intervals (2, m) of an identified frequency [Hz], with its known and unknown errors."""
+    @property
+    def errors(self) -> np.ndarray:
+        """Known and unknown relative errors (n, m) of an identified frequency, together."""
         known = self.data.frequency_cv
         if self.data.covariance is not None:
             known = np.sqrt(np.diag(self.data.covariance)) / self.data.mean_frequencies
-        errors = np.hypot(self.unknown[:, None], 0.0 if known is None else known)
-        errors = np.broadcast_to(errors, self.frequencies.shape)
-        drawn = self.frequencies * (1.0 + errors * _NORMAL_QUANTILES[:, None, None])
+        return np.hypot(self.unknown[:, None], np.zeros(self.data.n_modes) if known is None else known)
+
+    def interval(self, level: float = 0.9) -> np.ndarray:
+        """Central intervals (2, m) of an identified frequency [Hz], with its errors."""
+        drawn = self.frequencies * (1.0 + self.errors * _NORMAL_QUANTILES[:, None, None])
         return np.quantile(drawn, [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=(0, 1))
 
     def rows(self) -> list[list[str]]:

@@ -1,5 +1,7 @@
 """Findings about modes: each fault is named, and right data are not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -12,6 +14,8 @@ from fe_likelihoods import (
     ShearFrame,
     check_fit,
 )
+from fe_likelihoods.checks.compared import compare
+from fe_likelihoods.checks.fit import check_responses
 from fe_likelihoods.checks.rehearsal import check_model
 from fe_likelihoods.modal.mode_models import StructureModes
 
@@ -61,6 +65,26 @@ def test_units_are_named(factor, text):
 
 def test_frequencies_out_of_reach_are_named():
     assert before(changed(identified(1), [1.0, 2.0, 1.0])) == ["The prior does not reach the measurements"]
+    named = [0, 0]
+    for seed in range(20):  # five draws of the prior, as of a slow model, reach less far than the prior
+        for k, factor in enumerate((1.0, 2.0)):
+            likelihood = ModalLikelihood(FRAME, changed(identified(seed), [1.0, factor, 1.0]))
+            draws = Posterior(likelihood, PRIOR).sample_prior(5, np.random.RandomState(seed))
+            named[k] += bool(check_responses(compare(likelihood, draws)[0]))
+    assert named[0] == 0 and named[1] >= 15
+
+
+def test_held_out_modes_outside_of_their_interval_are_named():
+    rng, named = np.random.default_rng(1), [0, 0]
+    for seed in range(10):
+        data = identified(seed, (1, 2, 3, 4), **KNOWN)
+        theta = np.exp(0.2 * np.random.default_rng(seed).normal(size=4))
+        for k, factor in enumerate((1.0, 1.06)):
+            held_out = replace(data.select([3, 4]), frequencies=data.frequencies[:, 2:] * [1.0, factor])
+            likelihood = ModalLikelihood(FRAME, data.select([1, 2]), held_out=held_out)
+            found = check_fit(Posterior(likelihood, PRIOR), theta * (1.0 + 0.01 * rng.normal(size=(50, 4))))
+            named[k] += [each.kind for each in found] == ["A held-out mode is not predicted"]
+    assert named[0] == 0 and named[1] >= 9
 
 
 @pytest.mark.parametrize(

@@ -110,7 +110,11 @@ def test_other_models_have_modes(tmp_path):
 def test_held_out_modes_are_predicted_and_shown(tmp_path, monkeypatch):
     """The intervals of the report are those of fit.csv."""
     monkeypatch.chdir(tmp_path)
-    call("run", str(changed(tmp_path, "modal", ("modes = [1, 2, 3]", "held_out = [4, 3]"))), "--quiet")
+    errors = ("frequency_cv = 0.005", "frequency_cv = [0.005, 0.005, 0.005, 0.01]")  # of those held out as well
+    path = changed(tmp_path, "modal", ("modes = [1, 2, 3]", "held_out = [4, 3]"), errors)
+    held_out = make_problem(read_job(path)).posterior.likelihood.held_out
+    assert held_out.frequency_cv.tolist() == [0.01, 0.005]
+    call("run", str(path), "--quiet")
     with (tmp_path / "results-changed" / "fit.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [(row["mode"], row["compared"]) for row in rows] == [("1", "yes"), ("2", "yes"), ("4", "no"), ("3", "no")]
