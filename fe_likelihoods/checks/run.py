@@ -41,7 +41,6 @@ class FinishedRun(NamedTuple):
     effective_sample_size: float  # independent samples with the same error of the mean, the smallest
     truth: np.ndarray  # (ndim,), NaN where none is known
     discard: int  # iterations left out at the beginning of the chain
-    thin: int  # of the other iterations, one in `thin` was kept
     tempered: bool
     verdict: Verdict | None
     check: EvidenceCheck | None  # independent estimate of the evidence
@@ -83,9 +82,8 @@ def read_run(
     names: Sequence[str] | None = None,
     truth: Mapping[str, float] | Sequence[float] | None = None,
     discard: int = 0,
-    thin: int = 1,
 ) -> FinishedRun:
-    """Read a finished run of this project or of emcee; `discard` and `thin` as in `emcee.EnsembleSampler.get_chain`.
+    """Read a finished run of this project or of emcee; `discard` as in `emcee.EnsembleSampler.get_chain`.
 
     By default the posterior is the sampler's log-density. Names are for a posterior without them; `truth` has true
     values of synthetic data, in the units of the samples. ValueError if the sampler has no chain, or names, true values
@@ -95,13 +93,13 @@ def read_run(
         raise ValueError(
             f"report needs a sampler that has run (SMCSampler, TMCMCSampler or emcee.EnsembleSampler); got {sampler!r}"
         )
-    if not 0 <= discard < sampler.iteration or thin < 1:
+    if not 0 <= discard < sampler.iteration:
         raise ValueError(
-            f"report needs a chain: the sampler has made {sampler.iteration} iterations, and discard={discard}, "
-            f"thin={thin} leave none. Call run_mcmc with one step or more, and discard fewer iterations"
+            f"report needs a chain: the sampler has made {sampler.iteration} iterations, and discard={discard} leaves "
+            "none. Call run_mcmc with one step or more, and discard fewer iterations"
         )
     posterior = getattr(sampler.log_prob_fn, "f", None) if posterior is None else posterior
-    samples = sampler.get_chain(flat=True, discard=discard, thin=thin)
+    samples = sampler.get_chain(flat=True, discard=discard)
     parameters = _parameters(sampler, posterior, names)
     if len(parameters) != samples.shape[1]:
         raise ValueError(
@@ -110,7 +108,7 @@ def read_run(
         )
     tempered = hasattr(sampler, "ladder") and bool(sampler.ladder)
     autocorrelation = np.nan if tempered else _autocorrelation_time(sampler, discard)
-    mean_error, sd_error, size = _errors(sampler, samples, tempered, autocorrelation, discard, thin)
+    mean_error, sd_error, size = _errors(sampler, samples, tempered, autocorrelation, discard)
     likelihood, prior = getattr(posterior, "likelihood", None), getattr(posterior, "prior", None)
     return FinishedRun(
         sampler=sampler,
@@ -119,13 +117,12 @@ def read_run(
         prior=prior if isinstance(prior, Prior) else None,
         parameters=parameters,
         samples=samples,
-        log_prob=sampler.get_log_prob(flat=True, discard=discard, thin=thin),
+        log_prob=sampler.get_log_prob(flat=True, discard=discard),
         mean_error=mean_error,
         sd_error=sd_error,
         effective_sample_size=size,
         truth=_truth(truth, [each.name for each in parameters]),
         discard=discard,
-        thin=thin,
         tempered=tempered,
         verdict=_verdict(sampler) if tempered else None,
         check=sampler.log_evidence_check if tempered else None,
@@ -182,7 +179,7 @@ def _autocorrelation_time(sampler: EnsembleSampler, discard: int) -> float:
 
 
 def _errors(
-    sampler: EnsembleSampler, samples: np.ndarray, tempered: bool, autocorrelation: float, discard: int, thin: int
+    sampler: EnsembleSampler, samples: np.ndarray, tempered: bool, autocorrelation: float, discard: int
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Standard errors of means and standard deviations (ndim,), and the effective sample size of the worst parameter.
 
@@ -190,9 +187,9 @@ def _errors(
     """
     spread = samples.std(axis=0)
     if tempered:
-        error = sampler.mean_error(discard=discard, thin=thin)
+        error = sampler.mean_error(discard=discard)
         size = float(np.min((spread[error > 0.0] / error[error > 0.0]) ** 2, initial=len(samples)))
-        return error, sampler.sd_error(discard=discard, thin=thin), size
+        return error, sampler.sd_error(discard=discard), size
     iterations = sampler.iteration - discard
     size = min(iterations * sampler.nwalkers / autocorrelation, float(len(samples)))  # min keeps a first NaN
     of_variance = np.square(samples - samples.mean(axis=0)).std(axis=0)

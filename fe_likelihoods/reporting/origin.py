@@ -48,8 +48,6 @@ def sampler_settings(run: FinishedRun) -> list[tuple[str, str]]:
     rows.append(("stored iterations", str(sampler.iteration)))
     if run.discard:
         rows.append(("iterations left out as burn-in", str(run.discard)))
-    if run.thin > 1:
-        rows.append(("one iteration kept in", str(run.thin)))
     rows.append(("samples in this report", str(len(run.samples))))
     if not hasattr(sampler, "settings"):
         return rows

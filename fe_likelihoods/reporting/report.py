@@ -9,12 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..checks.compared import Fits
-from ..checks.failed_simulations import Failures
 from ..checks.finding import Finding
 from ..checks.result import JudgedRun, judge_run
 from ..checks.run import FinishedRun, read_run
-from ..checks.table import ParameterRow
 from ..information.identifiability import of_samples
 from ..prediction.prediction import Prediction
 from ..prediction.scores import HistoryScores, QuantityScores
@@ -22,7 +19,6 @@ from ..signals.channels import Measurements
 from ..simulation.model import SimulationFailed
 from ..units import from_si
 from .contents import (
-    DataSet,
     PredictedValue,
     cost,
     data_sets,
@@ -46,7 +42,7 @@ from .pictures import (
     draw_scores_of_events,
 )
 
-__all__ = ["Contents", "Predicted", "report", "write_page"]
+__all__ = ["Predicted", "report", "write_page"]
 
 
 class Predicted(NamedTuple):
@@ -62,41 +58,6 @@ class Predicted(NamedTuple):
     findings: tuple[Finding, ...]
 
 
-class Contents(NamedTuple):
-    """Everything that the template shows, in its order."""
-
-    title: str
-    date: str
-    status: str
-    summary: list[str]
-    findings: tuple[Finding, ...]
-    data: list[DataSet]
-    rows: list[ParameterRow]
-    has_truth: bool
-    factor: float
-    evidence: list[str]
-    fits: Fits
-    told: list[str]
-    posterior_pictures: list[Picture]
-    fit_pictures: list[tuple[str, list[Picture]]]
-    run_pictures: list[Picture]
-    predictions: list[Predicted]
-    events: list[OtherEvent]
-    event_pictures: list[list[Picture]]
-    score_pictures: list[Picture]
-    residuals: list[str]
-    verdict: list[str]
-    unknown: list[str]
-    inconclusive: bool
-    failures: Failures
-    cost: list[tuple[str, str]]
-    settings: list[tuple[str, str]]
-    versions: list[tuple[str, str]]
-    fingerprints: list[tuple[str, str]]
-    tests: tuple[tuple[str, str], ...]
-    repeat: str
-
-
 def report(
     sampler: Any,
     posterior: Any = None,
@@ -109,7 +70,6 @@ def report(
     measured: Measurements | Mapping[str, Measurements] | None = None,
     events: Mapping[str, Prediction | EventPredictions | SimulationFailed] | None = None,
     discard: int = 0,
-    thin: int = 1,
     repeat: str = "",
 ) -> Path:
     """Write a report of a finished run: one HTML file without scripts or links to other files.
@@ -143,8 +103,8 @@ def report(
         `fe_likelihoods.propagate` with ``record=`` or of `fe_likelihoods.predict_new_event`, of one quantity or of
         several by name, such as ``{"histories": None, "peaks": [peak("top")]}``. They are scored where `measured` has
         the event. The error `SimulationFailed` of an event that could not be predicted names it in the report.
-    discard, thin : int
-        Number of iterations to leave out at the beginning of the chain (burn-in); of the others, one in `thin` is kept.
+    discard : int
+        Number of iterations to leave out at the beginning of the chain (burn-in).
     repeat : str
         Commands that make the run again, for the last section. Default: lines of Python from what the sampler knows.
 
@@ -165,7 +125,7 @@ def report(
     >>> path.name
     'report.html'
     """
-    run = read_run(sampler, posterior, names=names, truth=truth, discard=discard, thin=thin)
+    run = read_run(sampler, posterior, names=names, truth=truth, discard=discard)
     return write_page(Path(out), run, prediction, title=title, measured=measured, events=events, repeat=repeat)
 
 
@@ -203,45 +163,45 @@ def gather(
     title: str = "",
     repeat: str = "",
     judged: JudgedRun | None = None,
-) -> Contents:
-    """Make the contents of a report; a run that was not judged is judged, which simulates where nothing is cached."""
+) -> dict[str, Any]:
+    """What the template shows, by name; a run that was not judged is judged, which may simulate."""
     rows, fits, failed, judgement = judge_run(run) if judged is None else judged
     sets = data_sets(run)
     models = " and ".join(dict.fromkeys(each.model for each in sets)) or "a log-density"
-    return Contents(
-        title=title or f"Bayesian updating of {models}",
-        date=datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
-        status=judgement.status,
-        summary=summary_sentences(run, rows, fits, judgement),
-        findings=judgement.findings,
-        data=sets,
-        rows=rows,
-        factor=judgement.width_factor,
-        has_truth=bool(np.isfinite(run.truth).any()),
-        evidence=evidence(run),
-        fits=fits,
-        told=_told(run),
-        posterior_pictures=draw_posterior(run),
-        fit_pictures=[
+    return {
+        "title": title or f"Bayesian updating of {models}",
+        "date": datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
+        "status": judgement.status,
+        "summary": summary_sentences(run, rows, fits, judgement),
+        "findings": judgement.findings,
+        "data": sets,
+        "rows": rows,
+        "factor": judgement.width_factor,
+        "has_truth": bool(np.isfinite(run.truth).any()),
+        "evidence": evidence(run),
+        "fits": fits,
+        "told": _told(run),
+        "posterior_pictures": draw_posterior(run),
+        "fit_pictures": [
             (fit.title, [*draw_fit(fit, fits.before, fits.after), *draw_residuals(fit)]) for fit in fits.fits
         ],
-        run_pictures=draw_run(run),
-        predictions=[_predicted(name, *each) for name, each in predictions.items()],
-        events=list(events),
-        event_pictures=[draw_event(each) for each in events],
-        score_pictures=draw_scores_of_events(events),
-        residuals=[] if run.is_inconclusive else residual_sentences(fits),
-        verdict=verdict_sentences(run, rows),
-        unknown=[] if run.verdict is None else list(run.verdict.unknown),
-        inconclusive=run.is_inconclusive,
-        failures=failed,
-        cost=cost(run, fits),
-        settings=sampler_settings(run),
-        versions=versions(),
-        fingerprints=fingerprints(run),
-        tests=judgement.tests,
-        repeat=repeat or how_to_repeat(run),
-    )
+        "run_pictures": draw_run(run),
+        "predictions": [_predicted(name, *each) for name, each in predictions.items()],
+        "events": list(events),
+        "event_pictures": [draw_event(each) for each in events],
+        "score_pictures": draw_scores_of_events(events),
+        "residuals": [] if run.is_inconclusive else residual_sentences(fits),
+        "verdict": verdict_sentences(run, rows),
+        "unknown": [] if run.verdict is None else list(run.verdict.unknown),
+        "inconclusive": run.is_inconclusive,
+        "failures": failed,
+        "cost": cost(run, fits),
+        "settings": sampler_settings(run),
+        "versions": versions(),
+        "fingerprints": fingerprints(run),
+        "tests": judgement.tests,
+        "repeat": repeat or how_to_repeat(run),
+    }
 
 
 def _told(run: FinishedRun) -> list[str]:
@@ -254,7 +214,7 @@ def _told(run: FinishedRun) -> list[str]:
         return []
 
 
-def render(contents: Contents) -> str:
+def render(contents: Mapping[str, Any]) -> str:
     """The page as text. All texts are escaped."""
     from jinja2 import Environment, StrictUndefined
 
@@ -267,7 +227,7 @@ def render(contents: Contents) -> str:
         "error": lambda x: _number(x, 2),
         "percent": _percent,
     }
-    return environment.from_string(template).render(contents._asdict())
+    return environment.from_string(template).render(contents)
 
 
 def _number(value: float, digits: int = 4) -> str:

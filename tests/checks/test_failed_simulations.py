@@ -51,25 +51,27 @@ def run(posterior, walkers=60, steps=4, **options):
 
 
 def notes_of(contents):
-    return {note.kind: note for note in contents.findings}
+    return {note.kind: note for note in contents["findings"]}
 
 
 def test_a_run_that_is_piled_up_against_failures_is_not_called_good():
     posterior = posterior_of([1.1003, 0.8])
     sampler = run(posterior)
     contents = gather(read_run(sampler, posterior), {})
-    (row,) = contents.failures.rows
+    (row,) = contents["failures"].rows
     assert row.reason == "no convergence" and row.where.startswith("at stiffness above 1.1 (100 %")
-    assert contents.failures.count == posterior.report()["failure_count"]
+    assert contents["failures"].count == posterior.report()["failure_count"]
     note = notes_of(contents)["Failures border on the samples"]
-    assert note.severity == "wrong" and contents.status == "do not use"
+    assert note.severity == "wrong" and contents["status"] == "do not use"
     # one place decides: the sampler
-    assert sampler.verdict.status == "not usable" and contents.failures.near == sampler.verdict.near_failures
+    assert sampler.verdict.status == "not usable" and contents["failures"].near == sampler.verdict.near_failures
     assert (
         f"{sampler.verdict.near_failures.failed} of {sampler.verdict.near_failures.evaluated} evaluated points failed"
         in note.text
     )
-    assert contents.summary[0].startswith("Do not use: ") and "failures border on the samples" in contents.summary[0]
+    assert (
+        contents["summary"][0].startswith("Do not use: ") and "failures border on the samples" in contents["summary"][0]
+    )
 
 
 def test_reasons_that_differ_in_their_numbers_are_one_row(tmp_path):
@@ -93,9 +95,9 @@ def test_control_failures_far_from_the_samples_are_no_severe_doubt():
     posterior = posterior_of([1.05, 0.8])
     sampler = run(posterior)
     contents = gather(read_run(sampler, posterior), {})
-    assert contents.failures.count > 10 and contents.failures.near.failed == 0
+    assert contents["failures"].count > 10 and contents["failures"].near.failed == 0
     assert "Failures border on the samples" not in notes_of(contents)
-    assert contents.status != "do not use" and sampler.verdict.status != "not usable"
+    assert contents["status"] != "do not use" and sampler.verdict.status != "not usable"
 
 
 def test_failures_that_are_not_counted_are_not_known(tmp_path):
@@ -131,7 +133,7 @@ def test_a_run_without_a_result_leads_to_no_conclusion():
     contents = gather(finished, {})
     titles = notes_of(contents).keys()
     assert titles.isdisjoint({"Not informed by the data", "The errors are correlated", "Far from the prior"})
-    assert "Nothing can be said about the parameters yet" in contents.summary[2] and not contents.residuals
+    assert "Nothing can be said about the parameters yet" in contents["summary"][2] and not contents["residuals"]
     assert "The chain is short" in titles
 
 
