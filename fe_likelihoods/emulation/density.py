@@ -21,7 +21,7 @@ from samplers.proposals.mixture import Mixture, draw, fit_mixture, invert_roots,
 from .emulator import ResponseEmulator
 from .target import ResponseTarget
 
-__all__ = ["EmulatedPosterior", "Region", "factor_of", "student_mixture"]
+__all__ = ["EmulatedPosterior", "Region", "factor_of", "student_mixture", "tempered"]
 
 _FREEDOM = 6.0  # at least, else as many as parameters: 50 keep 86 % of draws of a normal density in 50, 6 keep 44 %
 _BLOCK = 2000  # points for which densities are computed together
@@ -58,7 +58,7 @@ def _moments(coords: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.nd
     return mean, (apart * weights[:, None]).T @ apart
 
 
-def _tempered(log_weights: np.ndarray, least: float) -> np.ndarray:
+def tempered(log_weights: np.ndarray, least: float) -> np.ndarray:
     """Log-weights (n,), with a smaller power where they have fewer effective points than `least`."""
     power = 1.0
     while power > 1e-4 and effective_sample_size(power * log_weights) < least:
@@ -193,7 +193,7 @@ class EmulatedPosterior:
                     continue
                 own = log_weights[rows]
                 shares[k] = np.logaddexp.reduce(own)
-                fitted = self._fit(scaled[rows], _tempered(own, 1.5 * enough))
+                fitted = self._fit(scaled[rows], tempered(own, 1.5 * enough))
                 if fitted is not None:
                     regions[k] = region._replace(centre=fitted[0], covariance=fitted[1])
             mixture = self._mixture_of(regions, shares)
@@ -205,7 +205,7 @@ class EmulatedPosterior:
             if self.effective_share >= _CURVED or self._target.ndim > _MOST_BENT:
                 break
             rows = np.argsort(-self._log_weights)[:_FITTED]
-            weights = normalised_weights(_tempered(self._log_weights[rows], 1.5 * enough))
+            weights = normalised_weights(tempered(self._log_weights[rows], 1.5 * enough))
             fitted = fit_mixture(self._scaled[rows], weights, _COMPONENTS)
             rest = [(each, (1.0 - _FITTED_SHARE) * part) for each, part in base]
             self._fill([(fitted, _FITTED_SHARE), *rest], random)

@@ -17,11 +17,11 @@ enters through the expected likelihood. With the slopes f = d log L / dS at the 
 quadratic in the coefficients, with the gradient g and the Hessian -H, H_kl = -2 sum_a f_a B_a(P_k, P_l). By the method
 of Laplace, the expectation over the coefficients is
 
-    log E L = max over s of [log L(S(m + s)) - sum_k s_k^2 / (2 v_k)] - sum_k log(1 + H_kk v_k) / 2,
+    log E L = log L(S(m)) + sum_k [v_k g_k^2 / (1 + H_kk v_k) - log(1 + H_kk v_k)] / 2,
 
-which is exact for a quadratic with a diagonal H. The steps s_k = t v_k g_k / (1 + H_kk v_k) are tried, with t = 0 and
-with the t that is best for the quadratic. Where the emulator is certain, this is log L at the mean. Where it is not,
-residuals within its uncertainty cost little, so that draws are made there and train the emulator next.
+which is exact for a quadratic with a diagonal H. Where the emulator is certain, this is log L at the mean. Where it is
+not, residuals within its uncertainty cost little, so that draws are made there and train the emulator next; but at most
+`_LARGEST_GAIN` more than at the mean, since few draws would be left for the posterior.
 
 A Gaussian process with one length scale per input underestimates its error where the response has a kink or a jump. The
 variances are therefore widened, per component, until the largest error of a left-out run is as large as the largest of
@@ -49,7 +49,9 @@ _SMALLEST_SHARE = 1e-10  # of the leading component
 _REACH = 2.5  # squared distance up to which the emulator is used, as a multiple of the training points' largest one
 _TINY = 1e-300
 _WIDEST = 9.0  # factor by which variances are widened at most
-_SMALLEST_GAIN = 0.02  # in log-likelihood, for which a step is tried
+# In log-likelihood, at most. Without it, draws for a cyclic test had promised 20 to 130 more than at the mean, and
+# simulations gave what the mean had said.
+_LARGEST_GAIN = 3.0
 
 
 class TrainingSet(NamedTuple):
@@ -111,21 +113,10 @@ class ResponseEmulator:
         noise = scaled[:, self._target.n_structural :]
         mean, variance = predict(self.process, self._inputs(scaled))
         variance = variance * self._widening
-        curvature = np.maximum(-np.diagonal(self._hessian), 0.0)
+        curved = 1.0 + variance * np.maximum(-np.diagonal(self._hessian), 0.0)
         gradient = self._gradient + mean @ self._hessian
-        step = variance * gradient / (1.0 + curvature * variance)
-        cost = (np.square(step) / np.maximum(variance, _TINY)).sum(axis=1)
-        bend = cost - ((step @ self._hessian) * step).sum(axis=1)
-        best = (gradient * step).sum(axis=1) / np.maximum(bend, _TINY)
-        top = self._target.log_likelihood(self._at(mean), noise)
-        # far from the mode the quadratic may promise too much, but any step gives a lower bound
-        rows = np.flatnonzero(0.5 * best * (gradient * step).sum(axis=1) > _SMALLEST_GAIN)
-        if len(rows):
-            best = best[rows]
-            moved = self._at(mean[rows] + best[:, None] * step[rows])
-            moved = self._target.log_likelihood(moved, noise[rows]) - 0.5 * best**2 * cost[rows]
-            top[rows] = np.fmax(top[rows], moved)
-        return top - 0.5 * np.log1p(curvature * variance).sum(axis=1)
+        gain = 0.5 * (variance * np.square(gradient) / curved - np.log(curved)).sum(axis=1)
+        return self._target.log_likelihood(self._at(mean), noise) + np.minimum(gain, _LARGEST_GAIN)
 
     def _at(self, mean: np.ndarray) -> np.ndarray:
         """Statistics (n, n_numbers) at coefficients (n, k)."""

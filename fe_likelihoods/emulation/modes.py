@@ -32,6 +32,7 @@ __all__ = [
     "counted",
     "draw_starts",
     "ended",
+    "enough",
     "find_modes",
     "laplace",
     "search_modes",
@@ -205,7 +206,7 @@ def search_modes(
         ascents = _ascend_from(parts, {k: starts[k] for k in fresh}, standing_for, remember, fits)
         finished = yield from counted(ascents, spend)
         search = _modes_of(parts, standing_for, spent, finished)
-        few = _enough(search, first) - ended(search) if begin == 0 or not search.grown else 0
+        few = enough(search, first) - ended(search) if begin == 0 or not search.grown else 0
         missing = max(few, _further(first) if unseen_share(search) > DOUBTED_SHARE else 0)
         if not finished or missing <= 0 or following == most or not remember("starts", affordable)[0]:
             return search
@@ -279,7 +280,7 @@ def unseen_share(search: ModeSearch) -> float:
     return alone / max(ended(search), 1)
 
 
-def _enough(search: ModeSearch, first: int) -> int:
+def enough(search: ModeSearch, first: int) -> int:
     """Number of starts that shall lead to the modes found: `first` to one mode, and more to several ones.
 
     If as many starts lead to another mode as to each of k modes found, n starts miss it with the probability

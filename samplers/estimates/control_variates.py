@@ -48,7 +48,7 @@ FEW = 10.0
 FEWEST_CONTRIBUTIONS = 2.0
 # A density hardly reaches a point where another one is more than this many times larger. Emulators of a rough response
 # differ by factors of 10 to 100 from fit to fit.
-HARDLY = 1000.0
+HARDLY = 10.0
 # Points of a known density on which another one is evaluated.
 COMPARED = 2000
 
@@ -162,15 +162,15 @@ def signed_sample(rounds: Sequence[Round]) -> SignedSample | None:
     return SignedSample(np.concatenate(coords), np.concatenate(weights), np.concatenate(numbers), log_evidence, error)
 
 
-def unreached_share(earlier: KnownDensity, latest: KnownDensity) -> float:
-    """Probability under `latest` of the points that `earlier` hardly reaches.
+def unreached_share(log_density: Callable[[np.ndarray], np.ndarray], latest: KnownDensity) -> float:
+    """Probability under a known density of the points that draws of an earlier density hardly reach.
 
-    A guide may learn late that the posterior is larger. Few draws of the earlier density then have all but equal
+    A guide may learn late that the posterior is larger. Few draws of its earlier density then have all but equal
     weights, and say nothing of the part that is missing.
     """
     every = max(1, len(latest.weights) // COMPARED)
     coords, weights = latest.coords[::every], latest.weights[::every]
-    hardly = earlier.log_density(coords) < latest.log_density(coords) - np.log(HARDLY)
+    hardly = log_density(coords) < latest.log_density(coords) - np.log(HARDLY)
     return float(weights[hardly].sum() / weights.sum())
 
 

@@ -1,13 +1,9 @@
 r"""Importance sampling: the evidence from weighted draws, and whether their weights are reliable.
 
 A proposal is fixed before its draws are made, so the mean of posterior / proposal over the draws estimates the evidence
-without bias. If the proposal changes from round to round, round r has :math:`n_r` draws and the mean weight
-:math:`\hat Z_r`, and the rounds are combined as :math:`\hat Z = \sum_r \alpha_r \hat Z_r`.
-
-The shares :math:`\alpha_r` must not depend on the weights of the same round: a round with one very large weight has a
-small effective sample size, and a smaller share for it would bias the evidence. Therefore :math:`\alpha_r` is
-proportional to the number of draws times the effective share (effective sample size / number of draws) of the
-*previous* round. The first round uses its own effective share (Owen & Zhou 2020, doi:10.1145/3350426).
+without bias. If the proposal changes from round to round, every draw is weighted by the mixture of the proposals of all
+rounds, whose errors differ (Owen & Zhou 2000, doi:10.1080/01621459.2000.10473909; Cornuet, Marin, Mira & Robert 2012,
+doi:10.1111/j.1467-9469.2011.00756.x).
 
 The equations are in ``docs/theory/guided`` and ``docs/theory/evidence``.
 """
@@ -29,11 +25,13 @@ __all__ = [
     "KnownDensity",
     "PooledRounds",
     "Round",
+    "add_round",
     "draw_inside",
     "evidence_from_weights",
     "expected_efficiency",
     "fewest_points",
     "fits_poorly",
+    "log_mixture",
     "pool_rounds",
     "round_shares",
     "tail_growth",
@@ -210,6 +208,10 @@ class Round(NamedTuple):
     log_weights: np.ndarray  # (n,), log_prob minus log-density of the proposal; -inf for impossible points
     known: KnownDensity | None = None  # close to the posterior, fixed before the draws were made
     log_known: np.ndarray | None = None  # (n,), log-density of `known` minus log-density of the proposal
+    # log-density (m,) of the proposal at points (m, ndim), and the logarithm (n,) of the sum over all rounds of numbers
+    # of draws times densities at these draws
+    log_density: Callable[[np.ndarray], np.ndarray] | None = None
+    log_mixture: np.ndarray | None = None
 
     @property
     def effective_sample_size(self) -> float:
@@ -317,28 +319,48 @@ def tail_variance(log_weights: np.ndarray) -> float:
     return (largest * max(shape, 0.0) / (1.0 - shape)) ** 2
 
 
-def pool_rounds(rounds: Sequence[Round], log_density_error: float = 0.0) -> PooledRounds:
-    r"""Combine one or more rounds, in order.
+def add_round(rounds: Sequence[Round], latest: Round) -> list[Round]:
+    """Rounds and a further one, each with the mixture of the densities of all of them at its draws."""
+    count, alive = np.log(len(latest.coords)), latest.log_weights > -np.inf
+    log_prob = np.where(alive, latest.records["log_prob"], 0.0)
+    mixture = count + log_prob - np.where(alive, latest.log_weights, 0.0)
+    earlier = []
+    for each in rounds:
+        mixture = np.logaddexp(mixture, np.log(len(each.coords)) + each.log_density(latest.coords))
+        other = np.logaddexp(each.log_mixture, count + latest.log_density(each.coords))
+        earlier.append(each._replace(log_mixture=other))
+    return [*earlier, latest._replace(log_mixture=mixture)]
 
-    The variance of the log-evidence is the sum of three parts: the variance of the mean weights per round,
-    :math:`\sum_r \alpha_r^2 s_r^2 / (n_r \hat Z^2)` with the sample variance :math:`s_r^2` of the weights, or the
-    variance between the rounds, :math:`\sum_r \alpha_r^2 (\hat Z_r / \hat Z - 1)^2`, if it is larger; `tail_variance`;
-    and the square of `log_density_error`, the standard error of the proposal's log normalising constant.
+
+def log_mixture(rounds: Sequence[Round], coords: np.ndarray) -> np.ndarray:
+    """Log-density (m,) of the draws of all rounds together at points (m, ndim)."""
+    sizes = np.array([len(r.coords) for r in rounds])
+    parts = [np.log(n / sizes.sum()) + r.log_density(coords) for n, r in zip(sizes, rounds, strict=True)]
+    return np.logaddexp.reduce(parts)
+
+
+def pool_rounds(rounds: Sequence[Round], log_density_error: float = 0.0) -> PooledRounds:
+    r"""Combine one or more rounds: each draw is weighted by the mixture of all their densities (`add_round`).
+
+    The variance of the log-evidence is the sum of three parts: of the mean weights, :math:`\sum_r n_r s_r^2 / \hat Z^2`
+    with the sample variances :math:`s_r^2` of the weights in each round, or, if it is larger, that of n draws like the
+    latest ones, since proposals that were fitted to earlier draws make their weights too even; `tail_variance`; and the
+    square of `log_density_error`, the standard error of the proposal's log normalising constant.
     """
-    sizes = [len(r.log_weights) for r in rounds]
-    shares = round_shares(sizes, [r.effective_share for r in rounds])
-    parts = [r.log_weights + np.log(share / n) for r, share, n in zip(rounds, shares, sizes, strict=True)]
+    parts = [
+        np.where(alive, np.where(alive, r.records["log_prob"], 0.0) - r.log_mixture, -np.inf)
+        for r in rounds
+        for alive in (r.log_weights > -np.inf,)
+    ]
     log_weights = np.concatenate(parts)
     log_evidence = float(log_mean_weight(log_weights) + np.log(len(log_weights)))
     shape = tail_shape(log_weights)
     coords, records = np.concatenate([r.coords for r in rounds]), np.concatenate([r.records for r in rounds])
     if log_evidence == -np.inf:
         return PooledRounds(coords, records, log_weights, log_evidence, float("inf"), 0.0, shape)
-    within, between = 0.0, 0.0
-    for part, n, share in zip(parts, sizes, shares, strict=True):
-        weights = np.exp(part - log_evidence)
-        within += n * float(np.var(weights, ddof=1)) if n > 1 else np.inf
-        between += float(weights.sum() - share) ** 2  # a round that missed the posterior has small weights only
-    variance = max(within, between) + tail_variance(log_weights) + log_density_error**2
+    weights = [np.exp(part - log_evidence) for part in parts]
+    variance = sum(len(each) * float(np.var(each, ddof=1)) if len(each) > 1 else np.inf for each in weights)
+    fresh = (1.0 / max(rounds[-1].effective_share, np.finfo(float).tiny) - 1.0) / len(log_weights)
+    variance = max(variance, fresh) + tail_variance(log_weights) + log_density_error**2
     effective = effective_sample_size(log_weights)
     return PooledRounds(coords, records, log_weights, log_evidence, float(np.sqrt(variance)), effective, shape)

@@ -217,7 +217,7 @@ def _from_guide(
         resampled, distinct = _resampled(pooled.coords, pooled.records, pooled.log_weights, size, random)
         schedule.calibrate(pooled.coords, coarse_weights(pooled.log_weights), density.inside)
         yield resampled, start
-        ess, share = pooled.effective_sample_size, found.last.effective_share
+        ess, share = pooled.effective_sample_size, found.rounds[-1].effective_share
         yield resampled, Stage(1.0, ess, share, 0, distinct, *found.evidence)
         return None
     impossible = pooled.log_evidence == -np.inf
@@ -228,7 +228,7 @@ def _from_guide(
     if impossible:
         return found
     try:
-        started, mixture = start_from_guide(found.last, population, density, guidance.guide)
+        started, mixture = start_from_guide(found.rounds, population, density)
     except BudgetExhausted:
         raise stopped_rounds(found) from None
 

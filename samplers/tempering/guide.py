@@ -49,6 +49,8 @@ class GuideSession(NamedTuple):
         stored with `remember`: otherwise a run that is continued with a larger limit cannot repeat its first part.
     asynchronous : bool
         Whether draws arrive in any order, and new draws are made while earlier draws are still running.
+    weighted : callable
+        ``weighted()``: all draws (n, ndim) of complete rounds, and their log-weights (n,); None before the first.
     """
 
     random: np.random.RandomState
@@ -56,6 +58,7 @@ class GuideSession(NamedTuple):
     fits: Callable[[float], bool]
     remaining: Callable[[], float]
     asynchronous: bool
+    weighted: Callable[[], tuple[np.ndarray, np.ndarray] | None] = lambda: None
 
 
 class Guide(Protocol):
@@ -81,6 +84,8 @@ class Guide(Protocol):
     ``fresh()``
         A new guide in the state before `prepare`. A sampler works on this new guide and never changes the given guide;
         without this method, it works on a deep copy.
+    ``frozen()``
+        A function like `log_density` that does not change when the guide learns; by default of a deep copy.
     ``simulations`` : float
         Simulations made by `prepare` and `refine`; parts of a simulation count as fractions.
     ``log_density_error`` : float
@@ -170,6 +175,11 @@ class AdaptedGuide:
                 f"shape {values.shape}{'' if values.shape != (len(coords),) else ' with NaN or +inf'}"
             )
         return values
+
+    def frozen(self) -> Callable[[np.ndarray], np.ndarray]:
+        """The log-density as it is now, whatever the guide learns later."""
+        frozen = getattr(self.guide, "frozen", None)
+        return copy.deepcopy(self.guide).log_density if frozen is None else frozen()
 
     def refine(self, coords: np.ndarray, log_prob: np.ndarray, session: GuideSession) -> Generator:
         """Let the guide learn from the latest draws."""

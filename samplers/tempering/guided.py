@@ -2,8 +2,8 @@
 
 The density of a round is fixed before its draws are made, and each draw is weighted by this density
 (`samplers.estimates.importance`). The rounds end with a *reliable* round: fresh draws with a good effective share and
-Pareto shape. All rounds together must then have an effective sample size as large as the number of walkers.
-Rounds whose draws hardly reached a part of the posterior that the guide knows by then are left out.
+Pareto shape. All rounds together must then have an effective sample size as large as the number of walkers, and their
+draws must reach all of the posterior that the guide knows by then.
 
 Draws that are submitted together are a `Batch`; they may arrive in any order. A batch becomes a round when all its
 draws have arrived. Until then, its draws influence no weight, no share of a round and no decision: the first arrivals
@@ -18,6 +18,7 @@ trials on posteriors with known answers.
 import logging
 from collections.abc import Callable, Generator, Sequence
 from contextlib import suppress
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,6 +31,8 @@ from ..estimates.importance import (
     KnownDensity,
     PooledRounds,
     Round,
+    add_round,
+    log_mixture,
     pool_rounds,
     tails_are_light,
     usable,
@@ -73,8 +76,6 @@ ROUND_SHARE = 0.6
 FEWEST_DRAWS = 25
 # Largest number of rounds, and the number after which enough effective draws suffice: the response is rough then.
 MOST_ROUNDS, PATIENT_ROUNDS = 20, 8
-# They are left out so often at most: known densities of a rough response differ by as much from round to round.
-MOST_LEFT_OUT = 3
 
 
 class Guidance(NamedTuple):
@@ -103,7 +104,7 @@ def lend(
 
 
 class RoundsOfGuide(NamedTuple):
-    """Result of `draw_rounds`: all draws `pooled`, the last round, and the rounds with a known density (`signed`).
+    """Result of `draw_rounds`: all draws `pooled`, their rounds, and the signed sample where it is more accurate.
 
     `reason` says why the draws cannot be used. `shortfall` says what was not reached although they can be used.
     `stopped`: the limit of simulations ended the rounds.
@@ -112,24 +113,24 @@ class RoundsOfGuide(NamedTuple):
     reason: str
     shortfall: str
     pooled: PooledRounds | None
-    last: Round | None
+    rounds: Sequence[Round]
     stopped: bool = False
     signed: SignedSample | None = None
 
     @property
     def evidence(self) -> tuple[float, float]:
-        """Log-evidence and its standard error, from the signed sample where that is more accurate."""
-        signed, pooled = self.signed, self.pooled
-        if signed is not None and signed.log_evidence_error < pooled.log_evidence_error:
-            return signed.log_evidence, signed.log_evidence_error
-        return pooled.log_evidence, pooled.log_evidence_error
+        """Log-evidence and its standard error, from the signed sample where there is one."""
+        found = self.pooled if self.signed is None else self.signed
+        return found.log_evidence, found.log_evidence_error
 
 
 class Batch:
-    """Draws of a guide, with the log-density (n,) that they were drawn from, and its known density then."""
+    """Draws of a guide, with the log-density (n,) that they were drawn from, as a function too, and what it knew."""
 
-    def __init__(self, pending: PendingPoints, log_density: np.ndarray, known: KnownDensity | None = None):
-        self.pending, self._log_density, self._known = pending, log_density, known
+    def __init__(
+        self, pending: PendingPoints, log_density: np.ndarray, function: Callable, known: KnownDensity | None = None
+    ):
+        self.pending, self._log_density, self._function, self._known = pending, log_density, function, known
         self._learned = np.zeros(len(pending.coords), dtype=bool)
         self._observed = pending.arrived.copy()
 
@@ -153,9 +154,8 @@ class Batch:
         alive = log_prob > -np.inf
         log_density = self._log_density[self.pending.arrived]
         log_weights = np.where(alive, np.where(alive, log_prob, 0.0) - log_density, -np.inf)
-        if self._known is None:
-            return Round(coords, records, log_weights)
-        return Round(coords, records, log_weights, self._known, self._known.log_density(coords) - log_density)
+        known = None if self._known is None else self._known.log_density(coords) - log_density
+        return Round(coords, records, log_weights, self._known, known, self._function)
 
     def take_observable(self) -> np.ndarray:
         """Draws (m, ndim) that have arrived since the last call or the submission."""
@@ -195,7 +195,7 @@ def submit_batch(coords: np.ndarray, density: Density, guide: AdaptedGuide, sess
         pending = density.submit(coords)
     else:
         pending = density.submit(coords, lambda points: observe(points, session))
-    return Batch(pending, log_density[: len(pending.coords)], guide.known_density)
+    return Batch(pending, log_density[: len(pending.coords)], guide.frozen(), guide.known_density)
 
 
 def let_arrive(
@@ -229,9 +229,9 @@ def draw_rounds(
     search, whose result is sent back.
     """
     guide, session, budget = guidance
+    session = session._replace(weighted=lambda: None if pooled is None else (pooled.coords, pooled.log_weights))
     size, population = len(population.coords), population._replace(effective_sample_size=0.0)
-    made, last, left_out = 0, None, 0
-    rounds: list[Round] = []  # those whose draws reach all of the posterior that the guide knows
+    rounds: list[Round] = []
     batches: list[Batch] = []  # of which draws are running
     lessons: list[Batch] = []  # of which the guide has not learned from all draws
     refused, pooled = False, None
@@ -248,30 +248,28 @@ def draw_rounds(
 
     def judge(most: int) -> Generator[tuple[Population, Report], None, RoundsOfGuide | None]:
         """Let draws arrive; returns how the rounds end, or None if another round follows."""
-        nonlocal population, pooled, made, last
+        nonlocal population, pooled, rounds
         while True:
             let_arrive(batches, most, density, guide, session)
             outcome = None
             while batches and batches[0].pending.complete:
-                last = batches.pop(0).as_round()
-                rounds.append(last)
-                made += 1
+                rounds = add_round(rounds, batches.pop(0).as_round())
                 pooled = pool_rounds(rounds, guide.log_density_error)
                 population = population._replace(effective_sample_size=pooled.effective_sample_size)
-                yield population, _report(last, pooled)
-                yield tick(f"round {made}", True)
-                outcome = _outcome(rounds, pooled, size, made)
+                yield population, _report(rounds[-1], pooled)
+                yield tick(f"round {len(rounds)}", True)
+                outcome = _outcome(rounds, pooled, size)
             if refused or budget.refused:  # a search that was cut short goes on first, if the limit is raised
-                shortfall = "" if rounds or pooled is None else UNREACHED
-                outcome = RoundsOfGuide("", shortfall, pooled, last, True)
-            if not batches or (outcome is None and _too_few(rounds, batches, size, guide, made)):
-                return outcome and outcome._replace(signed=signed_sample(rounds))
+                reached = not rounds or reaches(partial(log_mixture, rounds), guide.known_density)
+                outcome = RoundsOfGuide("", "" if reached else UNREACHED, pooled, rounds, True)
+            if not batches or (outcome is None and _too_few(rounds, batches, size, guide)):
+                return outcome and _with_signed(outcome, guide)
             most = 0  # submitted draws are part of the result
 
     yield tick("search", False)
     yield from asked(guide.prepare(session), "search")
     while True:
-        yield tick(f"round {made + len(batches) + 1}", False)
+        yield tick(f"round {len(rounds) + len(batches) + 1}", False)
         coords = guide.draw(_next_size(rounds, batches, size, guide), random)
         batch = submit_batch(coords, density, guide, session)
         refused = batch.pending.refused
@@ -281,23 +279,30 @@ def draw_rounds(
         outcome = yield from judge(0 if refused or budget.refused else most_running(density, len(coords)))
         # with the last round as well, a guide with a known density may learn that the posterior is larger
         final = outcome is not None and (outcome.stopped or outcome.reason or guide.known_density is None)
-        if final or (outcome is not None and made == MOST_ROUNDS):
+        if final:
             return outcome
         parts = [each.take_lesson(guide.learns_from_parts) for each in lessons]
         lessons = [each for each in lessons if not each.learned]
         points, log_prob = (np.concatenate(column) for column in zip(*parts, strict=True))
         if len(points) > 0:
-            yield from asked(guide.refine(points, log_prob, session), f"after round {made}")
-        reaching = [each for each in rounds if reaches(each, guide.known_density)]
-        if len(reaching) < len(rounds) and left_out < MOST_LEFT_OUT:
-            logger.info("%d of %d rounds hardly reached a part of the posterior", len(rounds) - len(reaching), made)
-            rounds, outcome, left_out = reaching, None, left_out + 1
-        elif len(reaching) < len(rounds) and outcome is not None:
-            outcome = outcome._replace(shortfall=UNSETTLED)
+            yield from asked(guide.refine(points, log_prob, session), f"after round {len(rounds)}")
         if outcome is not None:
-            return outcome
+            outcome = _with_signed(outcome, guide)
+            if reaches(partial(log_mixture, rounds), guide.known_density):
+                return outcome
+            if len(rounds) == MOST_ROUNDS:
+                return outcome._replace(shortfall=UNSETTLED)
         if budget.refused:
             return (yield from judge(0))
+
+
+def _with_signed(outcome: RoundsOfGuide, guide: AdaptedGuide) -> RoundsOfGuide:
+    """The signed sample of the rounds whose known density reaches all that the guide knows, if it is more accurate."""
+    latest = guide.known_density
+    known = [r for r in outcome.rounds if r.known is not None and reaches(r.known.log_density, latest)]
+    found = signed_sample(known)
+    better = found is not None and found.log_evidence_error < outcome.pooled.log_evidence_error
+    return outcome._replace(signed=found if better else None)
 
 
 def _report(last: Round, pooled: PooledRounds) -> GuidedRound:
@@ -312,27 +317,27 @@ def _report(last: Round, pooled: PooledRounds) -> GuidedRound:
     )
 
 
-def _outcome(rounds: Sequence[Round], pooled: PooledRounds, size: int, made: int) -> RoundsOfGuide | None:
-    """How the rounds end; None if they continue. `made` rounds include those that were left out."""
+def _outcome(rounds: Sequence[Round], pooled: PooledRounds, size: int) -> RoundsOfGuide | None:
+    """How the rounds end; None if they continue."""
     last, enough = rounds[-1], pooled.effective_sample_size >= size
     if enough and is_reliable(last) and is_even(pooled):
         light = tails_are_light([r for r in rounds if is_reliable(r)])
-        return RoundsOfGuide("", LIGHT_TAILS if light else "", pooled, last)
+        return RoundsOfGuide("", LIGHT_TAILS if light else "", pooled, rounds)
     if reason := hopeless(rounds):
-        return RoundsOfGuide(reason, "", pooled, last)
+        return RoundsOfGuide(reason, "", pooled, rounds)
     usable = enough and last.effective_share >= USABLE_SHARE and pooled.pareto_shape < LARGEST_SHAPE
-    if made < (PATIENT_ROUNDS if usable and is_even(pooled) else MOST_ROUNDS):
+    if len(rounds) < (PATIENT_ROUNDS if usable and is_even(pooled) else MOST_ROUNDS):
         return None
-    shortfall = describe_rounds(last, pooled, made)
-    return RoundsOfGuide("" if usable else shortfall, shortfall, pooled, last)
+    shortfall = describe_rounds(last, pooled, len(rounds))
+    return RoundsOfGuide("" if usable else shortfall, shortfall, pooled, rounds)
 
 
-def _too_few(rounds: Sequence[Round], batches: Sequence[Batch], size: int, guide: AdaptedGuide, made: int) -> bool:
+def _too_few(rounds: Sequence[Round], batches: Sequence[Batch], size: int, guide: AdaptedGuide) -> bool:
     """Whether more draws are made while some are running, since the running draws will not be enough.
 
     A guide that learns only from complete rounds would draw from the same density again.
     """
-    if made + len(batches) >= MOST_ROUNDS:
+    if len(rounds) + len(batches) >= MOST_ROUNDS:
         return False
     if rounds and is_reliable(rounds[-1]):
         return _missing(rounds, batches, size, guide) > 0.0
@@ -359,17 +364,18 @@ def _next_size(rounds: Sequence[Round], batches: Sequence[Batch], size: int, gui
 
 
 def start_from_guide(
-    last: Round, prior: Population, density: Density, guide: AdaptedGuide
+    rounds: Sequence[Round], prior: Population, density: Density
 ) -> tuple[Population, StartingDensity]:
-    """Points to start recycling from, and their density: the guide's last round, and as many draws of the prior."""
-    few = prior.coords[: max(len(last.coords), prior.coords.shape[1] + 2)]
-    coords = np.concatenate([last.coords, few])
-    records = np.concatenate([last.records, density.evaluate(few)])
+    """Points to start recycling from, and their density: the draws of all rounds, and a few draws of the prior."""
+    drawn = np.concatenate([r.coords for r in rounds])
+    few = prior.coords[: max(len(rounds[-1].coords), prior.coords.shape[1] + 2)]
+    coords = np.concatenate([drawn, few])
+    records = np.concatenate([*(r.records for r in rounds), density.evaluate(few)])
     made = len(coords)
-    log_share, log_rest = np.log(len(last.coords) / made), np.log(len(few) / made)
+    log_share, log_rest = np.log(len(drawn) / made), np.log(len(few) / made)
 
     def log_density(points: np.ndarray, records: np.ndarray) -> np.ndarray:
-        return np.logaddexp(log_share + guide.log_density(points), log_rest + records["log_prior"])
+        return np.logaddexp(log_share + log_mixture(rounds, points), log_rest + records["log_prior"])
 
     return Population(0.0, coords, records, float(made)), StartingDensity(made, log_density)
 
