@@ -22,9 +22,9 @@ DOUBTED_SHARE = 0.05
 # The same, from which a result is not usable: 20 of 21, and 12 of 62.
 REFUSED_SHARE = 0.3
 # Starts that have to end at one mode, if the search grew with the record. Fewer than six, without growth, spoke in 9 of
-# 9 searches that had found one of several modes, and in 6 of 10 that had found the only one. A single one of several is
-# no reason to refuse a result: with starts in the order drawn and limits of 200 and 400, it was left in 3 of 22 searches
-# that had lost one of two modes, and in 29 of 40 right ones of a model that fails in a third of the prior.
+# 9 searches that had found one of several modes, and in 6 of 10 that had found the only one. A single one of several
+# is no reason to refuse a result: with starts in the order drawn and limits of 200 and 400, it was left in 3 of 22
+# searches that had lost one of two modes, and in 29 of 40 right ones of a model that fails in a third of the prior.
 GROWN_STARTS = 2
 HEAVY = 0.01  # largest weight of a draw of the emulated posterior; 0.006 in right runs with 30 parameters
 
