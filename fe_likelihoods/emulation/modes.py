@@ -197,7 +197,7 @@ def search_modes(
         spent += cost
 
     def affordable() -> list[np.ndarray]:  # the search is worth nothing without draws after it
-        return [np.array(remaining() > spent)]
+        return [np.array(remaining() > 2.0 * spent)]
 
     begin, following = 0, first
     while True:

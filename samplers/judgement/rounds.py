@@ -36,7 +36,7 @@ RELIABLE_EFFICIENCY, HIGH_EFFICIENCY = 0.25, 0.5
 LARGEST_DIFFERENCE = 0.25
 # A reliable round has at least this effective share, and a Pareto shape below this value, for which the variance of its
 # weights is finite. With fewer than 100 draws, the shape is uncertain, and a larger share is enough.
-RELIABLE_SHARE, LARGEST_RELIABLE_SHAPE = 0.5, 0.5
+RELIABLE_SHARE, LARGEST_RELIABLE_SHAPE = 0.25, 0.5
 SHORT_TAIL_SHARE, FEW_DRAWS = 0.75, 100
 # Rounds go on while more than this share of the guide's latest known density is hardly reached by the draws of all of
 # them, and the result is not usable if that is so at the end. A round whose known density reaches less is left out of

@@ -188,17 +188,6 @@ def test_two_events_take_hundreds_of_simulations():
 
 
 @pytest.mark.slow
-def test_a_joint_likelihood_of_one_event_is_guided_as_the_event_itself():
-    """Both are the same density, up to the name of a parameter."""
-    of_one = joint_of_one()
-    prior = {name.removesuffix("_first"): each for name, each in of_one.prior.distributions.items()}
-    alone = Posterior(likelihoods()["first"], prior)
-    runs = [guided(posterior) for posterior in (of_one, alone)]
-    assert runs[0].verdict.status == "converged"
-    assert np.array_equal(*(run.get_chain() for run in runs)) and runs[0].log_evidence == runs[1].log_evidence
-
-
-@pytest.mark.slow
 def test_an_asynchronous_run_gives_the_result_of_quadrature():
     log_evidence, mean, sd = exact(joint())
     with ThreadPoolExecutor(2) as pool:

@@ -54,17 +54,6 @@ def test_near_a_bound_the_emulator_follows_the_response(prior):
     assert np.abs(emulated - true).max() < 0.3
 
 
-def test_a_parameter_that_varies_by_factors_enters_by_its_logarithm():
-    posterior = vibration(damping=LogNormal(0.8, 1.0))
-    target = ResponseTarget(posterior)
-    coords = np.array([[0.0, -2.0], [0.0, 0.0], [0.0, 2.0]])
-    scaled = target.scaled_parameters(coords)
-    np.testing.assert_allclose(scaled[:, 1], np.log(0.8) + coords[:, 1])
-    np.testing.assert_allclose(scaled[:, 0], np.log(target.structural_parameters(coords)[:, 0]))
-    wide = ResponseTarget(vibration(damping=TruncatedNormal(1.0, 1.0)))  # reaches down to zero
-    np.testing.assert_allclose(wide.scaled_parameters(coords)[:, 1], wide.structural_parameters(coords)[:, 1])
-
-
 @pytest.mark.parametrize("scale", SCALES)
 def test_scaled_parameters_can_be_undone_and_their_volume_is_known(scale):
     target = ResponseTarget(vibration(damping=LogNormal(0.8, 0.3)))

@@ -9,14 +9,6 @@ def _smooth(inputs):
     return np.stack([np.sin(inputs[:, 0]) + inputs[:, 1] ** 2, np.exp(0.3 * inputs.sum(axis=1))], axis=1)
 
 
-def test_a_linear_function_is_predicted_exactly():
-    rng = np.random.default_rng(1)
-    inputs, slopes = rng.standard_normal((30, 3)), rng.standard_normal((3, 2))
-    process = fit_process(inputs, 2.0 + inputs @ slopes, np.ones(2))
-    new = 3.0 * rng.standard_normal((50, 3))
-    np.testing.assert_allclose(predict(process, new)[0], 2.0 + new @ slopes, atol=1e-5)
-
-
 def test_training_points_of_a_smooth_function_are_reproduced():
     rng = np.random.default_rng(2)
     inputs = rng.standard_normal((60, 2))

@@ -138,21 +138,6 @@ def test_a_second_sampler_repeats_no_simulation(tmp_path):
     assert results[:2] == results[2:]
 
 
-@pytest.mark.slow
-def test_a_second_sampler_in_memory(tmp_path):
-    posterior = guided_run.make(None, tmp_path / "log")[1]
-    counts = []
-    for _ in range(2):
-        sampler = SMCSampler(50, 3, posterior, vectorize=True, seed=1, guide=posterior.guide(2))
-        sampler.run_mcmc(None, 1)
-        counts.append((len(guided_run.runs(tmp_path / "log")), sampler.log_evidence))
-    assert counts[0] == counts[1]
-    marginal = posterior.marginal()  # shares the responses
-    SMCSampler(50, 2, marginal, vectorize=True, seed=1, guide=marginal.guide(2)).run_mcmc(None, 1)
-    runs = guided_run.runs(tmp_path / "log")
-    assert len(set(runs)) == len(runs) > 100
-
-
 def test_a_channel_with_an_offset_of_a_million_times_its_noise():
     """Residuals keep the digits that responses in single precision lose."""
     results = []

@@ -23,7 +23,6 @@ from fe_likelihoods import (
 from fe_likelihoods.emulation.modes import (
     Mode,
     ModeSearch,
-    _end_of,
     ended,
     find_modes,
     unseen_share,
@@ -74,24 +73,6 @@ def test_the_covariance_is_the_inverse_of_the_hessian(noise):
         step = 0.5 * factor[:, k]
         drop = here - 0.5 * sum(_log_density(posterior, mode.coords + sign * step) for sign in (1.0, -1.0))
         assert drop == pytest.approx(0.125, rel=0.25)
-
-
-def _two_modes():
-    """The response depends on the square of a parameter, so that both signs fit alike."""
-    channels = (Channel("top", "displacement", "mm"),)
-    time = np.linspace(0.0, 1.0, 100)
-    model = FunctionModel(lambda theta: [theta[0] ** 2 * time + theta[1]], ["a", "b"], channels, 0.01, 100)
-    measured = Measurements(channels, 0.01, model.simulate(np.array([0.7, 0.2])) + 0.05 * np.sin(40.0 * time))
-    prior = {"a": Uniform(-2.0, 2.0), "b": Uniform(-1.0, 1.0), "sigma_top": Uniform(0.01, 0.5)}
-    return Posterior(FELikelihood(model, measured), prior)
-
-
-def test_two_modes_are_found_and_the_starts_are_assigned_to_them():
-    search = find_modes(_two_modes(), starts=8, seed=3)
-    assert len(search.modes) == 2
-    assert sorted(round(float(mode.parameters[0]), 1) for mode in search.modes) == [-0.7, 0.7]
-    for number, mode in enumerate(search.modes):
-        assert all(search.ends[start] == number for start in mode.starts)
 
 
 def _equal_modes(n):
@@ -329,9 +310,3 @@ def test_channels_of_very_different_sizes():
     prior["sigma_base"] = Uniform(1e3, 1e6)
     mode = find_modes(Posterior(FELikelihood(model, measured), prior), starts=2, seed=1).modes[0]
     assert mode.converged and mode.parameters[:2] == pytest.approx([1.2, 0.9], rel=0.01)
-
-
-def test_starts_that_stand_for_each_other_have_an_end():
-    """The second start has taken the first one's place on the whole record, and lost its own on a first part."""
-    assert [_end_of(k, [1, 0, 1, -1, 4], {1}) for k in range(5)] == [1, 1, 1, -1, 4]
-    assert [_end_of(k, [1, 0], {}) for k in range(2)] == [0, 1]

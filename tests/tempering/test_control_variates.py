@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from samplers import SMCSampler
-from samplers.estimates.control_variates import signed_sample, unreached_share
+from samplers.estimates.control_variates import signed_sample
 from samplers.estimates.importance import KnownDensity, Round, add_round, pool_rounds
 from samplers.judgement.verdict import judge
 from tests.contract.targets import Box, Gaussian
@@ -76,13 +76,6 @@ def test_exact_knowledge_leaves_the_error_of_its_points(rng):
     assert sample.weights.sum() == pytest.approx(1.0)
     assert np.allclose(sample.weights[sample.rounds > 0], 0.0, atol=1e-15)
     assert sample.log_evidence == pytest.approx(LOG_EVIDENCE, abs=1e-12)
-    assert np.allclose(sample.expectation().error, 1.0 / np.sqrt(POOL), rtol=0.1)
-
-
-def test_rounds_that_share_a_known_density_count_its_points_once(rng):
-    first, second = rounds_of(rng, 30, 2, 0.0, 1.0)
-    sample = signed_sample([first, second._replace(known=first.known)])
-    assert len(sample.coords) == 60 + POOL
     assert np.allclose(sample.expectation().error, 1.0 / np.sqrt(POOL), rtol=0.1)
 
 
@@ -181,14 +174,6 @@ def two_modes(shares, n=POOL):
 
     points = np.concatenate(points)
     return KnownDensity(log_density, points, np.full(len(points), 1.0 / len(points)), 0.0)
-
-
-@pytest.mark.parametrize(
-    "earlier, latest, share", [(1.0, 0.5, 0.5), (2e-4, 0.3, 0.3), (0.5, 1.0, 0.0), (0.5, 0.5, 0.0)]
-)
-def test_the_share_that_an_earlier_density_hardly_reaches(earlier, latest, share):
-    found = unreached_share(two_modes([earlier, 1.0 - earlier]).log_density, two_modes([latest, 1.0 - latest]))
-    assert found == pytest.approx(share, abs=0.01)
 
 
 class GrowingGuide(FixedGuide):

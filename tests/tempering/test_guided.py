@@ -13,8 +13,6 @@ from samplers.estimates.importance import (
     Round,
     add_round,
     pool_rounds,
-    round_shares,
-    tail_growth,
     tail_shape,
     tail_variance,
     tails_are_light,
@@ -174,28 +172,6 @@ def test_the_progress_bar_counts_searches_rounds_and_sweeps(capfd):
     assert re.search(rf"round {len(sampler.rounds)}: simulation \d+ of about \d+: {evaluations} evaluations", shown)
 
 
-def test_shares_of_rounds_depend_on_earlier_rounds_only():
-    shares = round_shares([30, 60, 60], [0.1, 0.5, 0.9])
-    assert np.allclose(shares, np.array([3.0, 6.0, 30.0]) / 39.0)
-    assert np.array_equal(round_shares([30, 60, 60], [0.1, 0.5, 0.01]), shares)
-
-
-@pytest.mark.parametrize("variance", [0.5, 0.8, 1.0, 2.0])
-@pytest.mark.parametrize("noise", [0.0, 0.5])
-def test_weights_grow_towards_tails_that_are_too_light(variance, noise, rng):
-    """The posterior is in proportion to a power of the density of the draws: slope 1 / variance - 1, if it is exact."""
-    records = np.zeros(2000, dtype=[("log_prob", float), ("log_prior", float)])
-    x = np.sqrt(variance) * rng.standard_normal((2000, 3))
-    records["log_prob"] = -0.5 * np.sum(x**2, axis=1)
-    # errors of the density of the draws are part of the weights, and cause no slope
-    log_weights = (1.0 - 1.0 / variance) * records["log_prob"] + noise * rng.standard_normal(2000)
-    rounds = [Round(x[:800], records[:800], log_weights[:800]), Round(x[800:], records[800:], log_weights[800:])]
-    slope, error = tail_growth(rounds)
-    assert abs(slope - (1.0 / variance - 1.0)) < 4.0 * error + 1e-9
-    assert tails_are_light(rounds) == (variance < 1.0)
-    assert tail_growth([Round(x[:15], records[:15], log_weights[:15])]) == (0.0, np.inf)
-
-
 @pytest.mark.parametrize(("dof", "light"), [(None, True), (6.0, False)])
 def test_growth_among_the_outermost_draws_is_seen(dof, light, rng):
     """A normal proposal with half the variance of a t3: the weights fall in the bulk, and grow in the tails only."""
@@ -210,18 +186,6 @@ def test_growth_among_the_outermost_draws_is_seen(dof, light, rng):
         log_density = -squares / 3.0 if dof is None else -0.5 * (dof + 2.0) * np.log1p(squares / 2.0 / dof)
         reported += tails_are_light([Round(x, records, records["log_prob"] - log_density)])
     assert reported >= 36 if light else reported <= 1
-
-
-def test_few_draws_need_a_larger_growth(rng):
-    """Without a trend, the share of slopes above two errors is that of a normal law, however few draws there are."""
-    records = np.zeros(40, dtype=[("log_prob", float), ("log_prior", float)])
-    found = []
-    for _ in range(4000):
-        records["log_prob"] = -rng.exponential(size=40)
-        found.append(tail_growth([Round(np.zeros((40, 1)), records, rng.standard_normal(40))], 0.25))
-    ratios = np.array([slope / error for slope, error in found])
-    assert np.mean(np.abs(ratios) > 4.0) < 2e-3  # 0.004 without the factor, by Student's t with 8 degrees of freedom
-    assert np.mean(np.abs(ratios) > 2.0) < 0.05
 
 
 def _rounds(rng, spreads, ndim=3):
