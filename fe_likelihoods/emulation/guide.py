@@ -35,6 +35,7 @@ from samplers.proposals.mixture import Mixture, draw, fit_mixture, log_density
 from .density import EmulatedPosterior, Region, factor_of, student_mixture, tempered
 from .emulator import ResponseEmulator, TrainingSet, fit_emulator
 from .modes import (
+    MOST_STARTS,
     ModeSearch,
     check_starts,
     counted,
@@ -155,7 +156,9 @@ class ResponseGuide:
         if len(search.modes) > 1:
             found += check_unseen_modes(unseen_share(search), ended(search), len(search.modes))
         else:
-            found += check_ends(ended(search), len(search.ends), enough(search, self._starts), search.grown)
+            made = len(search.ends)
+            wanted = enough(search, self._starts) if made < MOST_STARTS * self._starts else self._starts
+            found += check_ends(ended(search), made, wanted, search.grown)
         if self._emulated is not None:
             found += check_draws_in_memory(self._emulated.largest_weight)
             found += check_excluded_runs(*self._emulated.of_runs)

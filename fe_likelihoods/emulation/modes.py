@@ -26,6 +26,7 @@ from .levenberg_marquardt import (
 from .target import Remember, ResponseTarget, Steps, at_once, nothing_stored
 
 __all__ = [
+    "MOST_STARTS",
     "Mode",
     "ModeSearch",
     "check_starts",
@@ -47,7 +48,7 @@ _FLATTEST = 0.2  # smallest curvature of the Laplace approximation: five times t
 _APART = 0.25  # prior standard deviations in one coordinate from which ends on a part of the record are different
 _APART_OF_ALL = 2.0  # the same, times the number of starts
 _FEW = 6  # parameters whose differences cost about as much as two steps
-_MOST_STARTS = 4  # times the number of the first ones
+MOST_STARTS = 4  # times the number of the first ones
 _DRAWN = 8  # the same for those of which the highest begin: a simulation each is cheaper than ascents given up
 _HOPELESS = 1.6  # log-density per measured number below the best end of a part: residuals five times as large
 _SHARES = 0.03, 0.1, 0.3, 0.6  # of the Arias intensity, at which the parts of the record end
@@ -186,7 +187,7 @@ def search_modes(
     and the cost of each batch when it is made, in simulations of the whole record.
     """
     first = len(starts) if first is None else first
-    most = min(_MOST_STARTS * first, len(starts))
+    most = min(MOST_STARTS * first, len(starts))
     shortened = [*target.shortened(shares), target]
     parts = [_Part(part, part.n_steps / target.n_steps, {}, Jacobians()) for part in shortened]
     standing_for: list[int] = []  # start that has taken the place of each; -1 for none

@@ -40,7 +40,10 @@ def find_missing_part(text: str, severity: str = CARE) -> Finding:
 
 
 def check_ends(ended: int, made: int, wanted: int, grown: bool) -> list[Finding]:
-    """Whether enough of the starts that were made led to the only mode; `grown`: on a record that grows."""
+    """Whether enough of the starts that were made led to the only mode; `grown`: on a record that grows.
+
+    More are `wanted` where the limit of simulations ended a search that other tops, of no weight, would have prolonged.
+    """
     if ended == 0 or ended >= (GROWN_STARTS if grown else wanted):
         return []
     text = (

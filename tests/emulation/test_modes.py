@@ -160,6 +160,15 @@ def test_modes_that_few_starts_led_to_are_doubted(ends, grown, severity):
     assert [each.severity for each in found] == ([] if severity is None else [severity])
 
 
+@pytest.mark.parametrize(("given_up", "low", "doubted"), [(8, 2, True), (17, 2, False), (8, 0, False)])
+def test_a_search_that_the_limit_ended_is_doubted_where_others_would_have_followed(given_up, low, doubted):
+    """Seven starts led to one mode; tops of no weight ask for eleven, and 24 are the most that begin."""
+    guide = _equal_modes(1).guide(starts=6)
+    mode = Mode(np.zeros(3), np.zeros(3), np.eye(3), 0.0, 0.0, (), True)
+    guide.search = ModeSearch((mode,), (0,) * 7 + (-1,) * given_up, 100.0, True, False, low)
+    assert any("not found" in each.text for each in guide.findings) == doubted
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_curved_ridge_is_sampled_whole_or_doubted(seed):
