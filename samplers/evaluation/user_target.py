@@ -11,7 +11,7 @@ from emcee.ensemble import ndarray_to_list_of_dicts
 
 from ..interrupts import Ended, SentFunction, interrupts_end_the_run, raise_if_it_ends_the_run
 from ..record import EvaluatedBatch
-from .starts import SEED, compare_with_draws, draws_to_compare, spread_by_metropolis
+from .starts import not_of_the_prior
 from .values import Caught, log_densities, most_common_reasons, outcomes
 
 __all__ = ["Target", "map_in"]
@@ -190,41 +190,16 @@ class Target:
 
     def check_start(self, coords: np.ndarray) -> None:
         """Raise ValueError for points (n, ndim) that cannot be draws of the prior (`samplers.evaluation.starts`)."""
-        fresh = self._fresh_draws(len(coords))
-        if fresh is None:
-            reason, compared = spread_by_metropolis(coords, self.log_prior), ""
-        else:
-            names = list(getattr(self.function, "parameter_names", None) or ())
-            reason, compared = compare_with_draws(coords, fresh, names), f"compared with {len(fresh)} fresh draws, "
-        if not reason:
+        if not (reason := not_of_the_prior(coords, self.log_prior)):
             return
-        known = "None, so that the sampler draws the prior" if fresh is not None else "draws of the prior"
+        draws = getattr(self.function, "sample_prior", None) is not None
+        known = "None, so that the sampler draws the prior" if draws else "draws of the prior"
         raise ValueError(
-            f"initial_state must consist of draws of the prior; got points that cannot be: {compared}{reason}. "
-            f"The evidence would be wrong. Pass {known}, not points near the posterior. If they are draws of the "
-            "prior, its log-density is another one: a constant without bounds has no draws. To continue a chain, pass "
-            "None, or the State that run_mcmc returned"
+            f"initial_state must consist of draws of the prior; got points that cannot be: {reason}. The evidence "
+            f"would be wrong. Pass {known}, not points near the posterior. If they are draws of the prior, its "
+            "log-density is another one: a constant without bounds has no draws. To continue a chain, pass None, or "
+            "the State that run_mcmc returned"
         )
-
-    def _fresh_draws(self, n: int) -> np.ndarray | None:
-        """Draws of the prior to compare n points with; None if there are none."""
-        draw = getattr(self.function, "sample_prior", None)
-        if draw is None:
-            return None
-        state, shape = np.random.get_state(), (draws_to_compare(n), self.ndim)  # noqa: NPY002
-        try:
-            fresh = _answer(draw, shape[0], np.random.RandomState(SEED), dtype=float)
-        finally:
-            np.random.set_state(state)  # noqa: NPY002  a sample_prior that uses the global generator changes no run
-        if fresh is not None and fresh.shape == shape and np.all(np.isfinite(fresh)):
-            return fresh
-        logger.warning(
-            "initial_state is tested without fresh draws: sample_prior(%d, random) must return finite numbers of "
-            "shape %s",
-            shape[0],
-            shape,
-        )
-        return None
 
 
 def _unless_ended(map_of_pool: Callable, caught: Callable, points: Any) -> Iterator:
@@ -235,11 +210,11 @@ def _unless_ended(map_of_pool: Callable, caught: Callable, points: Any) -> Itera
         yield answer
 
 
-def _answer(method: Callable, *args: Any, dtype: Any = None) -> np.ndarray | None:
+def _answer(method: Callable, *args: Any) -> np.ndarray | None:
     """What an optional method of the user returns; None if it fails."""
     before = sys.exception()
     try:
-        return np.asarray(method(*args), dtype=dtype)
+        return np.asarray(method(*args))
     except Exception as error:
         raise_if_it_ends_the_run(error, before)
         logger.warning("the method %s failed: %r", getattr(method, "__name__", method), error)
