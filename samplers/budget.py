@@ -65,11 +65,6 @@ class Budget:
         self._of_record = 0.0 if noted is None else float(noted[0])
         self._running.clear()
 
-    def forget(self) -> None:
-        """Another run begins, with an empty record."""
-        self._allowed = 0.0
-        self.restart(0.0)
-
     def take_from_record(self) -> None:
         """Guides have made the simulations that the record says: the annealing is not made again."""
         self._of_earlier_guides, self._guide = max(self._of_record, self._of_earlier_guides), None

@@ -4,7 +4,7 @@ They are used in this module only, and pinned by `tests.contract.test_emcee_cont
 later version of emcee (``emcee>=3.1.4,<4``) differs.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ __all__ = [
     "set_moves",
     "set_previous_state",
     "trim_chain",
+    "type_of_blobs",
 ]
 
 
@@ -87,26 +88,13 @@ def _remove_half_made_blobs(group: Any) -> None:
         group.pop("blobs", None)
 
 
-def change_blobs(backend: Backend, dtype: np.dtype, convert: Callable[[np.ndarray], np.ndarray]) -> bool:
-    """Store the blobs of a chain as another type, which emcee would convert new blobs from; whether this was needed."""
+def type_of_blobs(backend: Backend) -> np.dtype | None:
+    """The type of the blobs of a chain; None without any."""
     if not isinstance(backend, HDFBackend):
-        if backend.blobs is None or backend.blobs.dtype == dtype:
-            return False
-        backend.blobs = convert(backend.blobs)
-        return True
+        return None if backend.blobs is None else backend.blobs.dtype
     with backend.open() as file:
         group = file[backend.name]
-        if not group.attrs["has_blobs"] or group["blobs"].dtype.base == dtype:
-            return False
-        blobs = group["blobs"][...]
-    blobs = convert(blobs)
-    options = {"compression": backend.compression, "compression_opts": backend.compression_opts}
-    with backend.open("a") as file:
-        group, shape = file[backend.name], blobs.shape[:2]
-        del group["blobs"]
-        stored = np.dtype((dtype, blobs.shape[2:]))
-        group.create_dataset("blobs", shape, maxshape=(None, shape[1]), dtype=stored, **options)[...] = blobs
-    return True
+        return group["blobs"].dtype.base if group.attrs["has_blobs"] else None
 
 
 def restore_counts(backend: Backend, steps: int, accepted: np.ndarray) -> None:

@@ -19,8 +19,7 @@ import numpy as np
 from emcee import State
 from emcee.backends import Backend, HDFBackend
 
-from .blobs import converted
-from .emcee_internals import change_blobs, cut_chain, restore_counts, trim_chain
+from .emcee_internals import cut_chain, restore_counts, trim_chain, type_of_blobs
 from .estimates.importance import EvidenceCheck
 from .finding import Finding
 from .judgement.verdict import Verdict
@@ -73,18 +72,14 @@ class Output:
         if self._file is not None:
             self._file.save_now_and_then()
 
-    def change_blobs(self, blobs: np.ndarray | None) -> None:
-        """Store the blobs of the chain in the type of the blobs (n, ...) that are stored next."""
-        if blobs is None:
-            return
-
-        def convert(stored: np.ndarray) -> np.ndarray:
-            """Blobs (steps, n, ...) in the new type."""
-            steps, n, *shape = stored.shape
-            flat = converted(stored.reshape(steps * n, *shape), blobs.dtype, tuple(shape))
-            return flat.reshape(stored.shape)
-
-        change_blobs(self._backend, blobs.dtype, convert)
+    def check_blobs(self, blobs: np.ndarray | None) -> None:
+        """Raise ValueError if blobs (n, ...) that are stored next have another type than those of the chain."""
+        stored = type_of_blobs(self._backend)
+        if blobs is not None and stored not in (None, blobs.dtype):
+            raise ValueError(
+                f"the chain has blobs of type {stored}, and blobs_dtype is now {blobs.dtype}: use another backend; or "
+                "delete the file of the chain, but not its record, from which the chain is made again"
+            )
 
     def undo_half_a_step(self) -> None:
         """Remove a step that an error or Ctrl-C has left incomplete."""

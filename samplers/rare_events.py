@@ -5,11 +5,10 @@ The event is that a quantity g of the parameters exceeds a threshold. With thres
 .. math:: P(g > b) = P(g > b_1) \prod_{l=2}^m P(g > b_l \mid g > b_{l-1}),
 
 and each factor is near a tenth (Au & Beck 2001). It is Sequential Monte Carlo with the indicator of :math:`g > b_l` as
-the likelihood of stage l: points are weighted, resampled (`samplers.resampling`) and moved. The error of the product is
-the error of the evidence, which counts points with a common ancestor as dependent
-(`samplers.estimates.weights.EvidenceError`). Moves are the conditional sampling of Papaioannou et al. (2015), whose
-acceptance does not fall with the number of parameters, in chains of ten steps from the points that a level keeps. Moves
-fitted to the points of a level made a probability of 1e-5 five times too small.
+the likelihood of stage l, and the error of the product is that of an evidence (`samplers.estimates.weights`). Points
+move by the conditional sampling of Papaioannou et al. (2015), whose acceptance does not fall with the number of
+parameters, in chains of ten steps. Moves fitted to the points of a level made a probability of 1e-5 five times too
+small.
 
 References
 ----------
@@ -52,17 +51,14 @@ class RareEvent(NamedTuple):
         95 % interval, lognormal with this coefficient.
     threshold : float
         The threshold.
-    levels : (n_levels,) float
-        Thresholds of the stages, the last one is `threshold`.
-    shares : (n_levels,) float
-        Estimated conditional probability of each level, whose product is `probability`.
+    levels, shares : (n_levels,) float
+        Thresholds of the stages, and their conditional probabilities, whose product is `probability`.
     acceptance : (n_levels - 1,) float
         Share of accepted proposals between the levels. Below a tenth, the points of a stage are nearly copies.
     simulations, failed : int
         Number of points at which the quantity was computed, and how many of them failed.
     coords : (k, ndim) float
-        Points of the last stage at which the quantity exceeds the threshold: draws of the parameters given the event,
-        not independent.
+        Points of the last stage at which the quantity exceeds the threshold: dependent draws given the event.
     """
 
     probability: float
@@ -85,24 +81,6 @@ class RareEvent(NamedTuple):
         )
 
     __repr__ = __str__
-
-
-class _Counted:
-    """A user's function of points (k, ndim), with -inf for failures, which are counted."""
-
-    def __init__(self, function: Callable):
-        self._function, self.simulations, self.failed = function, 0, 0
-
-    def __call__(self, points: np.ndarray) -> np.ndarray:
-        values = np.asarray(self._function(points.copy()), dtype=float)
-        if values.shape != (len(points),):
-            raise ValueError(
-                f"function must return one number per point, shape ({len(points)},) for {len(points)} points; got "
-                f"{values.shape}"
-            )
-        failed = np.isnan(values)
-        self.simulations, self.failed = self.simulations + len(values), self.failed + int(failed.sum())
-        return np.where(failed, -np.inf, values)
 
 
 def subset_simulation(
@@ -142,9 +120,9 @@ def subset_simulation(
 
     Notes
     -----
-    A level makes n simulations, a probability of 10^-k takes k levels. The estimate has a bias of order 1/n, because
-    thresholds are quantiles of the points (study `rare_events` of docs/results.rst has its size). A region that no
-    point of the first levels is near is missed, without a sign in the stated error.
+    A probability of 10^-k takes k levels of n simulations. The estimate has a bias of order 1/n, because thresholds are
+    quantiles of the points (docs/results.rst). A region that no point of the first levels is near is missed, without a
+    sign in the stated error.
 
     Examples
     --------
@@ -159,8 +137,18 @@ def subset_simulation(
         raise ValueError(f"n must be {FEWEST / LEVEL_PROBABILITY:.0f} points or more; got {n}")
     if not np.isfinite(threshold):
         raise ValueError(f"threshold must be a finite number; got {threshold!r}")
+    simulations = failed = 0
+
+    def quantity(points: np.ndarray) -> np.ndarray:
+        nonlocal simulations, failed
+        values = np.asarray(function(points.copy()), dtype=float)
+        if values.shape != (len(points),):
+            raise ValueError(f"function must return one number per point, shape ({len(points)},); got {values.shape}")
+        simulations, failed = simulations + len(values), failed + int(np.isnan(values).sum())
+        return np.where(np.isnan(values), -np.inf, values)
+
     random = np.random.RandomState(np.random.MT19937(np.random.SeedSequence(seed)))
-    quantity, points = _Counted(function), random.standard_normal((n, as_whole_number("ndim", ndim)))
+    points = random.standard_normal((n, as_whole_number("ndim", ndim)))
     values = quantity(points)
     points, values = points[values > -np.inf], values[values > -np.inf]
     made, n, kept = n, len(values), int(np.ceil(LEVEL_PROBABILITY * len(values)))
@@ -207,16 +195,6 @@ def subset_simulation(
         acceptance.append(accepted / n)
     probability = float(np.prod(shares))
     factor = float(np.exp(ndtri(0.975) * np.sqrt(np.log1p(deviation**2))))
-    return RareEvent(
-        probability=probability,
-        coefficient_of_variation=deviation,
-        lower=probability / factor,
-        upper=min(probability * factor, 1.0),
-        threshold=float(threshold),
-        levels=np.array(levels),
-        shares=np.array(shares),
-        acceptance=np.array(acceptance),
-        simulations=quantity.simulations,
-        failed=quantity.failed,
-        coords=points[above],
-    )
+    interval = probability / factor, min(probability * factor, 1.0)
+    stages = (np.array(each) for each in (levels, shares, acceptance))
+    return RareEvent(probability, deviation, *interval, float(threshold), *stages, simulations, failed, points[above])

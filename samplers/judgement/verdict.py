@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..estimates.genealogy import standard_error_of_mean, worst_effective_sample_size
+from ..estimates.genealogy import standard_error_of_mean
 from ..estimates.importance import (
     FIRST_ROUND_SHARE,
     USABLE_SHARE,
@@ -80,7 +80,7 @@ class Verdict(_Stored):
 
     The attributes listed here are the judgement, which is stored, compared and pickled. Other attributes are computed
     on first use from the sampler that returned the verdict, and raise ValueError for a verdict without a sampler;
-    `modes`, `worst_effective_sample_size` and `summary` also do for an empty chain.
+    `modes` and `summary` also do for an empty chain.
 
     Attributes
     ----------
@@ -172,12 +172,7 @@ class Verdict(_Stored):
     @cached_property
     def modes(self) -> tuple[Cluster, ...]:
         """Modes in which the run has points, with shares and their standard errors, the largest first."""
-        return find_clusters(self._chain, self._founders)
-
-    @cached_property
-    def worst_effective_sample_size(self) -> float:
-        """Smallest effective sample size of any linear combination of the parameters in the chain."""
-        return worst_effective_sample_size(self._chain, self._founders)
+        return find_clusters(self._chain, self._founders, self._parts.result.ladder[-1].log_evidence_error)
 
     @property
     def summary(self) -> str:
@@ -201,7 +196,7 @@ class Verdict(_Stored):
             failed = f"{run.failed_simulations} simulations failed"
         return (
             f"{self.status.capitalize()}: {found}; log-evidence by {evidences}; effective sample size "
-            f"{self.worst_effective_sample_size:.0f} in the worst direction; {failed}."
+            f"{self.effective_sample_size:.0f}; {failed}."
         )
 
     def __str__(self) -> str:

@@ -166,11 +166,6 @@ class RandomWalkMove(_FittedMove):
         """Fit the covariance to points (n, ndim) with normalised weights (n,)."""
         self._root = location_and_root(coords, weights)[1]
 
-    @property
-    def root(self) -> np.ndarray | None:
-        """Lower-triangular root (ndim, ndim) of the fitted covariance; None before the first fit."""
-        return self._root
-
     def _draw(self, coords, random):
         ndim = coords.shape[1]
         scale = (2.38 / math.sqrt(ndim) if self.scale is None else self.scale) * math.exp(self._log_factor)
@@ -378,11 +373,6 @@ class GuideMove(MHMove):
     def __init__(self, guide: DrawsWithDensity):
         super().__init__(self._draw)
         self._guide = guide
-
-    @property
-    def guide(self) -> DrawsWithDensity:
-        """The proposal distribution."""
-        return self._guide
 
     def _draw(self, coords: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
         proposed = self._guide.draw(len(coords), random)

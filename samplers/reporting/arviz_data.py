@@ -127,19 +127,9 @@ def to_arviz(
 
 
 def _without_slashes(dataset: "xarray.Dataset") -> "xarray.Dataset":
-    """Data with ``_`` for ``/`` in names, which would be a folder in netCDF; the attribute ``name`` has the name."""
-    taken, renamed = {*dataset.variables, *dataset.dims}, {}
-    for name in sorted(name for name in taken if "/" in name):
-        new = name.replace("/", "_")
-        while new in taken:
-            new += "_"
-        taken.add(new)
-        renamed[name] = new
-    dataset = dataset.rename(renamed)
-    for name, new in renamed.items():
-        if new in dataset.variables:
-            dataset[new].attrs["name"] = name
-    return dataset
+    """Data with ``_`` for ``/`` in names, which would be a folder in netCDF."""
+    names = {*dataset.variables, *dataset.dims}
+    return dataset.rename({name: name.replace("/", "_") for name in names if "/" in name})
 
 
 def _check_posterior(posterior: Any, run: Any) -> None:

@@ -20,9 +20,6 @@ __all__ = ["ANNEALING", "Progress", "get_progress_bar", "show_sweeps"]
 SECONDS_BETWEEN_LINES = 60.0
 SECONDS_BETWEEN_FIGURES = 0.1
 ANNEALING = "annealing"
-# Guesses before anything is known, for the bar alone: six guides of the tutorials searched with 6 to 34 simulations for
-# each parameter and one more, and made 1.1 to 1.7 draws for each walker.
-SEARCH_SIMULATIONS, DRAWS_PER_WALKER = 12, 1.3
 ORDER = ("beta", "log Z", "failures", "ESS", "acceptance", "simulations", "running")  # the most important figures first
 
 
@@ -82,7 +79,7 @@ class Progress:
         self._silent = not hasattr(bar, "set_postfix")  # emcee's silent bar has only update
         self._figures: dict[str, Any] = {}
         self._phase = ""  # of a guide
-        self._expected = self._of_guide = 0.0  # simulations of the run; those that the posterior does not count
+        self._of_guide = 0.0  # simulations that the posterior does not count
         self._done = self._running = self._shown = 0
         self._part = 0.0  # of a point: simulations of a point that has several
         self._drawn = time.perf_counter()
@@ -142,11 +139,6 @@ class Progress:
         self._phase = report.phase if isinstance(report, GuideTick) else ""
         if isinstance(report, GuideTick):
             self._of_guide = report.simulations - self._made().get("simulations", 0)
-            search = SEARCH_SIMULATIONS * (population.coords.shape[1] + 1)
-            missing = DRAWS_PER_WALKER * max(report.target - population.effective_sample_size, 0.0)
-            self._expected = missing + (
-                max(search, report.simulations) if report.phase == "search" else report.simulations
-            )
             self._figures = {"simulations": round(report.simulations), "ESS": f"{effective}/{report.target}"}
             if result.rounds:
                 self._figures["log Z"] = f"{result.rounds[-1].log_evidence:.2f}"
@@ -183,8 +175,7 @@ class Progress:
         counts = self._made()
         if self._phase:
             made = round(self._of_guide + counts.get("simulations", 0))
-            text = f"{self._phase}: simulation {made} of about {max(made, float(f'{self._expected:.2g}')):.0f}"
-            self._bar.set_description_str(text, refresh=False)
+            self._bar.set_description_str(f"{self._phase}: simulation {made}", refresh=False)
         figures = {name: number for name, number in counts.items() if number or name == "simulations"}
         figures |= self._figures | ({"running": self._running} if self._running else {})
         self._bar.set_postfix({name: str(figures[name]) for name in ORDER if name in figures}, refresh=False)

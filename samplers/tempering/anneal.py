@@ -48,7 +48,7 @@ from .mutation import MoveSchedule, Mutated, VisitedPoints, move_together
 from .pending_points import PendingPoints
 from .population import Density, Population
 from .recycling import Recycled, recycle, submit_start
-from .smc_moves import anneal_by_moves, move
+from .smc_moves import anneal_by_moves
 
 __all__ = ["anneal", "check_population"]
 
@@ -174,10 +174,7 @@ def _by_recycling(
         schedule.expect_independence()
         moved = Mutated(population, effective / len(found.coords), 0, 0.0)
     else:
-        arguments = density, random, schedule, settings, None
-        moved = yield from move(population, population.founders[0], *arguments)
-        if moved.to_sweep is not None:
-            moved = yield from move_together(moved.population, *arguments, moved)
+        moved = yield from move_together(population, density, random, schedule, settings)
     increment, error = found.log_evidence - found.log_evidence_below_one, found.log_evidence_error
     yield moved.population, Stage(1.0, effective, moved.acceptance, moved.moves, distinct, increment, error)
     if moved.stopped:

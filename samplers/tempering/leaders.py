@@ -30,6 +30,7 @@ from .mutation import (
     Mutated,
     StartCorrelation,
     VisitedPoints,
+    move_together,
     tempered_log_prob,
     tempered_model,
 )
@@ -50,8 +51,7 @@ def grow_chains(
     """Grow a chain from each distinct point (leader), one step per copy of it, after ``settings.burn_in`` steps of all.
 
     The first step moves all chains together, later ones those that are long enough. With a burn-in, sweeps over all
-    points shall follow (`Mutated.to_sweep`) if these are still correlated with the resampled points. `ancestors` (n,)
-    are equal for copies of one point.
+    points follow if these are still correlated with the resampled points. `ancestors` (n,) are equal for copies.
     """
     beta, coords, records = population.beta, population.coords, population.records
     model = tempered_model(density, beta, random, visited)
@@ -85,4 +85,5 @@ def grow_chains(
     if settings.burn_in == 0 or grown.correlation < settings.max_correlation:
         return grown
     schedule.follow(ancestors)
-    return grown._replace(to_sweep=correlation)
+    arguments = density, random, schedule, settings, visited
+    return (yield from move_together(population, *arguments, grown.moves, correlation))

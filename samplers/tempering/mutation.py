@@ -114,8 +114,7 @@ class Mutated(NamedTuple):
     """A population after its moves at one beta, with the acceptance over all sweeps and their number.
 
     `correlation` is the largest one left with the resampled population; `stopped`: the limit of simulations ended the
-    moves. Chains that are still correlated with their leaders have a correlation `to_sweep`: all points are then moved
-    together.
+    moves.
     """
 
     population: Population
@@ -123,7 +122,6 @@ class Mutated(NamedTuple):
     moves: int
     correlation: float
     stopped: bool = False
-    to_sweep: "StartCorrelation | None" = None
 
 
 def tempered_log_prob(records: np.ndarray, beta: float) -> np.ndarray:
@@ -224,16 +222,17 @@ def move_together(
     schedule: MoveSchedule,
     settings: Settings,
     visited: VisitedPoints | None = None,
-    grown: Mutated | None = None,
+    made: int = 0,
+    correlation: StartCorrelation | None = None,
 ) -> Generator[tuple[Population, Sweep], None, Mutated]:
     """Move equally weighted points equally often, until they are nearly uncorrelated with their start; yields each
     sweep.
 
-    Points that are evaluated are added to `visited`. Chains that have `grown` before count as moves.
+    Points that are evaluated are added to `visited`. Chains may have `made` moves before, with a `correlation`.
     """
     beta, records = population.beta, population.records
-    model, made = tempered_model(density, beta, random, visited), 0 if grown is None else grown.moves
-    correlation = StartCorrelation(population.coords, records) if grown is None else grown.to_sweep
+    model = tempered_model(density, beta, random, visited)
+    correlation = StartCorrelation(population.coords, records) if correlation is None else correlation
     state = State(population.coords, log_prob=tempered_log_prob(records, beta), blobs=records)
     acceptance = []
     while not correlation.is_low_enough(settings):

@@ -60,7 +60,7 @@ def check_end(result: AnnealingResult, coords: np.ndarray) -> list[Finding]:
     founders = np.arange(len(coords)) if result.founders is None else result.founders
     error = result.ladder[-1].log_evidence_error
 
-    def has_several_modes() -> bool:
-        return len(find_clusters(coords[None], founders)) > 1
+    def share_error() -> float:
+        return max(mode.share_error for mode in find_clusters(coords[None], founders, error))
 
-    return check_evidence(result.log_evidence_ladder, error, result.check, has_several_modes)
+    return check_evidence(result.log_evidence_ladder, error, result.check, share_error)

@@ -40,11 +40,11 @@ from ..reports import Stage, Sweep
 from ..settings import Settings
 from .early_stop import stop_at
 from .leaders import grow_chains
-from .mutation import MoveSchedule, Mutated, VisitedPoints, move_together
+from .mutation import MoveSchedule, VisitedPoints, move_together
 from .next_beta import next_beta
 from .population import Density, Population
 
-__all__ = ["anneal_by_moves", "move"]
+__all__ = ["anneal_by_moves"]
 
 
 def anneal_by_moves(
@@ -89,10 +89,12 @@ def anneal_by_moves(
         distinct = len(np.unique(population.coords, axis=0))
 
         # 5. move
+        schedule.follow(ancestors)
         arguments = density, random, schedule, settings, visited
-        moved = yield from move(population, ancestors, *arguments)
-        if moved.to_sweep is not None:
-            moved = yield from move_together(moved.population, *arguments, moved)
+        if settings.chains == "leaders":
+            moved = yield from grow_chains(population, ancestors, *arguments)
+        else:
+            moved = yield from move_together(population, *arguments)
         population = moved.population
         if moved.stopped:
             raise stop_at(population, log_evidence, standard_error, log_evidence - increment)
@@ -106,22 +108,3 @@ def resample(population: Population, ancestors: np.ndarray, beta: float, ess: fl
     """Equally weighted points at `beta`: copies of the points with the indices `ancestors` (n,)."""
     founders = trace_founders(population.founders, ancestors)
     return Population(beta, population.coords[ancestors], population.records[ancestors], ess, founders)
-
-
-def move(
-    population: Population,
-    ancestors: np.ndarray,
-    density: Density,
-    random: np.random.RandomState,
-    schedule: MoveSchedule,
-    settings: Settings,
-    visited: VisitedPoints | None = None,
-) -> Generator[tuple[Population, Sweep], None, Mutated]:
-    """Move resampled points at their beta: all points equally often, or in chains from the distinct points.
-
-    After chains, all points may have to be moved together (`Mutated.to_sweep`).
-    """
-    schedule.follow(ancestors)
-    if settings.chains == "leaders":
-        return grow_chains(population, ancestors, density, random, schedule, settings, visited)
-    return move_together(population, density, random, schedule, settings, visited)

@@ -125,47 +125,37 @@ def interrupted(kind, path):
     return sampler
 
 
-@pytest.mark.parametrize(
-    ("kind", "finished", "of"), covering(list(KINDS), [True, False], ["backend", "sampler"], strength=1)
-)
-def test_reset_begins_anew(kind, finished, of, tmp_path):
+@pytest.mark.parametrize(("kind", "finished"), covering(list(KINDS), [True, False], strength=1))
+def test_reset_of_the_backend_begins_anew(kind, finished, tmp_path):
     """Also with another posterior and another seed, which a file that is not reset would refuse or ignore."""
     path = tmp_path / "run.h5"
     begin(make(kind, path, Counted()), 3) if finished else interrupted(kind, path)
     other = {"posterior": Counted("other", centre=0.3), "seed": 9}
-    if of == "backend":
-        emcee.backends.HDFBackend(str(path)).reset(N, NDIM)
-        anew = make(kind, path, **other)
-    else:
-        anew = make(kind, path, **other)
-        anew.reset()
-    begin(anew, 2)
+    emcee.backends.HDFBackend(str(path)).reset(N, NDIM)
+    anew = begin(make(kind, path, **other), 2)
     assert anew.iteration == 2
     other["posterior"] = Counted("other", centre=0.3)
     new = begin(make(kind, tmp_path / "new.h5", **other), 2)
-    if kind == "EnsembleSampler" and of == "sampler":  # emcee goes on with the random state that it found in the file
-        assert anew.get_chain().shape == new.get_chain().shape
-        return
     assert same(anew, new)
     if kind != "EnsembleSampler":
-        assert anew.report() == new.report()
+        assert (anew.evaluations, anew.simulations) == (new.evaluations, new.simulations)
         assert same(make(kind, path, Counted("other", centre=0.3)), new)
 
 
 @pytest.mark.parametrize(("kind", "finished", "in_file"), covering(OURS, [True, False], [True, False], strength=1))
-def test_other_draws_after_a_reset_begin_anew_in_the_same_object(kind, finished, in_file, tmp_path):
+def test_other_draws_after_a_reset_are_annealed_in_the_same_object(kind, finished, in_file, tmp_path):
     path = tmp_path / "run.h5"
     sampler = make(kind, path if in_file else None, Counted(interrupt_at=None if finished else N + 5))
     with nullcontext() if finished else pytest.raises(KeyboardInterrupt):
         begin(sampler, 3)
+    before = sampler.evaluations
     sampler.reset()
     sampler.run_mcmc(np.random.default_rng(2).standard_normal((N, NDIM)), 2)
     ladder, evaluations = sampler.ladder, sampler.evaluations
-    assert sampler.iteration == 2
+    assert sampler.iteration == 2 and evaluations > before
     if in_file:
         reopened = make(kind, path, Counted())
         assert reopened.ladder == ladder and reopened.evaluations == evaluations
-        assert len(list(tmp_path.glob("*.before_reset"))) == 1
     sampler.run_mcmc(np.random.default_rng(3).standard_normal((N, NDIM)), 1)  # without a reset: added to the chain
     assert sampler.iteration == 3 and sampler.evaluations > evaluations
 
@@ -180,19 +170,6 @@ def test_a_reset_goes_on_with_the_last_state_or_the_same_draws(kind, tmp_path, w
         draws = np.random.default_rng(1).standard_normal((N, NDIM))
         sampler.run_mcmc({None: None, "state": last, "draws": draws}[given], 2)
         assert np.array_equal(sampler.get_chain(), whole.get_chain()[2:])
-
-
-@pytest.mark.parametrize("kind", ONE)
-def test_a_wrong_start_after_a_reset_discards_nothing(kind, tmp_path):
-    begin(make(kind, tmp_path / "run.h5", Counted()), 2)
-    sampler = make(kind, tmp_path / "run.h5", Counted())
-    sampler.reset()
-    evaluations = sampler.evaluations
-    with pytest.raises(ValueError, match="must consist of draws of the prior"):
-        sampler.run_mcmc(0.7 + 1e-3 * np.random.default_rng(1).standard_normal((N, NDIM)), 1)
-    assert sampler.evaluations == evaluations
-    begin(sampler, 1)
-    assert sampler.iteration == 1
 
 
 @pytest.mark.parametrize("kind", ONE)

@@ -2,7 +2,6 @@
 
 import os
 import time
-from concurrent.futures import Executor, Future
 from pathlib import Path
 
 import emcee
@@ -15,22 +14,13 @@ from tests.tempering.guides import SearchingGuide
 N, NDIM, STEPS, BURN_IN = 40, 3, 4, 2
 
 
-class InOrder(Executor):
-    """An executor that evaluates a point when it is submitted, so that the order of arrival is no matter of chance."""
-
-    def submit(self, function, *args):
-        future = Future()
-        future.set_result(function(*args))
-        return future
-
-
 KINDS = {
     "smc": (SMCSampler, {"recycle": True}),
     "moves": (SMCSampler, {"recycle": False}),
     "tmcmc": (TMCMCSampler, {}),
     "guided": (SMCSampler, {"guide": SearchingGuide}),
     "map": (SMCSampler, {"recycle": True}),
-    "asynchronous": (SMCSampler, {"recycle": True, "asynchronous": True, "pool": InOrder}),
+    "asynchronous": (SMCSampler, {"recycle": True, "asynchronous": True}),
     "asynchronous, guided": (SMCSampler, {"guide": SearchingGuide, "asynchronous": True}),
     "limit": (SMCSampler, {"recycle": True}),
     "reset": (SMCSampler, {"recycle": False}),
@@ -111,9 +101,7 @@ def make(path, kind, seconds=0.0, sd=0.01, log=None, event=None, **changes):
     settings = {"seed": 5, **settings, **changes}
     if "guide" in settings:
         settings["guide"] = settings["guide"](posterior)
-    if "pool" in settings:
-        settings["pool"] = settings["pool"]()
-    return Sampler(N, NDIM, posterior, vectorize=kind not in ("map", "asynchronous"), backend=backend, **settings)
+    return Sampler(N, NDIM, posterior, vectorize=kind != "map", backend=backend, **settings)
 
 
 def go_on(sampler, kind="smc", steps=STEPS):

@@ -30,7 +30,7 @@ def _check(log_evidence, error=0.05, effective=200.0, shape=0.3):
     ],
 )
 def test_two_evidences_that_differ_are_reported_without_condemning_the_posterior(check, doubted):
-    found = check_evidence(-10.0, 0.1, check, lambda: True)
+    found = check_evidence(-10.0, 0.1, check, lambda: 0.2)
     assert [each.severity for each in found] == ["care"] * doubted
     for doubt in found:
         own = doubt.message.find("log_prior is a function of your own")
@@ -40,18 +40,19 @@ def test_two_evidences_that_differ_are_reported_without_condemning_the_posterior
 
 
 @pytest.mark.parametrize(
-    ("error", "check", "several_modes", "doubted"),
+    ("error", "check", "share_error", "doubted"),
     [
-        (0.5, None, False, True),
-        (0.38, None, False, False),
-        (0.38, None, True, True),
-        (0.5, _check(-10.0), False, False),
-        (0.5, _check(-10.0), True, True),  # of the stages, which give the modes their shares
-        (0.5, _check(-10.0, shape=0.9), False, True),
+        (0.5, None, 0.0, True),
+        (0.38, None, 0.0, False),
+        (0.38, None, 0.15, False),
+        (0.38, None, 0.17, True),
+        (0.5, _check(-10.0), 0.0, False),
+        (0.5, _check(-10.0), 0.2, True),  # of the stages, which give the modes their shares
+        (0.5, _check(-10.0, shape=0.9), 0.0, True),
     ],
 )
-def test_a_large_error_of_the_evidence_is_reported(error, check, several_modes, doubted):
-    found = check_evidence(-10.0, error, check, lambda: several_modes)
+def test_a_large_error_of_the_evidence_or_of_a_share_is_reported(error, check, share_error, doubted):
+    found = check_evidence(-10.0, error, check, lambda: share_error)
     assert [(doubt.severity == "wrong", "standard error of the log-evidence" in doubt.message) for doubt in found] == [
         (False, True)
     ] * doubted
@@ -94,26 +95,27 @@ def test_posteriors_that_are_followed_are_not_doubted(posterior):
     assert sampler.verdict.status == "converged"
 
 
-def _largest_shares(dimensions, walkers, seeds, Sampler, **settings):
-    """Error of the share of the larger one of two modes, and the verdict, for several runs."""
-    found = []
-    for seed in seeds:
-        posterior = analytic.modes(seed, 2, dimensions, 15.0, 2.0, 1.0, "box")
-        sampler = Sampler(walkers, dimensions, posterior, vectorize=True, seed=seed, **settings)
+@pytest.mark.slow
+@pytest.mark.parametrize(("Sampler", "settings"), [(SMCSampler, {"recycle": False}), (TMCMCSampler, {})])
+def test_shares_of_modes_that_the_moves_do_not_connect_have_their_errors(Sampler, settings):
+    """150 walkers in 11 dimensions: founders state errors of .03 to .05. A share that is off by .12 is doubted."""
+    off, stated, means, silent = [], [], [], 0
+    for seed in range(12):
+        posterior = analytic.modes(seed, 2, 11, 15.0, 2.0, 1.0, "box")
+        sampler = Sampler(150, 11, posterior, vectorize=True, seed=seed, **settings)
         with warnings.catch_warnings(record=True):
             sampler.run_mcmc(None, 1)
-        found.append((sampler.verdict.modes[0].share - max(posterior.shares), sampler.verdict.status))
-    return found
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("Sampler", [SMCSampler, TMCMCSampler])
-def test_modes_that_the_moves_do_not_connect_are_doubted(Sampler):
-    """150 walkers in 11 dimensions, 12 seeds: a share is off by more than 0.12 in 2 runs of each sampler (4 and 2 with
-    other proposals), and SMC says so; TMCMC loses a mode in 2, which no verdict can see."""
-    settings = {"recycle": False} if Sampler is SMCSampler else {}
-    wrong = [status for error, status in _largest_shares(11, 150, range(12), Sampler, **settings) if abs(error) > 0.12]
-    assert 0 < len(wrong) <= 5 and wrong.count("converged") <= (0 if Sampler is SMCSampler else 2)
+        chain, modes = sampler.get_chain(flat=True), sampler.verdict.modes
+        found = np.max(np.abs(posterior.responsibilities(chain).mean(axis=0) - posterior.shares))
+        silent += found > 0.12 and sampler.verdict.status == "converged"
+        if len(modes) == 2:  # with few points in many dimensions, two modes may look like one
+            off.append(found)
+            stated.append(modes[0].share_error)
+            means.append((chain.mean(axis=0) - posterior.mean) / sampler.mean_error())
+    ratio = np.sqrt(np.mean(np.square(off)) / np.mean(np.square(stated)))
+    assert len(off) >= 8 and 0.25 < ratio < 1.3  # 2 with the errors by founders
+    assert np.sqrt(np.mean(np.square(means))) < 1.3
+    assert silent == 0
 
 
 LOG_PRIOR = np.array([-1.0, -7.3, -900.0, -2.0])

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from samplers import SMCSampler, compare_models, ladder_table
-from samplers.estimates.genealogy import worst_effective_sample_size
 from tests.statistics import analytic_posteriors as analytic
 
 
@@ -60,15 +59,3 @@ def test_modes_need_a_chain(two_modes):
     assert len(sampler.verdict.unknown) == 1
     with pytest.raises(ValueError, match="one step or more"):
         sampler.verdict.modes  # noqa: B018
-
-
-def test_worst_direction_is_a_combination_of_parameters(rng):
-    """Pairs that move together in x + y but are independent in x - y: no single parameter shows all of it."""
-    shared = np.repeat(rng.standard_normal(200), 2)
-    own = rng.standard_normal(400)
-    chain = np.stack([shared + own, shared - own], axis=1)[None]
-    founders = np.repeat(np.arange(200), 2)
-    assert worst_effective_sample_size(chain, founders) == pytest.approx(200.0, rel=0.03)
-    assert worst_effective_sample_size(1e9 * chain + 1e12, founders) == pytest.approx(
-        worst_effective_sample_size(chain, founders), rel=1e-3
-    )

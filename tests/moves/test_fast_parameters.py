@@ -129,6 +129,28 @@ def test_fast_sweeps_alone_keep_the_target_and_the_other_coordinates(ensemble):
     assert stats.ks_2samp(state.coords[:10_000, 1], start[10_000:, 1]).pvalue > 1e-4
 
 
+def test_fast_sweeps_follow_the_covariance_given_the_other_coordinates(rng):
+    """It is narrower than the marginal one by factors of 1000 and 2, and correlated: other steps hardly move."""
+    root, slope = np.array([[1e-3, 0.0], [95.0, 31.0]]), np.array([1.0, 0.02])
+    slow, z = rng.normal(size=(400, 2)) * np.array([1.0, 1e4]), rng.normal(size=(400, 2))
+    coords = np.column_stack([slow, slow * slope + z @ root.T])
+
+    def score(x):
+        return np.linalg.solve(root, (x[:, 2:] - x[:, :2] * slope).T).T
+
+    def log_prob(x):
+        return -0.5 * np.sum(score(x) ** 2, axis=1), None
+
+    move = WithFastSweeps(Still(), [2, 3], sweeps=1)
+    move.calibrate(coords, np.full(400, 1 / 400))
+    state = emcee.State(coords, log_prob=log_prob(coords)[0], copy=True)
+    for _ in range(60):
+        state, accepted = move.propose(Model(None, log_prob, map, np.random.RandomState(rng.integers(2**31))), state)
+        move.tune(state, accepted)
+    left = [np.corrcoef(before, after)[0, 1] for before, after in zip(z.T, score(state.coords).T, strict=True)]
+    assert np.max(np.abs(left)) < 0.3
+
+
 @pytest.mark.filterwarnings("ignore:stuck")
 def test_fast_parameters_move_when_the_expensive_move_does_not(seed):
     """If the expensive move is almost never accepted, the fast parameters still change."""
