@@ -1,10 +1,8 @@
 """The tasks that emcee's documentation teaches, with each of the three samplers in emcee's place.
 
 Every example is a function of the sampler's class; `log_prior_fn` and a start drawn from the prior are the only
-additions for `SMCSampler` and `TMCMCSampler`. The table of docs/from_emcee.rst lists everything that differs.
+additions for `SMCSampler` and `TMCMCSampler`. docs/from_emcee.rst fits a line, and lists everything that differs.
 """
-
-import functools
 
 import emcee
 import numpy as np
@@ -25,74 +23,6 @@ def seeded():
 def extra(Sampler, log_prior):
     """What the example gains with our samplers."""
     return {} if Sampler is emcee.EnsembleSampler else {"log_prior_fn": log_prior}
-
-
-# ---------------------------------------------------------------- fitting a line: args, discard, thin, flat
-
-TRUTH = np.array([-0.96, 4.3, np.log(0.5)])  # slope, intercept, logarithm of the understated share of the noise
-LOW, HIGH = np.array([-5.0, 0.0, -10.0]), np.array([0.5, 10.0, 1.0])
-
-
-def line_data():
-    random = np.random.default_rng(3)
-    x = np.sort(10.0 * random.random(50))
-    yerr = 0.1 + 0.5 * random.random(50)
-    line = TRUTH[0] * x + TRUTH[1]
-    y = line + np.abs(np.exp(TRUTH[2]) * line) * random.standard_normal(50) + yerr * random.standard_normal(50)
-    return x, y, yerr
-
-
-def line_log_likelihood(theta, x, y, yerr):
-    m, b, log_f = theta
-    model = m * x + b
-    variance = yerr**2 + model**2 * np.exp(2 * log_f)
-    return -0.5 * np.sum((y - model) ** 2 / variance + np.log(2 * np.pi * variance), axis=-1)
-
-
-def line_log_prior(theta):
-    return -np.sum(np.log(HIGH - LOW)) if np.all((theta > LOW) & (theta < HIGH)) else -np.inf
-
-
-def line_log_probability(theta, x, y, yerr):
-    log_prior = line_log_prior(theta)
-    return log_prior + line_log_likelihood(theta, x, y, yerr) if np.isfinite(log_prior) else -np.inf
-
-
-def line_start(Sampler):
-    if Sampler is emcee.EnsembleSampler:
-        return TRUTH + 1e-4 * np.random.default_rng(1).standard_normal((NWALKERS, 3))
-    return np.random.default_rng(1).uniform(LOW, HIGH, (NWALKERS, 3))
-
-
-@functools.cache
-def line_quadrature():
-    """Posterior mean and standard deviation on a grid, and the log-evidence."""
-    m, b, f = np.linspace(-2.0, 0.0, 41), np.linspace(0.0, 8.0, 41), np.linspace(-3.0, 1.0, 33)
-    grid = np.stack(np.meshgrid(m, b, f, indexing="ij"), axis=-1).reshape(-1, 3)
-    columns = grid.T[..., None]
-    log_density = line_log_likelihood(columns, *line_data()) + line_log_prior(TRUTH)
-    weights = np.exp(log_density - log_density.max())
-    cell = (m[1] - m[0]) * (b[1] - b[0]) * (f[1] - f[0])
-    log_evidence = log_density.max() + np.log(weights.sum() * cell)
-    mean = weights @ grid / weights.sum()
-    return mean, np.sqrt(weights @ (grid - mean) ** 2 / weights.sum()), log_evidence
-
-
-@every
-def test_fitting_a_line(Sampler):
-    data = line_data()
-    sampler = Sampler(NWALKERS, 3, line_log_probability, args=data, **extra(Sampler, line_log_prior))
-    sampler.run_mcmc(line_start(Sampler), 200)
-    samples = sampler.get_chain(discard=100, thin=5, flat=True)
-    assert samples.shape == (20 * NWALKERS, 3)
-    mean, sd, log_evidence = line_quadrature()
-    assert np.all(np.abs(samples.mean(axis=0) - mean) < 0.3 * sd)
-    assert np.allclose(samples.std(axis=0), sd, rtol=0.3)
-    if Sampler is not emcee.EnsembleSampler and sampler.verdict.status != "not usable":
-        assert abs(sampler.log_evidence - log_evidence) < 4 * sampler.log_evidence_error
-        assert (
-            sampler.log_evidence_error < 2.0
-        )  # the stages of 32 walkers scatter by 0.6, and half a difference is stated
 
 
 # ---------------------------------------------------------------- the quickstart: state, reset, go on
@@ -169,24 +99,8 @@ def test_saving_and_monitoring_progress(Sampler, tmp_path):
 # ---------------------------------------------------------------- blobs
 
 
-def with_two_blobs(x):
-    return log_prob(x), log_prior(x), float(np.mean(x))
-
-
 def with_dictionary(x):
     return log_prob(x), {"mean": float(np.mean(x)), "first": float(x[0])}
-
-
-@every
-def test_several_blobs_with_names(Sampler, tmp_path):
-    dtype = [("log_prior", float), ("mean", float)]
-    backend = emcee.backends.HDFBackend(str(tmp_path / "blobs.h5"))
-    sampler = Sampler(NWALKERS, NDIM, with_two_blobs, backend=backend, blobs_dtype=dtype, **extra(Sampler, log_prior))
-    sampler.run_mcmc(prior_draws(), 10)
-    blobs, chain = sampler.get_blobs(), sampler.get_chain()
-    assert blobs.dtype.names == ("log_prior", "mean") and blobs["mean"].shape == (10, NWALKERS)
-    assert np.array_equal(blobs["mean"], chain.mean(axis=-1))
-    assert np.array_equal(sampler.get_blobs(flat=True)["log_prior"][-1], log_prior(chain[-1, -1]))
 
 
 @every

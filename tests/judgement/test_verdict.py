@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from samplers import SMCSampler, compare_models, ladder_table
+from samplers.judgement.clusters import error_between_modes, find_clusters, find_members
 from tests.statistics import analytic_posteriors as analytic
 
 
@@ -59,3 +60,19 @@ def test_modes_need_a_chain(two_modes):
     assert len(sampler.verdict.unknown) == 1
     with pytest.raises(ValueError, match="one step or more"):
         sampler.verdict.modes  # noqa: B018
+
+
+def test_errors_of_shares_are_those_of_the_stages_and_at_most_one(rng):
+    """Two modes 20 apart with shares .25 and .75: a share has sqrt(.1875) of the error, and the mean 20 times this."""
+    first = np.arange(400) < 100
+    chain = (rng.standard_normal((400, 2)) + np.where(first, 20.0, 0.0)[:, None])[None]
+    for stated, used in ((0.2, 0.2), (np.inf, 1.0)):
+        (large, small) = find_clusters(chain, np.arange(400), stated)
+        assert small.share == pytest.approx(0.25, rel=1e-3) and large.share > 0.7
+        expected = np.hypot(np.sqrt(0.1875 / 399), used * np.sqrt(0.1875))
+        assert small.share_error == pytest.approx(expected, rel=1e-3)
+        found = error_between_modes(find_members(chain), chain[0], stated)
+        assert found == pytest.approx(used * np.sqrt(0.1875) * (small.mean - large.mean), rel=1e-3)
+    one = chain[:, 100:]
+    assert find_clusters(one, np.arange(300), np.inf)[0].share_error == 0.0
+    assert np.all(error_between_modes(find_members(one), one[0], np.inf) < 1e-12)

@@ -8,7 +8,7 @@ import emcee
 import numpy as np
 import pytest
 
-from samplers import MixtureMove, SMCSampler, TemperedSampler, TMCMCSampler
+from samplers import SMCSampler, TMCMCSampler
 from samplers.presets import CHING_CHEN_2007, RAMANCHA_2022_LITERAL
 from samplers.settings import Settings
 from samplers.tmcmc import BURN_IN
@@ -59,11 +59,6 @@ def test_docstring_names_every_setting(Sampler):
         if kind and ", default " in kind:
             own = {"burn_in": BURN_IN} if Sampler is TMCMCSampler else {}
             assert eval(kind.split(", default ")[1]) == (vars(Settings()) | own)[names]
-
-
-def test_docstring_of_the_settings_names_every_setting():
-    entries = re.findall(r"^ {4}(\w[\w, ]*) : ", Settings.__doc__, re.MULTILINE)
-    assert [name for names in entries for name in names.split(", ")] == [field.name for field in fields(Settings)]
 
 
 class Target(Gaussian):
@@ -144,6 +139,8 @@ def test_a_setting_of_the_other_sampler_is_refused(Sampler):
         (TMCMCSampler, {"seed": 1.5}, "seed must be a whole number"),
         (TMCMCSampler, {"burn_in": 2, "chains": "equal"}, 'chains="leaders"'),
         (TMCMCSampler, {"max_moves": 9, "burn_in": 0}, 'chains="equal"'),
+        (TMCMCSampler, {"chains": "leaders", "moves": emcee.moves.StretchMove()}, 'several walkers.*chains="equal"'),
+        (TMCMCSampler, {"chains": "leaders", "moves": [(emcee.moves.DEMove(), 1.0)]}, "need several walkers"),
     ],
     ids=lambda value: str(value),
 )
@@ -206,21 +203,6 @@ def test_numpy_numbers_are_settings(tmp_path):
     assert type(sampler.settings.max_moves) is int and sampler.settings.recycle is False
 
 
-@pytest.mark.parametrize(
-    "moves",
-    [
-        emcee.moves.StretchMove(),
-        [emcee.moves.GaussianMove(0.01), emcee.moves.DEMove()],
-        [(emcee.moves.GaussianMove(0.01), 0.9), (emcee.moves.DEMove(), 0.1)],
-    ],
-    ids=["stretch", "list", "weighted"],
-)
-def test_chains_from_leaders_refuse_moves_of_several_walkers(moves):
-    with pytest.raises(ValueError, match='need several walkers.*chains="equal"'):
-        TMCMCSampler(60, 3, Gaussian(), chains="leaders", moves=moves)
-    TMCMCSampler(60, 3, Gaussian(), chains="equal", moves=moves)
-
-
 def test_settings_as_keywords_and_as_a_preset():
     sampler = SMCSampler(300, 3, Gaussian(), **RAMANCHA_2022_LITERAL)
     assert sampler.settings == Settings(
@@ -229,12 +211,6 @@ def test_settings_as_keywords_and_as_a_preset():
     assert TMCMCSampler(300, 3, Gaussian(), **CHING_CHEN_2007).settings.chains == "leaders"
     with pytest.raises(TypeError, match="unexpected keyword argument 'essratio'.*ess_ratio"):
         SMCSampler(60, 3, Gaussian(), essratio=0.7)
-
-
-def test_a_coefficient_of_variation_of_one_is_an_ess_ratio_of_a_half():
-    assert outcome(TMCMCSampler) == outcome(TMCMCSampler, coefficient_of_variation=1.0)
-    equal = outcome(TMCMCSampler, chains="equal")
-    assert equal == outcome(TemperedSampler, moves=MixtureMove(), ess_ratio=0.5)
 
 
 def test_defaults_of_the_samplers():
