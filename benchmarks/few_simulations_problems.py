@@ -9,6 +9,8 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
+from fe_likelihoods.data.make_bridge_column_eq1 import column_measurements
+from fe_likelihoods.data.make_isolated_bridge import bridge_measurements
 
 from fe_likelihoods import (
     FELikelihood,
@@ -72,17 +74,10 @@ def oscillator(seed: int, truth: tuple[float, float] = (1.15, 0.8)) -> Posterior
 def bridge(data: str, seed: int) -> Posterior:
     """Isolated bridge with new noise."""
     if seed == 1:
-        return problems.isolated_bridge(data=data, noise="marginal")
-    record = problems.isolated_bridge_data(data).record
-    measurements = problems.isolated_bridge_measurements(
-        record,
-        theta=problems.ISOLATED_BRIDGE_TRUTH[data],
-        outputs=problems.ISOLATED_BRIDGE_OUTPUTS[data],
-        noise=problems.ISOLATED_BRIDGE_NOISE[data],
-        seed=seed,
-    )
-    channels = 6 if data == "twin" else None
-    return problems.isolated_bridge(record=record, measurements=measurements, channels=channels, noise="marginal")
+        return problems.isolated_bridge(data=data).marginal()
+    bundled = problems.isolated_bridge_data(data)
+    test = bundled._replace(measurements=bridge_measurements(bundled.record, data, seed))
+    return problems.isolated_bridge(data=test, channels=6 if data == "twin" else None).marginal()
 
 
 def bridge_twin(seed: int) -> Posterior:
@@ -98,10 +93,10 @@ def bridge_means(seed: int) -> Posterior:
 def column(seed: int, every: int = 1) -> Posterior:
     """Bridge column with new noise."""
     if seed == 1:
-        return problems.bridge_column(every=every, noise="marginal")
-    record = problems.bridge_column_data().record
-    measurements = problems.bridge_column_measurements(record, seed=seed)
-    return problems.bridge_column(record=record, measurements=measurements, every=every, noise="marginal")
+        return problems.bridge_column(every=every).marginal()
+    bundled = problems.bridge_column_data()
+    test = bundled._replace(measurements=column_measurements(bundled.record, seed=seed))
+    return problems.bridge_column(data=test, every=every).marginal()
 
 
 def column_one_in_four(seed: int) -> Posterior:

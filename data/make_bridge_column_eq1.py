@@ -8,12 +8,14 @@ with white noise added.
 Run the script with ``make data``. It writes the same file every time.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
 from fe_likelihoods.data.ground_motion import stochastic_motion
 
-from fe_likelihoods import Record
-from fe_likelihoods.problems import BRIDGE_COLUMN_MEANS, BRIDGE_COLUMN_NOISE, bridge_column_measurements
+from fe_likelihoods import Events, Measurements, RCColumn, Record
+from fe_likelihoods.problems import BRIDGE_COLUMN_MEANS, BRIDGE_COLUMN_NOISE
 from fe_likelihoods.signals.datasets import write_dataset
 from fe_likelihoods.units import G0
 
@@ -50,10 +52,37 @@ def base_motion(seed: int = SEED) -> Record:
     return column_motion("synthetic EQ1", seed, duration=DURATION, peak=PEAK)
 
 
+def column_measurements(
+    record: Record,
+    *,
+    theta: Mapping[str, float] = BRIDGE_COLUMN_MEANS,
+    seed: int = 1,
+    n_strips: int = 200,
+    substeps: int = 4,
+    levels: Mapping[str, float] = BRIDGE_COLUMN_NOISE,
+) -> Measurements:
+    """Make the response of a refined model plus white noise with the standard deviations `levels` [SI].
+
+    In the pauses of `Events` nothing is measured (NaN).
+    """
+    model = RCColumn.lhpost(record, mesh=n_strips, substeps=substeps)
+    values = model.simulate([theta[name] for name in model.parameter_names])
+    deviations = np.array([levels[channel.name] for channel in model.channels])
+    values = values + deviations[:, None] * np.random.default_rng(seed).standard_normal(values.shape)
+    if isinstance(record, Events):
+        values = np.where(record.in_events, values, np.nan)
+    description = (
+        f"SYNTHETIC: response of RCColumn.lhpost ({n_strips} strips, {substeps} integration steps per sample) to "
+        f"{record.name} at {'the posterior means of the paper' if theta is BRIDGE_COLUMN_MEANS else 'an assumed truth'}"
+        f", plus white noise (seed {seed})"
+    )
+    return Measurements(model.channels, record.dt, values, description)
+
+
 def main() -> None:
     """Write the file."""
     record = base_motion()
-    measurements = bridge_column_measurements(record, seed=SEED)
+    measurements = column_measurements(record, seed=SEED)
     attributes = {
         "title": "Synthetic EQ1 of the bridge column: NOT measured data",
         "truth": dict(BRIDGE_COLUMN_MEANS) | {f"sigma_{k}": v for k, v in BRIDGE_COLUMN_NOISE.items()},

@@ -14,13 +14,12 @@ Run the script with ``make data``. It writes the same file every time.
 
 from pathlib import Path
 
-from fe_likelihoods.data.make_bridge_column_eq1 import base_motion, column_motion
+from fe_likelihoods.data.make_bridge_column_eq1 import base_motion, column_measurements, column_motion
 
 from fe_likelihoods import Events, Record
 from fe_likelihoods.problems import (
     BRIDGE_COLUMN_MEANS,
     BRIDGE_COLUMN_SENSOR_NOISE,
-    bridge_column_measurements,
 )
 from fe_likelihoods.signals.datasets import write_dataset
 from fe_likelihoods.units import G0
@@ -41,7 +40,7 @@ def second_motion(seed: int = SEED, peak: float = PEAK, name: str = "synthetic E
 def main() -> None:
     """Write the file."""
     events = Events([base_motion(), second_motion()], REST, ["EQ1", "EQ2"])
-    measurements = bridge_column_measurements(
+    measurements = column_measurements(
         events, seed=NOISE_SEED, n_strips=40, substeps=1, levels=BRIDGE_COLUMN_SENSOR_NOISE
     )
     attributes = {

@@ -9,10 +9,10 @@ Run the script with ``make data``. It writes the same file every time.
 
 from pathlib import Path
 
-from fe_likelihoods.data.make_bridge_column_eq1 import SEED, column_motion
+from fe_likelihoods.data.make_bridge_column_eq1 import SEED, column_measurements, column_motion
 
 from fe_likelihoods import Record
-from fe_likelihoods.problems import BRIDGE_COLUMN_NOISE, SHORT_SUBSTEPS, bridge_column_measurements
+from fe_likelihoods.problems import BRIDGE_COLUMN_NOISE, SHORT_SUBSTEPS
 from fe_likelihoods.signals.datasets import write_dataset
 from fe_likelihoods.units import G0
 
@@ -33,9 +33,7 @@ def short_motion() -> Record:
 def main() -> None:
     """Write the file."""
     record = short_motion()
-    measurements = bridge_column_measurements(
-        record, theta=TRUTH, seed=NOISE_SEED, n_strips=40, substeps=SHORT_SUBSTEPS
-    )
+    measurements = column_measurements(record, theta=TRUTH, seed=NOISE_SEED, n_strips=40, substeps=SHORT_SUBSTEPS)
     attributes = {
         "title": "Synthetic short test of the bridge column: NOT measured data",
         "truth": TRUTH | {f"sigma_{k}": v for k, v in BRIDGE_COLUMN_NOISE.items()},

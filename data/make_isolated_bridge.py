@@ -6,18 +6,20 @@ default integration step, at parameters that differ from the nominal values, at 
 noise is added, with a given fraction of the root mean square of each channel.
 
 `isolated_bridge_means.h5` has only means over the two piers. The piers are structurally identical, so that these data
-do not distinguish them, and the posterior has exactly two modes (see `IsolatedBridge.exchange_piers`).
+do not distinguish them, and the posterior has exactly two modes.
 
 Run the script with ``make data``. It writes the same files every time.
 """
 
 from pathlib import Path
 
+import numpy as np
+
+from fe_likelihoods import IsolatedBridge, Measurements, Record
 from fe_likelihoods.problems import (
     ISOLATED_BRIDGE_NOISE,
     ISOLATED_BRIDGE_OUTPUTS,
     ISOLATED_BRIDGE_TRUTH,
-    isolated_bridge_measurements,
     table_motion,
 )
 from fe_likelihoods.signals.datasets import write_dataset
@@ -28,17 +30,25 @@ NOISE_SEED = 1999
 of the truth. Tests of calibration use many draws of the noise."""
 
 
+def bridge_measurements(record: Record, data: str, seed: int) -> Measurements:
+    """Make the response with a small step at the truth of a bundled test, plus its white noise."""
+    step, noise = 0.05e-3, ISOLATED_BRIDGE_NOISE[data]
+    model = IsolatedBridge(record, outputs=ISOLATED_BRIDGE_OUTPUTS[data], step=step, every=2)
+    values = model.simulate([ISOLATED_BRIDGE_TRUTH[data][name] for name in model.parameter_names])
+    rms = np.sqrt(np.mean(values**2, axis=1, keepdims=True))
+    values = values + noise * rms * np.random.default_rng(seed).standard_normal(values.shape)
+    description = (
+        f"SYNTHETIC, nominal values assumed: response of IsolatedBridge (step {1e3 * step:g} ms) to {record.name}, "
+        f"plus white noise of {100 * noise:g} % of each channel's root mean square (seed {seed})"
+    )
+    return Measurements(model.channels, model.dt, values, description)
+
+
 def main() -> None:
     """Write the files."""
     record = table_motion(SEED)
     for data, name in (("twin", "isolated_bridge"), ("means", "isolated_bridge_means")):
-        measurements = isolated_bridge_measurements(
-            record,
-            theta=ISOLATED_BRIDGE_TRUTH[data],
-            outputs=ISOLATED_BRIDGE_OUTPUTS[data],
-            noise=ISOLATED_BRIDGE_NOISE[data],
-            seed=NOISE_SEED,
-        )
+        measurements = bridge_measurements(record, data, NOISE_SEED)
         attributes = {
             "title": "Synthetic test of an isolated bridge: NOT measured data, nominal values assumed",
             "truth": dict(ISOLATED_BRIDGE_TRUTH[data]) | {"sigma": ISOLATED_BRIDGE_NOISE[data]},

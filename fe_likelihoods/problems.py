@@ -4,7 +4,7 @@
 multiples of nominal values with normal priors truncated at zero, and two noise levels with half-normal priors. The
 measured record and responses are not public. The bundled data are **synthetic** (``data/README.md``): EQ1, and a set
 of EQ1 and a stronger EQ2 (``data="eq1-eq2"``) that informs every parameter, and a short test for first examples
-(``data="short"``). `bridge_column_measurements` makes such data for any other base motion.
+(``data="short"``).
 
 `isolated_bridge` is a bridge on sliding bearings with fluid dampers, after the shake-table tests of Tsopelas et al.
 (1994): ten multiples of nominal values of friction and dampers. Its data are **synthetic** and most nominal values are
@@ -29,7 +29,6 @@ Examples
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
 from importlib import resources
 from types import MappingProxyType
 from typing import Any
@@ -40,13 +39,11 @@ from .cache.simulation_cache import SimulationCache
 from .likelihood.likelihood import FELikelihood
 from .likelihood.posterior import Posterior
 from .models.isolated_bridge_channels import CHANNEL_SETS
-from .noise.autoregressive import AutoregressiveNoise
 from .noise.gaussian import GaussianNoise
 from .priors.distributions import HalfNormal, TruncatedNormal
 from .priors.problem_priors import bridge_column_prior, correlation_priors, isolated_bridge_prior
 from .signals.channels import Channel, Measurements
 from .signals.datasets import Dataset, read_dataset
-from .signals.events import Events
 from .signals.records import Record
 from .units import to_si
 
@@ -59,12 +56,10 @@ __all__ = [
     "ISOLATED_BRIDGE_TRUTH",
     "bridge_column",
     "bridge_column_data",
-    "bridge_column_measurements",
     "bridge_column_prior",
     "free_vibration",
     "isolated_bridge",
     "isolated_bridge_data",
-    "isolated_bridge_measurements",
     "isolated_bridge_prior",
     "table_motion",
 ]
@@ -127,96 +122,12 @@ def bridge_column_data(data: str = "eq1") -> Dataset:
     return _bundled(_COLUMN_FILES[data])
 
 
-def bridge_column_measurements(
-    record: Record,
-    *,
-    theta: Mapping[str, float] = BRIDGE_COLUMN_MEANS,
-    seed: int = 1,
-    n_strips: int = 200,
-    substeps: int = 4,
-    noise: bool = True,
-    levels: Mapping[str, float] = BRIDGE_COLUMN_NOISE,
-    **changes,
-) -> Measurements:
-    """Make synthetic measurements of the bridge column: the response of a refined model plus white noise.
-
-    Parameters
-    ----------
-    record : Record
-        Base acceleration. In the pauses of `Events` nothing is measured (NaN).
-    theta : mapping of str to float
-        Multiples of the nominal values. Default: posterior means of the paper.
-    seed : int
-        Seed of the noise.
-    n_strips : int
-        Number of strips of the section in the refined model (40 in the model that is updated).
-    substeps : int
-        Integration steps per sample of the record in the refined model (1 in the model that is updated).
-    noise : bool
-        Whether to add the noise. False: the response alone.
-    levels : mapping of str to float
-        Standard deviation of the noise of each channel [SI].
-    **changes
-        Other arguments of `RCColumn.lhpost`.
-
-    Returns
-    -------
-    Measurements
-        The channels "acceleration" and "displacement", or those of the outputs.
-
-    Examples
-    --------
-    >>> problems.bridge_column_measurements(record, n_strips=40, substeps=1).values.shape
-    (2, 200)
-    """
-    from .models.rc_column import RCColumn
-
-    model = RCColumn.lhpost(record, mesh=n_strips, substeps=substeps, **changes)
-    values = model.simulate([theta[name] for name in model.parameter_names])
-    if noise:
-        rng = np.random.default_rng(seed)
-        if missing := [channel.name for channel in model.channels if channel.name not in levels]:
-            raise ValueError(
-                f"no noise level for {', '.join(missing)}: give levels={{channel: standard deviation [SI]}} for all "
-                "channels, or noise=False"
-            )
-        deviations = np.array([levels[c.name] for c in model.channels])
-        values = values + deviations[:, None] * rng.standard_normal(values.shape)
-    if isinstance(record, Events):
-        values = np.where(record.in_events, values, np.nan)
-    description = (
-        f"SYNTHETIC: response of RCColumn.lhpost ({n_strips} strips, {substeps} integration steps per sample) to "
-        f"{record.name} at {'the posterior means of the paper' if theta is BRIDGE_COLUMN_MEANS else 'an assumed truth'}"
-        + (f", plus white noise (seed {seed})" if noise else "")
-    )
-    return Measurements(model.channels, record.dt, values, description)
-
-
-def _make_noise(noise: Any, channels: Sequence[Channel]) -> Any:
-    """Return the noise with a name, or the noise that was given; raise ValueError for an unknown name."""
-    if not isinstance(noise, str):
-        return noise
-    if noise == "channel":
-        return GaussianNoise(channels)
-    if noise == "all":
-        return GaussianNoise(channels, groups="all")
-    if noise == "autoregressive":
-        return AutoregressiveNoise(channels)
-    raise ValueError(
-        'expected noise="channel", "all", "autoregressive" or "marginal", or a noise such as GaussianNoise; '
-        f"got {noise!r}"
-    )
-
-
 def bridge_column(
     *,
-    data: str = "eq1",
-    record: Record | None = None,
-    measurements: Measurements | None = None,
+    data: str | Dataset = "eq1",
     every: int = 1,
     duration: float | None = None,
-    noise: Any = "channel",
-    seed: int = 1,
+    noise: Any = None,
     cache: SimulationCache | str | os.PathLike | None = None,
     **changes,
 ) -> Posterior:
@@ -226,28 +137,19 @@ def bridge_column(
 
     Parameters
     ----------
-    data : {"eq1", "eq1-eq2", "short"}
-        Bundled data (`bridge_column_data`). "eq1" is EQ1, during which the bars stay elastic and the data say nothing
-        about a1. "eq1-eq2" is EQ1 and a stronger EQ2, which inform every parameter. "short" is a test of ten seconds
-        for first examples.
-    record : Record, optional
-        Base motion. Default: that of the bundled data.
-    measurements : Measurements, optional
-        Responses at the step of the record. Default: the bundled ones, or, for another record, synthetic measurements
-        (`bridge_column_measurements`).
+    data : {"eq1", "eq1-eq2", "short"} or Dataset
+        Bundled data (`bridge_column_data`), or your own. "eq1" is EQ1, during which the bars stay elastic and the data
+        say nothing about a1. "eq1-eq2" is EQ1 and a stronger EQ2, which inform every parameter. "short" is a test of
+        ten seconds for first examples.
     every : int
         Use every n-th sample only: the record is resampled with a filter, the measurements are decimated. 2 halves the
         cost of a simulation.
     duration : float, optional
         Use the first `duration` seconds only.
-    noise : {"channel", "all", "autoregressive", "marginal"}, or a noise such as `GaussianNoise`
-        "channel" is white noise with one sigma per channel, as in the paper. "all" has one sigma for all
-        channels, in root mean squares of the measured channels. "autoregressive" has a correlation ``rho_...`` per
-        channel in addition. "marginal" is "channel" with the sigmas integrated out (`Posterior.marginal`), which
-        leaves five parameters. The priors are in `bridge_column_prior`; those of other sensors (`outputs`) have 0.3
-        times the measured root mean square as their scale.
-    seed : int
-        Seed of the noise of synthetic measurements.
+    noise : Noise, optional
+        Default: white noise with one sigma per channel, as in the paper. The priors of others are in
+        `bridge_column_prior`; those of other sensors (`outputs`) have 0.3 times the measured root mean square as their
+        scale.
     cache : SimulationCache or path, optional
         Cache of simulations on disk.
     **changes
@@ -262,8 +164,7 @@ def bridge_column(
     Raises
     ------
     ValueError
-        If measurements are given without a record or do not match it, there is no such bundled set, or the noise is
-        unknown.
+        If there is no such bundled set, or the measurements do not match the record.
 
     Examples
     --------
@@ -273,30 +174,21 @@ def bridge_column(
     """
     from .models.rc_column import RCColumn
 
-    if record is None:
-        if measurements is not None:
-            raise ValueError("measurements need the record under which they were measured: give record= too")
-        bundled = bridge_column_data(data)
-        record, measurements = bundled.record, bundled.measurements
-        if data == "short":
-            changes = {"substeps": SHORT_SUBSTEPS} | changes
-    elif data != "eq1":
-        raise ValueError("data= chooses bundled data; leave it out with a record of your own, which may be Events")
-    elif measurements is None:
-        measurements = bridge_column_measurements(record, seed=seed)
+    if data == "short":
+        changes = {"substeps": SHORT_SUBSTEPS} | changes
+    record, measurements, _ = bridge_column_data(data) if isinstance(data, str) else data
     if duration is not None:
         record, measurements = record.trim(0.0, duration), measurements.trim(0.0, duration)
     if every != 1:
         measurements = measurements.decimate(every)
         record = record.resample(record.dt * every)
     model = RCColumn.lhpost(record, **changes)
-    law = _make_noise("channel" if noise == "marginal" else noise, model.channels)
-    likelihood = FELikelihood(model, measurements, law, cache=cache)
+    noise = GaussianNoise(model.channels) if noise is None else noise
+    likelihood = FELikelihood(model, measurements, noise, cache=cache)
     sensors = [channel.name for channel in model.channels if channel.name not in BRIDGE_COLUMN_NOISE]
     rms = measurements.select(sensors).root_mean_squares if sensors else ()
-    prior = bridge_column_prior(law.parameter_names, dict(zip(sensors, rms, strict=True)))
-    posterior = Posterior(likelihood, prior)
-    return posterior.marginal() if noise == "marginal" else posterior
+    prior = bridge_column_prior(noise.parameter_names, dict(zip(sensors, rms, strict=True)))
+    return Posterior(likelihood, prior)
 
 
 # ------------------------------------------------------------------ isolated bridge
@@ -407,64 +299,11 @@ def isolated_bridge_data(data: str = "twin") -> Dataset:
     return _bundled("isolated_bridge.h5" if data == "twin" else "isolated_bridge_means.h5")
 
 
-def isolated_bridge_measurements(
-    record: Record,
-    *,
-    theta: Mapping[str, float] = ISOLATED_BRIDGE_TRUTH["twin"],
-    outputs: tuple[str, ...] | int = 10,
-    noise: float = 0.05,
-    seed: int = 1,
-    step: float = 0.05e-3,
-    every: int = 2,
-    **changes,
-) -> Measurements:
-    """Make synthetic measurements of the isolated bridge: the response with a finer time step plus white noise.
-
-    Parameters
-    ----------
-    record : Record
-        Acceleration of the shake table.
-    theta : mapping of str to float
-        Multiples of the nominal values of all ten parameters.
-    outputs : tuple of str, 5, 6 or 10
-        Channels (see `IsolatedBridge`).
-    noise : float
-        Standard deviation of the noise, in root mean squares of each channel. 0: the response alone.
-    seed : int
-        Seed of the noise.
-    step : float
-        Integration step [s]. The model that is updated has 0.25 ms.
-    every : int
-        Return every n-th sample of the record only.
-    **changes
-        Other arguments of `IsolatedBridge`.
-
-    Returns
-    -------
-    Measurements
-        The channels `outputs`.
-    """
-    from .models.isolated_bridge import IsolatedBridge
-
-    model = IsolatedBridge(record, outputs=outputs, step=step, every=every, **changes)
-    values = model.simulate([theta[name] for name in model.parameter_names])
-    rms = np.sqrt(np.mean(values**2, axis=1, keepdims=True))
-    values = values + noise * rms * np.random.default_rng(seed).standard_normal(values.shape)
-    description = (
-        f"SYNTHETIC, nominal values assumed: response of IsolatedBridge (step {1e3 * step:g} ms) to {record.name}"
-        + (f", plus white noise of {100 * noise:g} % of each channel's root mean square (seed {seed})" if noise else "")
-    )
-    return Measurements(model.channels, model.dt, values, description)
-
-
 def isolated_bridge(
     *,
-    data: str = "twin",
+    data: str | Dataset = "twin",
     channels: tuple[str, ...] | int | None = None,
-    noise: Any = "all",
-    record: Record | None = None,
-    measurements: Measurements | None = None,
-    seed: int = 1,
+    noise: Any = None,
     cache: str | os.PathLike | SimulationCache | None = None,
     **changes,
 ) -> Posterior:
@@ -472,28 +311,19 @@ def isolated_bridge(
 
     Parameters
     ----------
-    data : {"twin", "means"}
-        Bundled synthetic test. "twin" has a known truth and one mode. "means" has only means over the two piers, so
-        that the devices of the piers can be exchanged: its posterior has exactly two modes, whose masses are known
-        (`IsolatedBridge.exchange_piers`).
+    data : {"twin", "means"} or Dataset
+        Bundled synthetic test, or your own, whose step may be a multiple of that of its record. "twin" has a known
+        truth and one mode. "means" has only means over the two piers, so that the devices of the piers can be
+        exchanged: its posterior has exactly two modes, whose masses are proportional to the prior densities.
     channels : tuple of str, 5, 6 or 10, optional
         Measured channels to use. Default: six of "twin", all of any other data.
-    noise : {"all", "channel", "autoregressive", "marginal"}, or a noise such as `GaussianNoise`
-        "all" is white noise with one sigma for all channels, in root mean squares of the measured channels. "channel"
-        has one sigma per channel [SI]. "autoregressive" has a correlation ``rho_...`` per channel in addition
-        (uniform between -1 and 1). "marginal" is "all" with sigma integrated out (`Posterior.marginal`), which
-        leaves ten parameters.
-    record : Record, optional
-        Table motion of your own. Default: that of `data`.
-    measurements : Measurements, optional
-        Responses of your own. Their step may be a multiple of that of the record. Default: for a record of your own,
-        synthetic measurements (`isolated_bridge_measurements`).
-    seed : int
-        Seed of the noise of synthetic measurements.
+    noise : Noise, optional
+        Default: white noise with one sigma for all channels, in root mean squares of the measured channels.
+        Correlations ``rho_...`` of another noise are uniform between -1 and 1.
     cache : SimulationCache or path, optional
         Cache of simulations on disk.
     **changes
-        Other arguments of `IsolatedBridge`: step, friction, bearings, parameters ...
+        Other arguments of `IsolatedBridge`: step, bearings, parameters ...
 
     Returns
     -------
@@ -503,7 +333,7 @@ def isolated_bridge(
     Raises
     ------
     ValueError
-        If a name is unknown, or measurements are given without a record or do not match it.
+        If a name is unknown, or the measurements do not match the record.
 
     Examples
     --------
@@ -512,29 +342,20 @@ def isolated_bridge(
     """
     from .models.isolated_bridge import IsolatedBridge
 
-    if record is None:
-        if measurements is not None:
-            raise ValueError("measurements need the record under which they were measured: give record= too")
-        bundled = isolated_bridge_data(data)
-        record, measurements = bundled.record, bundled.measurements
-        channels = 6 if channels is None and data == "twin" else channels
-    elif measurements is None:
-        measurements = isolated_bridge_measurements(record, seed=seed)
+    channels = 6 if channels is None and data == "twin" else channels
+    record, measurements, _ = isolated_bridge_data(data) if isinstance(data, str) else data
     names = CHANNEL_SETS.get(channels) if isinstance(channels, int) else channels
     if isinstance(channels, int) and names is None:
         raise ValueError(f"expected channels by name, or one of the sets {tuple(CHANNEL_SETS)}; got {channels}")
     if names is not None:
         measurements = measurements.select(names)
-    every = round(measurements.dt / record.dt)
-    model = IsolatedBridge(
-        record, outputs=tuple(c.name for c in measurements.channels), **({"every": max(1, every)} | changes)
-    )
-    law = _make_noise("all" if noise == "marginal" else noise, model.channels)
+    every = max(1, round(measurements.dt / record.dt))
+    outputs = tuple(channel.name for channel in measurements.channels)
+    model = IsolatedBridge(record, outputs=outputs, **({"every": every} | changes))
+    noise = GaussianNoise(model.channels, groups="all") if noise is None else noise
     rms = measurements.root_mean_squares
-    scales = {"sigma": 1.0} | {f"sigma_{c.name}": scale for c, scale in zip(measurements.channels, rms, strict=True)}
-    sigmas = {name: scales[name] for name in law.parameter_names if name in scales}
-    prior = isolated_bridge_prior(model.parameter_names, sigmas).distributions | correlation_priors(
-        law.parameter_names, scales
-    )
-    posterior = Posterior(FELikelihood(model, measurements, law, cache=cache), prior)
-    return posterior.marginal() if noise == "marginal" else posterior
+    scales = {"sigma": 1.0} | {f"sigma_{name}": scale for name, scale in zip(outputs, rms, strict=True)}
+    sigmas = {name: scales[name] for name in noise.parameter_names if name in scales}
+    prior = isolated_bridge_prior(model.parameter_names, sigmas).distributions
+    prior |= correlation_priors(noise.parameter_names, scales)
+    return Posterior(FELikelihood(model, measurements, noise, cache=cache), prior)

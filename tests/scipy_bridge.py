@@ -231,3 +231,9 @@ def solve(
 def peak_errors(response: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """Return the largest difference of each channel over the largest value of the reference."""
     return np.abs(response - reference).max(axis=-1) / np.abs(reference).max(axis=-1)
+
+
+def exchange_piers(model, thetas):
+    """Multiples (..., 10) of the nominal values with the same physical values at the other pier."""
+    nominal = np.array(list(model.nominal.values()))
+    return (np.asarray(thetas) * nominal)[..., [3, 4, 5, 0, 1, 2, 8, 9, 6, 7]] / nominal

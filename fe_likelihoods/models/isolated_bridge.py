@@ -58,7 +58,6 @@ _NOMINAL_UNITS = {
     for pier in (1, 2)
     for name, unit in zip(("a", "Kd", "C0"), ("s/m", "N/m", "N s/m"), strict=True)
 }
-_EXCHANGED = [3, 4, 5, 0, 1, 2, 8, 9, 6, 7]  # PARAMETERS with the devices of the two piers exchanged
 _LONGEST_STEP = 0.25e-3  # of the default [s]
 _STATE_ROWS = (
     *("deck", "pier_1", "rotation_1", "pier_2", "rotation_2"),
@@ -267,18 +266,6 @@ class IsolatedBridge(ThreadedModel):
         names = (*_STATE_ROWS, "Z_1", "Z_2", *ALL_CHANNELS)
         kept = np.concatenate([run.values[:N_STATES], run.values[14:16], rows])[:, :: self.every]
         return BridgeHistory(names, kept, beyond, run.iterations)
-
-    def exchange_piers(self, thetas: np.ndarray) -> np.ndarray:
-        """Exchange the devices of the two piers: multiples (..., 10) with the same physical values at the other pier.
-
-        If the piers are equal and the data do not identify them, the likelihood is the same at both points. The map
-        preserves volumes, so the masses of the two modes are proportional to the prior densities.
-        """
-        if self.parameters != PARAMETERS:
-            raise ValueError(f"expected a model with the parameters {PARAMETERS}, in this order; got {self.parameters}")
-        nominal = np.array(list(self.nominal.values()))
-        physical = np.asarray(thetas, dtype=float) * nominal
-        return physical[..., _EXCHANGED] / nominal
 
     def _respond(self, theta: np.ndarray) -> np.ndarray:
         return self._outputs_of(run_bridge(self, self._prepared, theta), theta)

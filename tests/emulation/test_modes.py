@@ -232,7 +232,7 @@ def test_a_budget_is_kept(budget):
 
 @pytest.mark.slow
 def test_parts_of_the_record_count_as_fractions():
-    posterior = problems.isolated_bridge(noise="marginal")
+    posterior = problems.isolated_bridge().marginal()
     search = find_modes(posterior, starts=4, seed=1)
     assert len(search.modes) == 1 and search.ends[0] == 0 and set(search.ends) <= {0, -1}
     whole = posterior.report()["simulations"]

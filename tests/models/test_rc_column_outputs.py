@@ -272,10 +272,10 @@ def test_the_loading_decides_which_outputs_of_the_top_there_are():
 
 def test_measurements_of_some_channels_name_the_outputs_to_choose():
     data = bridge_column_data()
-    measured = data.measurements.select(["acceleration"])
+    data = data._replace(measurements=data.measurements.select(["acceleration"]))
     with pytest.raises(ValueError, match=r"make the model with outputs=\('acceleration',\)"):
-        bridge_column(record=data.record, measurements=measured)
-    posterior = bridge_column(record=data.record, measurements=measured, outputs=("acceleration",))
+        bridge_column(data=data)
+    posterior = bridge_column(data=data, outputs=("acceleration",))
     assert posterior.parameter_names[-1] == "sigma_acceleration"
 
 

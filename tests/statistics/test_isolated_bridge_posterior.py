@@ -12,6 +12,7 @@ import pytest
 from fe_likelihoods import problems
 from fe_likelihoods.likelihood.posterior import Posterior
 from samplers import SMCSampler
+from tests.scipy_bridge import exchange_piers
 
 pytestmark = pytest.mark.slow
 
@@ -43,7 +44,7 @@ def exact_weight(samples: np.ndarray, posterior: Posterior) -> float:
     first = samples[:, 1] < samples[:, 4]
     larger = first if first.mean() > 0.5 else ~first
     inside = samples[larger]
-    other = np.column_stack([model.exchange_piers(inside[:, :10]), inside[:, 10]])
+    other = np.column_stack([exchange_piers(model, inside[:, :10]), inside[:, 10]])
     ratio = float(np.mean(np.exp(posterior.log_prior(other) - posterior.log_prior(inside))))
     return 1.0 / (1.0 + ratio) if first.mean() > 0.5 else ratio / (1.0 + ratio)
 
