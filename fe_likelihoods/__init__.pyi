@@ -28,13 +28,12 @@ from .models.function import FunctionModel
 from .models.isolated_bridge import IsolatedBridge
 from .models.linear_oscillator import LinearOscillator
 from .models.linear_structure import LinearStructure
-from .models.linear_structure_parts import BridgeDeck, ShearFrame
+from .models.linear_structure_parts import BridgeDeck, ModalModel, ShearFrame
 from .models.opensees import OpenSeesModel
 from .models.rc_column import RCColumn
 from .models.rc_column_curves import material_curves, moment_curvature
 from .models.rc_column_parts import Bars, Concrete, Hoops, LowCycleFatigue, Steel
 from .models.sensed import SensedModel, Sensor
-from .models.tall_buildings import GroupedFrame, ModalModel
 from .models.umbridge import UMBridgeModel
 from .noise.autoregressive import AutoregressiveNoise
 from .noise.gaussian import GaussianNoise
@@ -86,7 +85,6 @@ __all__ = [
     "FunctionModel",
     "FunctionModes",
     "GaussianNoise",
-    "GroupedFrame",
     "HalfNormal",
     "HierarchicalPosterior",
     "Hierarchy",

@@ -19,7 +19,6 @@ import numpy as np
 from fe_likelihoods import (
     AutoregressiveNoise,
     FELikelihood,
-    GroupedFrame,
     HalfNormal,
     LinearStructure,
     LogNormal,
@@ -78,7 +77,7 @@ def measure(name: str) -> Measurements:
 stiffnesses = [f"stiffness_{storey}" for storey in range(1, STOREYS + 1)]
 calibrated = {}
 for name, record in records.items():
-    frame = GroupedFrame(FLOORS, np.ones(STOREYS), NOMINAL, groups=range(1, STOREYS + 1))
+    frame = ShearFrame(FLOORS, np.ones(STOREYS), NOMINAL, groups=range(1, STOREYS + 1))
     model, data = LinearStructure(frame, record), measure(name)
     prior = {each: LogNormal(1.0, 0.2) for each in stiffnesses} | {"damping": LogNormal(0.03, 0.3)}
     for channel, level in zip(model.channels, data.values.std(axis=1).tolist(), strict=True):

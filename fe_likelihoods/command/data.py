@@ -68,7 +68,7 @@ def read_base_motion(job: Job) -> Record | None:
             '"second.csv"], and other structures have one motion, file'
         )
     if given is None:
-        if job.kind in ("column", "bridge", "oscillator", "frame", "grouped frame"):
+        if job.kind in ("column", "bridge", "oscillator", "frame"):
             raise ValueError(f"{job.where('record')} file: this key is missing; the {job.kind} needs a base motion")
         return None
     if given.supports is not None:

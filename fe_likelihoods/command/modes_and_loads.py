@@ -18,7 +18,7 @@ from .keys import read_by_channel
 
 __all__ = ["STRUCTURES", "modal_likelihood", "modes_of_user", "read_load_cases", "read_modes"]
 
-STRUCTURES = "frame", "grouped frame", "bridge deck"  # built-in ones that have modes
+STRUCTURES = "frame", "bridge deck"  # built-in ones that have modes
 
 
 def read_modes(job: Job) -> tuple[ModalData, ModalData | None]:

@@ -341,7 +341,7 @@ _OWN = {
 _COLUMN_PARTS = dict(concrete="Concrete", steel="Steel", bars="Bars", hoops="Hoops", fatigue="LowCycleFatigue")
 _BRIDGE_PARTS = {f"{name.lower()}_{i}": name for name in ("Pier", "Bearing", "Damper") for i in (1, 2)}
 _STOREYS: dict[str, Any] = dict(
-    names="floors masses stiffnesses", required="floors masses stiffnesses", floors="table of whole numbers"
+    names="floors masses stiffnesses groups", required="floors masses stiffnesses", floors="table of whole numbers"
 )
 _BUILT_IN: dict[str, tuple[str, dict[str, Any]]] = {
     "column": (
@@ -354,7 +354,6 @@ _BUILT_IN: dict[str, tuple[str, dict[str, Any]]] = {
     ),
     "oscillator": ("linear_oscillator.LinearOscillator", dict(without="record", required="period")),
     "frame": ("linear_structure_parts.ShearFrame", _STOREYS),
-    "grouped frame": ("tall_buildings.GroupedFrame", dict(names="groups", required="groups")),
     "bridge deck": ("linear_structure_parts.BridgeDeck", {}),
 }
 _PARTS = {"column": ("rc_column_parts", _COLUMN_PARTS), "bridge": ("isolated_bridge_parts", _BRIDGE_PARTS)}
@@ -375,8 +374,7 @@ def model_keys(kind: str) -> tuple[Key, ...]:
     if kind in _OWN:
         return _OWN[kind]
     name, options = _BUILT_IN[kind]
-    storeys = model_keys("frame") if kind == "grouped frame" else ()
-    return (*storeys, *_arguments(_in_models(name), **options))
+    return _arguments(_in_models(name), **options)
 
 
 def part_keys(kind: str) -> dict[str, tuple[Key, ...]]:

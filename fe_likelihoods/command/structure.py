@@ -61,10 +61,9 @@ def built_in(job: Job, record: Record, names: tuple[str, ...] | None, measured: 
 def linear_parts(job: Job) -> Any:
     """A shear frame, with groups of storeys or without, or a bridge deck."""
     from ..models.linear_structure_parts import BridgeDeck, ShearFrame
-    from ..models.tall_buildings import GroupedFrame
 
-    kinds = {"frame": ShearFrame, "grouped frame": GroupedFrame, "bridge deck": BridgeDeck}
-    return job.located("model", lambda: kinds[job.kind](**job.model))
+    kind = ShearFrame if job.kind == "frame" else BridgeDeck
+    return job.located("model", lambda: kind(**job.model))
 
 
 def _changed(job: Job, part: str, usual: Any, changes: Mapping[str, Any]) -> Any:

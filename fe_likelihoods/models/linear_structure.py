@@ -10,8 +10,8 @@ usual). C need not be diagonalised by the modes of M and K. In the state (u, u')
 uncouple in the complex modes, q' = lam q + f(t). With accelerations that are linear between their samples, each mode
 has a closed-form solution without time-stepping error (``docs/theory/time_integration.rst``).
 
-`LinearStructure` makes a model from any object that computes these matrices from parameters: a bridge deck and a frame
-(`fe_likelihoods.models.linear_structure_parts`), or a tall building (`fe_likelihoods.models.tall_buildings`).
+`LinearStructure` makes a model from any object that computes these matrices from parameters: a bridge deck, a frame, or
+a building as a sum of modes (`fe_likelihoods.models.linear_structure_parts`).
 
 References
 ----------

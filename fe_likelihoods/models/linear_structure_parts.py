@@ -1,7 +1,8 @@
-"""Two linear structures with few parameters: the deck of a short bridge, and a shear frame.
+"""Linear structures with few parameters: the deck of a short bridge, a shear frame, and a building as a sum of modes.
 
 Each is a frozen dataclass that computes the matrices which `fe_likelihoods.models.linear_structure.LinearStructure`
-simulates. Masses are relative, because accelerations of supports identify only the ratio of stiffness to mass.
+simulates. Masses are relative, because accelerations of supports identify only the ratio of stiffness to mass. The
+equations of buildings are in ``docs/theory/tall_buildings.rst``.
 """
 
 import math
@@ -12,9 +13,11 @@ import numpy as np
 
 from ..simulation.model import SimulationFailed
 from .linear_system import LinearSystem, modal_damping
-from .validation import check_positive
+from .validation import check_integer, check_positive
 
-__all__ = ["BridgeDeck", "ShearFrame"]
+__all__ = ["BridgeDeck", "ModalModel", "ShearFrame"]
+
+_MOST_MODES = 50
 
 
 @dataclass(frozen=True)
@@ -122,8 +125,9 @@ class ShearFrame:
 
     Storey i, below floor i, has the shear stiffness theta_i k_i; floor i has the mass m_i. The modes have the given
     ratios of critical damping, lowest frequency first. The parameters are ``stiffness_1``, ``stiffness_2``, ...,
-    multiples of the nominal stiffnesses; and ``damping_1``, ``damping_2``, ..., ratios [-]. Masses are known, because
-    accelerations identify only the ratios of stiffness to mass.
+    multiples of the nominal stiffnesses; and ``damping_1``, ``damping_2``, ..., ratios [-]. With `groups`, the storeys
+    of a group share a multiple, and all modes the ratio ``damping``. Masses are known, because accelerations identify
+    only the ratios of stiffness to mass.
 
     Parameters
     ----------
@@ -133,11 +137,14 @@ class ShearFrame:
         Nominal mass of each floor, in any unit; relative masses are sufficient.
     stiffnesses : sequence of float
         Nominal stiffness of each storey, in the unit of the masses times 1/s² (N/m if the masses are in kg).
+    groups : sequence of int, optional
+        Group of each storey, from the lowest one: 1 to the number of groups, each of which has a storey. Groups usually
+        end where the section of the columns changes.
 
     Raises
     ------
     ValueError
-        If a floor does not exist, values are not positive, or their numbers differ.
+        If a floor does not exist, values are not positive, their numbers differ, or `groups` do not fit.
 
     Examples
     --------
@@ -146,11 +153,14 @@ class ShearFrame:
     ('stiffness_1', 'stiffness_2', 'damping_1', 'damping_2')
     >>> LinearStructure(frame, record).simulate([1.0, 1.0, 0.03, 0.03]).shape
     (2, 200)
+    >>> ShearFrame({"roof": 6}, [1.0] * 6, [900.0] * 6, groups=[1, 1, 1, 2, 2, 2]).parameter_names
+    ('stiffness_1', 'stiffness_2', 'damping')
     """
 
     floors: Mapping[str, int] | Sequence[tuple[str, int]]
     masses: Sequence[float]
     stiffnesses: Sequence[float]
+    groups: Sequence[int] | None = None
 
     n_supports = 1
 
@@ -164,14 +174,22 @@ class ShearFrame:
         for _, floor in floors:
             if floor not in range(1, n + 1):
                 raise ValueError(f"ShearFrame: expected floors from 1 to {n}; got {floor!r}")
+        groups = None if self.groups is None else tuple(map(int, self.groups))
+        if groups is not None and (len(groups) != n or set(groups) != set(range(1, max(groups, default=0) + 1))):
+            raise ValueError(
+                f"ShearFrame: expected the group of each of {n} storeys, numbers from 1 without gaps; got {groups!r}"
+            )
+        object.__setattr__(self, "groups", groups)
         object.__setattr__(self, "floors", tuple((str(name), int(floor)) for name, floor in floors))
         object.__setattr__(self, "masses", tuple(map(float, self.masses)))
         object.__setattr__(self, "stiffnesses", tuple(map(float, self.stiffnesses)))
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """``stiffness_1``, ..., and ``damping_1``, ..."""
-        return tuple(f"{what}_{i}" for what in ("stiffness", "damping") for i in range(1, len(self.masses) + 1))
+        """``stiffness_1``, ..., and ``damping_1``, ... or, with groups, ``damping``."""
+        numbers = range(1, (len(self.masses) if self.groups is None else max(self.groups)) + 1)
+        dampings = ("damping",) if self.groups else (f"damping_{i}" for i in numbers)
+        return (*(f"stiffness_{i}" for i in numbers), *dampings)
 
     @property
     def channel_names(self) -> tuple[str, ...]:
@@ -189,12 +207,11 @@ class ShearFrame:
         if not (theta > 0.0).all():
             bad = [name for name, value in zip(self.parameter_names, theta, strict=True) if not value > 0.0]
             raise SimulationFailed(f"stiffnesses and dampings must be positive; not positive: {', '.join(bad)}")
-        n = sum(name.startswith("stiffness") for name in self.parameter_names)
-        return self._system(theta[:n], theta[n:])
-
-    def _system(self, factors: np.ndarray, ratios: np.ndarray) -> LinearSystem:
-        """Matrices for multiples of the stiffnesses (n,) and damping ratios (n,)."""
         n = len(self.masses)
+        if self.groups is None:
+            factors, ratios = theta[:n], theta[n:]
+        else:
+            factors, ratios = theta[np.array(self.groups) - 1], np.full(n, theta[-1])
         storeys = factors * self.stiffnesses
         above = np.append(storeys[1:], 0.0)
         stiffness = np.diag(storeys + above) - np.diag(storeys[1:], 1) - np.diag(storeys[1:], -1)
@@ -208,4 +225,86 @@ class ShearFrame:
             influence=np.ones((n, 1)),
             shape=shape,
             direct=np.zeros((len(self.floors), 1)),
+        )
+
+
+@dataclass(frozen=True)
+class ModalModel:
+    """A building on one support as a sum of modes, whose properties at the sensors are the parameters.
+
+    With the relative displacement u_k of an oscillator with the frequency and the damping of mode k, channel c has the
+    absolute acceleration a + sum_k s_ck u_k''. The effective shape s_ck is the participation factor times the mode
+    shape at the sensor; its sum over all modes of a structure is 1. Modes that are left out are stiff: they move with
+    the support, with the remaining share 1 - sum_k s_ck.
+
+    The parameters are ``frequency_1``, ... [Hz], in ascending order; ``damping_1``, ...; and ``shape_<channel>_1``, ...
+    for each channel.
+
+    Parameters
+    ----------
+    channels : sequence of str
+        Names of the channels.
+    n_modes : int
+        Number of modes.
+
+    Raises
+    ------
+    ValueError
+        If there is no channel, or the number of modes is not from 1 to 50.
+
+    Examples
+    --------
+    >>> tower = ModalModel(["roof", "floor 20"], n_modes=1)
+    >>> tower.parameter_names
+    ('frequency_1', 'damping_1', 'shape_roof_1', 'shape_floor 20_1')
+    >>> LinearStructure(tower, record).simulate([0.2, 0.02, 1.4, 0.7]).shape
+    (2, 200)
+    """
+
+    channels: Sequence[str]
+    n_modes: int
+
+    n_supports = 1
+
+    def __post_init__(self) -> None:
+        names = self.channels
+        if isinstance(names, str) or not names or not all(isinstance(name, str) and name for name in names):
+            raise ValueError(f"ModalModel: expected the names of one or more channels; got {names!r}")
+        object.__setattr__(self, "channels", tuple(names))
+        check_integer("n_modes of a ModalModel", self.n_modes, 1, _MOST_MODES)
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """``frequency_1``, ..., ``damping_1``, ..., and ``shape_<channel>_1``, ..., channel by channel."""
+        what = ("frequency", "damping", *(f"shape_{channel}" for channel in self.channels))
+        return tuple(f"{each}_{k}" for each in what for k in range(1, self.n_modes + 1))
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Names of the channels."""
+        return self.channels
+
+    def assemble(self, theta: np.ndarray) -> LinearSystem:
+        """Compute the matrices at the parameters (n_parameters,), with the modes as degrees of freedom.
+
+        Raises
+        ------
+        SimulationFailed
+            If the frequencies are not positive and ascending, or a damping ratio is not positive.
+        """
+        n = self.n_modes
+        frequencies, ratios, shapes = theta[:n], theta[n : 2 * n], theta[2 * n :].reshape(-1, n)
+        if not (frequencies[0] > 0.0 and (np.diff(frequencies) > 0.0).all()):
+            listed = ", ".join(f"{value:.4g}" for value in frequencies)
+            raise SimulationFailed(f"frequencies must be positive and ascending; they are {listed} Hz")
+        if not (ratios > 0.0).all():
+            raise SimulationFailed(f"damping ratios must be positive; they are {ratios}")
+        omegas = 2.0 * np.pi * frequencies
+        return LinearSystem(
+            mass=np.eye(n),
+            damping=np.diag(2.0 * ratios * omegas),
+            stiffness=np.diag(np.square(omegas)),
+            influence=np.ones((n, 1)),
+            shape=shapes,
+            direct=1.0 - shapes.sum(axis=1, keepdims=True),
         )

@@ -91,7 +91,7 @@ def plot_sensors(model: RCColumn | LinearStructure, axes: Axes | None = None, ra
     Parameters
     ----------
     model : RCColumn or LinearStructure
-        The column, or a building whose parts have floors (`ShearFrame`, `GroupedFrame`); its channels
+        The column, or a building whose parts have floors (`ShearFrame`); its channels
         have the names of its outputs.
     axes : matplotlib Axes, optional
         Where to draw. Default: a new figure.

@@ -103,7 +103,7 @@ def test_other_models_have_modes(tmp_path):
         settings = f"{text[:start]}[model]\n{own}\n{text[end:]}".replace("[modes]", "[modes]\nn_modes = 4")
         (tmp_path / "own.toml").write_text(settings)
         assert make_problem(read_job(tmp_path / "own.toml")).posterior(point) == pytest.approx(frame(point), rel=1e-9)
-    path = changed(tmp_path, "modal", ('"frame"  ', '"grouped frame"'), ("[modes]", "groups = [1, 2, 3, 4]\n[modes]"))
+    path = changed(tmp_path, "modal", ("[modes]", "groups = [1, 2, 3, 4]\n[modes]"))
     assert make_problem(read_job(path)).posterior(point) == pytest.approx(frame(point), rel=1e-12)
 
 

@@ -10,7 +10,6 @@ from scipy import stats
 from fe_likelihoods import (
     FELikelihood,
     GaussianNoise,
-    GroupedFrame,
     HalfNormal,
     LinearStructure,
     LogNormal,
@@ -19,6 +18,7 @@ from fe_likelihoods import (
     Posterior,
     Prior,
     Record,
+    ShearFrame,
     StoredPosterior,
     stiffness_loss,
 )
@@ -199,7 +199,7 @@ def building(stiffnesses, seed) -> Posterior:
     """Three storeys, two of them measured, as a function of three stiffness factors."""
     time, motion = 0.02 * np.arange(400), np.random.default_rng(seed).standard_normal(400)
     record = Record("synthetic", 0.02, np.convolve(motion, np.ones(3) / 3.0, mode="same") * np.minimum(1.0, time))
-    frame = GroupedFrame({"floor": 1, "roof": 3}, [1.0] * 3, [900.0] * 3, groups=[1, 2, 3])
+    frame = ShearFrame({"floor": 1, "roof": 3}, [1.0] * 3, [900.0] * 3, groups=[1, 2, 3])
     model = LinearStructure(frame, record)
     clean = model.simulate([*stiffnesses, 0.03])
     noise = 0.05 * clean.std(axis=1, keepdims=True) * np.random.default_rng(seed + 10).standard_normal(clean.shape)

@@ -11,7 +11,6 @@ from fe_likelihoods import (
     Channel,
     ExecutableModel,
     FunctionModes,
-    GroupedFrame,
     ModalData,
     ModalLikelihood,
     OpenSeesModel,
@@ -104,7 +103,7 @@ def test_opensees_has_the_modes_of_the_frame():
 
 
 def test_dampings_are_no_parameters_of_modes():
-    grouped = GroupedFrame({"low": 1, "roof": 3}, [1.0] * 3, [1.0] * 3, groups=[1, 1, 2])
+    grouped = ShearFrame({"low": 1, "roof": 3}, [1.0] * 3, [1.0] * 3, groups=[1, 1, 2])
     model = StructureModes(grouped)
     assert model.parameter_names == ("stiffness_1", "stiffness_2") and model.n_steps == 3
     same(model.simulate([1.0, 0.9]), StructureModes(FRAME).simulate([1.0, 1.0, 0.9]), 1e-12)

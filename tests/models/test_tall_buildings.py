@@ -7,7 +7,6 @@ import pytest
 from scipy.linalg import eigh
 
 from fe_likelihoods import (
-    GroupedFrame,
     LinearStructure,
     ModalModel,
     Record,
@@ -63,7 +62,7 @@ def test_modes_that_are_left_out_move_with_the_base(record, modes):
 def test_groups_are_the_frame_with_equal_factors(record):
     groups = [1, 1, 1, 2, 2, 3]
     frame = LinearStructure(ShearFrame(FLOORS, MASSES, STIFFNESSES), record)
-    grouped = LinearStructure(GroupedFrame(FLOORS, MASSES, STIFFNESSES, groups), record)
+    grouped = LinearStructure(ShearFrame(FLOORS, MASSES, STIFFNESSES, groups), record)
     assert grouped.parameter_names == ("stiffness_1", "stiffness_2", "stiffness_3", "damping")
     expected = frame.simulate([1.1, 1.1, 1.1, 0.8, 0.8, 1.3] + [0.03] * N)
     np.testing.assert_array_equal(grouped.simulate([1.1, 0.8, 1.3, 0.03]), expected)
@@ -75,7 +74,7 @@ def test_groups_are_the_frame_with_equal_factors(record):
         (ModalModel(["roof"], 2), [1.0, 0.9, 0.02, 0.02, 1.0, 0.1], "ascending; they are 1, 0.9 Hz"),
         (ModalModel(["roof"], 1), [-1.0, 0.02, 1.0], "positive and ascending"),
         (ModalModel(["roof"], 1), [1.0, 0.0, 1.0], "damping ratios must be positive"),
-        (GroupedFrame({"roof": 2}, [1, 1], [9, 9], [1, 1]), [1.0, -0.1], "not positive: damping"),
+        (ShearFrame({"roof": 2}, [1, 1], [9, 9], [1, 1]), [1.0, -0.1], "not positive: damping"),
     ],
 )
 def test_impossible_parameters_fail_with_reasons(record, parts, theta, words):
@@ -89,9 +88,9 @@ def test_impossible_parameters_fail_with_reasons(record, parts, theta, words):
         (lambda: ModalModel([], 2), "names of one or more channels"),
         (lambda: ModalModel("roof", 2), "names of one or more channels"),
         (lambda: ModalModel(["roof"], 0), "between 1 and 50"),
-        (lambda: GroupedFrame({"roof": 2}, [1, 1], [9, 9], [1, 3]), "without gaps; got"),
-        (lambda: GroupedFrame({"roof": 2}, [1, 1], [9, 9], [1]), "each of 2 storeys"),
-        (lambda: GroupedFrame({"roof": 3}, [1, 1], [9, 9], [1, 1]), "floors from 1 to 2"),
+        (lambda: ShearFrame({"roof": 2}, [1, 1], [9, 9], [1, 3]), "without gaps; got"),
+        (lambda: ShearFrame({"roof": 2}, [1, 1], [9, 9], [1]), "each of 2 storeys"),
+        (lambda: ShearFrame({"roof": 3}, [1, 1], [9, 9], [1, 1]), "floors from 1 to 2"),
     ],
 )
 def test_wrong_arguments_are_rejected(make, words):
@@ -103,7 +102,7 @@ def test_fingerprints_differ(record):
     parts = [
         ModalModel(["roof"], 2),
         ModalModel(["roof"], 3),
-        GroupedFrame({"roof": 2}, [1, 1], [9, 9], [1, 1]),
-        GroupedFrame({"roof": 2}, [1, 1], [9, 9], [1, 2]),
+        ShearFrame({"roof": 2}, [1, 1], [9, 9], [1, 1]),
+        ShearFrame({"roof": 2}, [1, 1], [9, 9], [1, 2]),
     ]
     assert len({LinearStructure(each, record).fingerprint for each in parts}) == len(parts)
