@@ -14,7 +14,6 @@ import hashlib
 import logging
 import multiprocessing
 import os
-import shutil
 import stat
 import tempfile
 import time
@@ -53,33 +52,18 @@ KERNEL_HASH: str = _hash_sources()
 """Hash over all kernel sources."""
 
 
-def _is_ours(path: str) -> bool:
-    """Whether a path is a folder of this user, and not a link."""
-    status = os.lstat(path)
-    return stat.S_ISDIR(status.st_mode) and (not hasattr(os, "getuid") or status.st_uid == os.getuid())
-
-
 def _private_folder(path: str) -> str:
-    """Create a folder that only this user can read and write; OSError if that is impossible.
+    """Create a folder into which only this user can write; OSError if that is impossible.
 
-    numba's index is a pickle, and loading it runs the code in it: nobody else may have written it. An existing folder
-    that others could write to is emptied.
+    numba's index is a pickle, and loading it runs the code in it: nobody else may have written it. A folder of somebody
+    else, one that others could write to, and a link are not used.
     """
     with suppress(FileExistsError):
         os.mkdir(path, 0o700)
-    if not _is_ours(path):
-        raise PermissionError(f"{path} does not belong to this user")
-    if hasattr(os, "getuid"):
-        writable_by_others = os.lstat(path).st_mode & 0o022
-        os.chmod(path, 0o700)
-        if os.lstat(path).st_mode & 0o077:
-            raise PermissionError(f"{path} cannot be made private")
-        if writable_by_others:
-            for entry in os.scandir(path):
-                if entry.is_dir(follow_symlinks=False):
-                    shutil.rmtree(entry.path)
-                else:
-                    os.unlink(entry.path)
+    status = os.lstat(path)
+    ours = not hasattr(os, "getuid") or (status.st_uid == os.getuid() and not status.st_mode & 0o022)
+    if not (stat.S_ISDIR(status.st_mode) and ours):
+        raise PermissionError(f"{path} is not a folder into which only this user can write")
     return path
 
 

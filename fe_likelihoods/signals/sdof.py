@@ -48,18 +48,12 @@ def hold_integrals(z: complex) -> tuple[complex, complex]:
 
 
 def respond(
-    base_acceleration: np.ndarray,
-    dt: float,
-    angular_frequency: float,
-    damping_ratio: float,
-    displacement: float = 0.0,
-    velocity: float = 0.0,
+    base_acceleration: np.ndarray, dt: float, angular_frequency: float, damping_ratio: float
 ) -> OscillatorResponse:
-    """Exact response to a base acceleration (n_steps,) [m/s²] that is linear between its samples (Nigam & Jennings
-    1969).
+    """Exact response from rest to a base acceleration (n_steps,) [m/s²] that is linear between its samples (Nigam &
+    Jennings 1969).
 
-    The angular frequency [rad/s] is undamped and positive, 0 <= damping_ratio < 1; displacement [m] and velocity [m/s],
-    relative to the base, are values at the first sample.
+    The angular frequency [rad/s] is undamped and positive, 0 <= damping_ratio < 1.
     """
     from scipy.signal import lfilter  # imported here because scipy.signal takes longer to import than this package
 
@@ -69,8 +63,7 @@ def respond(
     constant, slope = hold_integrals(eigenvalue * dt)
     # q_{k+1} = decay q_k - dt (constant - slope) a_k - dt slope a_{k+1}
     numerator = [-dt * slope, -dt * (constant - slope)]
-    first = velocity - eigenvalue.conjugate() * displacement
-    state, _ = lfilter(numerator, [1.0, -decay], base_acceleration, zi=[first - numerator[0] * base_acceleration[0]])
+    state, _ = lfilter(numerator, [1.0, -decay], base_acceleration, zi=[-numerator[0] * base_acceleration[0]])
     relative_displacement = state.imag / damped_frequency
     relative_velocity = (eigenvalue * state).imag / damped_frequency
     return OscillatorResponse(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods.kernels import bar_fatigue, reinforcing_steel
-from fe_likelihoods.kernels.bar_fatigue import DAMAGE, FRACTURED, HALF_CYCLES, N_FAILURE, N_STATE
+from fe_likelihoods.kernels.bar_fatigue import DAMAGE, FRACTURED, N_FAILURE, N_STATE
 from tests.opensees_bar import bar_stresses
 from tests.opensees_column import require_opensees
 
@@ -130,25 +130,6 @@ def test_damage_is_that_of_rainflow_counting(rng):
     assert np.abs(np.array(ratios) - 1.0).max() < 0.01
 
 
-def test_counting_reversals_without_closing_loops_is_detected(rng):
-    """Negative control of the test above: half cycles from each reversal to the next are another sum."""
-    strain = random_turns(rng, 30)
-    x, s = natural(strain, lawful(strain))
-    naive = sum(coffin_manson(x[i + 40] - x[i], s[i + 40] - s[i], 0.26) for i in range(0, len(x) - 1, 40))
-    assert abs(naive / rainflow(x, s, 0.26) - 1.0) > 0.05
-
-
-def test_a_nested_loop_leaves_the_outer_half_cycle_as_it_was():
-    """Miner's sum with a small loop inside a large half cycle is the sum of both."""
-    cf = 0.26
-    plain = follow(path(0.03, -0.03, 0.03), cf=cf)[2, -1]
-    strain = path(0.03, -0.03, 0.0, -0.01, 0.03)
-    x, s = natural(strain, lawful(strain))
-    loop = 2.0 * coffin_manson(x[600] - x[800], s[600] - s[800], cf)
-    assert follow(strain, cf=cf)[2, -1] == pytest.approx(plain + loop, rel=0.01)
-    assert loop > 0.005 * plain
-
-
 def test_steps_do_not_matter():
     turns = (0.03, -0.02, 0.01, -0.01, 0.02, -0.03, 0.04)
     coarse, fine = (follow(path(*turns, n=n), cf=0.2)[2, -1] for n in (4, 400))
@@ -218,26 +199,3 @@ def test_tangent_is_the_derivative(rng):
             assert values[1][1] == pytest.approx(difference, rel=2e-4, abs=2e-5 * MODULUS)
             tested += 1
     assert tested > 30
-
-
-def test_a_trial_leaves_the_memory_as_it_was(rng):
-    c, f = failure(cf=0.1)
-    state, trial = np.zeros(N_STATE), np.zeros(N_STATE)
-    for eps in random_turns(rng, 15):
-        before, copy = state.copy(), state.copy()
-        tried = bar_fatigue.stress_tangent(eps + 1e-3, state, c, f, trial)
-        np.testing.assert_array_equal(state, before)
-        assert tried == bar_fatigue.update(eps + 1e-3, copy, c, f)
-        bar_fatigue.update(eps, state, c, f)
-
-
-def test_kernels_equal_pure_python(rng):
-    c, f = failure(cf=0.1)
-    state, pure = np.zeros(N_STATE), np.zeros(N_STATE)
-    for eps in random_turns(rng, 12)[::4]:
-        compiled = bar_fatigue.update(eps, state, c, f)
-        assert bar_fatigue.update.py_func(eps, pure, c, f) == pytest.approx(compiled, rel=1e-11, abs=1.0)
-    np.testing.assert_allclose(pure[HALF_CYCLES:], state[HALF_CYCLES:], rtol=1e-9, atol=1e-9)
-    out = np.zeros(N_FAILURE)
-    bar_fatigue.constants.py_func(0.1, ALPHA, CD, out)
-    np.testing.assert_allclose(out, f, rtol=1e-14)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fe_likelihoods.kernels.concrete04 import commit, envelope, stress_tangent, unloading
+from fe_likelihoods.kernels.concrete04 import envelope, stress_tangent, unloading
 
 from . import golden
 
@@ -105,14 +105,6 @@ def test_envelope_is_the_formula(args, rng):
     np.testing.assert_allclose(out, softening(strain, args), rtol=1e-12, atol=1e-14)
 
 
-def test_initial_tangent_is_the_modulus(args):
-    c = golden.concrete_constants(args)
-    below_secant = args[FC] / args[E0] >= args[EC]  # the envelope then ignores Ec
-    expected = args[FC] / args[E0] * 400 / 399 if below_secant else args[EC]
-    assert envelope(-1e-12, c)[1] == pytest.approx(expected, rel=1e-5)
-    assert stress_tangent(0.0, 0.0, 0.0, *unloading(0.0, 0.0, c), c) == (0.0, args[EC])
-
-
 def test_continuous_at_cracking_and_where_unloading_starts(args, rng):
     c = golden.concrete_constants(args)
     cracked = args[FT] / args[EC]
@@ -171,29 +163,6 @@ def test_tangent_is_the_derivative(args, rng):
         assert tangent == pytest.approx(difference, rel=1e-6, abs=1e-5 * args[EC])
         tested += 1
     assert tested > 3900
-
-
-def test_a_trial_changes_nothing(args, rng):
-    """The stress at a committed strain does not depend on the trials before it."""
-    c = golden.concrete_constants(args)
-    strain = next(golden.random_walks(rng, 1, 400, 0.002))
-    out = np.zeros((5, strain.size))
-    golden.concrete_history(strain, c, out)
-    eps_min = eps_max = 0.0
-    for i, eps in enumerate(strain):
-        memory = eps_min, eps_max, *unloading(eps_min, eps_max, c)
-        for trial in rng.uniform(args[ECU], 0.002, 3):
-            stress_tangent(trial, *memory, c)
-        assert stress_tangent(eps, *memory, c) == tuple(out[:2, i])
-        eps_min, eps_max = commit(eps, eps_min, eps_max)
-    assert eps_min == min(strain.min(), 0.0)
-    assert eps_max == max(strain.max(), 0.0)
-
-
-def test_committing_within_the_memory_changes_nothing():
-    assert commit(-1e-4, -2e-4, 3e-5) == (-2e-4, 3e-5)
-    assert commit(-3e-4, -2e-4, 3e-5) == (-3e-4, 3e-5)
-    assert commit(4e-5, -2e-4, 3e-5) == (-2e-4, 4e-5)
 
 
 def test_tension_closes_to_zero_strain_and_a_gap_stays_open():

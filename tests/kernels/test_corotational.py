@@ -8,7 +8,7 @@ from fe_likelihoods.kernels.jit import kernel
 from fe_likelihoods.kernels.static import Iteration, Position, apply_gravity, equilibrate
 
 from . import golden
-from .test_beam_column import stiffness_of_section, symmetric
+from .test_beam_column import stiffness_of_section
 
 LENGTH = 1.3
 # Basic stiffness K11 K12 K13 K22 K23 K33 of a fictitious linear element, without zero or equal entries.
@@ -103,44 +103,6 @@ def test_tangent_is_the_derivative_of_the_forces(rng, corotational, size):
         derivative = central(lambda w, q0=q0: element(w, q0, corotational=corotational)[0], u, 1e-5)
         np.testing.assert_allclose(stiffness, derivative, rtol=0, atol=2e-6)
         np.testing.assert_allclose(stiffness, stiffness.T, rtol=0, atol=1e-12)
-
-
-def test_a_missing_geometric_part_is_detected(rng):
-    u, q0 = displaced(rng, 0.5), np.array([3.0, 1.0, -2.0])
-    derivative = central(lambda w: element(w, q0)[0], u, 1e-5)
-    transformation = np.array([element(u, row, np.zeros(6))[0] for row in np.eye(3)])
-    material = transformation.T @ symmetric(STIFFNESS) @ transformation
-    assert np.abs(material - derivative).max() > 0.1
-
-
-def test_end_forces_are_in_equilibrium(rng):
-    """Forces sum to zero, and so do moments about the base in the deformed position."""
-    for _ in range(20):
-        u = displaced(rng, 0.5)
-        force, _ = element(u, rng.normal(size=3))
-        np.testing.assert_allclose(force[:2], -force[3:5], atol=1e-13)
-        arm = np.array([u[3] - u[0], LENGTH + u[4] - u[1]])
-        assert abs(force[2] + force[5] + arm[0] * force[4] - arm[1] * force[3]) < 1e-12
-
-
-def test_both_variants_agree_for_small_displacements(rng):
-    u = 1e-9 * rng.normal(size=6)
-    np.testing.assert_allclose(element(u)[0], element(u, corotational=False)[0], rtol=0, atol=1e-16)
-    np.testing.assert_allclose(element(u)[1], element(u, corotational=False)[1], rtol=0, atol=1e-7)
-
-
-def test_fixed_base_takes_the_rows_of_the_free_end(rng):
-    """With first = -3 only end J contributes."""
-    u = displaced(rng, 0.3)
-    u[:3] = 0.0
-    q0 = np.array([1.0, 2.0, -0.5])
-    force, stiffness = element(u, q0)
-    basic_forces = q0 + symmetric(STIFFNESS) @ basic(u)
-    chord = deformations(u[3], u[4], 0.0, u[5], LENGTH, True)
-    out, matrix = np.zeros(3), np.zeros((3, 3))
-    add_to_stiffness(-3, BasicForces(*basic_forces, *STIFFNESS), chord, True, out, matrix)
-    np.testing.assert_allclose(out, force[3:], rtol=1e-13)
-    np.testing.assert_allclose(matrix, stiffness[3:, 3:], rtol=1e-13)
 
 
 def amplified_deflection(n_elements, corotational=True):

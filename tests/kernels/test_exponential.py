@@ -26,12 +26,6 @@ def test_rotation_and_decay(size):
     np.testing.assert_allclose(np.diag(exponential(decay)), np.exp([-size, -2.0 * size]), rtol=1e-15 * max(1.0, size))
 
 
-def test_nilpotent_is_a_polynomial():
-    a = np.diag(np.arange(1.0, 6.0), 1)
-    closed = sum(np.linalg.matrix_power(a, k) / float(np.prod(np.arange(1, k + 1))) for k in range(6))
-    np.testing.assert_allclose(exponential(a), closed, rtol=1e-14, atol=1e-13)
-
-
 @pytest.mark.parametrize("norm", [1e-3, 0.4, 3.0, 40.0])
 def test_agrees_with_scipy(norm, rng):
     a = rng.normal(size=(18, 18))

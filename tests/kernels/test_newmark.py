@@ -197,23 +197,6 @@ def test_second_order(row, scale):
     assert np.all(np.abs(orders - 2.0) < 0.1)
 
 
-def test_a_scheme_of_first_order_is_detected():
-    """Backward Euler on an oscillator of the same frequency."""
-    omega = frequency(golden.column(golden.circle()))
-
-    def response(dt):
-        ground = pulse(dt)
-        u, v, out = 0.0, 0.0, np.zeros(len(ground))
-        for i, g in enumerate(ground[1:], start=1):
-            v = (v - dt * (g + omega**2 * u)) / (1.0 + dt * golden.A0 + dt**2 * omega**2)
-            u += dt * v
-            out[i] = u
-        return out
-
-    orders = observed_orders(response, coarsest=0.002)
-    assert np.all(np.abs(orders - 1.0) < 0.1)
-
-
 # --- energy ---
 
 
@@ -255,14 +238,6 @@ def test_repeated_run_gives_the_same_result(column, motion):
     again_result, again = run(column, 2.0 * motion)
     assert again_result == result
     np.testing.assert_array_equal(again, first)
-
-
-def test_first_sample_is_the_state_after_gravity(column):
-    (status, _, _), history = run(column, np.full(3, 5.0))
-    assert status == 0
-    assert abs(history[0, 0]) < 1e-10
-    assert history[1, 0] == 5.0
-    assert history[2, 0] < 0.0
 
 
 def test_absolute_acceleration_is_that_of_equilibrium(motion):

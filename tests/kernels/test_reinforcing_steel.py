@@ -131,32 +131,6 @@ def test_backbone_is_the_formula(constants):
     np.testing.assert_allclose(out, exact_backbone(x, c), rtol=1e-11)
 
 
-def test_backbone_is_odd(constants, rng):
-    for x in rng.uniform(0.0, 1.1 * constants[steel.UP], 300):
-        stress, modulus = backbone(x, constants)
-        assert backbone(-x, constants) == (-stress, modulus)
-
-
-def test_backbone_is_continuous(usual):
-    """The law itself has small jumps: at its smooth knee, and of 1e-4 where the transition meets the hardening."""
-    c = usual
-    for x, limit in ((c[steel.A_SHIFT], 1e-6), (c[steel.SHP] + 0.0002, 1e-4), (c[steel.UP], 1e-12)):
-        below, above = backbone(x * (1 - 1e-13), c)[0], backbone(x * (1 + 1e-13), c)[0]
-        assert above == pytest.approx(below, rel=limit)
-
-
-def test_backbone_tangent_is_the_derivative_in_every_branch(usual, rng):
-    c = usual
-    edges = [0.0, c[steel.A_SHIFT], c[steel.SHP] + 0.0002, c[steel.UP], 1.2 * c[steel.UP]]
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
-        step = 1e-4 * (high - low)
-        for x in rng.uniform(low + 2 * step, high - 2 * step, 100) * rng.choice([-1, 1], 100):
-            # five points give an error of fourth order in the step
-            s = [backbone(x + k * step, c)[0] for k in (-2, -1, 1, 2)]
-            difference = (s[0] - 8 * s[1] + 8 * s[2] - s[3]) / (12 * step)
-            assert backbone(x, c)[1] == pytest.approx(difference, rel=1e-6, abs=1e-8 * c[steel.E0])
-
-
 def test_tangent_of_a_reversal_is_the_derivative(usual, rng):
     """Along the Menegotto-Pinto curves, in engineering strain, wherever both neighbours are on the same curve.
 
@@ -203,14 +177,6 @@ def test_series_below_yield_are_exact_to_round_off(multiplier):
         assert tangent == pytest.approx(exact_tangent, rel=1e-14)
 
 
-def test_series_fail_beyond_their_limit():
-    """Control: at twice the limit the truncation is detected."""
-    c = golden.steel_constants(golden.STEEL)
-    eps = 2 * c[steel.VIRGIN_LIMIT]
-    series = virgin_stress_tangent(eps, c[steel.E0], c[steel.EP], c[steel.F0])[0]
-    assert abs(series / monotonic_stress_tangent(eps, c)[0] - 1) > 1e-6
-
-
 def test_steel_below_yield_follows_the_backbone(usual, rng):
     """Any history that stays below yield follows the backbone in both directions."""
     c = usual
@@ -254,14 +220,6 @@ def mirrored_deviation(x, c):
     return np.abs(one[0] * np.exp(x) + other[0] * np.exp(-x)).max() / c[steel.FYP]
 
 
-@pytest.mark.parametrize("amplitude", [0.6, 3.0])
-def test_mirrored_cycles_give_mirrored_stress(usual, amplitude):
-    """Growing cycles use the backbone and the first reversals only, and agree to round-off."""
-    peaks = np.concatenate([[0.0], amplitude * usual[steel.SHP] * np.linspace(0.1, 1.0, 20) * (-1.0) ** np.arange(20)])
-    x = np.interp(0.05 * np.arange(400), np.arange(21), peaks)
-    assert mirrored_deviation(x, usual) < 1e-12
-
-
 def test_mirrored_walks_give_mirrored_stress(usual, rng):
     """In nested reversals the last digit of ln(1 + eps) may decide whether a slope is clipped by 1/1000."""
     limit = 0.95 * usual[steel.SHP]
@@ -276,12 +234,13 @@ def test_mirrored_walks_give_mirrored_stress(usual, rng):
     assert np.abs(difference).max() / usual[steel.FYP] > 1e-2
 
 
-def test_large_random_walks_stay_finite(usual, seed):
-    rng = np.random.default_rng(seed)
+@pytest.mark.parametrize("material", ["nominal", "other", "stiff", "soft"])  # soft: hardening soon after yield
+def test_large_random_walks_stay_finite(material, seed):
+    rng, c = np.random.default_rng(seed), golden.steel_constants(MATERIALS[material])
     largest = 0.0
     for amplitude in (0.003, 0.01, 0.03, 0.1):
         for strain in golden.random_walks(rng, 500, 200, amplitude):
-            out = follow(strain, usual)
+            out = follow(strain, c)
             assert np.isfinite(out).all()
             largest = max(largest, np.abs(strain).max())
     assert largest > 0.2
@@ -317,11 +276,3 @@ STEEP_CHORDS = [
 @pytest.mark.parametrize(("args", "strain", "stress"), STEEP_CHORDS)
 def test_chord_steeper_than_the_reversal(args, strain, stress):
     np.testing.assert_allclose(follow(strain, golden.steel_constants(args))[0], stress, rtol=1e-10)
-
-
-def test_large_random_walks_of_soft_steel_stay_finite(seed):
-    """With a fifth of Es, hardening begins soon after yield, and such chords are common."""
-    rng, c = np.random.default_rng(seed), golden.steel_constants(MATERIALS["soft"])
-    for amplitude in (0.01, 0.03, 0.1):
-        for strain in golden.random_walks(rng, 300, 200, amplitude):
-            assert np.isfinite(follow(strain, c)).all()

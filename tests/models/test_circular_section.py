@@ -94,13 +94,6 @@ def test_gauss_lobatto_equals_published_tables(n, points, weights):
     np.testing.assert_allclose(2 * got_weights, weights, rtol=1e-13)
 
 
-def test_confinement_of_the_tested_column(lhpost):
-    confinement, peak = lhpost.confinement, 2 * 6.1 / 3320
-    assert confinement.strength_ratio * 6.1 == pytest.approx(7.59, abs=5e-3)
-    assert confinement.strain_ratio * peak == pytest.approx(0.00816, abs=5e-6)
-    assert confinement.ultimate_strain > confinement.strain_ratio * peak
-
-
 def test_strength_gain_by_confinement(lhpost):
     """Zero without hoops, concave in their area, and equal to a hand calculation at a pressure of fc/10."""
 

@@ -16,6 +16,7 @@ from fe_likelihoods.problems import bridge_column, isolated_bridge
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import DisplacementHistory, Record
 from fe_likelihoods.simulation.local_pool import LocalPool
+from fe_likelihoods.simulation.model import first_part
 
 RECORD = bridge_column(every=2, duration=8.0).likelihood.model.loading
 TABLE = Record("table", 0.005, 3.0 * np.sin(np.arange(400) / 20.0))
@@ -46,7 +47,7 @@ def cases():
 
 @pytest.mark.parametrize(("model", "seconds"), cases().values(), ids=cases().keys())
 def test_the_response_is_the_first_part_bit_for_bit(model, seconds, rng):
-    part = model.first(seconds)
+    part = first_part(model, seconds)
     measured = Measurements(model.channels, model.dt, np.zeros((len(model.channels), model.n_steps)))
     n_steps = measured.trim(0.0, seconds).n_steps  # the same rule for models and measurements
     assert 2 < n_steps < model.n_steps
@@ -60,14 +61,14 @@ def test_the_response_is_the_first_part_bit_for_bit(model, seconds, rng):
 
 @pytest.mark.parametrize(("model", "seconds"), cases().values(), ids=cases().keys())
 def test_fingerprints_of_parts(model, seconds):
-    part, end = model.first(seconds), (model.n_steps - 1) * model.dt
+    part, end = first_part(model, seconds), (model.n_steps - 1) * model.dt
     assert part.fingerprint != model.fingerprint
-    assert part.fingerprint == model.first(seconds).fingerprint
-    assert part.fingerprint == model.first(end).first(seconds).fingerprint
-    assert model.first(end).n_steps == model.n_steps
+    assert part.fingerprint == first_part(model, seconds).fingerprint
+    assert part.fingerprint == first_part(first_part(model, end), seconds).fingerprint
+    assert first_part(model, end).n_steps == model.n_steps
     for wrong in (0.0, -1.0, 1e6, 0.5 * model.dt, np.nan):
         with pytest.raises(ValueError, match=r"expected 0 <= start|fewer than 2 samples"):
-            model.first(wrong)
+            first_part(model, wrong)
 
 
 @pytest.mark.parametrize("pool", [None, pytest.param(2, marks=pytest.mark.slow)])
@@ -79,7 +80,7 @@ def test_the_likelihood_of_the_first_part(pool, rng, tmp_path):
         model, measurements, AutoregressiveNoise(model.channels), pool=pool, cache=tmp_path / "cache.sqlite"
     )
     part = whole.first(5.003)
-    expected = FELikelihood(model.first(5.003), measurements.trim(0.0, 5.003), whole.noise)
+    expected = FELikelihood(first_part(model, 5.003), measurements.trim(0.0, 5.003), whole.noise)
     x = np.array([[1.02, 0.9, 0.01, 0.02, 0.1, 0.2], [0.98, 1.1, 0.01, 0.02, 0.1, 0.2]])
     np.testing.assert_array_equal(part.log_likelihood(x), expected.log_likelihood(x))
     assert (part.log_likelihood(x) != whole.log_likelihood(x)).all()

@@ -280,10 +280,6 @@ def test_methods_and_callable_objects():
     assert value_digest(Spring(1.0)) != value_digest(Spring(1.0).respond)
 
 
-def test_recursive_functions_have_a_digest():
-    assert value_digest(defined("def f(n):\n    return f(n - 1) if n else h(n)\ndef h(n):\n    return f(n)\n"))
-
-
 def test_fingerprint_depends_on_names_channels_and_steps():
     models = [
         model_of(),

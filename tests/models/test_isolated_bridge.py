@@ -116,12 +116,6 @@ def test_order_of_convergence(rng):
 # ------------------------------------------------------------------ invariances
 
 
-def test_a_mirrored_record_mirrors_the_response(rng):
-    model = IsolatedBridge(shaking(rng))
-    mirrored = model.with_record(model.record.scale(-1.0))
-    np.testing.assert_allclose(mirrored.simulate(np.ones(10)), -model.simulate(np.ones(10)), atol=1e-9)
-
-
 def test_piers_can_be_exchanged(rng):
     theta = rng.uniform(0.6, 1.5, 10)
     outputs = CHANNEL_SETS[10]

@@ -142,17 +142,6 @@ def test_deck_equals_the_weighted_oscillator(three):
     assert [channel.name for channel in model.channels] == ["s1", "m", "s2"]
 
 
-@pytest.mark.parametrize("share", [0.0, 1.0])
-def test_a_single_kind_of_support_is_a_limit(three, share):
-    fixed = LinearStructure(BridgeDeck("m", share=share), three)
-    assert fixed.parameter_names == ("frequency", "damping")
-    free = LinearStructure(BridgeDeck("m"), three).simulate([3.0, 0.1, share])
-    np.testing.assert_array_equal(fixed.simulate([3.0, 0.1]), free)
-    silent = [Record("none", DT, 0 * record.acceleration) for record in three]
-    alone = [three[0], *silent[1:]] if share == 0.0 else [silent[0], *three[1:]]
-    np.testing.assert_array_equal(fixed.with_record(alone).simulate([3.0, 0.1]), free)
-
-
 def test_a_lead_starts_the_channels_from_a_moving_state(three):
     theta = [3.0, 0.02, 0.7, 0.6]
     whole = LinearStructure(BridgeDeck("m", "s"), three).simulate(theta)

@@ -96,13 +96,3 @@ def test_impossible_parameters_fail_with_reasons(record, parts, theta, words):
 def test_wrong_arguments_are_rejected(make, words):
     with pytest.raises(ValueError, match=words):
         make()
-
-
-def test_fingerprints_differ(record):
-    parts = [
-        ModalModel(["roof"], 2),
-        ModalModel(["roof"], 3),
-        ShearFrame({"roof": 2}, [1, 1], [9, 9], [1, 1]),
-        ShearFrame({"roof": 2}, [1, 1], [9, 9], [1, 2]),
-    ]
-    assert len({LinearStructure(each, record).fingerprint for each in parts}) == len(parts)

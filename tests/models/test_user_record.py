@@ -83,13 +83,6 @@ def test_the_record_is_part_of_the_fingerprint(record):
     np.testing.assert_array_equal(copy.simulate([1.0, 1.0]), 2.0 * model.simulate([1.0, 1.0]))
 
 
-def test_likelihood_of_the_first_part(record):
-    model = FunctionModel(oscillator, NAMES, CHANNELS, record=record)
-    likelihood = FELikelihood(model, Measurements(CHANNELS, 0.02, model.simulate([1.1, 1.0])))
-    assert likelihood.first(0.4).measurements.n_steps == 21
-    assert likelihood.first(0.4).log_likelihood([1.1, 1.0, 0.1, 0.1]) > -np.inf
-
-
 def test_opensees_under_another_record(record):
     require_opensees()
     model = OpenSeesModel(in_opensees, NAMES, CHANNELS, record=record, path_dependent=False)

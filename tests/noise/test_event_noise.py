@@ -19,6 +19,7 @@ from fe_likelihoods import (
     SimulationCache,
     TruncatedNormal,
 )
+from fe_likelihoods.simulation.model import first_part
 
 NAMES = ("stiffness", "damping")
 
@@ -129,7 +130,7 @@ def test_first_part_cache_and_guide(model, measured, tmp_path):
     assert again(point) == value and again.simulator.disk_hits == 1
     assert FELikelihood(model, measured, cache=cache).fingerprint != again.fingerprint
     part = likelihood.first(0.5)  # within the first event
-    only = FELikelihood(model.first(0.5), measured["EQ1"].trim(0.0, 0.5), GaussianNoise(model.channels))
+    only = FELikelihood(first_part(model, 0.5), measured["EQ1"].trim(0.0, 0.5), GaussianNoise(model.channels))
     assert part(point) == pytest.approx(only(point[:4]), rel=1e-12)
     prior = {name: TruncatedNormal(1.0, 0.3) for name in NAMES}
     prior |= {name: HalfNormal(1.0) for name in likelihood.parameter_names[2:]}

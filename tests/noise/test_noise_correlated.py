@@ -14,7 +14,6 @@ from fe_likelihoods.noise.residuals import lag_one_sums
 from fe_likelihoods.prediction.propagation import propagate
 from fe_likelihoods.priors.distributions import Uniform
 from fe_likelihoods.signals.channels import Channel, Measurements
-from fe_likelihoods.simulation.model import SimulationFailed
 from tests import lines
 
 CHANNELS = (Channel("top", "absolute acceleration", "g"), Channel("drift", "relative displacement", "in"))
@@ -141,27 +140,9 @@ def test_sigmas_and_correlations_need_no_simulation(rng, kind):
     np.testing.assert_allclose(likelihood.misfit(good[:, :2]), np.square(residuals).sum(axis=2), rtol=1e-13)
 
 
-def test_impossible_noise_parameters_are_not_simulated(rng):
-    model = Line()
-    likelihood = FELikelihood(model, measured_by(model, rng), AutoregressiveNoise(CHANNELS))
-    x = np.array([[0.0, 0.0, 1.0, 1.0, 0.5, 1.0], [0.0, 0.0, 1.0, -1.0, 0.5, 0.5]])
-    assert np.isneginf(likelihood.log_likelihood(x)).all() and model.runs == 0
-
-
 def test_a_noise_of_other_channels_is_refused(rng):
     with pytest.raises(ValueError, match="noise's channels are drift, top, the model's are top, drift"):
         FELikelihood(Line(), measured_by(Line(), rng), GaussianNoise(CHANNELS[::-1]))
-
-
-def test_residuals_of_a_likelihood(rng):
-    likelihood = FELikelihood(Line(), measured_by(Line(), rng))
-    expected = likelihood.measurements.values - Line().simulate(np.array([0.2, 0.1]))
-    np.testing.assert_array_equal(likelihood.residuals([0.2, 0.1]), expected)
-    np.testing.assert_array_equal(likelihood.residuals([0.2, 0.1, 1.0, 1.0]), expected)
-    with pytest.raises(ValueError, match=r"shape \(2,\), or \(4,\) with the noise"):
-        likelihood.residuals([0.2])
-    with pytest.raises(SimulationFailed, match="too steep"):
-        likelihood.residuals([0.0, 2.0])
 
 
 # predictions ----------------------------------------------------------------------------------------------------------

@@ -49,18 +49,6 @@ def test_effective_samples_of_autoregressive_errors(rng, rho):
     assert found == pytest.approx(N * (1.0 - rho**2) / (1.0 + rho**2), rel=0.06)
 
 
-def test_oscillating_errors_are_worth_fewer_samples(rng):
-    """The correlation time of a mean would give more than n samples."""
-    z = rng.standard_normal((1, N))
-    pole = 0.97 * np.exp(0.6j)
-    errors = signal.lfilter([1.0], np.poly([pole, pole.conjugate()]).real, z, axis=1)
-    pulse = signal.lfilter([1.0], np.poly([pole, pole.conjugate()]).real, np.eye(1, N)[0])
-    assert (
-        pulse.sum() ** 2 / np.square(pulse).sum() < 1.0
-    )  # that time is the spectrum at zero frequency over the variance
-    assert effective_samples(errors)[0] < 0.1 * N
-
-
 def test_innovations_of_autoregressive_errors_are_white(rng):
     errors = 3.0 * autoregressive(rng, 0.9)
     new = innovations(errors, [0.9])
@@ -111,9 +99,3 @@ def test_what_checks_say_of_residuals(rng):
     assert residual_checks(gappy[None]).n_samples == [600]
     title = plot_residuals(slow[None], [Channel("top", "displacement", "mm")], 0.01).axes[0].get_title(loc="left")
     assert " ".join(title.split()) == second
-
-
-def test_few_samples_and_zeros_are_named():
-    assert describe_residuals(residual_checks(np.array([[1.0, -2.0]])))[0].startswith("Not checked: 2 samples")
-    with pytest.raises(ValueError, match="residuals of top are all zero"):
-        residual_checks(np.zeros((1, 20)), [Channel("top", "displacement", "mm")])

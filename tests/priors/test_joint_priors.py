@@ -90,6 +90,21 @@ def test_mixture_describes_the_samples_within_its_stated_error(bent):
     np.testing.assert_allclose(whole.to_normal(whole.from_normal(z)), z, atol=1e-6)
 
 
+def test_a_mixture_is_exact_in_both_tails(rng):
+    """Scores far out, where a probability above or below is rounded to one."""
+    prior = Prior({"a": NORMAL, "b": NORMAL})
+    mixture = fit_mixture(prior.rvs(500, 1) + rng.choice([-1.0, 1.0], (500, 1)), prior)
+    z = np.array([[-20.0, 20.0], [20.0, -20.0], [9.0, 9.0], [-9.0, -9.0]])
+    x = mixture.from_normal(z)
+    np.testing.assert_allclose(mixture.to_normal(x), z, rtol=1e-9)
+    slopes = [
+        (mixture.from_normal(z + 1e-4 * unit) - mixture.from_normal(z - 1e-4 * unit)) / 2e-4 for unit in np.eye(2)
+    ]
+    jacobian = np.linalg.det(np.moveaxis(slopes, 0, -1))
+    density = stats.norm.logpdf(z).sum(axis=1) - np.log(np.abs(jacobian))
+    np.testing.assert_allclose(mixture.logpdf(x), density, rtol=1e-5)
+
+
 def test_a_mixture_gets_its_parameters_by_name(bent):
     prior, samples, _ = bent
     mixture = fit_mixture(samples, prior, ["k", "c"])

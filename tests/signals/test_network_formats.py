@@ -48,17 +48,6 @@ def test_geonet_components(shared, name, component, n_steps, dt, peak):
     assert np.abs(record.acceleration).max() == pytest.approx(peak, abs=1e-9)
 
 
-def test_velocity_of_geonet_is_the_integral_of_its_acceleration(shared):
-    """Unit and step of the acceleration, against the second block of the same file [mm/s]."""
-    path = shared / "records/formats/20180212_211557_WPWS_20.V2A"
-    record = read_record(path, "S74E")
-    lines = path.read_text(encoding="latin-1").splitlines()[1766 + 26 + 580 : 1766 + 26 + 1160]
-    velocity = 1e-3 * np.array([float(line[k : k + 8]) for line in lines for k in range(0, 80, 8)])
-    steps = 0.5 * record.dt * (record.acceleration[1:] + record.acceleration[:-1])
-    integral = np.concatenate([[0.0], np.cumsum(steps)])
-    assert np.abs(integral - velocity).max() < 0.1 * np.abs(velocity).max()
-
-
 def uneven_smc():
     """Lines of an SMC file with times: three digitised points less than in 62 with a step of 0.02 s."""
     kept = np.delete(np.arange(VALUES.size), [5, 6, 40])
@@ -231,12 +220,3 @@ def test_text_of_an_unknown_format(tmp_path):
         ValueError, match="expected 3 cells .* no known format of ground motions and was read as a table"
     ):
         read_record(path)
-
-
-def test_a_column_is_chosen_by_its_name(tmp_path):
-    table = write(tmp_path / "a.csv", ["time_s,a_g,b_g", "0,1,2", "0.5,3,4"])
-    np.testing.assert_allclose(read_record(table, "b_g").acceleration / G0, [2.0, 4.0])
-    with pytest.raises(ValueError, match="choose it with column="):
-        read_record(table)
-    with pytest.raises(ValueError, match="cannot read"):
-        read_record(tmp_path / "none.csv")

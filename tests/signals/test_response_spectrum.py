@@ -67,16 +67,6 @@ def test_peaks_are_those_of_a_much_finer_record(noise):
     assert np.max(1.0 - at_samples / fine.displacement) > 0.02, "control: the samples of the record miss peaks"
 
 
-def test_the_three_quantities_belong_together(noise):
-    spectrum = noise.spectrum()
-    omega = 2 * math.pi / spectrum.periods
-    assert spectrum.periods[0] == pytest.approx(0.04) and spectrum.periods[-1] == pytest.approx(10.0)
-    np.testing.assert_allclose(spectrum.pseudo_velocity, omega * spectrum.displacement)
-    np.testing.assert_allclose(spectrum.pseudo_acceleration, omega**2 * spectrum.displacement)
-    twice = noise.scale(-2.0).spectrum()
-    np.testing.assert_allclose(twice.displacement, 2.0 * spectrum.displacement)
-
-
 @pytest.mark.parametrize(
     ("periods", "damping_ratio", "message"),
     [

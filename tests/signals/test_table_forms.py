@@ -158,19 +158,6 @@ def test_text_above_a_table_is_no_other_format(path, preamble, separator):
         read_record(path)
 
 
-def test_numbers_for_missing_samples_in_a_record(path):
-    path.write_text("time_s,acc_g\n0.00,1\n0.01,-9999\n0.02,4\n")
-    with pytest.raises(ValueError, match="line 3: expected a measured number"):
-        read_record(path)
-    with pytest.raises(ValueError, match="an excitation needs all samples, 1 are missing"):
-        read_record(path, missing=(-9999.0,))
-    assert read_record(path, missing=()).acceleration[1] == -9999 * G0
-    with pytest.raises(ValueError, match=r"got -9999 in 1 rows.* missing=\[-999, -9999\]"):
-        read_record(path, missing=(-999.0,))  # known and not listed
-    with pytest.raises(ValueError, match="missing must be finite numbers"):
-        read_record(path, missing=["-9999"])
-
-
 def test_a_number_for_missing_samples_that_does_not_occur(path):
     path.write_text("time_s,acc_g\n0.00,1\n0.01,-9999.9\n0.02,4\n")
     reads = (

@@ -449,32 +449,12 @@ def test_a_scale_factor_without_a_number_is_one_gal(tmp_path):
         read(tmp_path, "a.NS", text(*(line.replace("(gal)/1048.2", "(gal)/1000") for line in bare)))
 
 
-def test_a_unit_with_a_period_is_read(tmp_path):
-    record = read(tmp_path, "a.V1c", text(*cosmos(1, 1e-3 * VALUES, 0.005, units="g. (2)")))
-    np.testing.assert_allclose(record.acceleration, 1e-3 * VALUES * G0, rtol=1e-6)
-
-
 def test_the_stated_peak_of_v2_is_compared(tmp_path):
     lines = csmip(1, VALUES, 0.0125, " .013 sec, in cm/sec2. (8f10.6)")
     lines[18] = f"Peak acceleration = {VALUES[np.argmax(np.abs(VALUES))]:9.3f}    cm/sec/sec   at  0.063 sec"
     assert read(tmp_path, "a.V2", text(*lines)).n_steps == 61
     with pytest.raises(ValueError, match="the file states 'Peak acceleration"):
         read(tmp_path, "a.V2", text(*lines).replace("in cm/sec2", "in mm/sec2"))
-
-
-def test_samples_of_geonet_may_be_cut_to_fewer_digits_than_the_peak(tmp_path):
-    values = np.trunc(VALUES * 24.9 / np.abs(VALUES).max())
-    lines = geonet({"Up": values}, 0.02, corrected=False)
-    assert any("peak     24.0" in line for line in lines)
-    lines = [line.replace("peak     24.0", "peak     24.9") for line in lines]
-    assert len(lines[26].split()) == 10
-    cells = [f"{value:8.0f}" for value in values]
-    path = tmp_path / "a.V1A"
-    path.write_text(text(*lines[:26], *("".join(cells[k : k + 10]) for k in range(0, 61, 10))))
-    assert read_record(path).acceleration.max() == pytest.approx(0.024)
-    path.write_text(path.read_text().replace("24.9", "25.2"))
-    with pytest.raises(ValueError, match="states a peak of 25.2"):
-        read_record(path)
 
 
 def advised_step(error):
