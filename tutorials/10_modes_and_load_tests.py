@@ -124,4 +124,4 @@ run = SMCSampler(200, static.ndim, static, seed=5, vectorize=True)
 run.run_mcmc(None, 4)
 stiffness = run.get_chain(flat=True)[:, 0]
 print(f"stiffness {stiffness.mean():.3f} +- {stiffness.std():.3f} (true: 0.9)")
-print(test.table(girder.simulate([stiffness.mean()])))
+print(np.stack([test.values, girder.simulate([stiffness.mean()])], axis=-1).round(4))  # measured and computed [m]

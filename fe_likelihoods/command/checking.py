@@ -130,7 +130,7 @@ def _say_simulation(
     for part, columns in likelihood.parts():
         theta, measured = mean[None, columns[: len(part.model.parameter_names)]], part.measurements
         if part.is_modal:
-            say(f"At the mean of the prior:\n{part.predict_modes(theta).short()}")
+            say(f"At the mean of the prior:\n{part.predict_modes(theta)}")
             continue
         response = part.simulate(theta).response[0]
         errors = rrmse(measured.values - part.residuals_of(response), measured.values)

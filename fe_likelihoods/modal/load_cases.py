@@ -10,9 +10,8 @@ import numpy as np
 
 from ..models.function import FunctionModel
 from ..signals.channels import Channel, Measurements
-from ..signals.tables import read_table, stated_unit
-from ..text_tables import text_table
-from ..units import from_si, to_si
+from ..signals.tables import column_unit, read_table
+from ..units import to_si
 
 __all__ = ["LoadTest", "read_load_test"]
 
@@ -21,8 +20,8 @@ __all__ = ["LoadTest", "read_load_test"]
 class LoadTest:
     """Measured values under load cases, such as trucks at several places.
 
-    Its measurements have a sample for each load case instead of a time. Any model whose response is (n_channels,
-    n_cases), with ``dt=1`` and ``n_steps=len(cases)``, can be compared with them: a `FunctionModel`, an
+    The attribute ``measurements`` has a sample for each load case instead of a time. Any model whose response is
+    (n_channels, n_cases), with ``dt=1`` and ``n_steps=len(cases)``, can be compared with them: a `FunctionModel`, an
     `ExecutableModel` whose output file has a line for each load case, or an `OpenSeesModel`.
 
     Parameters
@@ -68,21 +67,15 @@ class LoadTest:
         errors, names = dict(self.errors or {}), [channel.name for channel in channels]
         if isinstance(self.cases, str) or not cases or len(set(cases)) != len(cases):
             raise ValueError(f"LoadTest: expected different names of load cases; got {self.cases!r}")
-        values = Measurements(channels, 1.0, self.values).values
-        if values.shape[1] != len(cases):
-            raise ValueError(f"LoadTest: expected a value for each of {len(cases)} load cases; got {values.shape[1]}")
+        measurements = Measurements(channels, 1.0, self.values, self.description, axis=self.axis, points=cases)
         if bad := [name for name, error in errors.items() if name not in names or not 0.0 < error < np.inf]:
             raise ValueError(
                 f"LoadTest: errors must be positive standard deviations [SI] of {', '.join(names)}; got "
                 f"{', '.join(f'{name}: {errors[name]!r}' for name in bad)}"
             )
-        for name, value in (("channels", channels), ("cases", cases), ("values", values), ("errors", errors)):
+        found = {"channels": channels, "cases": cases, "values": measurements.values, "errors": errors}
+        for name, value in (found | {"measurements": measurements}).items():
             object.__setattr__(self, name, value)
-
-    @property
-    def measurements(self) -> Measurements:
-        """The values as measurements with one step per load case."""
-        return Measurements(self.channels, 1.0, self.values, self.description, axis=self.axis, points=self.cases)
 
     @property
     def known(self) -> dict[str, float]:
@@ -92,16 +85,6 @@ class LoadTest:
     def model(self, function: Callable[..., Any], parameter_names: Sequence[str], **options: Any) -> FunctionModel:
         """Model of a function of theta that returns (n_channels, n_cases) [SI], options of `FunctionModel`."""
         return FunctionModel(function, parameter_names, self.channels, 1.0, len(self.cases), **options)
-
-    def table(self, response: Any) -> str:
-        """Measured and computed values (n_channels, n_cases) in the units of the channels, as text."""
-        response = np.reshape(response, self.values.shape)
-        rows = [["load case", *(f"{c.name} [{c.unit}]{end}" for c in self.channels for end in ("", " computed"))]]
-        for place, case in enumerate(self.cases):
-            pairs = zip(self.values[:, place], response[:, place], self.channels, strict=True)
-            shown = [float(from_si(x, c.unit, c.dimension)) for one, other, c in pairs for x in (one, other)]
-            rows.append([str(case), *(f"{x:.4g}" for x in shown)])
-        return text_table(rows)
 
 
 def read_load_test(
@@ -149,27 +132,25 @@ def read_load_test(
     names, values = [column.name for column in table.columns], []
     plain = [re.sub(r"\s*[\[(].*", "", name).strip() for name in names]
     for channel in channels:
-        wanted = (columns or {}).get(channel.name, channel.name)
+        wanted, given = ((by_name or {}).get(channel.name) for by_name in (columns, units))
+        wanted = wanted or channel.name
         places = [k for k in range(len(names)) if wanted in (names[k], plain[k])]
         if len(places) != 1:
             raise ValueError(
                 f"{table.file}: expected one column {wanted!r} of the channel {channel.name}; the columns are "
                 f"{', '.join(names)}"
             )
-        given, stated = (units or {}).get(channel.name), stated_unit(table, places[0], channel.dimension)
-        if (given is None) == (stated is None):
-            found = f"the file states {stated} and {given!r} is given: leave it out" if stated else "it is not stated"
-            raise ValueError(f"{table.file}: unit of {channel.name}: {found}; units={{{channel.name!r}: 'mm'}}")
-        values.append(to_si(table.columns[places[0]].values, stated or given, channel.dimension))
+        column = table.columns[places[0]].values
+        unit = column_unit(table, places[0], column, given, channel.dimension, f"{table.file}, {channel.name}")
+        values.append(to_si(column, unit, channel.dimension))
         plain[places[0]] = ""
-    first = names[0] if plain[0] else None
-    chosen = first if cases is None else cases
+    chosen = cases or (names[0] if plain[0] else None)
+    options = {"errors": errors, "description": f"load test of {Path(path).name}"}
     if chosen is None:
-        return LoadTest(channels, [str(k + 1) for k in range(len(table.lines))], values, errors=errors)
+        return LoadTest(channels, [str(k + 1) for k in range(len(table.lines))], values, **options)
     if chosen not in names:
         raise ValueError(f"{table.file}: no column {chosen!r} of load cases; the columns are {', '.join(names)}")
     column = table.columns[names.index(chosen)]
-    points, axis = column.values.tolist(), chosen
     if column.kind == "text" or np.isnan(column.values).any():  # names
-        points, axis = column.cells, "load case"
-    return LoadTest(channels, points, values, errors=errors, axis=axis, description=f"load test of {Path(path).name}")
+        return LoadTest(channels, column.cells, values, **options)
+    return LoadTest(channels, column.values.tolist(), values, axis=chosen, **options)

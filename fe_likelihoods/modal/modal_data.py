@@ -1,13 +1,13 @@
 """Identified natural frequencies and mode shapes as data."""
 
-import hashlib
-import json
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from ..models.base import digest
+from ..signals.sampling import array_digest
 from ..text_tables import text_table
 from .pairing import MeasuredModes, close_groups
 
@@ -160,10 +160,8 @@ class ModalData:
     @property
     def fingerprint(self) -> str:
         """Hex digest of frequencies, shapes, sensors and mode numbers: what simulations are compared with."""
-        state = hashlib.blake2b(json.dumps([self.sensors, self.mode_numbers]).encode(), digest_size=16)
-        for values in (self.frequencies, self.shapes):
-            state.update(np.ascontiguousarray(np.where(np.isnan(values), np.nan, values), dtype="<f8").tobytes())
-        return state.hexdigest()
+        values = [np.where(np.isnan(each), np.nan, each) for each in (self.frequencies, self.shapes)]  # one NaN
+        return digest(repr([self.sensors, self.mode_numbers]), array_digest(*values))
 
     def measured(self, close: float) -> MeasuredModes:
         """The modes as `pair_modes` takes them; frequencies within a ratio of 1 + `close` are one group.

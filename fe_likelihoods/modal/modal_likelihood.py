@@ -247,9 +247,5 @@ class PredictedModes(NamedTuple):
             rows.append([str(number), *(f"{x:.4g}" for x in values), f"{np.median(self.assurance[:, k]):.3f}"])
         return rows
 
-    def short(self) -> str:
-        """The table without intervals, as text."""
-        return text_table([[*row[:3], row[5]] for row in self.rows()])
-
     def __str__(self) -> str:
         return text_table(self.rows())

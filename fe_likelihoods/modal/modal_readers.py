@@ -15,19 +15,22 @@ from .modal_data import ModalData, real_shapes
 
 __all__ = ["read_modal_data"]
 
-# words in the names of columns that are no sensors, and whole names
+# what a column is that is no sensor: patterns of the words of its name; whole names; T by its unit
 _WORDS = {
-    "deviation": ("std", "stdev", "sd", "cv"),
-    "frequency": ("frequency", "frequencies", "freq", "eigenfrequency", "omega"),
-    "period": ("period",),
-    "damping": ("damping",),
-    "temperature": ("temperature", "temp"),
-    "set": ("set", "identification"),
-    "mode": ("mode",),
-    "quality": ("mac", "automac", "mpc", "mpd", "mcf", "complexity", "order", "quality", "confidence"),
+    "part": r"im|imag\w*|phase|angle",  # of a complex shape
+    "quality": r"\w*mac|mp[cd]|mcf|complexity|order|quality|confidence|participation|effective",
+    "deviation": r"std\w*|sd|cv|sigma|uncertainty|deviation",
+    "period": r"period\w*",
+    "frequency": r"(eigen)?fr[eé][cq]\w*|omega|ω",
+    "damping": r"damp\w*|dämpf\w*|amort\w*|zeta|ksi|ζ|ξ",
+    "temperature": r"temp|temperature",
+    "set": r"set|identification|date",
+    "mode": r"mode",
 }
-_NAMES = {"f": "frequency", "f_hz": "frequency", "fn": "frequency", "fn_hz": "frequency", "xi": "damping", "no": "mode"}
-_BY_UNIT = {"s": "period", "sec": "period", **dict.fromkeys(("°c", "degc", "c", "k"), "temperature")}  # of T
+_NAMES = {"f": "frequency", "fn": "frequency", "xi": "damping", "no": "mode"}
+_BY_UNIT = {"s": "period", "sec": "period", **dict.fromkeys(("°c", "degc", "c", "k"), "temperature")}
+_OF_MODE = r"(?:fn?|freq|frequency)[ _]?(\d+)(?:_hz)?\s*(?:[\[(].*)?"  # a column for each mode
+_COMPLEX = "make real ones, real_shapes(shapes) of fe_likelihoods.modal.modal_data, and give them to ModalData"
 
 
 def read_modal_data(
@@ -45,13 +48,14 @@ def read_modal_data(
     source : path, or result of an identification
         * A CSV file, a text file or a workbook with a header line and a line for each mode: a column ``frequency`` with
           its unit, such as ``frequency_Hz``, or ``period_s`` (or ``T [s]``); optional columns ``mode`` (its number),
-          ``damping``, ``frequency_std`` [Hz] or ``frequency_cv``, ``temperature`` [°C] and ``set`` (the number of the
+          ``damping``, ``frequency_std`` [Hz] or ``frequency_cv``, ``temperature`` [°C] and ``set`` or ``date`` (the
           identification, where there are several). What describes an identification, such as ``MAC`` or ``order``, is
-          left out, which the description says. All other columns of numbers are sensors. A table with a column for each
-          mode is transposed.
+          left out, which the description says. All other columns of numbers are sensors.
+        * The same with a column for each mode.
+        * Frequencies alone with a line for each identification: ``f1_Hz``, ``f2_Hz``, ... and ``temperature``.
         * A MATLAB file (``.mat``, up to version 7.2) with the `variables`, the modes in the columns of the shapes.
-        * A result of pyOMA2, such as ``ssi.result`` after the choice of the modes: ``Fn``, ``Phi``, ``Xi``, ``Fn_std``,
-          ``Phi_std``.
+        * An algorithm of pyOMA2 or its result, after the choice of the modes: ``Fn``, ``Phi``, ``Xi``, ``Fn_std``.
+          ``Phi_std`` is not used: in pyOMA2 1.4.3 it is 6 to 100 times the scatter of shapes (four masses, 20 records).
     sensors : sequence of str, optional
         Names of the sensors. In a table: the columns that are sensors, in this order. Needed for other sources.
     unit : str, optional
@@ -86,6 +90,7 @@ def read_modal_data(
     >>> identified.sensors
     ('floor 1', 'roof')
     """
+    source = getattr(source, "result", source)
     if hasattr(source, "Fn") and hasattr(source, "Phi"):
         return _of_result(source, sensors, options)
     if not isinstance(source, str | Path):
@@ -93,15 +98,18 @@ def read_modal_data(
     options = {"description": Path(source).name} | options
     if Path(source).suffix.lower() == ".mat":
         return _of_matlab(Path(source), sensors, unit, variables or {}, options)
-    table = read_table(source)
-    if not {"frequency", "period"} & set(map(_kind, _names_of(table))):
-        table = _transposed(table)
-    return _of_table(table, sensors, unit, options)
-
-
-def _names_of(table: Table) -> list[str]:
-    """Names of the columns."""
-    return [column.name for column in table.columns]
+    try:
+        table = read_table(source)
+    except ValueError as error:
+        is_complex = re.search(r"\d[ij]'$", str(error))
+        raise ValueError(f"{error}, a complex shape: {_COMPLEX}" if is_complex else str(error)) from None
+    head = table.columns[0]
+    if not {"frequency", "period"} & {_kind(column.name) for column in table.columns}:
+        if head.kind == "text" and {"frequency", "period"} & set(map(_kind, head.cells)):
+            table = _transposed(table)
+        elif any(re.fullmatch(_OF_MODE, column.name.lower()) for column in table.columns):
+            return _of_days(table, unit, options)
+    return _of_modes(table, sensors, unit, options)
 
 
 def _kind(name: str) -> str:
@@ -109,164 +117,191 @@ def _kind(name: str) -> str:
     name, unit = re.fullmatch(r"\s*(.*?)[\s._]*(?:[\[(](.*?)[\])]?)?\s*", name.lower(), re.S).groups()
     if of_t := re.fullmatch(r"tn?(?:_(\w+))?", name):
         return _BY_UNIT.get((unit or of_t[1] or "").strip(), "")
-    words = set(re.split(r"[^a-z]+", name))
-    return next((kind for kind, known in _WORDS.items() if words & set(known)), _NAMES.get(name, ""))
+    words = re.split(r"[\W\d_]+", name)
+    kinds = [kind for kind, known in _WORDS.items() if any(re.fullmatch(known, word) for word in words)]
+    if {"deviation", "damping"} <= set(kinds):
+        return "quality"
+    return kinds[0] if kinds else _NAMES.get(name.removesuffix("_hz"), "")
 
 
 def _transposed(table: Table) -> Table:
-    """A table with a column for each mode with a line for each mode; any other table as it is."""
-    names = table.columns[0].cells
-    if table.columns[0].kind != "text" or not {"frequency", "period"} & set(map(_kind, names)):
-        return table
-    digits = [re.sub(r"\D", "", column.name) for column in table.columns[1:]]
-    numbers = np.array(digits if all(digits) else range(1, len(digits) + 1), dtype=float)
-    rows = np.array([column.values for column in table.columns[1:]]).T
-    columns = [
-        Column(name, values, 0, "", "number") for name, values in zip(("mode", *names), (numbers, *rows), strict=True)
-    ]
-    return table._replace(columns=tuple(columns), lines=tuple(range(len(numbers))))
+    """A table with a column for each mode with a line for each mode."""
+    head, *modes = table.columns
+    values = np.array([column.values for column in modes]).T
+    names = Column("mode", np.full(len(modes), np.nan), 0, "", "text", tuple(column.name for column in modes))
+    rows = [Column(name, row, 0, "", "number") for name, row in zip(head.cells, values, strict=True)]
+    return table._replace(columns=(names, *rows), lines=tuple(range(len(modes))))
 
 
-def _of_table(table: Table, sensors: Sequence[str], unit: str | None, options: dict[str, Any]) -> ModalData:
-    names = _names_of(table)
-    kinds = list(map(_kind, names))
-    found = {what: kinds.index(what) if what in kinds else None for what in _WORDS}
-    left_out = [name for name, kind in zip(names, kinds, strict=True) if kind == "quality" and name not in sensors]
-    notes = [f"without {', '.join(left_out)}"] if left_out else []
-    notes += ["frequencies from periods"] if found["frequency"] is None else []
-    options["description"] = ", ".join([options["description"], *notes])
-    if found["frequency"] is None and found["period"] is None:
+def _of_days(table: Table, unit: str | None, options: dict[str, Any]) -> ModalData:
+    """Frequencies of a table with a line for each identification, and a column for each mode."""
+    numbers = [re.fullmatch(_OF_MODE, column.name.lower()) for column in table.columns]
+    frequencies = [_in_hertz(table, place, unit) for place, number in enumerate(numbers) if number]
+    warm = [column for column in table.columns if _kind(column.name) == "temperature"]
+    found = {"temperatures": _degrees(warm[0])} if warm else {}
+    found["mode_numbers"] = [int(number[1]) for number in numbers if number]
+    return ModalData(np.stack(frequencies, axis=1), **found | options)
+
+
+def _of_modes(table: Table, sensors: Sequence[str], unit: str | None, options: dict[str, Any]) -> ModalData:
+    """Modes of a table with a line for each mode."""
+    names = [column.name for column in table.columns]
+    kinds = ["" if name in sensors else _kind(name) for name in names]
+    at = {kind: [place for place, each in enumerate(kinds) if each == kind] for kind in _WORDS}
+    if at["part"]:
+        parts = ", ".join(names[place] for place in at["part"])
+        raise ValueError(f"{table.file}: the columns {parts} are parts of complex shapes: {_COMPLEX}")
+    for kind, places in at.items():
+        if len(places) > 1 and kind != "quality":
+            several = ", ".join(names[place] for place in places)
+            raise ValueError(f"{table.file}: expected one column of the {kind}; got {several}: rename the others")
+    notes = [f"without {', '.join(names[place] for place in at['quality'])}"] if at["quality"] else []
+    if at["frequency"]:
+        frequencies = _in_hertz(table, at["frequency"][0], unit)
+    elif at["period"]:
+        notes, frequencies = [*notes, "frequencies from periods"], _of_periods(table, at["period"][0])
+    else:
         raise ValueError(
             f"{table.file}: expected a column of frequencies, such as frequency_Hz; the columns are {', '.join(names)}"
         )
-    texts = [place for place, column in enumerate(table.columns) if column.kind == "text"]  # such as remarks
-    taken = [*(place for what, place in found.items() if what != "quality"), *texts, *map(names.index, left_out)]
-    others = [name for place, name in enumerate(names) if place not in taken]
-    if unknown := [name for name in sensors if name not in others]:
-        raise ValueError(f"{table.file}: no columns {', '.join(unknown)}; the sensors are {', '.join(others)}")
-    sensors = tuple(sensors) or tuple(others)
-    values = {what: None if place is None else table.columns[place].values for what, place in found.items()}
-    frequencies = _frequencies(table, found, unit)
-    _refuse_complex(table, sensors)
-    shapes = np.array([table.columns[names.index(name)].values for name in sensors])
-    shapes = shapes.reshape(len(sensors), len(frequencies)).T
-    sets = np.zeros(len(frequencies)) if values["set"] is None else values["set"]
-    modes = values["mode"]
-    if modes is None:  # the place among the lines of its identification
-        modes = np.array([(sets[: place + 1] == each).sum() for place, each in enumerate(sets)])
-    numbers, order = np.unique(modes), np.unique(sets)
-    shape = len(order), len(numbers)
-    rows = np.searchsorted(order, sets), np.searchsorted(numbers, modes)
-    if len(set(zip(*rows, strict=True))) < len(modes) or (numbers != np.round(numbers)).any():
-        raise ValueError(
-            f"{table.file}: expected different whole numbers in the column of modes; got {modes.tolist()}: give a "
-            "column 'set' with the number of the identification if there are several"
-        )
-    placed = {"frequencies": np.full(shape, np.nan), "shapes": np.full((*shape, len(sensors)), np.nan)}
-    placed["frequencies"][rows], placed["shapes"][rows] = frequencies, shapes
-    if found["deviation"] is not None:  # the mean square of several identifications
-        squares = np.full(shape, np.nan)
-        squares[rows] = np.square(_coefficients(table, found["deviation"], frequencies))
-        options = {"frequency_cv": np.sqrt(np.nanmean(squares, axis=0))} | options
-    if values["temperature"] is not None:
-        degrees = values["temperature"] - (273.15 if re.search(r"[\[( _]K\W*$", names[found["temperature"]]) else 0.0)
-        by_set = [np.unique(degrees[sets == each]) for each in order]
-        if any(len(each) > 1 for each in by_set):
+    others = [place for place, kind in enumerate(kinds) if not kind and table.columns[place].kind == "number"]
+    shapes = _sensor_columns(table, others, sensors)  # texts are remarks
+    columns = {kind: table.columns[places[0]] for kind, places in at.items() if places}
+    n_sets, of_set, numbers, of_mode = _places(columns, len(frequencies), table.file)
+
+    def placed(values: np.ndarray) -> np.ndarray:
+        """Values (n_lines, ...) by set and mode."""
+        found = np.full((n_sets, len(numbers), *values.shape[1:]), np.nan)
+        found[of_set, of_mode] = values
+        return found
+
+    found = {"description": ", ".join([options["description"], *notes])}
+    if at["deviation"]:  # the mean square of several identifications
+        squares = placed(np.square(_coefficients(table, at["deviation"][0], frequencies)))
+        found["frequency_cv"] = np.sqrt(np.nanmean(squares, axis=0))
+    if at["temperature"]:
+        degrees = placed(_degrees(columns["temperature"]))
+        if (np.nanmin(degrees, axis=1) != np.nanmax(degrees, axis=1)).any():
             raise ValueError(f"{table.file}: expected one temperature for each identification (column 'set')")
-        options = {"temperatures": np.concatenate(by_set)} | options
-    if values["damping"] is not None:
-        placed["damping"] = np.full(shape, np.nan)
-        named = stated_unit(table, found["damping"], "dimensionless")
-        placed["damping"][rows] = to_si(values["damping"], named or "1", "dimensionless")
-    return ModalData(sensors=sensors, mode_numbers=numbers.astype(int).tolist(), **placed, **options)
+        found["temperatures"] = np.nanmean(degrees, axis=1)
+    if at["damping"]:
+        named = stated_unit(table, at["damping"][0], "dimensionless")
+        found["damping"] = placed(to_si(columns["damping"].values, named or "1", "dimensionless"))
+    values = np.reshape([column.values for column in shapes], (len(shapes), len(frequencies))).T
+    found |= {"sensors": [column.name for column in shapes], "mode_numbers": numbers.astype(int).tolist()}
+    return ModalData(placed(frequencies), placed(values), **found | options | {"description": found["description"]})
 
 
-def _refuse_complex(table: Table, sensors: Sequence[str]) -> None:
-    """Raise ValueError for columns that are real and imaginary parts, or magnitudes and phases, of a shape."""
-    words = [(re.sub(r"[^a-z]+(re|im|real|imag|mag|abs|phase)$", "", name.lower()), name) for name in sensors]
-    ends = [name for stem, name in words if stem != name.lower()]
-    if len(ends) > 1 and len({stem for stem, _ in words}) < len(words):
+def _sensor_columns(table: Table, others: Sequence[int], sensors: Sequence[str]) -> list[Column]:
+    """The columns of the sensors among those at the places `others`: all of them, or those with the given names."""
+    columns = {table.columns[place].name: table.columns[place] for place in others}
+    if unknown := [name for name in sensors if name not in columns]:
+        raise ValueError(f"{table.file}: no columns {', '.join(unknown)}; the sensors are {', '.join(columns)}")
+    if sensors:
+        return [columns[name] for name in sensors]
+    if len({stated_unit(table, place, "dimensionless") for place in others}) > 1:
         raise ValueError(
-            f"{table.file}: the columns {', '.join(ends)} are parts of complex shapes; make real ones of them, "
-            "real_shapes(parts) of fe_likelihoods.modal.modal_data, and give these to ModalData"
+            f"{table.file}: the columns {', '.join(columns)} have different units, and a shape has one: give those "
+            "that are sensors, sensors=[...] (columns in a TOML file)"
         )
+    return [table.columns[place] for place in others]
 
 
-def _frequencies(table: Table, found: Mapping[str, int | None], unit: str | None) -> np.ndarray:
-    """Frequencies [Hz] from a column of frequencies or periods."""
-    place = found["frequency"]
-    if place is None:
-        stated = stated_unit(table, found["period"], "time")
-        if stated is None:
-            raise ValueError(f"{table.file}: the unit of the periods is not stated; name the column period_s")
-        return 1.0 / to_si(table.columns[found["period"]].values, stated, "time")
-    stated = stated_unit(table, place, "frequency")
-    return _in_hertz(table.columns[place].values, stated, unit, f"{table.file}, column {_names_of(table)[place]!r}")
+def _places(columns: Mapping[str, Column], n: int, file: str) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
+    """Number of identifications, place of each of n lines among them, numbers of the modes, place among these."""
+    day, mode = columns.get("set"), columns.get("mode")
+    days = np.zeros(n) if day is None else np.array(day.cells) if day.kind == "text" else day.values
+    order, of_set = np.unique(days, return_inverse=True)
+    modes = np.array([(of_set[: k + 1] == each).sum() for k, each in enumerate(of_set)])  # in the order of the lines
+    if mode is not None and mode.kind != "text":
+        modes = mode.values
+    elif mode is not None:
+        digits = [re.sub(r"\D", "", cell) for cell in mode.cells]  # of names such as mode 3
+        different = all(digits) and len(set(zip(of_set, digits, strict=True))) == n
+        modes = np.array(digits, dtype=float) if different else modes
+    numbers, of_mode = np.unique(modes, return_inverse=True)
+    if len(set(zip(of_set, of_mode, strict=True))) < n or (numbers != np.round(numbers)).any():
+        raise ValueError(
+            f"{file}: expected a line for each mode, with different whole numbers in the column of modes; got "
+            f"{modes.tolist()}: give a column 'set' with the number of the identification if there are several, and a "
+            "column for each sensor"
+        )
+    return len(order), of_set, numbers, of_mode
+
+
+def _degrees(column: Column) -> np.ndarray:
+    """Temperatures [°C] of a column in degrees Celsius or Fahrenheit, or in kelvin."""
+    found = re.search(r"[\[( _°](K|F)\W*$", f"{column.name} {column.below}".strip())
+    if found:
+        return column.values - 273.15 if found[1] == "K" else (column.values - 32.0) / 1.8
+    return column.values
+
+
+def _in_hertz(table: Table, place: int, given: str | None) -> np.ndarray:
+    """Frequencies [Hz] in a column; ValueError if the unit is not known, or is stated and given differently."""
+    column, stated = table.columns[place], stated_unit(table, place, "frequency")
+    if stated is not None and given is not None and stated != given:
+        raise ValueError(f"{table.file}: the file states {stated}, and unit={given!r} is given: leave unit out")
+    return _to_hertz(column.values, stated or given, f"{table.file}, column {column.name!r}")
+
+
+def _to_hertz(values: np.ndarray, unit: str | None, where: str) -> np.ndarray:
+    if unit is None:
+        raise ValueError(f"{where}: the unit of the frequencies is not stated; give unit='Hz' or unit='rad/s'")
+    return to_si(values, unit, "frequency")
+
+
+def _of_periods(table: Table, place: int) -> np.ndarray:
+    """Frequencies [Hz] from a column of periods."""
+    stated = stated_unit(table, place, "time")
+    if stated is None:
+        raise ValueError(f"{table.file}: the unit of the periods is not stated; name the column period_s")
+    return 1.0 / to_si(table.columns[place].values, stated, "time")
 
 
 def _coefficients(table: Table, place: int, frequencies: np.ndarray) -> np.ndarray:
     """Coefficients of variation from a column ``frequency_std`` [Hz, rad/s] or ``frequency_cv``."""
-    name, stated = _names_of(table)[place], stated_unit(table, place)
-    if "cv" in re.split(r"[^a-z]+", name.lower()):
-        return to_si(table.columns[place].values, stated or "1", "dimensionless")
-    return _in_hertz(table.columns[place].values, stated, None, f"{table.file}, column {name!r}") / frequencies
+    column = table.columns[place]
+    if "cv" not in re.split(r"[^a-z]+", column.name.lower()):
+        return _in_hertz(table, place, None) / frequencies
+    return to_si(column.values, stated_unit(table, place) or "1", "dimensionless")
 
 
 def _of_matlab(
     path: Path, sensors: Sequence[str], unit: str | None, variables: Mapping[str, str], options: dict[str, Any]
 ) -> ModalData:
+    """Modes of a MATLAB file."""
     from scipy.io import loadmat  # slow to import
 
     try:
         content = {name: value for name, value in loadmat(path).items() if not name.startswith("__")}
-    except NotImplementedError:
-        raise ValueError(f"{path}: a file of version 7.3; save it with '-v7', or read it with h5py") from None
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{path}: cannot be read as a MATLAB file: {error}; save it again with '-v7'") from None
+    except (NotImplementedError, OSError, ValueError) as error:
+        raise ValueError(
+            f"{path}: cannot be read as a MATLAB file up to version 7.2: {error}; save it again with '-v7'"
+        ) from None
     missing = [name for name in variables.values() if name not in content]
     if missing or not {"frequencies"} <= set(variables) <= {"frequencies", "shapes", "damping"}:
         raise ValueError(
             f"{path}: name the variables, such as variables={{'frequencies': 'f', 'shapes': 'Phi'}}; got "
             f"{dict(variables)}, the file has {', '.join(content)}"
         )
-    values = {what: np.squeeze(content[name]) for what, name in variables.items()}
-    values["frequencies"] = _in_hertz(np.atleast_1d(values["frequencies"]), None, unit, str(path))
+    values = {what: np.atleast_1d(np.squeeze(content[name])) for what, name in variables.items()}
+    values["frequencies"] = _to_hertz(values["frequencies"], unit, str(path))
     if "shapes" in values:
-        m, shapes = len(values["frequencies"]), content[variables["shapes"]]
-        if m == 1:
-            shapes = shapes.reshape(-1, 1)
-        if shapes.ndim != 2 or shapes.shape[1] != m:
-            raise ValueError(
-                f"{path}: expected {m} modes in the columns of {variables['shapes']}; got the shape {shapes.shape}: "
-                "transpose it"
-            )
-        values["shapes"] = _real(shapes.T)
+        values["shapes"] = _real(np.reshape(values["shapes"], (len(values["shapes"]), -1)).T)  # modes in columns
     return ModalData(sensors=sensors, **values, **options)
 
 
 def _of_result(result: Any, sensors: Sequence[str], options: dict[str, Any]) -> ModalData:
     """Modes of a result with the attributes of pyOMA2, whose shapes have the modes in columns."""
-    if result.Fn is None or result.Phi is None:
-        raise ValueError("read_modal_data: the result has no modes yet; choose them first, with mpe or mpe_from_plot")
+    if result.Fn is None or result.Phi is None or not np.size(result.Fn):
+        raise ValueError("read_modal_data: the result has no modes; choose them first, with mpe or mpe_from_plot")
     frequencies = np.atleast_1d(np.asarray(result.Fn, dtype=float))
     if (deviations := getattr(result, "Fn_std", None)) is not None:
         options = {"frequency_cv": np.ravel(deviations) / frequencies} | options
     if (damping := getattr(result, "Xi", None)) is not None:
         options = {"damping": np.ravel(damping)} | options
-    shapes = np.asarray(result.Phi).T
-    if (deviations := getattr(result, "Phi_std", None)) is not None:
-        squares = np.square(np.abs(np.asarray(deviations).T)).mean(axis=1)
-        options = {"shape_error": np.sqrt(squares) / np.linalg.norm(shapes, axis=1)} | options
-    return ModalData(frequencies, _real(shapes), sensors, **options)
-
-
-def _in_hertz(values: np.ndarray, stated: str | None, given: str | None, where: str) -> np.ndarray:
-    """Frequencies [Hz]; ValueError if the unit is not known, or is stated and given differently."""
-    if stated is None and given is None:
-        raise ValueError(f"{where}: the unit of the frequencies is not stated; give unit='Hz' or unit='rad/s'")
-    if stated is not None and given is not None and stated != given:
-        raise ValueError(f"{where}: the file states {stated}, and unit={given!r} is given: leave unit out")
-    return to_si(values, stated or given, "frequency")
+    return ModalData(frequencies, _real(np.asarray(result.Phi).T), sensors, **options)
 
 
 def _real(shapes: np.ndarray) -> np.ndarray:

@@ -26,14 +26,7 @@ __all__ = ["REFERENCE_TEMPERATURE", "SLOPE", "PairedModes", "sensor_rows"]
 REFERENCE_TEMPERATURE = 20.0  # [°C], of the frequencies of the model
 SLOPE = "temperature_slope"
 
-_OF_THE_MODEL = (
-    "code_parts",
-    "nominal",
-    "nominal_units",
-    "range_remark",
-    "response_tolerance",
-    "time_limit",
-)
+_OF_THE_MODEL = "nominal", "nominal_units", "response_tolerance", "time_limit"
 
 
 def sensor_rows(model: Model, data: ModalData) -> list[int]:
@@ -83,6 +76,19 @@ class PairedModes:
         self.channels = tuple(Channel(f"mode {number}", "dimensionless", "1") for number in data.mode_numbers)
         self.n_steps = data.n_sets * (1 + data.n_sensors)
         self.groups = self._measured.groups
+        for name in _OF_THE_MODEL:
+            if hasattr(model, name):
+                setattr(self, name, getattr(model, name))
+        if has_jacobian(model):
+            self.jacobian = self._differentiate
+        if hasattr(model, "simulate_together"):
+            self.simulate_together = self._simulate_together
+        if hasattr(model, "code_parts") or is_of_user(type(model).__module__):
+            self.code_parts = self._code_parts
+
+    def _code_parts(self) -> dict[str, Any]:
+        own = {"model": self.model} if is_of_user(type(self.model).__module__) else {}
+        return own | (self.model.code_parts() if hasattr(self.model, "code_parts") else {})
 
     @property
     def fingerprint(self) -> str:
@@ -108,19 +114,6 @@ class PairedModes:
     def _warmed(self, theta: np.ndarray) -> np.ndarray | float:
         """Factors of frequencies (n_sets, 1) at parameters (n_parameters,)."""
         return 1.0 if self._warmer is None else 1.0 + theta[-1] * self._warmer[:, None]
-
-    def __getattr__(self, name: str) -> Any:
-        """Optional members of the model, such as `code_parts`, and `jacobian` if the model has it."""
-        model = vars(self).get("model")
-        if model is not None and name == "code_parts" and is_of_user(type(model).__module__):
-            return lambda: {"model": model} | (model.code_parts() if hasattr(model, "code_parts") else {})
-        if model is not None and name in _OF_THE_MODEL:
-            return getattr(model, name)
-        if model is not None and name == "simulate_together" and hasattr(model, "simulate_together"):
-            return self._simulate_together
-        if model is not None and name == "jacobian" and has_jacobian(model):
-            return self._differentiate
-        raise AttributeError(f"{type(self).__name__} has no {name}")
 
     @property
     def measurements(self) -> Measurements:
