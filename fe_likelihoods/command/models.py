@@ -11,11 +11,12 @@ from ..likelihood.joint import JointLikelihood
 from ..likelihood.likelihood import FELikelihood
 from ..likelihood.parameters import channels_of_deviations
 from ..likelihood.posterior import Posterior
+from ..modal.paired_modes import SLOPE
 from ..models.one_run import one_run
 from ..models.sensed import SensedModel, Sensor
 from ..noise.autoregressive import AutoregressiveNoise
 from ..noise.gaussian import GaussianNoise
-from ..priors.distributions import Distribution, HalfNormal, LogNormal, Uniform
+from ..priors.distributions import Distribution, HalfNormal, LogNormal, TruncatedNormal, Uniform
 from ..signals.channels import Channel, Measurements
 from ..signals.records import Record
 from ..simulation.model import Model
@@ -30,6 +31,9 @@ from .structure import built_in, linear_parts, load_function, user_channels, use
 __all__ = ["Problem", "make_problem", "noise_channels_of", "runs_code_of_user"]
 
 ERRORS_OF_MODES = {"frequency_error": 0.01, "shape_error": 0.03}  # medians of log-normal priors without one (assumed)
+TEMPERATURE_SLOPE = (
+    2e-3  # [1/K], its standard deviation without a prior (assumed): -1e-4 to -5e-4 in concrete, more if frozen
+)
 NOISE_SCALE = 0.3  # half-normal prior of a sigma without one in the file, in root mean squares of the channel (assumed)
 
 
@@ -244,7 +248,7 @@ def _make_priors(
             given[name] = parse_prior(text, channels[name].dimension if name in channels else None)
         except ValueError as error:
             raise ValueError(f"{job.where('priors')} {name}: {error}") from None
-    if missing := [name for name in structural if name not in given]:
+    if missing := [name for name in structural if name not in given and name != SLOPE]:
         raise ValueError(
             f"{job.where('priors')} {missing[0]}: this prior is missing; write for example "
             f'{missing[0]} = "normal(1, 0.3)"'
@@ -265,6 +269,8 @@ def noise_channels_of(likelihood: FELikelihood) -> dict[str, Channel]:
 def _default_prior(name: str, channel: Channel | None, measured: Mapping[str, Measurements]) -> Distribution:
     if name.startswith("rho_"):
         return Uniform(-1.0, 1.0)
+    if name == SLOPE:
+        return TruncatedNormal(0.0, TEMPERATURE_SLOPE, -math.inf, math.inf)
     for error, median in ERRORS_OF_MODES.items():
         if name.startswith(error):
             return LogNormal(median, 1.0)

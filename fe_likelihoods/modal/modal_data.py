@@ -120,18 +120,24 @@ class ModalData:
         """The covariance of the frequencies [Hz²]; ValueError if it is none."""
         if self.covariance is None:
             return None
-        m = frequencies.shape[1]
-        covariance = np.array(self.covariance, dtype=float)
         if self.frequency_cv is not None or np.isnan(frequencies).any():
             raise ValueError(
                 "ModalData: covariance and frequency_cv state the same errors: leave one out (frequency_cv=None, "
                 "where a file has them); a covariance is for modes that were never missed"
             )
-        symmetric = covariance.shape == (m, m) and np.allclose(covariance, covariance.T, rtol=1e-8, atol=0.0)
-        if not symmetric or not np.linalg.eigvalsh(covariance)[0] > 0.0:
+        m = frequencies.shape[1]
+        try:
+            covariance = np.array(self.covariance, dtype=float)
+            largest = np.sqrt(covariance.diagonal()) / frequencies.mean(axis=0)
+            symmetric = covariance.shape == (m, m) and np.allclose(covariance, covariance.T, rtol=1e-8, atol=0.0)
+            fits = symmetric and np.linalg.eigvalsh(covariance)[0] > 0.0 and largest.max() < _LARGEST_SHARE
+        except ValueError:  # rows of different lengths
+            fits = False
+        if not fits:
             raise ValueError(
-                f"ModalData: covariance must be a symmetric positive definite matrix ({m}, {m}) [Hz²]; got "
-                f"{covariance.tolist()}: take the variances alone (frequency_cv) if the covariances are poorly known"
+                f"ModalData: covariance must be a symmetric positive definite matrix ({m}, {m}) [Hz²], with standard "
+                f"deviations below {_LARGEST_SHARE} of the frequencies; got {self.covariance}: take the variances "
+                "alone (frequency_cv) if the covariances are poorly known"
             )
         return covariance
 

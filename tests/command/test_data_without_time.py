@@ -137,8 +137,9 @@ def test_columns_and_errors_of_modes(tmp_path):
     known = "covariance = [[1e-4, 5e-5], [5e-5, 4e-4]]\ntemperatures = 12"
     path = changed(tmp_path, "modal", ("frequency_cv = 0.005", known), ("[1, 2, 3]", "[1, 2]"))
     (tmp_path / "synthetic_modes.csv").write_text(modes)
-    path.write_text(path.read_text().replace("[priors]", '[priors]\ntemperature_slope = "uniform(-0.001, 0)"'))
-    data = make_problem(read_job(path)).posterior.likelihood.model.data
+    problem = make_problem(read_job(path))
+    data = problem.posterior.likelihood.model.data
+    assert "temperature_slope" in problem.assumed
     assert data.covariance.tolist() == [[1e-4, 5e-5], [5e-5, 4e-4]] and data.temperatures.tolist() == [12.0]
 
 
@@ -163,6 +164,9 @@ def test_a_bridge_deck_has_a_mode(tmp_path):
         ("modal", [("modes = [1, 2, 3]", "modes = [1, 7]")], r"\[modes\] ModalData has no modes"),
         ("modal", [("[modes]", "[modes]\nheld_out = [3]")], r"the modes \[3\] are in modes too"),
         ("modal", [("[modes]", "[modes]\ncovariance = [[1e-4]]")], "state the same errors: leave one out"),
+        ("modal", [("frequency_cv = 0.005", "covariance = [[1, 2], [1]]")], "symmetric positive definite matrix"),
+        ("modal", [("frequency_cv = 0.005", "frequency_cv = [0.005, 0.01]")], "one for each of 3 modes"),
+        ("modal", [("frequency_cv = 0.005", "temperatures = 293")], "from -80 to 80"),
         ("modal", [("[modes]", "[modes]\nn_modes = 3")], "a frame has a mode for each storey"),
         ("modal", [("[sampler]", '[noise]\nlevel = "si"\n[sampler]')], "modes have no such errors"),
         ("modal", [("floor_4 = 4}", "roof = 4}")], "the model has no sensors floor_4"),
