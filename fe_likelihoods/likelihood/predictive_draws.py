@@ -237,6 +237,9 @@ def _blocks(
 ) -> BlockLogLikelihood:
     whole = np.array([np.inf])
     total = block_log_likelihood(noise, likelihood.measurements, values, residuals, parameters, whole)[:, 0]
+    if likelihood.is_modal:  # no blocks of time: the samples of a mode belong together
+        starts, stops, terms = np.zeros(1), np.ones(1), total[:, None]
+        return BlockLogLikelihood(terms, starts, stops, (name,), 1.0, "all modes are one block")
     starts, stops = choose_blocks(likelihood.measurements, values, residuals[np.argmax(total)], block)
     terms = block_log_likelihood(noise, likelihood.measurements, values, residuals, parameters, stops)
     seconds = float(np.max(stops - starts))

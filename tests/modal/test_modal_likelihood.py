@@ -333,3 +333,12 @@ def test_modes_a_load_test_and_histories_of_one_structure_have_a_guide(rng):
     (evidence, mean, deviation), other = found
     assert other[0] == pytest.approx(evidence, abs=0.5)
     assert (abs(other[1] - mean) < 0.4 * deviation).all()
+
+
+def test_several_identifications_are_one_observation(rng):
+    """For comparisons of models: modes have no blocks of time, and the term is the log-likelihood."""
+    data = identified(np.ones(4), [1, 3], rng, n_sets=30, frequency_cv=0.01, shape_error=0.03)
+    posterior = Posterior(ModalLikelihood(FRAME, data), PRIOR)
+    points = posterior.sample_prior(3, 1)
+    found = posterior.predictive_draws(points)
+    np.testing.assert_allclose(found.blocks.values[:, 0], posterior.log_likelihood(points), rtol=1e-12)
