@@ -273,7 +273,7 @@ def _default_prior(name: str, channel: Channel | None, measured: Mapping[str, Me
         return TruncatedNormal(0.0, TEMPERATURE_SLOPE, -math.inf, math.inf)
     for error, median in ERRORS_OF_MODES.items():
         if name.startswith(error):
-            return LogNormal(median, 1.0)
+            return LogNormal(median, 0.5)
     if channel is None:
         return HalfNormal(NOISE_SCALE)
     rms = measured[channel.name].select([channel.name]).root_mean_squares[0]
