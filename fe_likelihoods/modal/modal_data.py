@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from ..models.base import digest
 from ..signals.sampling import array_digest
 from ..text_tables import text_table
-from .pairing import MeasuredModes, close_groups
+from .pairing import close_groups
 
 __all__ = ["ModalData", "real_shapes"]
 
@@ -153,15 +154,20 @@ class ModalData:
     def n_sensors(self) -> int:
         return len(self.sensors)
 
-    @property
+    @cached_property
     def mean_frequencies(self) -> np.ndarray:
         """Mean frequency of each mode (m,) [Hz]."""
         return np.nanmean(self.frequencies, axis=0)
 
-    @property
+    @cached_property
     def has_shape(self) -> np.ndarray:
         """Whether each identification (n_sets, m) has a shape of each mode."""
         return ~np.isnan(self.shapes).any(axis=2) & (self.n_sensors > 0)
+
+    @cached_property
+    def known_shapes(self) -> np.ndarray:
+        """Shapes (n_sets, m, n_sensors), zero where there is none."""
+        return np.where(self.has_shape[:, :, None], self.shapes, 0.0)
 
     @property
     def fingerprint(self) -> str:
@@ -169,8 +175,8 @@ class ModalData:
         values = [np.where(np.isnan(each), np.nan, each) for each in (self.frequencies, self.shapes)]  # one NaN
         return digest(repr([self.sensors, self.mode_numbers]), array_digest(*values))
 
-    def measured(self, close: float) -> MeasuredModes:
-        """The modes as `pair_modes` takes them; frequencies within a ratio of 1 + `close` are one group.
+    def groups(self, close: float) -> tuple[tuple[int, ...], ...]:
+        """Modes whose frequencies are within a ratio of 1 + `close`, as groups.
 
         Modes without a shape, and groups whose plane would take up all sensors, are single.
         """
@@ -179,8 +185,7 @@ class ModalData:
         for group in close_groups(self.mean_frequencies[shaped], close) if len(shaped) else ():
             modes = tuple(int(shaped[each]) for each in group)
             groups += [modes] if len(modes) < self.n_sensors else [(mode,) for mode in modes]
-        shapes = np.where(self.has_shape[:, :, None], self.shapes, 0.0)
-        return MeasuredModes(self.mean_frequencies, shapes, self.has_shape, tuple(groups), self.mode_numbers)
+        return tuple(groups)
 
     def select(self, mode_numbers: Sequence[int]) -> "ModalData":
         """Return the modes with these numbers; ValueError for an unknown one."""

@@ -92,28 +92,6 @@ def opensees_modes(ops: Any, n_modes: int, sensors: Sequence[tuple[int, int]]) -
     return modal_response(np.sqrt(squares) / (2.0 * np.pi), np.reshape(shapes, (n_modes, len(sensors))))
 
 
-class _ModesOf:
-    """Function of theta that makes the response of what a user's function returns: matrices, or modes."""
-
-    def __init__(self, function: Callable[..., Any], dofs: tuple[int, ...] | None, n_modes: int) -> None:
-        self.function, self.dofs, self.n_modes = function, dofs, n_modes
-
-    def __call__(self, theta: np.ndarray) -> np.ndarray:
-        returned = self.function(theta)
-        if not isinstance(returned, tuple | list) or len(returned) != 2:
-            raise SimulationFailed(
-                "expected the function to return (stiffness, mass) or (frequencies, shapes); got "
-                f"{type(returned).__name__}"
-            )
-        first, second = returned
-        if len(getattr(first, "shape", np.shape(first))) == 1:
-            return modal_response(first, second, self.n_modes)
-        modes = undamped_modes(first, second, self.n_modes)
-        if self.dofs is None:
-            raise SimulationFailed("the function returns matrices: give sensors as a mapping of names to rows of these")
-        return modal_response(modes.frequencies, modes.shapes[:, list(self.dofs)])
-
-
 class FunctionModes(FunctionModel):
     """Python function as a model that has modes.
 
@@ -151,19 +129,28 @@ class FunctionModes(FunctionModel):
         n_modes: int,
         **options: Any,
     ) -> None:
-        dofs = tuple(int(row) for row in sensors.values()) if isinstance(sensors, Mapping) else None
-        if not callable(function):
-            raise ValueError(f"FunctionModes: expected a function of the parameters; got {function!r}")
-        called = _ModesOf(function, dofs, n_modes)
-        super().__init__(called, parameter_names, modal_channels(tuple(sensors)), 1.0, n_modes, **options)
+        self.rows = tuple(int(row) for row in sensors.values()) if isinstance(sensors, Mapping) else None
+        super().__init__(function, parameter_names, modal_channels(tuple(sensors)), 1.0, n_modes, **options)
 
     def code_parts(self) -> dict[str, Any]:
         """User code and rows of the sensors, for the label of stored simulations."""
-        return super().code_parts() | {"rows of the sensors": self.function.dofs}
+        return super().code_parts() | {"rows of the sensors": self.rows}
 
-    @property
-    def _user_function(self) -> Callable[..., Any]:
-        return self.function.function
+    def _respond(self, theta: np.ndarray) -> np.ndarray:
+        """The response of what the function returns: matrices, or modes."""
+        returned = super()._respond(theta)
+        if not isinstance(returned, tuple | list) or len(returned) != 2:
+            raise SimulationFailed(
+                "expected the function to return (stiffness, mass) or (frequencies, shapes); got "
+                f"{type(returned).__name__}"
+            )
+        first, second = returned
+        if len(getattr(first, "shape", np.shape(first))) == 1:
+            return modal_response(first, second, self.n_steps)
+        modes = undamped_modes(first, second, self.n_steps)
+        if self.rows is None:
+            raise SimulationFailed("the function returns matrices: give sensors as a mapping of names to rows of these")
+        return modal_response(modes.frequencies, modes.shapes[:, list(self.rows)])
 
 
 class StructureModes(ExternalModel):

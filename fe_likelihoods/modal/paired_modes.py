@@ -62,7 +62,6 @@ class PairedModes:
     def __init__(self, model: Model, data: ModalData, close: float) -> None:
         self.model, self.data, self.close = model, data, close
         self._rows = sensor_rows(model, data)
-        self._measured = data.measured(close)
         self._there = ~np.isnan(data.frequencies)
         # frequencies with a covariance are compared in coordinates in which their errors are independent
         self.frequency_cv, self._whitening = data.frequency_cv, np.eye(data.n_modes)
@@ -75,7 +74,7 @@ class PairedModes:
         self._n_own = len(model.parameter_names)
         self.channels = tuple(Channel(f"mode {number}", "dimensionless", "1") for number in data.mode_numbers)
         self.n_steps = data.n_sets * (1 + data.n_sensors)
-        self.groups = self._measured.groups
+        self.groups = data.groups(close)
         for name in _OF_THE_MODEL:
             if hasattr(model, name):
                 setattr(self, name, getattr(model, name))
@@ -118,7 +117,7 @@ class PairedModes:
     @property
     def measurements(self) -> Measurements:
         """The data as measurements of the channels."""
-        values = self._joined(self._there.astype(float), self._measured.shapes)
+        values = self._joined(self._there.astype(float), self.data.known_shapes)
         sets = [f" of set {k + 1}" if self.data.n_sets > 1 else "" for k in range(self.data.n_sets)]
         points = [f"{what}{end}" for end in sets for what in ("frequency", *self.data.sensors)]
         text = " of ".join(filter(None, ["natural frequencies and mode shapes", self.data.description]))
@@ -148,7 +147,7 @@ class PairedModes:
         """Pair modes (1 + n_sensors, n_modes), a response of the model, with the measured ones."""
         if not (modes[0] > 0.0).all():
             raise SimulationFailed(f"natural frequencies must be positive; they are {modes[0]} Hz")
-        return pair_modes(modes[0], modes[self._rows].T, self._measured)
+        return pair_modes(modes[0], modes[self._rows].T, self.data, self.groups)
 
     def _ratios(self, frequencies: np.ndarray) -> np.ndarray:
         """Frequencies (..., m) as multiples (..., n_sets, m) of the measured ones; zero where there is none."""
@@ -170,7 +169,7 @@ class PairedModes:
             basis = modes[np.ix_(self._rows, space)]
             turned = slopes[:, self._rows][:, :, list(space)]
             inverse = np.linalg.pinv(basis)
-            for k in np.flatnonzero(self._measured.there[:, mode]):
+            for k in np.flatnonzero(self.data.has_shape[:, mode]):
                 target, projected = self.data.shapes[k, mode], paired.shapes[k, mode]
                 # y = B c with c = B+ t: y' = (I - B B+) B' c + (B+)^T B'^T (t - y)
                 moved = turned @ (inverse @ target)

@@ -19,16 +19,20 @@ Mechanical Systems and Signal Processing 56, 2015, 123-149, doi:10.1016/j.ymssp.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-__all__ = ["MeasuredModes", "Paired", "close_groups", "pair_modes"]
+if TYPE_CHECKING:
+    from .modal_data import ModalData
+
+__all__ = ["Paired", "close_groups", "pair_modes"]
 
 _FREQUENCY_WEIGHT = 0.1  # of |log(f / measured f)| beside 1 - MAC: decides only where the shapes hardly do
 _COINCIDENT = 1e-6  # relative difference of computed frequencies whose shapes are any basis of their space
 _SAME = 1e-6  # smallest singular value of shapes that the sensors tell apart, as a share of the largest
+Groups = Sequence[tuple[int, ...]]
 _FORCED = 1e3  # cost of any pairing but the one by number
 
 
@@ -42,16 +46,6 @@ def close_groups(frequencies: Sequence[float], close: float) -> tuple[tuple[int,
     return tuple(map(tuple, groups))
 
 
-class MeasuredModes(NamedTuple):
-    """Measured modes as the pairing needs them; m modes, identified n_sets times."""
-
-    frequencies: np.ndarray  # (m,) [Hz], the means of the identifications
-    shapes: np.ndarray  # (n_sets, m, n_sensors) of unit norm; zero where there is none
-    there: np.ndarray  # (n_sets, m) whether there is a shape
-    groups: tuple[tuple[int, ...], ...]  # modes that are close to each other, in ascending order of frequency
-    numbers: tuple[int, ...]  # of the computed modes, for modes without a shape
-
-
 class Paired(NamedTuple):
     """Computed modes at the measured ones."""
 
@@ -62,31 +56,31 @@ class Paired(NamedTuple):
     spaces: tuple[tuple[int, ...], ...]  # computed modes on whose space each measured shape is projected
 
 
-def pair_modes(frequencies: np.ndarray, shapes: np.ndarray, measured: MeasuredModes) -> Paired:
+def pair_modes(frequencies: np.ndarray, shapes: np.ndarray, measured: "ModalData", groups: Groups) -> Paired:
     """Pair n computed modes with m measured ones; frequencies (n,) [Hz] and shapes (n, n_sensors) in any scale.
 
     Pairs are assigned so that the sum of 1 - MAC, with a weak term in the frequencies, is least. Modes without a shape
-    are paired by their number.
+    are paired by their number. `groups` are modes that are close to each other (`ModalData.groups`).
     """
     clusters = close_groups(frequencies, _COINCIDENT)
     members = {mode: cluster for cluster in clusters for mode in cluster}
-    counts = measured.there.sum(axis=0)
+    counts = measured.has_shape.sum(axis=0)
     normed = _normed(shapes)
-    cosines = measured.shapes @ normed.T
+    cosines = measured.known_shapes @ normed.T
     similar = np.square(cosines)
-    for group in measured.groups:
+    for group in groups:
         for cluster in clusters:
             if len(group) + len(cluster) > 2:
                 _compare_spaces(similar, measured, group, cluster, normed)
-    cost = np.abs(np.log(frequencies / measured.frequencies[:, None])) * _FREQUENCY_WEIGHT
+    cost = np.abs(np.log(frequencies / measured.mean_frequencies[:, None])) * _FREQUENCY_WEIGHT
     cost += 1.0 - similar.sum(axis=0) / np.maximum(counts, 1)[:, None]
     for mode in np.flatnonzero(counts == 0):
         cost[mode] = _FORCED
-        cost[mode, measured.numbers[mode] - 1] = 0.0
+        cost[mode, measured.mode_numbers[mode] - 1] = 0.0
     columns = linear_sum_assignment(cost)[1]
     spaces: list[tuple[int, ...]] = [()] * len(columns)
-    projected = np.empty(measured.shapes.shape)
-    for group in measured.groups:
+    projected = np.empty(measured.known_shapes.shape)
+    for group in groups:
         modes = list(group)
         columns[modes] = columns[modes][np.argsort(frequencies[columns[modes]], kind="stable")]
         space = tuple(sorted({each for mode in modes for each in members[int(columns[mode])]}))
@@ -96,22 +90,22 @@ def pair_modes(frequencies: np.ndarray, shapes: np.ndarray, measured: MeasuredMo
                 projected[:, mode] = cosines[:, mode, space] * normed[list(space)]
             else:
                 basis = normed[list(space)].T
-                projected[:, mode] = (basis @ np.linalg.lstsq(basis, measured.shapes[:, mode].T, rcond=None)[0]).T
+                projected[:, mode] = (basis @ np.linalg.lstsq(basis, measured.known_shapes[:, mode].T, rcond=None)[0]).T
     assurance = np.where(counts > 0, np.square(projected).sum(axis=(0, 2)) / np.maximum(counts, 1), np.nan)
     return Paired(columns, assurance, frequencies[columns], projected, tuple(spaces))
 
 
 def _compare_spaces(
     similar: np.ndarray,
-    measured: MeasuredModes,
+    measured: "ModalData",
     group: tuple[int, ...],
     cluster: tuple[int, ...],
     shapes: np.ndarray,
 ) -> None:
     """Let `similar` (n_sets, m, n) be the largest MAC between the spaces of close measured and of coincident modes."""
-    for k, there in enumerate(measured.there):
+    for k, there in enumerate(measured.has_shape):
         if modes := [mode for mode in group if there[mode]]:
-            cosines = _basis(measured.shapes[k, modes]).T @ _basis(shapes[list(cluster)])
+            cosines = _basis(measured.known_shapes[k, modes]).T @ _basis(shapes[list(cluster)])
             similar[np.ix_([k], modes, cluster)] = np.linalg.norm(cosines, 2) ** 2
 
 

@@ -4,6 +4,9 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import (
+    HalfNormal,
+    HierarchicalPosterior,
+    Hierarchy,
     LogNormal,
     ModalData,
     ModalLikelihood,
@@ -11,6 +14,7 @@ from fe_likelihoods import (
     ShearFrame,
     StoredPosterior,
     Uniform,
+    Varying,
     stiffness_loss,
 )
 from fe_likelihoods.modal.mode_models import StructureModes
@@ -45,6 +49,31 @@ def test_a_loss_is_found_and_a_warmer_day_is_none(seed):
         assert loss.presence() > 0.9 and loss.location().argmax() == storey
     else:
         assert loss.presence() < 0.1
+
+
+def test_modes_of_several_structures_have_a_population(rng):
+    """Six frames whose stiffnesses differ by 8 %: the population, and the modes of another frame."""
+    frame = ShearFrame({"floor 1": 1, "roof": 2}, [20e3] * 2, [30e6] * 2)
+    prior, tests, truths = dict.fromkeys(NAMES[:2], LogNormal(1.0, 0.3)), {}, np.exp(0.08 * rng.normal(size=(6, 2)))
+    for k, truth in enumerate(truths):
+        modes = StructureModes(frame).simulate(truth)
+        shapes = modes[1:].T / np.linalg.norm(modes[1:], axis=0)[:, None] + 0.02 * rng.normal(size=(2, 2))
+        frequencies = modes[0] * (1.0 + 0.01 * rng.normal(size=2))
+        data = ModalData(frequencies, shapes, ("floor 1", "roof"), frequency_cv=0.01, shape_error=0.02)
+        posterior = Posterior(ModalLikelihood(frame, data), prior)
+        samples = truth * np.exp(0.1 * rng.normal(size=(400, 2)))  # around it, and weighted
+        wider = -0.5 * np.square(np.log(samples / truth) / 0.1).sum(axis=1) - np.log(samples).sum(axis=1)
+        tests[f"frame {k}"] = StoredPosterior(samples, posterior.prior, posterior(samples) - wider)
+    population = HierarchicalPosterior(tests, dict.fromkeys(NAMES[:2], Varying(LogNormal(1.0, 0.3), HalfNormal(0.2))))
+    points = population.sample_prior(6000, 1)
+    weights = np.exp((logs := population.log_likelihood(points)) - logs.max())
+    mean = weights @ points / weights.sum()
+    np.testing.assert_allclose(np.log(mean[[0, 2]]), np.log(truths).mean(axis=0), atol=0.08)
+    hierarchy = Hierarchy(population, points[rng.choice(len(points), 200, p=weights / weights.sum())])
+    predicted = posterior.likelihood.predict_modes(hierarchy.new_test(200, rng=1))
+    other = StructureModes(frame).simulate([1.0, 1.0])[0]
+    low, high = predicted.interval()
+    assert (low < other).all() and (other < high).all() and (high / low > 1.1).all() and (high / low < 1.6).all()
 
 
 @pytest.mark.slow

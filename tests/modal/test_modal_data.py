@@ -108,5 +108,5 @@ def test_bad_options_are_refused(options, text):
 
 def test_close_modes_are_a_group_unless_their_plane_takes_up_all_sensors():
     data = ModalData([2.01, 1.0, 2.0], [*SHAPES, [1.0, 0.0, 0.0]], FLOORS)
-    assert data.measured(0.02).groups == ((1,), (2, 0)) and data.measured(0.0).groups == ((1,), (2,), (0,))
-    assert len(data.at(FLOORS[:2]).measured(0.02).groups) == 3
+    assert data.groups(0.02) == ((1,), (2, 0)) and data.groups(0.0) == ((1,), (2,), (0,))
+    assert len(data.at(FLOORS[:2]).groups(0.02)) == 3
