@@ -19,13 +19,10 @@ Mechanical Systems and Signal Processing 56, 2015, 123-149, doi:10.1016/j.ymssp.
 """
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-
-if TYPE_CHECKING:
-    from .modal_data import ModalData
 
 __all__ = ["Paired", "close_groups", "pair_modes"]
 
@@ -56,8 +53,8 @@ class Paired(NamedTuple):
     spaces: tuple[tuple[int, ...], ...]  # computed modes on whose space each measured shape is projected
 
 
-def pair_modes(frequencies: np.ndarray, shapes: np.ndarray, measured: "ModalData", groups: Groups) -> Paired:
-    """Pair n computed modes with m measured ones; frequencies (n,) [Hz] and shapes (n, n_sensors) in any scale.
+def pair_modes(frequencies: np.ndarray, shapes: np.ndarray, measured: Any, groups: Groups) -> Paired:
+    """Pair n computed modes with the m of `ModalData`; frequencies (n,) [Hz], shapes (n, n_sensors) in any scale.
 
     Pairs are assigned so that the sum of 1 - MAC, with a weak term in the frequencies, is least. Modes without a shape
     are paired by their number. `groups` are modes that are close to each other (`ModalData.groups`).
@@ -97,7 +94,7 @@ def pair_modes(frequencies: np.ndarray, shapes: np.ndarray, measured: "ModalData
 
 def _compare_spaces(
     similar: np.ndarray,
-    measured: "ModalData",
+    measured: Any,
     group: tuple[int, ...],
     cluster: tuple[int, ...],
     shapes: np.ndarray,
