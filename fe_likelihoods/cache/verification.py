@@ -86,6 +86,7 @@ class Trust:
 
     def __init__(self, label: ModelLabel, key: str) -> None:
         self.label, self.key = label, key
+        self.cpu = zlib.crc32(cpu_name().encode())
         self.generations: dict[int, int] = {}
         self.written: dict[int, tuple] = {}
         self.is_blocked = False
@@ -165,6 +166,10 @@ class VerifiedCache:
         """Label of the model."""
         return self._trust.label
 
+    def _cpu(self, run: VerifyingRun) -> int:
+        """Number of the processor; 0 if simulations run on other machines."""
+        return self._trust.cpu if run.pool is None or isinstance(run.pool, LocalPool) else 0
+
     def share_trust(self, other: "VerifiedCache") -> None:
         """Trust rows that another object has verified or stored, if its model has the same code."""
         if other.label.code == self.label.code:
@@ -191,7 +196,7 @@ class VerifiedCache:
             if generation is None and is_blocked:  # it is not known which rows agree
                 return
             generation = self._use(source, generation or self._new_generation([]))
-            place = Place(generation, _cpu(run), trust.session)
+            place = Place(generation, self._cpu(run), trust.session)
         rows = []
         if misfit is not None:
             rows += pack_rows(fingerprint, thetas, misfit, reasons, seconds, place)
@@ -391,7 +396,7 @@ class VerifiedCache:
         if not reason and row.size is not None:  # a response
             batch = SimulationBatch(misfit.reshape(1, len(run.model.channels), -1), [""])
             (misfit,), (reason,) = misfit_of_responses(run.model, batch, run.measured, run.statistic)
-        other = run.tolerance is None and not row.cpu == _cpu(run) != 0
+        other = run.tolerance is None and not row.cpu == self._cpu(run) != 0
         return difference_in_words(misfit, reason, new, run, max(run.accepted, DEFAULT_TOLERANCE if other else 0.0))
 
     def _use_no_rows(self, row: Row, new: Simulated, used: int, generation: int, run: VerifyingRun) -> bool:
@@ -421,11 +426,6 @@ class VerifiedCache:
             )
         trust.stale = StaleCache(text, theta)
         raise trust.stale
-
-
-def _cpu(run: VerifyingRun) -> int:
-    """Number of the processor; 0 if simulations run on other machines."""
-    return zlib.crc32(cpu_name().encode()) if run.pool is None or isinstance(run.pool, LocalPool) else 0
 
 
 # coverage of the space ------------------------------------------------------------------------------------------------

@@ -136,7 +136,7 @@ class RunningSimulation:
 
     def __init__(self, thread: int, place: str = "", hop: str = "", base: str = "") -> None:
         self.place, self.base, self._hop, self._thread = place, base, hop, thread
-        self.shared, self.has_programs, self._is_elsewhere = "", False, False
+        self.shared, self.has_programs = "", False
         self._made: list[str] = []  # files and folders
         self._databases: list[str] = []  # that may only be read
         self._start = time.time_ns()
@@ -189,7 +189,7 @@ class RunningSimulation:
         with contextlib.suppress(OSError):
             status = os.stat(path)
             if self._start <= status.st_mtime_ns <= time.time_ns() and stat.S_ISREG(status.st_mode):
-                self.shared = self.shared or (path if path in _fresh or self._is_elsewhere else "")
+                self.shared = self.shared or (path if path in _fresh else "")
                 _fresh.add(path)
 
     def makes(self, path: Any) -> None:
@@ -211,12 +211,6 @@ class RunningSimulation:
         self.has_programs = True
         if isinstance(folder, str | bytes | os.PathLike):
             self.writes(os.path.join(os.path.realpath(os.fsdecode(folder)), "*"))
-
-    def enters(self, folder: Any) -> None:
-        """In another folder, what compiled code has written is noticed the first time that it is read."""
-        known = isinstance(folder, str | bytes | os.PathLike)
-        path = os.path.join(os.path.realpath(os.fsdecode(folder)), "*") if known else ""
-        self._is_elsewhere = not (self._is_own(path) or self._has_made(path))
 
     def writes(self, path: Any) -> None:
         """Note a file that does not belong to this simulation alone."""
@@ -265,7 +259,6 @@ def refuse_shared(path: str, n_workers: int | None) -> None:
 
 _EVENTS: dict[str, Callable[[RunningSimulation, tuple], Any]] = {
     "open": lambda simulation, arguments: simulation.opens(*arguments),
-    "os.chdir": lambda simulation, arguments: simulation.enters(arguments[0]),
     "os.fork": lambda simulation, _: simulation.starts(),
     "os.posix_spawn": lambda simulation, _: simulation.starts("."),
     "os.system": lambda simulation, _: simulation.starts("."),

@@ -15,7 +15,6 @@ import functools
 import itertools
 import os
 import shutil
-import stat
 import subprocess
 import sys
 import tempfile
@@ -27,14 +26,7 @@ from typing import Any, NamedTuple
 
 from .by_value import process_name
 from .faults import RunFailed, TransientReason, UnusableModel, reason_of, reworded
-from .files import (
-    Opened,
-    RunningSimulation,
-    observing,
-    of_this_library,
-    refuse_shared,
-    running_simulation,
-)
+from .files import Opened, RunningSimulation, observing, of_this_library, refuse_shared, running_simulation
 
 __all__ = [
     "KEEP",
@@ -49,9 +41,7 @@ __all__ = [
 
 KEEP = "FE_LIKELIHOODS_KEEP_FAILURES"  # environment variable: where the folders of failed simulations are kept
 _MOST_KEPT = 20
-_MOST_REPEATED = 100  # if more files were opened, a result names the new ones only
-_MOST_BELOW = 300  # entries of subfolders that are linked one by one; larger subfolders are links until they are used
-_MOST_USED = 3000  # entries of a subfolder that was used, and beside the working folder, which ``..`` shows
+_MOST_LINKS = 2000  # in subfolders, the hidden ones last, and beside the working folder, which ``..`` shows
 _CLOCK_TICK = 20_000_000  # [ns]; a file changed more recently may change again with the same modification time
 
 _mirror: "_Mirror | None" = None
@@ -86,16 +76,17 @@ def working_folder() -> str:
 class Observed:
     """A function of one item, whose results include what it opened; other processes call it in a folder of its own.
 
-    A call returns the result, and an `Opened` with all files that calls in this process have opened, or with the new
-    files if there are more than 100 in all; None if there is nothing to report.
+    A call returns the result, and an `Opened` with all files that calls in this process have opened, since earlier
+    results may have been lost.
     """
 
     def __init__(self, function: Callable[[Any], Any], sender: Sender | None = None) -> None:
         self.function, self._sender = function, sender
-        if sender is not None:
-            _get_ready(sender)
         self.__qualname__ = getattr(function, "__qualname__", type(function).__qualname__)  # for messages
         self._known: Opened | None = None
+        if sender is not None and sender.process != process_name() and running_simulation() is None and _is_main():
+            with contextlib.suppress(OSError):
+                _mirror_for(sender)  # now, so that it does not count as time of the first simulation
 
     def __repr__(self) -> str:
         return repr(self.function)
@@ -111,8 +102,7 @@ class Observed:
         new = observer.result(self._known)
         if new is not None:
             self._known = new if self._known is None else new | self._known
-        # all files each time, since earlier results may have been lost
-        return result, self._known if len(self._known.files) <= _MOST_REPEATED else new
+        return result, self._known
 
 
 def unpack(outcome: tuple, pool: Any) -> tuple[Any, Opened | None]:
@@ -132,12 +122,11 @@ def run_in_folder(function: Callable[[Any], Any], item: Any, sender: Sender | No
 
     `sender` is the process that has sent the function; None if it was not sent.
     """
-    is_main = threading.current_thread() is threading.main_thread()
     is_home = sender is None or sender.process == process_name()
-    if running_simulation() is not None or (is_home and is_main):  # one after the other
+    if running_simulation() is not None or (is_home and _is_main()):  # one after the other
         return function(item), ""
-    thread = 0 if is_main else threading.get_ident()
-    if is_home or not (is_main or _is_only_thread_of_dask()):
+    thread = 0 if _is_main() else threading.get_ident()
+    if is_home or not (_is_main() or _is_only_thread_of_dask()):
         simulation = RunningSimulation(thread)
         return simulation.run(function, item), simulation.shared
     try:
@@ -150,12 +139,18 @@ def run_in_folder(function: Callable[[Any], Any], item: Any, sender: Sender | No
     return result, shared
 
 
-def _get_ready(sender: Sender) -> None:
-    """Make the folder for simulations of a sender, so that this does not count as time of the first simulation."""
-    is_main = threading.current_thread() is threading.main_thread()
-    if sender.process != process_name() and running_simulation() is None and is_main:
-        with contextlib.suppress(OSError):
-            _mirror_for(sender)
+def _is_main() -> bool:
+    return threading.current_thread() is threading.main_thread()
+
+
+def _is_only_thread_of_dask() -> bool:
+    """Whether this is the thread of a dask worker that runs one task at a time."""
+    distributed = sys.modules.get("distributed")
+    try:
+        distributed.get_worker()
+        return [worker.state.nthreads for worker in distributed.Worker._instances] == [1]
+    except (AttributeError, ValueError):
+        return False
 
 
 def _mirror_for(sender: Sender) -> "_Mirror":
@@ -172,7 +167,7 @@ def _run_in_mirror(
     """Result or exception of a simulation, and the first file that it shares with others."""
     is_wanted = True
     while is_wanted:
-        mirror.prepare()
+        mirror.show()
         simulation = RunningSimulation(thread, mirror.path, mirror.hop, mirror.base)
         argument, result, error, before = copy.deepcopy(item), None, None, working_folder()
         os.chdir(mirror.path)
@@ -186,29 +181,16 @@ def _run_in_mirror(
         if mirror.owner != os.getpid():  # the simulation has forked, and its copy has returned as well
             return result, error, ""
         is_wanted = mirror.was_written_through() and not isinstance(error, KeyboardInterrupt)
-    reason = reason_of(error) if error is not None else result[1] if _is_failure(result) else ""
-    is_kept = reason and sender.keep and mirror.has_changed
-    kept = keep_folder(Path(mirror.path), sender.keep, reason) if is_kept else None
-    mirror.clean(anew=kept is not None or simulation.has_programs)  # which may still write
+    is_failure = isinstance(result, tuple) and len(result) == 2 and result[0] is None and isinstance(result[1], str)
+    reason = reason_of(error) if error is not None else result[1] if is_failure else ""
+    kept = None
+    if reason and sender.keep and mirror.has_changed:
+        kept = keep_folder(Path(mirror.path), sender.keep, reason)
+    mirror.is_new = kept is None and not simulation.has_programs  # which may still write
     if kept is not None and not isinstance(error, UnusableModel | KeyboardInterrupt):
         reason = reworded(reason, f"{reason} (its folder is {kept})")
         error, result = (None, (None, reason)) if error is None else (RunFailed(reason), None)
     return result, error, simulation.shared
-
-
-def _is_failure(result: Any) -> bool:
-    """Whether a result is an `Outcome` with a reason."""
-    return isinstance(result, tuple) and len(result) == 2 and result[0] is None and isinstance(result[1], str)
-
-
-def _is_only_thread_of_dask() -> bool:
-    """Whether this is the thread of a dask worker that runs one task at a time."""
-    distributed = sys.modules.get("distributed")
-    try:
-        distributed.get_worker()
-        return [worker.state.nthreads for worker in distributed.Worker._instances] == [1]
-    except (AttributeError, ValueError):
-        return False
 
 
 def keep_folder(place: Path, folder: str | Path, reason: str) -> Path | None:
@@ -276,15 +258,11 @@ def discard(process: int, reason: str = "") -> str:
     return "" if kept is None else f" (its folder is {kept})"
 
 
-Stamp = tuple[int, int, int]
-"""Time of modification [ns], size and inode of a file."""
-
-
 class _Mirror:
     """A folder `path` that shows another folder, `base`, to one simulation after the other.
 
     Links go through one link, `hop`, whose time of access tells whether any of them was used. A time of modification
-    of 0 says that nothing was added or removed in a folder.
+    of 0 says that nothing was added or removed in a folder. If not `is_new`, the next simulation gets another folder.
     """
 
     def __init__(self, sender: Sender) -> None:
@@ -300,168 +278,110 @@ class _Mirror:
         with contextlib.suppress(FileNotFoundError):
             os.stat(self.hop)
         self._has_access_times = os.lstat(self.hop).st_atime_ns != 0  # not on every file system
-        self._private: set[str] = set()
-        # folders that contain these paths must not be shown: they would be within themselves
-        self._above = os.path.join(os.path.realpath(self.base), ""), os.path.join(self._place, "")
-        parent = os.path.dirname(self.base)
-        for entry in _scan(parent, _MOST_USED) if self.base else ():
+        self._private: set[str] = set()  # files that were written through their links
+        for entry in _scan(os.path.dirname(self.base), _MOST_LINKS) if self.base else ():
             with contextlib.suppress(FileExistsError):
                 os.symlink(entry.path, os.path.join(self._place, entry.name))
-        self._build()
+        self.path, self.is_new = "", False
+        self.show()
 
-    def _build(self) -> None:
-        self.path = tempfile.mkdtemp(prefix="run_", dir=self._place)
-        self._files: dict[str, tuple[str, Stamp | None]] = {}  # linked files: paths and stamps
-        self._linked: set[str] = set()  # linked folders
-        self._folders: dict[str, Stamp | None] = {}  # folders of `base` that are shown
-        self._names: dict[str, set[str]] = {}  # what is shown in each of them, besides private files
-        self._left = _MOST_BELOW
-        self._fill("", _scan(self.base))
-        _mark(self.hop)
-
-    def _fill(self, folder: str, entries: list[os.DirEntry]) -> None:
-        """Show entries of a folder of `base`, and those of its subfolders."""
-        waiting = [(folder, entries)]
-        while waiting:
-            folder, entries = waiting.pop(0)
-            self._folders.setdefault(folder, _stamp(os.path.join(self.base, folder)))
-            names = self._names.setdefault(folder, set())
-            for entry in entries:
-                name = os.path.join(folder, entry.name)
-                if (below := self._entries_of(name, entry)) is not None:
-                    os.mkdir(os.path.join(self.path, name))
-                    waiting.append((name, below))
-                elif entry.is_dir():
-                    self._link(name)
-                    self._linked.add(name)
-                elif name not in self._private:
-                    self._link(name)
-                    if entry.is_file():
-                        self._files[name] = self._stamped(name)
-                else:
-                    continue
-                names.add(entry.name)
-        self._settle()
-
-    def _entries_of(self, name: str, entry: os.DirEntry) -> list[os.DirEntry] | None:
-        """Entries of a folder that is shown as a folder; None for what is shown as a link."""
-        if not self._may_be_folder(entry) or (name not in self._private and entry.name.startswith(".")):
-            return None
-        most = _MOST_USED if name in self._private else self._left
-        entries = _scan(entry.path, most + 1)
-        if len(entries) > most:
-            return None
-        self._left -= 0 if name in self._private else len(entries)
-        return entries
-
-    def _settle(self) -> None:
-        """Nothing that was added or removed so far was added or removed by a simulation."""
-        for name in self._folders:
-            os.utime(os.path.join(self.path, name), ns=(0, 0))
-
-    def _may_be_folder(self, entry: os.DirEntry) -> bool:
-        """Whether a folder, or a link to one, may be shown as a folder."""
-        return entry.is_dir() and not any(
-            each.startswith(os.path.realpath(entry.path) + os.sep) for each in self._above
-        )
-
-    def _stamped(self, name: str) -> tuple[str, Stamp | None]:
-        path = os.path.join(self.base, name)
-        return path, _stamp(path)
-
-    def _link(self, name: str) -> None:
-        os.symlink(self._through_hop(name), os.path.join(self.path, name))
-        _mark(os.path.join(self.path, name))
-
-    def _through_hop(self, name: str) -> str:
-        return os.path.join(self.hop, name)
-
-    def prepare(self) -> None:
-        """Show what `base` contains now, before a simulation."""
-        for name, stamp in list(self._folders.items()):
-            folder = os.path.join(self.base, name)
-            if stamp is None or _status(folder) != stamp:
-                self._folders[name] = _stamp(folder)
-                private = {n for n in self._private if os.path.dirname(n) == name and n not in self._folders}
-                entries = {entry.name: entry for entry in _scan(folder)}
-                gone = {os.path.join(name, each) for each in self._names[name] - entries.keys()}
-                if gone & self._folders.keys():
-                    self._anew()
-                    break
-                new = entries.keys() - self._names[name] - set(map(os.path.basename, private))
-                for each in gone:
-                    os.unlink(os.path.join(self.path, each))
-                    self._files.pop(each, None)
-                    self._linked.discard(each)
-                self._names[name] -= set(map(os.path.basename, gone))
-                if gone or new:
-                    self._fill(name, [entries[each] for each in sorted(new)])
-        for name in self._private.difference(self._folders, self._linked):
+    def show(self) -> None:
+        """Show what `base` contains now, and nothing that another simulation has left."""
+        if not self.is_new:
+            shutil.rmtree(self.path, ignore_errors=True)
+            self.path, self.is_new = tempfile.mkdtemp(prefix="run_", dir=self._place), True
+            self._shown: dict[str, tuple[Stamp | None, dict[str, bool]]] = {}  # folders; whether entries are folders
+            self._files: dict[str, Stamp | None] = {}  # that are linked
+        folders = [""]
+        for folder in folders:
+            folders += self._show_folder(folder)
+        for name in self._private:
             with contextlib.suppress(FileNotFoundError):
                 shutil.copy2(os.path.join(self.base, name), os.path.join(self.path, name))
+                os.utime(os.path.join(self.path, os.path.dirname(name)), ns=(0, 0))
+        _mark(self.hop)
+
+    def _show_folder(self, folder: str) -> list[str]:
+        """Show the entries of a folder of `base`; returns those that are shown as folders."""
+        place, source = os.path.join(self.path, folder), os.path.join(self.base, folder)
+        before, names = self._shown.get(folder, (None, {}))
+        if before is None or _status(source) != before or not self._is_untouched(folder):
+            stamp, entries = _stamp(source), _scan(source)
+            for each in names.keys() - {entry.name for entry in entries}:
+                self._drop(os.path.join(folder, each))
+            names = {entry.name: names.get(entry.name) or self._is_folder(entry) for entry in entries}
+            self._shown[folder] = stamp, names
+            missing = dict(names)
+            for entry in _scan(place):
+                name = os.path.join(folder, entry.name)
+                is_link, is_folder = entry.is_symlink(), entry.is_dir(follow_symlinks=False)
+                if entry.name in names and (
+                    is_folder if names[entry.name] else is_link and os.readlink(entry.path) == self._target(name)
+                ):
+                    del missing[entry.name]
+                elif is_folder:
+                    shutil.rmtree(entry.path, ignore_errors=True)
+                else:
+                    os.unlink(entry.path)
+            for name, is_folder in ((os.path.join(folder, each), shown) for each, shown in missing.items()):
+                if is_folder:
+                    os.mkdir(os.path.join(self.path, name))
+                elif name not in self._private:
+                    os.symlink(self._target(name), os.path.join(self.path, name))
+                    _mark(os.path.join(self.path, name))
+                    self._files[name] = _stamp(os.path.join(self.base, name))
+            os.utime(place, ns=(0, 0))
+        return [os.path.join(folder, name) for name, is_folder in names.items() if is_folder]
+
+    def _is_folder(self, entry: os.DirEntry) -> bool:
+        """Whether an entry of `base` is shown as a folder, not as a link.
+
+        Hidden folders are not, many files, and folders that contain the mirror, which would be within itself.
+        """
+        if not entry.is_dir() or entry.name.startswith("."):
+            return False
+        above = os.path.realpath(entry.path) + os.sep
+        if any(os.path.join(each, "").startswith(above) for each in (os.path.realpath(self.base), self._place)):
+            return False
+        left = _MOST_LINKS - sum(len(names) for folder, (_, names) in self._shown.items() if folder)
+        return len(_scan(entry.path, left + 1)) <= left
+
+    def _drop(self, name: str) -> None:
+        """Forget a file or folder that is not in `base` any more."""
+        for known in (self._shown, self._files):
+            for each in [each for each in known if each == name or each.startswith(name + os.sep)]:
+                del known[each]
+
+    def _target(self, name: str) -> str:
+        return os.path.join(self.hop, name)
 
     def was_written_through(self) -> bool:
-        """Whether files of `base` have changed whose links were used, or a linked folder was used.
-
-        The files are private from now on, and the folders are shown as folders.
-        """
+        """Whether files of `base` have changed whose links were used; they are private from now on."""
         if self._has_access_times and os.lstat(self.hop).st_atime_ns == 0:
             return False
-        changed = [name for name, (path, stamp) in self._files.items() if stamp is None or _status(path) != stamp]
-        self._files |= {name: self._stamped(name) for name in changed}
+        paths = {name: os.path.join(self.base, name) for name in self._files}
+        changed = [name for name, stamp in self._files.items() if stamp is None or _status(paths[name]) != stamp]
+        self._files |= {name: _stamp(paths[name]) for name in changed}
         written = {n for n in changed if not self._has_access_times or _access(os.path.join(self.path, n))}
-        if self._has_access_times:
-            written |= {n for n in self._linked if _access(os.path.join(self.path, n))} - self._private
-        _mark(self.hop)
-        if written:
-            self._private |= written
-            self._anew()
+        written = {name for name in written if not os.path.isdir(paths[name])}
+        self._private |= written
+        self.is_new = self.is_new and not written
         return bool(written)
-
-    def clean(self, anew: bool) -> None:
-        """Remove what a simulation has left; with `anew`, the next simulation gets a folder of another name."""
-        if anew or not all(self._mend(name) for name in list(self._folders) if not self._is_untouched(name)):
-            self._anew()
-
-    def _mend(self, folder: str) -> bool:
-        """Remove what a simulation has added to a folder, and show what it has removed; False if that is too much."""
-        place, missing = os.path.join(self.path, folder), set(self._names[folder])
-        if os.path.islink(place) or not os.path.isdir(place):
-            return False
-        for entry in _scan(place):
-            name = os.path.join(folder, entry.name)
-            is_link, is_folder = entry.is_symlink(), entry.is_dir(follow_symlinks=False)
-            if entry.name in missing and (
-                is_folder if name in self._folders else is_link and os.readlink(entry.path) == self._through_hop(name)
-            ):
-                missing.remove(entry.name)
-            elif is_folder:
-                shutil.rmtree(entry.path, ignore_errors=True)
-            else:
-                os.unlink(entry.path)
-        names = {os.path.join(folder, name) for name in missing}
-        if names & self._folders.keys():
-            return False
-        for name in names:
-            self._link(name)
-        os.utime(place, ns=(0, 0))
-        return True
 
     @property
     def has_changed(self) -> bool:
         """Whether a simulation has added or removed files or folders."""
-        return not all(map(self._is_untouched, self._folders))
+        return not all(map(self._is_untouched, self._shown))
 
-    def _is_untouched(self, name: str) -> bool:
+    def _is_untouched(self, folder: str) -> bool:
         """Whether a simulation has added and removed nothing in a folder."""
         with contextlib.suppress(OSError):
-            status = os.lstat(os.path.join(self.path, name))
-            return stat.S_ISDIR(status.st_mode) and status.st_mtime_ns == 0
+            return os.lstat(os.path.join(self.path, folder)).st_mtime_ns == 0
         return False
 
-    def _anew(self) -> None:
-        shutil.rmtree(self.path, ignore_errors=True)
-        self._build()
+
+Stamp = tuple[int, int, int]
+"""Time of modification [ns], size and inode of a file."""
 
 
 def _mark(link: str) -> None:
