@@ -71,7 +71,7 @@ def observed(label: ModelLabel, pool: Any) -> Iterator[None]:
         return
     with observing() as observer:
         yield
-    label.add(observer.result(label.known) if pool is None else Opened(observer.noted))
+    label.add(observer.result(label.opened) if pool is None else Opened(observer.noted))
 
 
 def simulate_again(run: VerifyingRun, thetas: np.ndarray, label: ModelLabel) -> list[Simulated]:

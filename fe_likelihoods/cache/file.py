@@ -25,7 +25,7 @@ try:
 except ImportError:  # without file locks, two programs must not move the same damaged file aside at the same time
     lock_file = None
 
-from .rows import COLUMNS, LAYOUT, STORE, is_undamaged, transaction
+from .rows import COLUMNS, LABEL_COLUMNS, LAYOUT, STORE, STORE_LABEL, is_undamaged, is_undamaged_label, transaction
 
 __all__ = ["APPLICATION_ID", "SCHEMA_VERSION", "CacheFile"]
 
@@ -101,18 +101,14 @@ class CacheFile:
         A damaged cache is moved aside with a warning, and a new one is created.
         """
         folder = self.path.parent
-        if self.path.is_dir():
-            raise ValueError(f"{self.path} is a folder; give the path of a file, such as 'cache.sqlite' in it")
-        if not folder.is_dir():
-            raise ValueError(f"{self.path} cannot be created: there is no folder {folder}; create it first")
-        if not self.path.exists() and not os.access(folder, os.W_OK | os.X_OK):
-            raise ValueError(f"{self.path} cannot be created: {folder} is not writable; give another path")
+        if self.path.is_dir() or not folder.is_dir():
+            raise ValueError(f"{self.path}: expected the path of a file in an existing folder, as 'cache.sqlite'")
         with self._exclusive():  # another process may move a damaged file aside between the two questions
-            is_there = self.path.exists()
-            is_usable = os.access(self.path, os.R_OK | os.W_OK) and os.access(folder, os.W_OK | os.X_OK)
-        if is_there and not is_usable:
+            is_usable = not self.path.exists() or os.access(self.path, os.R_OK | os.W_OK)
+            is_usable = is_usable and os.access(folder, os.W_OK | os.X_OK)
+        if not is_usable:
             raise ValueError(
-                f"{self.path} or its folder is not writable or readable for this user; copy it to another one"
+                f"{self.path} or its folder is not writable or readable for this user; give another path, or copy it"
             )
         with _lock:
             try:
@@ -351,17 +347,20 @@ class CacheFile:
 
 
 def _salvage(damaged: Path, connection: sqlite3.Connection) -> int:
-    """Copy the rows of a damaged file that can be read to a new one; return their number.
+    """Copy the rows and labels of a damaged file that can be read to a new one; return the number of rows.
 
-    Rows are read from the first on and from the last on, until a damaged page. Each row has a checksum, so nothing
-    wrong is copied. Labels are not copied: rows without a label are compared with new simulations before they are used.
+    They are read from the first on and from the last on, until a damaged page. Each has a checksum, so nothing wrong is
+    copied.
     """
     with contextlib.suppress(sqlite3.Error), transaction(connection):
-        connection.executemany(STORE, filter(is_undamaged, _readable_rows(damaged)))
+        rows = _readable(damaged, "rows", f"id, {COLUMNS}, stops", COLUMNS)
+        connection.executemany(STORE, filter(is_undamaged, rows))
+        labels = _readable(damaged, "labels", LABEL_COLUMNS, LABEL_COLUMNS)
+        connection.executemany(STORE_LABEL, filter(is_undamaged_label, labels))
     return connection.execute("SELECT count(*) FROM rows").fetchone()[0]
 
 
-def _readable_rows(damaged: Path) -> Iterator[tuple]:
+def _readable(damaged: Path, table: str, names: str, columns: str) -> Iterator[tuple]:
     # a file without a log is not in use, and gets no log
     options = "mode=ro" if damaged.with_name(f"{damaged.name}-wal").exists() else "mode=ro&immutable=1"
     for order in ("ASC", "DESC"):
@@ -370,6 +369,8 @@ def _readable_rows(damaged: Path) -> Iterator[tuple]:
                 source.text_factory = bytes
                 source.execute("PRAGMA writable_schema = ON")  # so that a truncated file can be read
                 # by places and `rowid`, because names in the layout may be damaged as well
-                names = f"WITH readable (number, id, {COLUMNS}, stops) AS (SELECT rowid, * FROM rows)"
-                yield from source.execute(f"{names} SELECT {COLUMNS} FROM readable ORDER BY number {order}")
+                query = (
+                    f"WITH readable (number, {names}) AS (SELECT rowid, * FROM {table}) SELECT {columns} FROM readable"
+                )
+                yield from source.execute(f"{query} ORDER BY number {order}")
                 return

@@ -1,12 +1,14 @@
 """Rows of the simulation cache: what they contain, their keys and checksums, and how they are read and written.
 
-One table has the rows of all simulations. A row belongs to an identity, the `source`: that of a model against
-measurements, whose values are statistics, or that of a model, whose values are responses [SI] and whose failures are
-valid for any measurements. A row without values is a failure. The generation 0 of a model has its remark.
+One table has the rows of all simulations, another one the labels of models with their generations. A row belongs to an
+identity, the `source`: that of a model against measurements, whose values are statistics, or that of a model, whose
+values are responses [SI] and whose failures are valid for any measurements. A row without values is a failure. The
+generation 0 of a model has its remark.
 """
 
 import contextlib
 import hashlib
+import json
 import sqlite3
 import struct
 import zlib
@@ -19,13 +21,17 @@ from ..simulation.faults import MisfitReason, TransientReason
 
 __all__ = [
     "COLUMNS",
+    "LABEL_COLUMNS",
     "LAYOUT",
     "MIN_STOPS",
     "STORE",
+    "STORE_LABEL",
     "CachedRows",
     "Place",
     "Row",
     "is_undamaged",
+    "is_undamaged_label",
+    "pack_label",
     "pack_rows",
     "reason_of",
     "select_rows",
@@ -55,6 +61,8 @@ STORE = (
     "stops = CASE WHEN time_limit = excluded.time_limit THEN stops + 1 ELSE 1 END, time_limit = excluded.time_limit "
     "WHERE length(reason) > 0"  # a success is never overwritten
 )
+LABEL_COLUMNS = "source, code, files, generation, crc"
+STORE_LABEL = f"INSERT OR REPLACE INTO labels ({LABEL_COLUMNS}) VALUES (?, ?, ?, ?, ?)"
 MIN_STOPS = 2  # stops at a time limit before the simulation counts as too slow; a busy machine may cause the first
 KEY_BYTES = 16
 KEYS_PER_QUERY = 500  # keys in one SELECT
@@ -173,6 +181,17 @@ def is_undamaged(row: tuple) -> bool:
         return row[10] == _checksum(*row[:10])
     except (TypeError, struct.error):  # damage may change the type of a value
         return False
+
+
+def pack_label(source: int, code: str, files: dict[str, str], generation: int) -> tuple:
+    """Values of `LABEL_COLUMNS`."""
+    values = source, code.encode(), json.dumps(files, sort_keys=True).encode(), generation
+    return *values, zlib.crc32(repr(values).encode())
+
+
+def is_undamaged_label(row: tuple) -> bool:
+    """Whether the values of `LABEL_COLUMNS` match their checksum."""
+    return row[4] == zlib.crc32(repr(row[:4]).encode())
 
 
 def reason_of(row: Row) -> str:

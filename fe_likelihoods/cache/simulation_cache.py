@@ -26,6 +26,7 @@ from ..simulation.model import Model
 from .file import CacheFile
 from .rows import (
     COLUMNS,
+    LABEL_COLUMNS,
     MIN_STOPS,
     STORE,
     CachedRows,
@@ -271,23 +272,17 @@ class SimulationCache:
             self.store(model.fingerprint, nothing, nothing, [text], 0.0, 0, of_model=True)
             self._remark = text
 
-    def look_up_remark(self, model: Model) -> str:
-        """Remark of a model; empty if there is none."""
-        rows = self.rows_of(simulation_keys(model.fingerprint, np.zeros((1, 0)), 0))
-        return reason_of(rows[0]) if rows else ""
-
     def repeat_remark(self, model: Model, fingerprint: str) -> None:
         """Log a model's stored remark, once per process, unless the model has just made a remark itself.
 
         A built-in model warns once if a simulation was beyond the range of its laws. Without the stored remark, a later
         process that uses cached simulations would give no warning.
         """
-        if not hasattr(model, "range_remark") or (str(self.path), fingerprint) in _repeated:
-            return
-        _repeated.add((str(self.path), fingerprint))
-        text = self.look_up_remark(model)
-        if text and not model.range_remark:
-            logger.warning("simulations of this model in %s: %s", self.path, text)
+        if hasattr(model, "range_remark") and (str(self.path), fingerprint) not in _repeated:
+            _repeated.add((str(self.path), fingerprint))
+            rows = self.rows_of(simulation_keys(fingerprint, np.zeros((1, 0)), 0))
+            if rows and not model.range_remark:
+                logger.warning("simulations of this model in %s: %s", self.path, reason_of(rows[0]))
 
     # the file -----------------------------------------------------------------------------------------------------
 
@@ -313,7 +308,7 @@ class SimulationCache:
             raise ValueError(f"{path} is the cache itself; give another file")
         other.close()
         before = self.info().simulations
-        tables = ("rows", COLUMNS), ("labels", "source, code, files, generation, crc")
+        tables = ("rows", COLUMNS), ("labels", LABEL_COLUMNS)
 
         def insert(connection: sqlite3.Connection) -> None:
             connection.execute("ATTACH ? AS other", (str(other.path),))

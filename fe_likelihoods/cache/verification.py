@@ -34,7 +34,18 @@ from ..simulation.label import ModelLabel, cpu_name
 from ..simulation.local_pool import LocalPool
 from ..simulation.model import Model, SimulationBatch, misfit_of_responses
 from .comparison import DEFAULT_TOLERANCE, Simulated, VerifyingRun, difference_in_words, simulate_again
-from .rows import CachedRows, Place, Row, pack_rows, reason_of, source_number
+from .rows import (
+    LABEL_COLUMNS,
+    STORE_LABEL,
+    CachedRows,
+    Place,
+    Row,
+    is_undamaged_label,
+    pack_label,
+    pack_rows,
+    reason_of,
+    source_number,
+)
 from .simulation_cache import SimulationCache
 
 __all__ = ["ROWS", "StaleCache", "Trust", "VerifiedCache", "choose_rows"]
@@ -289,10 +300,10 @@ class VerifiedCache:
         Files that belong to other labels of the model count from now on.
         """
         label = self.label
-        query = "SELECT source, code, files, generation, crc FROM labels WHERE source = ? ORDER BY rowid"
-        rows = [row for row in self.cache.file.select(query, (source,)) if row[4] == zlib.crc32(repr(row[:4]).encode())]
+        rows = self.cache.file.select(f"SELECT {LABEL_COLUMNS} FROM labels WHERE source = ? ORDER BY rowid", (source,))
+        rows = list(filter(is_undamaged_label, rows))
         for row in rows:
-            label.add(Opened(json.loads(row[2])).read_again(), here=False)
+            label.add(Opened(json.loads(row[2])).read_again())
         known = None
         for row in rows:
             files = json.loads(row[2])
@@ -309,15 +320,11 @@ class VerifiedCache:
     def _use(self, source: int, generation: int) -> int:
         """Store to which generation the label belongs, with the files that simulations have opened by now."""
         label, trust = self.label, self._trust
-        trust.generations[source] = generation
-        row = source, label.code.encode(), json.dumps(label.opened.files, sort_keys=True).encode(), generation
-        row = *row, zlib.crc32(repr(row).encode())
-        before, trust.written[source] = trust.written.get(source), row
+        row = pack_label(source, label.code, label.opened.files, generation)
+        before, trust.generations[source], trust.written[source] = trust.written.get(source), generation, row
         if before != row:
-            self.cache.file.write(
-                ("DELETE FROM labels WHERE source = ? AND code = ? AND files = ?", [before[:3]] if before else []),
-                ("INSERT OR REPLACE INTO labels (source, code, files, generation, crc) VALUES (?, ?, ?, ?, ?)", [row]),
-            )
+            delete = "DELETE FROM labels WHERE source = ? AND code = ? AND files = ?"
+            self.cache.file.write((delete, [before[:3]] if before else []), (STORE_LABEL, [row]))
         return generation
 
     def _say(self, text: str, *values: Any) -> None:

@@ -20,7 +20,7 @@ import sys
 import sysconfig
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,6 +31,7 @@ __all__ = [
     "Opened",
     "RunningSimulation",
     "file_digest",
+    "mapped",
     "note",
     "observing",
     "of_this_library",
@@ -87,14 +88,14 @@ class _Observer:
 
     def result(self, known: Opened | None = None) -> Opened | None:
         """Files that were read and not written, including new modules and shared libraries; None if all are known."""
-        if known is not None and self.noted.keys() <= known.files.keys() and len(sys.modules) == len(self.modules):
-            if not any(path not in known.files and _counts(path) for path in self.read - self.written):
-                if known.shared or not self.shared:
-                    return None
-        new = [getattr(sys.modules[name], "__file__", None) for name in set(sys.modules) - self.modules]
-        read = self.read | {file for file in new if isinstance(file, str)} | set(_mapped())
-        files = {path: _digest_or(path, "") for path in read - self.written if _counts(path)}
-        return Opened({path: digest for path, digest in files.items() if digest} | self.noted, self.shared)
+        new = sys.modules.keys() - self.modules if len(sys.modules) != len(self.modules) else ()
+        read = {file for name in new if isinstance(file := getattr(sys.modules[name], "__file__", None), str)}
+        read |= self.read - self.written
+        if known is not None and self.noted.keys() <= known.files.keys() and (known.shared or not self.shared):
+            if not new and not any(path not in known.files and _counts(path) for path in read):
+                return None
+        files = {path: digest for path, digest in mapped(read).files.items() if path not in self.written}
+        return Opened(files | self.noted, self.shared)
 
     def see(self, path: Any, writes: bool = False) -> None:
         """Note a path, or the file that it shows if it is a link in the own folder of a simulation."""
@@ -330,14 +331,14 @@ def _digest_or(path: str, otherwise: str) -> str:
         return otherwise
 
 
-def _mapped() -> list[str]:
-    """Files mapped into this process's memory, such as shared libraries; on Linux only."""
-    try:
-        lines = Path("/proc/self/maps").read_text().splitlines()
-    except OSError:
-        return []
-    paths = [line.split(None, 5)[5:] for line in lines]
-    return [path for (path,) in filter(None, paths) if path.startswith("/") and not path.endswith("(deleted)")]
+def mapped(read: Iterable[str] = ()) -> Opened:
+    """Files that were read, and those mapped into this process's memory, such as shared libraries (on Linux only)."""
+    paths = set(read)
+    with contextlib.suppress(OSError):
+        lines = [line.split(None, 5)[5:] for line in Path("/proc/self/maps").read_text().splitlines()]
+        paths |= {path for (path,) in filter(None, lines) if path.startswith("/") and not path.endswith("(deleted)")}
+    files = {path: _digest_or(path, "") for path in paths if _counts(path)}
+    return Opened({path: digest for path, digest in files.items() if digest})
 
 
 def _counts(path: str) -> bool:

@@ -34,7 +34,7 @@ from typing import Any
 import numpy as np
 
 from .by_value import names_in
-from .files import Opened, file_digest
+from .files import Opened, file_digest, mapped
 from .user_code import LIBRARY, SCRIPTS, is_of_user, package_version, sources_digest
 
 __all__ = [
@@ -90,7 +90,7 @@ class ModelLabel:
         self.items = self._present(model)
         self.items |= {name: _first[name][1] for name in self.changing}
         self.observes = _has_user_code(model) or (statistic is not None and _defined_by_user(statistic))
-        self.opened, self._was_observed = Opened({}), False
+        self.opened = mapped() if self.observes else Opened({})
 
     @property
     def code(self) -> str:
@@ -105,14 +105,8 @@ class ModelLabel:
         items = {name: digest for name, digest in self.items.items() if name not in ("python", "library")}
         return _joined(items or {"kernels": KERNEL_HASH})
 
-    @property
-    def known(self) -> Opened | None:
-        """What simulations of this process opened; None before the first simulation."""
-        return self.opened if self._was_observed else None
-
-    def add(self, opened: Opened | None, here: bool = True) -> None:
-        """Add what simulations opened (`here`: in this process)."""
-        self._was_observed = self._was_observed or (here and opened is not None)
+    def add(self, opened: Opened | None) -> None:
+        """Add what simulations opened."""
         if opened is not None and not opened.files.keys() <= self.opened.files.keys():
             self.opened = opened | self.opened
 
