@@ -77,23 +77,6 @@ def test_duplicates_and_zeros_of_both_signs(path):
     assert likelihood.simulator.cache.info().simulations == 2
 
 
-def test_a_batch_needs_two_queries_and_one_write(path, thetas):
-    likelihood = likelihood_of(Batched(np.inf), path)
-    for shift in (1.0, 2.0):  # the first begins a generation, the second finds it
-        likelihood.misfit(thetas[:1] + shift)
-    statements = []
-    likelihood.simulator.cache.file.connection().set_trace_callback(statements.append)
-    likelihood.simulator.chunk_size = 1000
-    likelihood.misfit(thetas)
-    kinds = [statement.split()[0] for statement in statements]
-    assert kinds.count("SELECT") == 2  # of statistics, and of responses or failures where these are missing
-    assert kinds.count("BEGIN") == kinds.count("COMMIT") == 1
-    assert kinds.count("INSERT") == 300
-    statements.clear()
-    likelihood.misfit(thetas)
-    assert statements == []  # served by the cache in memory
-
-
 def test_a_batch_of_several_queries(path, rng):
     thetas = np.column_stack([rng.normal(size=2345), np.full(2345, 0.5)])
     likelihood_of(Line(), path).misfit(thetas[::2])

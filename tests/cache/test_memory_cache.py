@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fe_likelihoods.cache.memory import MemoryCache
 from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.likelihood.posterior import Posterior
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
@@ -85,21 +84,6 @@ def test_the_cache_is_not_pickled(rng):
     assert copy.simulator.memory_cache.most == 500
     np.testing.assert_array_equal(copy.log_likelihood(x), values)
     assert copy.model.runs == 200
-
-
-def test_the_least_recently_used_row_is_evicted():
-    memory = MemoryCache(2)
-    misfit, known = memory.look_up([], 3)
-    assert misfit.shape == (0, 3)
-    assert known == []
-    memory.store([b"a", b"b"], np.array([[1.0], [np.nan]]), ["", "diverged"])
-    assert memory.reason(b"b") == "diverged"
-    memory.look_up([b"a"], 1)
-    memory.store([b"c"], np.array([[3.0]]), [""])  # b is the least recently used
-    misfit, known = memory.look_up([b"a", b"b", b"c"], 1)
-    assert known == [True, False, True]
-    assert misfit[known].ravel().tolist() == [1.0, 3.0]
-    assert np.isnan(misfit[1, 0]) and not memory.reason(b"b")
 
 
 # fingerprint ----------------------------------------------------------------------------------------------------------

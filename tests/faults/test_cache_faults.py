@@ -22,6 +22,7 @@ from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.signals.channels import Measurements
 from fe_likelihoods.signals.records import Record
+from tests.covering import covering
 
 ROOT = Path(__file__).parents[2]
 MODEL = LinearOscillator(Record("sine", 0.02, np.sin(np.arange(20.0))))
@@ -234,8 +235,7 @@ def cut_to_its_header(path):
 DAMAGES = [zeros, cut_off, cut_to_its_header, overwritten_in_the_middle, another_column, without_a_table]
 
 
-@pytest.mark.parametrize("damage", DAMAGES, ids=lambda damage: damage.__name__)
-@pytest.mark.parametrize("before", [0, 2])
+@pytest.mark.parametrize(("damage", "before"), covering(DAMAGES, [0, 2], strength=1))
 def test_a_damaged_file_is_set_aside(filled, thetas, expected, caplog, damage, before):
     for n in range(1, before + 1):
         filled.with_name(f"{filled.name}.damaged-{n}").write_text("an earlier one")
