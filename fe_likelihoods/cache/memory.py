@@ -5,7 +5,6 @@ sampler returns to a point, and when a chain is evaluated again. Responses depen
 measurements. They are reused when a mode search is repeated, and by other likelihoods with the same model.
 """
 
-import logging
 import threading
 from collections import OrderedDict
 from collections.abc import Iterable, Sequence
@@ -14,8 +13,6 @@ from typing import Any
 import numpy as np
 
 __all__ = ["MemoryCache", "ResponseMemory", "distinct_keys", "thetas_of"]
-
-logger = logging.getLogger(__name__)
 
 _NAN = np.array([np.nan]).tobytes()
 _ENTRY_BYTES = 250  # memory of one stored response, besides its numbers
@@ -101,8 +98,7 @@ class MemoryCache(_Memory):
 class ResponseMemory(_Memory):
     """The most recently stored responses in double precision, and reasons of failures, in at most `most` bytes.
 
-    Likelihoods with the same model or shortened versions of it share one. The oldest are dropped (`dropped` counts
-    them); the first time, a message at level INFO.
+    Likelihoods with the same model or shortened versions of it share one. The oldest are dropped.
     """
 
     _what = "memory_bytes must be the size of the responses to keep in memory [bytes]"
@@ -129,18 +125,11 @@ class ResponseMemory(_Memory):
                 self._outcomes[fingerprint, key] = outcome if isinstance(outcome, str) else np.array(outcome)
                 while self._bytes > self.most:
                     self._bytes -= _size(self._outcomes.popitem(last=False)[1])
-                    if not self.dropped:
-                        logger.info(
-                            "responses are dropped from memory, the oldest first, because they have more than %d bytes "
-                            "(memory_bytes); they are simulated again if they are needed and in no cache on disk",
-                            self.most,
-                        )
-                    self.dropped += 1
 
     def clear(self) -> None:
         """Drop all outcomes."""
         super().clear()
-        self._bytes = self.dropped = 0
+        self._bytes = 0
 
 
 def _size(outcome: np.ndarray | str | None) -> int:

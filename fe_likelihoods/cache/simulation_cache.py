@@ -82,8 +82,7 @@ class SimulationCache:
         Store the response of every simulation. By default, only requested responses are stored
         (`FELikelihood.simulate`, guides).
     max_response_bytes : int
-        Largest size of all stored responses [bytes], at 8 bytes per channel and sample. The oldest are evicted; the
-        first time, a message at level INFO.
+        Largest size of all stored responses [bytes], at 8 bytes per channel and sample. The oldest are evicted.
     verify : bool
         Whether some stored rows are simulated again before other rows are used (`fe_likelihoods.cache.verification`).
         If the model's label is known: two rows per process, and one of every 100. If it is unknown, because code, a
@@ -147,7 +146,6 @@ class SimulationCache:
         self.damaged = 0
         self._waiting: list[Row] = []
         self._remark = ""  # that was stored last
-        self._said_evicted = False
 
     def __getstate__(self) -> tuple:
         settings = ("max_response_bytes", "responses", "verify", "tolerance")
@@ -220,18 +218,14 @@ class SimulationCache:
             self._waiting = [] if written else [row for row in rows if not row.size][-MAX_WAITING_ROWS:]
 
     def _insert(self, connection: sqlite3.Connection, rows: list[Row]) -> None:
-        responses, limit = 0, (self.max_response_bytes,)
+        limit = (self.max_response_bytes,)
         with transaction(connection):
             connection.executemany(STORE, rows)
             too_many = "SELECT total(size) > ? FROM rows WHERE size > 0"
             if any(row.size for row in rows) and connection.execute(too_many, limit).fetchone()[0]:
                 sums = "SELECT id, sum(size) OVER (ORDER BY id DESC) AS newest FROM rows WHERE size > 0"
                 evict = f"DELETE FROM rows WHERE id IN (SELECT id FROM ({sums}) WHERE newest > ?)"
-                responses = connection.execute(evict, limit).rowcount
-        if responses and not self._said_evicted:
-            self._said_evicted = True
-            text = "%s: the oldest responses are evicted, because all have more than %d bytes (max_response_bytes)"
-            logger.info(text, self.path, self.max_response_bytes)
+                connection.execute(evict, limit)
 
     # generations --------------------------------------------------------------------------------------------------
 
