@@ -158,7 +158,7 @@ class VerifiedCache:
 
     def __init__(self, cache: SimulationCache, label: ModelLabel, model: Model) -> None:
         # user code may depend on what no label contains: there, each model object is verified
-        same = cache.path, cache.file.identity, cache.verify, label.code, model.fingerprint
+        same = cache.path, cache.file.version, cache.verify, label.code, model.fingerprint
         self._set_up(cache, Trust.of(label, secrets.token_hex(16) if label.observes else repr(same)))
 
     def _set_up(self, cache: SimulationCache, trust: Trust) -> None:

@@ -334,6 +334,15 @@ def test_a_model_may_change_its_own_values(workshop, helper, monkeypatch):
     assert workshop.run().simulator.verifications == USUAL  # the label is that of the beginning
 
 
+def test_values_that_a_model_changes_itself_are_known_of_one_import(workshop):
+    workshop.write(helper=COUNTERS["counter"])
+    first = workshop.run(points=POINTS[:10])
+    assert label.ModelLabel(first.model).code == first.simulator._checked.label.code
+    again = workshop.run(points=POINTS[:0])
+    sys.modules["helper"].calls = 5  # by a script
+    assert label.ModelLabel(again.model).code != first.simulator._checked.label.code
+
+
 # labels ---------------------------------------------------------------------------------------------------------------
 
 

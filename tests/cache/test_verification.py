@@ -378,6 +378,16 @@ def test_a_file_that_replaces_another_one_is_verified(path):
     assert misfit() == (0, 2)
 
 
+def test_a_file_that_is_made_again_gets_the_label_too(path):
+    """It may have the inode of the removed one."""
+    for _ in range(3):
+        path.unlink(missing_ok=True)
+        likelihood = oscillator(path)
+        likelihood.misfit([[1.0, 0.9]])
+        assert likelihood.simulator.cache.file.select("SELECT count(*) FROM labels") == [(1,)]
+        likelihood.simulator.cache.close()
+
+
 # copies ---------------------------------------------------------------------------------------------------------------
 
 
