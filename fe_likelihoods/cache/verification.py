@@ -414,8 +414,9 @@ class VerifiedCache:
         source, difference = source_number(run.fingerprint), self._difference(row, new, run)
         if self.cache.file.select(query, (source, generation)) > [(1,)]:
             # the model has changed in a part of the space where no row was compared, or by what no label contains
-            trust.generations.clear()
-            self._use(source, self._new_generation([generation]))
+            new_generation = self._new_generation([generation])
+            for each in {source, *trust.generations}:
+                self._use(each, new_generation)
             self._say(DIFFER, type(run.model).__name__)
             if not used:
                 return False
