@@ -13,20 +13,16 @@ from ..signals.comparison import Comparison
 from ..simulation.files import Opened, observing
 from ..simulation.label import ModelLabel
 from ..simulation.model import Model, misfit_of_responses, most_responses, simulate_batch
-from ..simulation.user_code import is_of_user
 
 __all__ = [
-    "DEFAULT_TOLERANCE",
     "Simulated",
     "VerifyingRun",
     "difference_in_words",
     "largest_difference",
     "observed",
-    "response_tolerance",
     "simulate_again",
 ]
 
-DEFAULT_TOLERANCE = 1e-9
 ROUNDING = 1e-13  # relative error of a sum of squares, since processors add the terms in different orders
 
 
@@ -39,17 +35,12 @@ class VerifyingRun:
     measured: np.ndarray | Comparison  # response (n_channels, n_steps) [SI]
     statistic: Statistic | None  # that is stored; None: sums of squares
     n_numbers: int  # length of the statistic
-    tolerance: float | None = None  # as for `SimulationCache`
+    tolerance: float  # as for `SimulationCache`
 
     @cached_property
     def fingerprint(self) -> str:
         """Declared identity of the model, when it was first asked for."""
         return self.model.fingerprint
-
-    @property
-    def accepted(self) -> float:
-        """Accepted difference of two responses on one processor, relative to their norm."""
-        return response_tolerance(self.model) if self.tolerance is None else self.tolerance
 
 
 class Simulated(NamedTuple):
@@ -91,24 +82,12 @@ def simulate_again(run: VerifyingRun, thetas: np.ndarray, label: ModelLabel) -> 
 # differences ----------------------------------------------------------------------------------------------------------
 
 
-def response_tolerance(model: Model) -> float:
-    """Accepted relative difference between two responses of a model with the same parameters.
-
-    It is zero for the compiled models of this library, which repeat to the last bit on the same processor, and 1e-9 for
-    models of the user, because sums over several threads may differ in their last digits.
-    """
-    of_user = is_of_user(type(model).__module__)
-    return DEFAULT_TOLERANCE if of_user else float(getattr(model, "response_tolerance", DEFAULT_TOLERANCE))
-
-
-def difference_in_words(
-    earlier: np.ndarray, reason: str, new: Simulated, run: VerifyingRun, tolerance: float
-) -> tuple[str, float]:
+def difference_in_words(earlier: np.ndarray, reason: str, new: Simulated, run: VerifyingRun) -> tuple[str, float]:
     """How a simulation differs from an earlier one, in words and relative to the response norm; empty if it agrees."""
     if reason or new.reason:
         was, now = (f"failed ({text})" if text else "succeeded" for text in (reason, new.reason))
         return ("" if reason and new.reason else f"it {was}; simulated again, it {now}"), 0.0
-    found = largest_difference(earlier, new.misfit, new.norm, tolerance, needs_response(run.statistic))
+    found = largest_difference(earlier, new.misfit, new.norm, run.tolerance, needs_response(run.statistic))
     if found is None:
         return "", 0.0
     index, change = found

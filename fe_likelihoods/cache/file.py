@@ -360,7 +360,7 @@ def _salvage(damaged: Path, connection: sqlite3.Connection) -> int:
     copied.
     """
     with contextlib.suppress(sqlite3.Error), transaction(connection):
-        rows = _readable(damaged, "rows", f"id, {COLUMNS}, stops", COLUMNS)
+        rows = _readable(damaged, "rows", f"id, {COLUMNS}", COLUMNS)
         connection.executemany(STORE, filter(is_undamaged, rows))
         labels = _readable(damaged, "labels", LABEL_COLUMNS, LABEL_COLUMNS)
         connection.executemany(STORE_LABEL, filter(is_undamaged_label, labels))

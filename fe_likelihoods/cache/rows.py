@@ -23,11 +23,9 @@ __all__ = [
     "COLUMNS",
     "LABEL_COLUMNS",
     "LAYOUT",
-    "MIN_STOPS",
     "STORE",
     "STORE_LABEL",
     "CachedRows",
-    "Place",
     "Row",
     "is_undamaged",
     "is_undamaged_label",
@@ -44,30 +42,25 @@ LAYOUT = (
     # the id orders rows by age; the size of a response [bytes] is 0 for failures of a model and empty for statistics
     "CREATE TABLE rows (id INTEGER PRIMARY KEY, key BLOB NOT NULL UNIQUE, source INTEGER NOT NULL, "
     "generation INTEGER NOT NULL, theta BLOB NOT NULL, value BLOB NOT NULL, reason BLOB NOT NULL, "
-    "time_limit REAL NOT NULL, seconds REAL NOT NULL, cpu INTEGER NOT NULL, session INTEGER NOT NULL, "
-    "crc INTEGER NOT NULL, size INTEGER, stops INTEGER NOT NULL DEFAULT 1)",
+    "session INTEGER NOT NULL, crc INTEGER NOT NULL, size INTEGER)",
     "CREATE INDEX row_generations ON rows (source, generation)",
     "CREATE INDEX response_sizes ON rows (size) WHERE size > 0",  # for their sum without reading the responses
     # labels of models, and the generation of each label
     "CREATE TABLE labels (source INTEGER NOT NULL, code BLOB NOT NULL, files BLOB NOT NULL, "
     "generation INTEGER NOT NULL, crc INTEGER NOT NULL, UNIQUE (source, code, files))",
 )
-COLUMNS = "key, source, generation, theta, value, reason, time_limit, seconds, cpu, session, crc, size"
+COLUMNS = "key, source, generation, theta, value, reason, session, crc, size"
 STORE = (
-    f"INSERT INTO rows ({COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?) "
-    "ON CONFLICT (key) DO UPDATE SET value = excluded.value, reason = excluded.reason, seconds = excluded.seconds, "
-    "cpu = excluded.cpu, session = excluded.session, crc = excluded.crc, size = excluded.size, "
-    # counts how often a simulation was stopped at the same time limit
-    "stops = CASE WHEN time_limit = excluded.time_limit THEN stops + 1 ELSE 1 END, time_limit = excluded.time_limit "
-    "WHERE length(reason) > 0"  # a success is never overwritten
+    f"INSERT INTO rows ({COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?) "
+    "ON CONFLICT (key) DO UPDATE SET value = excluded.value, reason = excluded.reason, session = excluded.session, "
+    "crc = excluded.crc, size = excluded.size WHERE length(reason) > 0"  # a success is never overwritten
 )
 LABEL_COLUMNS = "source, code, files, generation, crc"
 STORE_LABEL = f"INSERT OR REPLACE INTO labels ({LABEL_COLUMNS}) VALUES (?, ?, ?, ?, ?)"
-MIN_STOPS = 2  # stops at a time limit before the simulation counts as too slow; a busy machine may cause the first
 KEY_BYTES = 16
 KEYS_PER_QUERY = 500  # keys in one SELECT
 MAX_REASON_LENGTH = 2000
-NUMBERS = struct.Struct("<qqddqq")
+NUMBERS = struct.Struct("<qqq")
 
 
 class Row(NamedTuple):
@@ -79,20 +72,9 @@ class Row(NamedTuple):
     theta: bytes  # structural parameters
     value: bytes  # statistics or response; empty if it failed
     reason: bytes  # of the failure
-    time_limit: float  # that stopped the simulation [s]; 0 for other causes
-    seconds: float  # wall time [s]
-    cpu: int  # number of the processor; 0 if unknown
     session: int  # number of the process that stored the row
     crc: int
     size: int | None
-
-
-class Place(NamedTuple):
-    """Where rows belong: their generation, and the numbers of the processor and of the process that stores them."""
-
-    generation: int
-    cpu: int = 0
-    session: int = 0
 
 
 class CachedRows(NamedTuple):
@@ -144,41 +126,37 @@ def pack_rows(
     thetas: np.ndarray,
     values: np.ndarray,
     reasons: Sequence[str],
-    seconds: float,
-    place: Place,
+    generation: int,
+    session: int = 0,
     of_model: bool = False,
 ) -> list[Row]:
-    """Simulations as they are stored: statistics, or responses `of_model`; `seconds` is the wall time of all [s].
+    """Simulations as they are stored: statistics, or responses `of_model`.
 
-    Failures whose cause may be gone are left out: faults of the infrastructure, except time limits in the rows of a
-    model, and in these rows failures that depend on the measurements.
+    Failures whose cause may be gone are left out: faults of the infrastructure, and in the rows of a model failures
+    that depend on the measurements.
     """
     source, rows = source_number(fingerprint), []
-    keys = simulation_keys(fingerprint, thetas, place.generation)
+    keys = simulation_keys(fingerprint, thetas, generation)
     for key, theta, value, reason in zip(keys, thetas, values, reasons, strict=True):
-        limit = reason.time_limit if isinstance(reason, TransientReason) else 0.0
-        if isinstance(reason, MisfitReason if of_model else TransientReason):
-            continue
-        if isinstance(reason, TransientReason) and not limit:
+        if isinstance(reason, TransientReason) or (of_model and isinstance(reason, MisfitReason)):
             continue
         data = b"" if reason else np.asarray(value, dtype="<f8").tobytes()
         text = reason[:MAX_REASON_LENGTH].encode("utf-8", "backslashreplace")
-        parameters = np.asarray(theta, dtype="<f8").tobytes()
-        packed = key, source, place.generation, parameters, data, text, limit, seconds / len(keys), *place[1:]
+        packed = key, source, generation, np.asarray(theta, dtype="<f8").tobytes(), data, text, session
         rows.append(Row(*packed, _checksum(*packed), len(data) if of_model else None))
     return rows
 
 
-def _checksum(key, source, generation, theta, value, reason, time_limit, seconds, cpu, session) -> int:  # noqa: ANN001
+def _checksum(key, source, generation, theta, value, reason, session) -> int:  # noqa: ANN001
     """CRC-32 of a row; the key is included, so swapped rows count as damaged."""
-    numbers = NUMBERS.pack(source, generation, time_limit, seconds, cpu, session)
+    numbers = NUMBERS.pack(source, generation, session)
     return zlib.crc32(value, zlib.crc32(b"".join((key, numbers, theta, reason))))
 
 
 def is_undamaged(row: tuple) -> bool:
     """Whether the values of `COLUMNS` match their checksum."""
     try:
-        return row[10] == _checksum(*row[:10])
+        return row[7] == _checksum(*row[:7])
     except (TypeError, struct.error):  # damage may change the type of a value
         return False
 
@@ -196,8 +174,7 @@ def is_undamaged_label(row: tuple) -> bool:
 
 def reason_of(row: Row) -> str:
     """Reason of a stored failure."""
-    text = row.reason.decode("utf-8", "replace")
-    return TransientReason(text, row.time_limit) if row.time_limit else text
+    return row.reason.decode("utf-8", "replace")
 
 
 @contextlib.contextmanager

@@ -4,16 +4,13 @@ The statistics of a simulation depend neither on the noise parameters nor on the
 noise level, every tempering stage and every sampler. Its key is a digest of the declared identity (fingerprints of
 model and measurements), the generation, and the structural parameters to the last bit. Responses and failures of the
 model have keys of the model alone, for any measurements. Faults of the infrastructure
-(`fe_likelihoods.simulation.faults`) are not stored. A simulation that was stopped at a time limit is stored with this
-limit: a later run with a longer limit repeats it, and a run with the same or a shorter one repeats it once, because a
-busy machine may have been the cause.
+(`fe_likelihoods.simulation.faults`), also of a time limit, are not stored.
 
 A cache never makes a run fail. A row that does not match its checksum is simulated again, a damaged file is moved
 aside, and while the file cannot be written, rows wait in memory.
 """
 
 import logging
-import math
 import os
 import sqlite3
 from collections.abc import Collection, Sequence
@@ -27,10 +24,8 @@ from .file import CacheFile
 from .rows import (
     COLUMNS,
     LABEL_COLUMNS,
-    MIN_STOPS,
     STORE,
     CachedRows,
-    Place,
     Row,
     is_undamaged,
     pack_rows,
@@ -41,12 +36,13 @@ from .rows import (
     transaction,
 )
 
-__all__ = ["CacheInfo", "SimulationCache"]
+__all__ = ["TOLERANCE", "CacheInfo", "SimulationCache"]
 
 logger = logging.getLogger(__name__)
 
 MAX_WAITING_ROWS = 100_000  # rows kept in memory while the file cannot be written
 MAX_CANDIDATES = 5000  # rows from which the rows to compare are chosen
+TOLERANCE = 1e-9
 TIMEOUT = 30.0  # how long to wait for another writer [s]
 
 _repeated: set[tuple[str, str]] = set()  # remarks by file and model, in this process
@@ -60,7 +56,6 @@ class CacheInfo(NamedTuple):
     failures: int  # among the stored simulations
     responses: int
     response_bytes: int  # of the stored responses [bytes]
-    seconds: float  # wall time of the stored simulations [s]
     file_bytes: int  # without its write-ahead log [bytes]
 
 
@@ -88,9 +83,9 @@ class SimulationCache:
         If the model's label is known: two rows per process, and one of every 100. If it is unknown, because code, a
         file or a package has changed: 59 rows, which detect a change in 5 % of the parameter space with a probability
         of 95 %.
-    tolerance : float, optional
-        Accepted difference between a stored and a new response, relative to the response norm. By default 0 for the
-        compiled models of this library on the same processor, 1e-9 on another processor and for other models.
+    tolerance : float
+        Accepted difference between a stored and a new response, relative to the response norm. On another processor,
+        and in sums over several threads, the last digits differ.
 
     Attributes
     ----------
@@ -127,15 +122,15 @@ class SimulationCache:
         responses: bool = False,
         max_response_bytes: int = 2**30,
         verify: bool = True,
-        tolerance: float | None = None,
+        tolerance: float = TOLERANCE,
     ) -> None:
         if not isinstance(path, str | os.PathLike):
             raise ValueError(f"SimulationCache: expected the path of a file; got {path!r}")
         most = max_response_bytes
         if isinstance(most, bool) or not isinstance(most, int | np.integer) or most < 1:
             raise ValueError(f"SimulationCache: max_response_bytes must be a whole number of 1 or more; got {most!r}")
-        if tolerance is not None and not 0.0 <= tolerance < np.inf:
-            raise ValueError(f"SimulationCache: tolerance must be a number of 0 or more, or None; got {tolerance!r}")
+        if not 0.0 <= tolerance < np.inf:
+            raise ValueError(f"SimulationCache: tolerance must be a number of 0 or more; got {tolerance!r}")
         self.max_response_bytes, self.responses = int(max_response_bytes), bool(responses)
         self.verify, self.tolerance = bool(verify), tolerance
         self._begin(CacheFile(path, TIMEOUT))
@@ -166,46 +161,28 @@ class SimulationCache:
 
     # rows ---------------------------------------------------------------------------------------------------------
 
-    def look_up(
-        self,
-        fingerprint: str,
-        thetas: np.ndarray,
-        width: int,
-        generation: int | None = None,
-        time_limit: float | None = None,
-    ) -> CachedRows:
+    def look_up(self, fingerprint: str, thetas: np.ndarray, width: int, generation: int | None = None) -> CachedRows:
         """Look up simulations of `width` numbers each, with few queries for the whole batch.
 
-        Rows of another width count as damaged. `time_limit` is that of the model [s], if it has one.
+        Rows of another width count as damaged.
         """
-        keys, limit = self._keys(fingerprint, thetas, generation), time_limit or math.inf
+        keys = self._keys(fingerprint, thetas, generation)
         with self.file.lock:
             good, bad = {}, []
             for row in map(Row._make, self._rows(keys)):
-                if not is_undamaged(row) or not (row.reason or len(row.value) == 8 * width):
-                    bad.append(row.key)
-                elif not row.reason or not self._may_end(row, limit):
+                if is_undamaged(row) and (row.reason or len(row.value) == 8 * width):
                     good[row.key] = row
+                else:
+                    bad.append(row.key)
             self._drop(bad)
         return CachedRows([good.get(key) for key in keys], width)
 
-    def _may_end(self, row: Row, limit: float) -> bool:
-        """Whether a failed simulation was stopped at a shorter time limit [s] than the present one, or only once."""
-        return bool(row.time_limit) and (limit > row.time_limit or self._rows([row.key], "stops") < [(MIN_STOPS,)])
-
     def store(
-        self,
-        fingerprint: str,
-        thetas: np.ndarray,
-        values: np.ndarray,
-        reasons: Sequence[str],
-        seconds: float,
-        generation: int | None = None,
-        of_model: bool = False,
+        self, fingerprint: str, thetas: np.ndarray, values: np.ndarray, reasons: Sequence[str], of_model: bool = False
     ) -> None:
-        """Store simulations and evict the oldest, in one transaction, see `pack_rows`."""
-        place = Place(self._given_or_latest(fingerprint, generation))
-        self.write(pack_rows(fingerprint, thetas, values, reasons, seconds, place, of_model))
+        """Store simulations of the latest generation, see `pack_rows`."""
+        generation = self._given_or_latest(fingerprint, None)
+        self.write(pack_rows(fingerprint, thetas, values, reasons, generation, of_model=of_model))
 
     def write(self, rows: list[Row]) -> None:
         """Store rows, and those that wait, and evict the oldest, in one transaction."""
@@ -235,11 +212,11 @@ class SimulationCache:
         return [generation for (generation,) in self.file.select(query, (source_number(fingerprint),))]
 
     def candidates(self, fingerprint: str, generation: int, width: int) -> list[tuple[bytes, bytes]]:
-        """Keys and parameters of rows of one identity and generation, without failures at a time limit.
+        """Keys and parameters of rows of one identity and generation, random ones if there are many.
 
-        Random ones if there are many. Other values of these rows are read by `rows_of`.
+        Other values of these rows are read by `rows_of`.
         """
-        where = "WHERE source = ? AND generation = ? AND time_limit = 0 AND (length(value) = ? OR length(reason) > 0)"
+        where = "WHERE source = ? AND generation = ? AND (length(value) = ? OR length(reason) > 0)"
         query = f"SELECT key, theta FROM rows WHERE id IN (SELECT id FROM rows {where} ORDER BY random() LIMIT ?)"
         values = source_number(fingerprint), generation, 8 * width, MAX_CANDIDATES
         return self.file.select(query, values)
@@ -263,7 +240,7 @@ class SimulationCache:
         text = getattr(model, "range_remark", "")
         if text and text != self._remark:
             nothing = np.zeros((1, 0))
-            self.store(model.fingerprint, nothing, nothing, [text], 0.0, 0, of_model=True)
+            self.write(pack_rows(model.fingerprint, nothing, nothing, [text], 0, of_model=True))
             self._remark = text
 
     def repeat_remark(self, model: Model, fingerprint: str) -> None:
@@ -320,13 +297,13 @@ class SimulationCache:
     def info(self) -> CacheInfo:
         """State of the cache."""
         query = (
-            "SELECT total(size IS NULL), total(size IS NULL AND length(reason) > 0), total(size > 0), total(size), "
-            "total(seconds) FROM rows"
+            "SELECT total(size IS NULL), total(size IS NULL AND length(reason) > 0), total(size > 0), total(size) "
+            "FROM rows"
         )
         with self.file.lock:
-            *counted, seconds = (self.file.select(query) or [(0,) * 5])[0]
+            counted = (self.file.select(query) or [(0,) * 4])[0]
             size = self.path.stat().st_size if self.path.exists() else 0
-            return CacheInfo(self.path, *map(int, counted), seconds, size)
+            return CacheInfo(self.path, *map(int, counted), size)
 
     def forget(self, *fingerprints: str) -> int:
         """Delete all rows with these fingerprints, in all generations, for all users of the file; returns their number.
@@ -361,9 +338,9 @@ class SimulationCache:
     def _keys(self, fingerprint: str, thetas: np.ndarray, generation: int | None) -> list[bytes]:
         return simulation_keys(fingerprint, thetas, self._given_or_latest(fingerprint, generation))
 
-    def _rows(self, keys: list[bytes], columns: str = COLUMNS) -> list[tuple]:
+    def _rows(self, keys: list[bytes]) -> list[tuple]:
         """Stored rows with given keys."""
-        return self.file.attempt("read", lambda connection: select_rows(connection, keys, columns), [])
+        return self.file.attempt("read", lambda connection: select_rows(connection, keys, COLUMNS), [])
 
     def _delete(self, keys: Collection[bytes]) -> None:
         self.file.write(("DELETE FROM rows WHERE key = ?", [(key,) for key in keys]), what="repaired")

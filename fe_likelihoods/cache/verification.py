@@ -19,7 +19,6 @@ import os
 import secrets
 import threading
 import time
-import zlib
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator
 from hashlib import blake2b
@@ -30,15 +29,13 @@ import numpy as np
 
 from ..simulation.faults import TransientReason
 from ..simulation.files import Opened
-from ..simulation.label import ModelLabel, cpu_name
-from ..simulation.local_pool import LocalPool
+from ..simulation.label import ModelLabel
 from ..simulation.model import Model, SimulationBatch, misfit_of_responses
-from .comparison import DEFAULT_TOLERANCE, Simulated, VerifyingRun, difference_in_words, simulate_again
+from .comparison import Simulated, VerifyingRun, difference_in_words, simulate_again
 from .rows import (
     LABEL_COLUMNS,
     STORE_LABEL,
     CachedRows,
-    Place,
     Row,
     is_undamaged_label,
     pack_label,
@@ -97,7 +94,6 @@ class Trust:
 
     def __init__(self, label: ModelLabel, key: str) -> None:
         self.label, self.key = label, key
-        self.cpu = zlib.crc32(cpu_name().encode())
         self.generations: dict[int, int] = {}
         self.written: dict[int, tuple] = {}
         self.is_blocked = False
@@ -177,10 +173,6 @@ class VerifiedCache:
         """Label of the model."""
         return self._trust.label
 
-    def _cpu(self, run: VerifyingRun) -> int:
-        """Number of the processor; 0 if simulations run on other machines."""
-        return self._trust.cpu if run.pool is None or isinstance(run.pool, LocalPool) else 0
-
     def share_trust(self, other: "VerifiedCache") -> None:
         """Trust rows that another object has verified or stored, if its model has the same code."""
         if other.label.code == self.label.code:
@@ -195,7 +187,6 @@ class VerifiedCache:
         misfit: np.ndarray | None,
         reasons: list[str],
         responses: np.ndarray | None,
-        seconds: float,
         run: VerifyingRun,
     ) -> None:
         """Store simulations under the model's label: statistics and responses, if given, and failures of the model."""
@@ -207,16 +198,15 @@ class VerifiedCache:
             if generation is None and is_blocked:  # it is not known which rows agree
                 return
             generation = self._use(source, generation or self._new_generation([]))
-            place = Place(generation, self._cpu(run), trust.session)
         rows = []
         if misfit is not None:
-            rows += pack_rows(fingerprint, thetas, misfit, reasons, seconds, place)
+            rows += pack_rows(fingerprint, thetas, misfit, reasons, generation, trust.session)
         if responses is not None or any(reasons):
             finite = np.zeros(len(thetas), bool) if responses is None else np.isfinite(responses).all(axis=(1, 2))
             values = np.zeros((len(thetas), 0)) if responses is None else responses
             chosen = [row for row, reason in enumerate(reasons) if reason or finite[row]]
             why = ["" if finite[row] else reasons[row] for row in chosen]
-            rows += pack_rows(run.fingerprint, thetas[chosen], values[chosen], why, 0.0, place, True)
+            rows += pack_rows(run.fingerprint, thetas[chosen], values[chosen], why, generation, trust.session, True)
         self.cache.write(rows)
 
     def discard(self, thetas: np.ndarray, *fingerprints: str) -> None:
@@ -228,31 +218,28 @@ class VerifiedCache:
 
     def look_up(self, fingerprint: str, thetas: np.ndarray, run: VerifyingRun) -> CachedRows:
         """Statistics that are stored, some verified; `StaleCache` if one differs although the label is known."""
-        return self._look_up(fingerprint, thetas, run, run.n_numbers, None)
+        return self._look_up(fingerprint, thetas, run, run.n_numbers)
 
     def look_up_responses(self, thetas: np.ndarray, run: VerifyingRun) -> list[np.ndarray | str | None]:
         """Responses (n_channels, n_steps) [SI], or reasons of failures for any measurements; None if not stored.
 
-        Some are verified by their statistics, as in `look_up`, but no failures at a time limit, because each would take
-        as long as the limit.
+        Some are verified by their statistics, as in `look_up`.
         """
-        shape, limit = (len(run.model.channels), run.model.n_steps), getattr(run.model, "time_limit", None)
-        rows = self._look_up(run.fingerprint, thetas, run, shape[0] * shape[1], limit).rows
+        shape = len(run.model.channels), run.model.n_steps
+        rows = self._look_up(run.fingerprint, thetas, run, shape[0] * shape[1]).rows
         return [
             row and (reason_of(row) if row.reason else np.frombuffer(row.value, dtype="<f8").reshape(shape))
             for row in rows
         ]
 
-    def _look_up(
-        self, fingerprint: str, thetas: np.ndarray, run: VerifyingRun, width: int, limit: float | None
-    ) -> CachedRows:
+    def _look_up(self, fingerprint: str, thetas: np.ndarray, run: VerifyingRun, width: int) -> CachedRows:
         trust, source = self._trust, source_number(run.fingerprint)
         while True:
             with trust.lock:
                 generation = trust.generations.get(source) or self._find(source, fingerprint, run, width)
             if generation is None:
                 return CachedRows([None] * len(thetas), width)
-            rows = self.cache.look_up(fingerprint, thetas, width, generation, limit)
+            rows = self.cache.look_up(fingerprint, thetas, width, generation)
             if not self.cache.verify or self._verify(fingerprint, rows.rows, generation, run, width):
                 return rows
 
@@ -336,7 +323,7 @@ class VerifiedCache:
         """Verify some of the rows that were found; False if the look-up must be repeated in a new generation."""
         trust = self._trust
         with trust.lock:
-            others = [row for row in rows if row is not None and row.session != trust.session and not row.time_limit]
+            others = [row for row in rows if row is not None and row.session != trust.session]
             if not others:
                 return True
             if trust.stale is not None:
@@ -395,16 +382,12 @@ class VerifiedCache:
         return _Comparison(compared, stopped)
 
     def _difference(self, row: Row, new: Simulated, run: VerifyingRun) -> tuple[str, float]:
-        """How a simulation differs from a stored one, as `difference_in_words`.
-
-        A row of another or unknown processor may differ in the last digits.
-        """
+        """How a simulation differs from a stored one, as `difference_in_words`."""
         misfit, reason = np.frombuffer(row.value, dtype="<f8"), reason_of(row)
         if not reason and row.size is not None:  # a response
             batch = SimulationBatch(misfit.reshape(1, len(run.model.channels), -1), [""])
             (misfit,), (reason,) = misfit_of_responses(run.model, batch, run.measured, run.statistic)
-        other = run.tolerance is None and not row.cpu == self._cpu(run) != 0
-        return difference_in_words(misfit, reason, new, run, max(run.accepted, DEFAULT_TOLERANCE if other else 0.0))
+        return difference_in_words(misfit, reason, new, run)
 
     def _use_no_rows(self, row: Row, new: Simulated, used: int, generation: int, run: VerifyingRun) -> bool:
         """Begin a new generation, if the label was adopted and no row was used; False. `StaleCache` otherwise."""

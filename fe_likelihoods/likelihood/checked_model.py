@@ -157,8 +157,7 @@ class CheckedModel:
             new = simulate_again(run, thetas, self.label)
             self._repeated += len(thetas)
             return all(
-                isinstance(each.reason, TransientReason)
-                or not difference_in_words(before, "", each, run, run.accepted)[0]
+                isinstance(each.reason, TransientReason) or not difference_in_words(before, "", each, run)[0]
                 for before, each in zip(earlier, new, strict=True)
             ), [each.misfit for each in new]
 

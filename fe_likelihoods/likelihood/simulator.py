@@ -23,7 +23,7 @@ from samplers.interrupts import interrupts_end_the_run
 
 from ..cache.comparison import VerifyingRun, observed
 from ..cache.memory import MemoryCache, ResponseMemory, distinct_keys, thetas_of
-from ..cache.simulation_cache import SimulationCache
+from ..cache.simulation_cache import TOLERANCE, SimulationCache
 from ..cache.verification import StaleCache
 from ..noise.statistics import Statistic, statistic_width
 from ..priors.points import as_rows
@@ -377,7 +377,7 @@ class Simulator:
             statistics, reasons = misfit_of_responses(self.model, batch, self.measured, self.statistic)
             self._enter(request, new, statistics, reasons)
             if stored is not None and not self._responses_only:
-                stored.store(self._key, request.thetas[new], statistics, reasons, None, 0.0, run)
+                stored.store(self._key, request.thetas[new], statistics, reasons, None, run)
 
     def _enter(self, request: _Request, rows: list[int], statistics: np.ndarray, reasons: list[str]) -> None:
         """Fill in known statistics (n, n_numbers), cache them in memory, and count failures."""
@@ -571,7 +571,7 @@ class Simulator:
         if self.cache is not None:
             kept = None if self._responses_only else statistics
             stored = responses if full or self.cache.responses else None
-            self._checked.rows.store(self._key, thetas, kept, reasons, stored, seconds, run)
+            self._checked.rows.store(self._key, thetas, kept, reasons, stored, run)
             self.cache.store_remark(self.model)
         for place, row in enumerate(rows):
             request.fill(row, statistics[place], reasons[place], responses[place] if full else None)
@@ -580,7 +580,7 @@ class Simulator:
 
     @property
     def _run(self) -> VerifyingRun:
-        tolerance = None if self.cache is None else self.cache.tolerance
+        tolerance = TOLERANCE if self.cache is None else self.cache.tolerance
         return VerifyingRun(self.model, self.pool, self.measured, self.statistic, self.n_numbers, tolerance)
 
     def _check_before(self, run: VerifyingRun) -> None:

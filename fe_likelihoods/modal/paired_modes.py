@@ -26,7 +26,7 @@ __all__ = ["REFERENCE_TEMPERATURE", "SLOPE", "PairedModes", "sensor_rows"]
 REFERENCE_TEMPERATURE = 20.0  # [°C], of the frequencies of the model
 SLOPE = "temperature_slope"
 
-_OF_THE_MODEL = "nominal", "nominal_units", "response_tolerance", "time_limit"
+_OF_THE_MODEL = "nominal", "nominal_units", "time_limit"
 
 
 def sensor_rows(model: Model, data: ModalData) -> list[int]:

@@ -93,7 +93,6 @@ class BuiltInModel(StructuralModel):
     """
 
     parameters: tuple[str, ...]
-    response_tolerance: ClassVar[float] = 0.0  # the same bits in every process
     _nominal_units: ClassVar[dict[str, str]] = {}
     _display_fields: ClassVar[tuple[str, ...]] = ("outputs", "unit", "units")
 

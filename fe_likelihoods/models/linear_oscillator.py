@@ -59,7 +59,6 @@ class LinearOscillator(StructuralModel):
     # no `nominal`: a joint likelihood may have one multiple for oscillators with different periods
     parameter_units = {"stiffness": "x nominal", "damping": "x nominal"}
     path_dependent = False
-    response_tolerance = 0.0  # the same bits in every process
 
     def __init__(self, record: Record, period: float = 1.0, damping_ratio: float = 0.05) -> None:
         if not 0.0 < damping_ratio < 1.0:

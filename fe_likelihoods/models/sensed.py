@@ -32,7 +32,6 @@ _OF_THE_MODEL = (
     "nominal_units",
     "path_dependent",
     "range_remark",
-    "response_tolerance",
     "time_limit",
 )
 

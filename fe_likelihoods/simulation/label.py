@@ -16,7 +16,6 @@ identifiers, sets in varying order, and file names of notebook cells.
 """
 
 import ast
-import contextlib
 import functools
 import itertools
 import logging
@@ -39,7 +38,6 @@ from .user_code import LIBRARY, SCRIPTS, is_of_user, package_version, sources_di
 
 __all__ = [
     "ModelLabel",
-    "cpu_name",
     "items_of",
     "value_digest",
 ]
@@ -153,17 +151,6 @@ def _defined_by_user(function: Any) -> bool:
 def _has_user_code(model: Any) -> bool:
     """Whether a model may run user code."""
     return hasattr(model, "code_parts") or is_of_user(type(model).__module__)
-
-
-@functools.cache
-def cpu_name() -> str:
-    """Name and features of the processor; on another processor, the last digits of results may differ."""
-    import llvmlite.binding as llvm  # late, because it is slow
-
-    asked = [os.environ.get(name, "") for name in ("NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES", "OPENBLAS_CORETYPE")]
-    with contextlib.suppress(RuntimeError):  # features are not known everywhere
-        asked.append(llvm.get_host_cpu_features().flatten())
-    return " ".join([llvm.get_host_cpu_name(), *filter(None, asked)])
 
 
 def value_digest(value: Any) -> str:

@@ -8,11 +8,10 @@ from fe_likelihoods.cache.rows import reason_of
 def stored_outcomes(cache, model, thetas):
     """Responses or reasons of failures that are stored for a model; None where nothing is stored."""
     shape = len(model.channels), model.n_steps
-    limit = getattr(model, "time_limit", None)
-    rows = cache.look_up(model.fingerprint, np.asarray(thetas), shape[0] * shape[1], time_limit=limit).rows
+    rows = cache.look_up(model.fingerprint, np.asarray(thetas), shape[0] * shape[1]).rows
     return [row and (reason_of(row) if row.reason else np.frombuffer(row.value).reshape(shape)) for row in rows]
 
 
 def store_outcomes(cache, model, thetas, reasons):
     """Store failures of a model for any measurements."""
-    cache.store(model.fingerprint, thetas, np.zeros((len(thetas), 0)), reasons, 0.0, of_model=True)
+    cache.store(model.fingerprint, thetas, np.zeros((len(thetas), 0)), reasons, of_model=True)

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import Channel, ExecutableModel, FELikelihood, FunctionModel, Measurements, SimulationCache
-from fe_likelihoods.cache import verification
-from fe_likelihoods.cache.verification import StaleCache, choose_rows
+from fe_likelihoods.cache.verification import choose_rows
 from fe_likelihoods.simulation import label
 from fe_likelihoods.simulation.faults import ChangedModel
 from fe_likelihoods.simulation.folder import Observed
@@ -254,22 +253,6 @@ def test_versions_and_dependencies_are_declared(workshop):
     options = [{}, {"version": "2"}, {"depends_on": [3.0]}]
     assert [workshop.run(**each).simulations for each in options] == [300] * 3
     assert [workshop.run(**each).simulator.verifications for each in options] == [USUAL] * 3
-
-
-def test_another_processor_may_differ_in_the_last_digits(workshop, monkeypatch):
-    first = workshop.run()
-    monkeypatch.setattr(verification, "cpu_name", lambda: "another")
-    monkeypatch.setattr(FunctionModel, "response_tolerance", 0.0, raising=False)
-    law = type(first.model)._respond
-    monkeypatch.setattr(FunctionModel, "_respond", lambda self, theta: law(self, theta) * (1.0 + 1e-13))
-    assert workshop.run().simulations == 0
-    monkeypatch.undo()
-    monkeypatch.setattr(FunctionModel, "response_tolerance", 0.0, raising=False)
-    monkeypatch.setattr(FunctionModel, "_respond", lambda self, theta: law(self, theta) * (1.0 + 1e-13))
-    sys.path.insert(0, str(workshop.folder))
-    with pytest.raises(StaleCache):
-        workshop.run()
-    sys.path.remove(str(workshop.folder))
 
 
 # coverage -------------------------------------------------------------------------------------------------------------
