@@ -41,7 +41,8 @@ __all__ = [
 
 KEEP = "FE_LIKELIHOODS_KEEP_FAILURES"  # environment variable: where the folders of failed simulations are kept
 _MOST_KEPT = 20
-_MOST_LINKS = 2000  # in subfolders, the hidden ones last, and beside the working folder, which ``..`` shows
+_MOST_LINKS = 500  # in subfolders; other subfolders are links. A link takes 10 us, 1 ms on slow file systems
+_MOST_BESIDE = 3000  # entries beside the working folder, which ``..`` shows
 _CLOCK_TICK = 20_000_000  # [ns]; a file changed more recently may change again with the same modification time
 
 _mirror: "_Mirror | None" = None
@@ -279,7 +280,7 @@ class _Mirror:
             os.stat(self.hop)
         self._has_access_times = os.lstat(self.hop).st_atime_ns != 0  # not on every file system
         self._private: set[str] = set()  # files that were written through their links
-        for entry in _scan(os.path.dirname(self.base), _MOST_LINKS) if self.base else ():
+        for entry in _scan(os.path.dirname(self.base), _MOST_BESIDE) if self.base else ():
             with contextlib.suppress(FileExistsError):
                 os.symlink(entry.path, os.path.join(self._place, entry.name))
         self.path, self.is_new = "", False
@@ -292,6 +293,7 @@ class _Mirror:
             self.path, self.is_new = tempfile.mkdtemp(prefix="run_", dir=self._place), True
             self._shown: dict[str, tuple[Stamp | None, dict[str, bool]]] = {}  # folders; whether entries are folders
             self._files: dict[str, Stamp | None] = {}  # that are linked
+            self._left = _MOST_LINKS
         folders = [""]
         for folder in folders:
             folders += self._show_folder(folder)
@@ -343,8 +345,11 @@ class _Mirror:
         above = os.path.realpath(entry.path) + os.sep
         if any(os.path.join(each, "").startswith(above) for each in (os.path.realpath(self.base), self._place)):
             return False
-        left = _MOST_LINKS - sum(len(names) for folder, (_, names) in self._shown.items() if folder)
-        return len(_scan(entry.path, left + 1)) <= left
+        below = len(_scan(entry.path, self._left + 1))
+        if below <= self._left:
+            self._left -= below
+            return True
+        return False
 
     def _drop(self, name: str) -> None:
         """Forget a file or folder that is not in `base` any more."""
