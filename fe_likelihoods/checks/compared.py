@@ -78,7 +78,6 @@ class Fit:
     white: np.ndarray | None = None  # residuals of the fit as the noise whitens them; None without time
     assumed: np.ndarray | None = None  # (n_channels,) independent samples that the noise assumes at most
     deviations: np.ndarray | None = None  # of the errors (n_channels, 1); None if not known
-    supports: int = 1  # whose motions excite the model
     modal: ModalFit | None = None  # modes, instead of responses
 
     @property
@@ -201,14 +200,12 @@ def compare(
     white, deviations = _errors(likelihood, found.get("after"), point)
     assumed = getattr(sampled_noise(likelihood.noise), "effective_samples", None)
     assumed = None if assumed is None else np.broadcast_to(assumed, measured.n_channels)
-    supports, fits = len(getattr(likelihood.model, "supports", ())), []
+    fits = []
     for title, part, rows, cut in _events(likelihood, key):
         of_event = {name: cut(each) for name, each in found.items()}
         own = None if white is None else cut(white)
         counts, errors = (None if each is None else each[rows] for each in (assumed, deviations))
-        fits.append(
-            Fit(title, part, cut(drawn), white=own, assumed=counts, deviations=errors, supports=supports, **of_event)
-        )
+        fits.append(Fit(title, part, cut(drawn), white=own, assumed=counts, deviations=errors, **of_event))
     return fits, failed
 
 

@@ -15,12 +15,10 @@ from ..prediction.prediction import Prediction
 
 __all__ = [
     "DataSet",
-    "PredictedValue",
     "cost",
     "data_sets",
     "evidence",
     "names_of_values",
-    "predicted_values",
     "residual_sentences",
     "summary_sentences",
     "verdict_sentences",
@@ -36,15 +34,6 @@ class DataSet(NamedTuple):
     description: str
     noise: str
     channels: str  # names, units, numbers of samples and steps
-
-
-class PredictedValue(NamedTuple):
-    """One number of a prediction that is not a history; quantiles in the order of `Prediction.probabilities`."""
-
-    name: str
-    mean: float
-    sd: float
-    quantiles: tuple[float, ...]
 
 
 def data_sets(run: FinishedRun) -> list[DataSet]:
@@ -228,18 +217,6 @@ def _duration(seconds: float) -> str:
     if seconds < 120.0:
         return f"{seconds:.3g} s"
     return f"{seconds / 60.0:.1f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.1f} h"
-
-
-def predicted_values(prediction: Prediction) -> list[PredictedValue]:
-    """Mean, standard deviation and quantiles of quantities that are not histories [SI]; at most twenty."""
-    if prediction.dt is not None:
-        return []
-    mean, sd = np.ravel(prediction.mean), np.ravel(prediction.sd)
-    quantiles = np.reshape(prediction.quantiles, (len(prediction.probabilities), -1))
-    return [
-        PredictedValue(name, float(mean[i]), float(sd[i]), tuple(quantiles[:, i].tolist()))
-        for i, name in enumerate(names_of_values(prediction)[:20])
-    ]
 
 
 def names_of_values(prediction: Prediction) -> list[str]:

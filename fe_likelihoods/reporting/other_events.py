@@ -20,6 +20,7 @@ EventPredictions = Mapping[str, Prediction]
 """Predictions of one event by quantity, such as the result of `fe_likelihoods.propagate` for several quantities."""
 
 LEVEL = 0.9  # of the intervals
+MOST_NUMBERS = 20  # of a prediction that are shown
 
 
 class NumberRow(NamedTuple):
@@ -118,7 +119,7 @@ def _number_rows(prediction: Prediction, scores: QuantityScores | None) -> list[
     ends, quartiles = central_interval(values, LEVEL), central_interval(values, 0.5)
     known, names = len(prediction.channels) == values.shape[1], names_of_values(prediction)
     rows = []
-    for k, name in enumerate(names):
+    for k, name in enumerate(names[:MOST_NUMBERS]):
         unit = prediction.channels[k].unit if known else "SI"
         found = [np.median(values[:, k]), *(end[k] for end in (*quartiles, *ends))]
         found.append(np.nan if scores is None else scores.measured[k])
@@ -136,7 +137,8 @@ def _sentence(
     if first.ratios is not None:
         noise = "times ratios of measured to simulated values in other events"
     state = "as the event of the calibration has left it" if first.from_state == "end" else "before any other event"
-    text = f"Predicted from {first.n_samples} samples, {noise}. The motion meets the structure {state}."
+    text = f"Predicted from {first.n_samples} samples, {noise}."
+    text += f" The motion meets the structure {state}." if first.data is None or first.data.is_history else ""
     if measured is None:
         return f"{text} There are no measurements to compare with."
     known = [row for row in numbers if np.isfinite(row.pit)]

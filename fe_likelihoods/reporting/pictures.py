@@ -4,7 +4,7 @@ import base64
 import io
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -14,8 +14,6 @@ from ..checks.compared import Fit
 from ..checks.run import FinishedRun
 from ..plots.fits import plot_fit
 from ..plots.without_time import plot_modes, plot_points
-from ..prediction.prediction import Prediction
-from ..prediction.scores import HistoryScores, QuantityScores
 from .other_events import OtherEvent
 
 if TYPE_CHECKING:
@@ -26,10 +24,8 @@ __all__ = [
     "draw_event",
     "draw_fit",
     "draw_posterior",
-    "draw_prediction",
     "draw_residuals",
     "draw_run",
-    "draw_scores",
     "draw_scores_of_events",
     "save_picture",
 ]
@@ -199,32 +195,6 @@ def draw_run(run: FinishedRun) -> list[Picture]:
     ]
 
 
-def draw_prediction(prediction: Prediction, measurements: Any) -> list[Picture]:
-    """Predicted histories with their band, or predicted values; modes are in the figure of the fit."""
-    from ..plots.predictions import plot_bands
-
-    data = prediction.data
-    if data is not None and not data.is_history:
-        return [
-            _picture(
-                "Predicted values",
-                "The error bars hold the predicted values with the stated probability. They contain the uncertainty of "
-                "the parameters.",
-                f"Predicted values of {', '.join(channel.name for channel in prediction.channels)}.",
-                lambda: plot_points(data, prediction=prediction),
-            )
-        ]
-    return [
-        _picture(
-            "Predicted histories",
-            "The band holds the predicted response with the stated probability. It contains the uncertainty of the "
-            "parameters, and the noise only if the legend says so.",
-            f"Predicted histories of {', '.join(channel.name for channel in prediction.channels)} with their band.",
-            lambda: plot_bands(prediction, measurements),
-        )
-    ]
-
-
 def draw_event(event: OtherEvent) -> list[Picture]:
     """Predicted histories of another event with their band and its measurements."""
     from ..plots.predictions import plot_bands
@@ -233,7 +203,13 @@ def draw_event(event: OtherEvent) -> list[Picture]:
     for each in event.predictions.values():
         if each.dt is None:
             continue
-        names = [channel.name for channel in each.channels]
+        names, data = [channel.name for channel in each.channels], each.data
+        if data is not None and not data.is_history:
+            caption = "The error bars hold the predicted values with the stated probability, of the parameters alone."
+            alt = f"Predicted values of {', '.join(names)}: {event.name}."
+            draw = lambda data=data, each=each: plot_points(data, prediction=each)  # noqa: E731
+            pictures.append(_picture(event.name, caption, alt, draw))
+            continue
         measured = event.measured
         if measured is not None and not {channel.name for channel in measured.channels} & set(names):
             measured = None
@@ -242,7 +218,7 @@ def draw_event(event: OtherEvent) -> list[Picture]:
                 event.name,
                 "Mean and band of the prediction, and the measurements where there are any. The band contains the "
                 "uncertainty of the parameters, and the noise only if the legend says so.",
-                f"Predicted histories of {', '.join(names)} in the event {event.name}.",
+                f"Predicted histories of {', '.join(names)}: {event.name}.",
                 lambda each=each, measured=measured: plot_bands(each, measured),
             )
         )
@@ -281,21 +257,3 @@ def draw_scores_of_events(events: Sequence[OtherEvent]) -> list[Picture]:
             )
         )
     return pictures
-
-
-def draw_scores(scores: HistoryScores | QuantityScores) -> list[Picture]:
-    """Calibration of a prediction, its coverage and its sharpness; none where a measured number is zero."""
-    if isinstance(scores, QuantityScores) and not scores.measured.all():
-        return []
-    from ..plots.scores import plot_scores
-
-    return [
-        _picture(
-            "Scores of the prediction",
-            "Left: bars outside of the grey band show a prediction that is too narrow (high at both ends), too wide "
-            "(high in the middle) or biased (high at one end). Coverage is right near the grey line; of two "
-            "predictions, the one with the smaller interval score is better.",
-            "Histogram of the probability integral transform, coverage, and width and interval score of the bands.",
-            lambda: plot_scores(scores),
-        )
-    ]

@@ -5,25 +5,21 @@ from collections.abc import Mapping, Sequence
 from datetime import datetime
 from importlib import resources
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from ..checks.finding import Finding
 from ..checks.result import JudgedRun, judge_run
 from ..checks.run import FinishedRun, read_run
 from ..information.identifiability import of_samples
 from ..prediction.prediction import Prediction
-from ..prediction.scores import HistoryScores, QuantityScores
 from ..signals.channels import Measurements
 from ..simulation.model import SimulationFailed
 from ..units import from_si
 from .contents import (
-    PredictedValue,
     cost,
     data_sets,
     evidence,
-    predicted_values,
     residual_sentences,
     summary_sentences,
     verdict_sentences,
@@ -31,31 +27,15 @@ from .contents import (
 from .origin import fingerprints, how_to_repeat, sampler_settings, versions
 from .other_events import EventPredictions, OtherEvent, as_events, describe_event
 from .pictures import (
-    Picture,
     draw_event,
     draw_fit,
     draw_posterior,
-    draw_prediction,
     draw_residuals,
     draw_run,
-    draw_scores,
     draw_scores_of_events,
 )
 
-__all__ = ["Predicted", "report", "write_page"]
-
-
-class Predicted(NamedTuple):
-    """A prediction in a report: figures of histories, or a table of other quantities."""
-
-    title: str
-    pictures: tuple[Picture, ...]
-    values: tuple[PredictedValue, ...]
-    probabilities: tuple[float, ...]
-    n_samples: int
-    n_failed: int
-    scores: str
-    findings: tuple[Finding, ...]
+__all__ = ["report", "write_page"]
 
 
 def report(
@@ -101,8 +81,8 @@ def report(
     events : mapping of str to Prediction, to mapping of str to Prediction, or to SimulationFailed, optional
         Predictions of events other than the calibration event, by the name of the event: results of
         `fe_likelihoods.propagate` with ``record=`` or of `fe_likelihoods.predict_new_event`, of one quantity or of
-        several by name, such as ``{"histories": None, "peaks": [peak("top")]}``. They are scored where `measured` has
-        the event. The error `SimulationFailed` of an event that could not be predicted names it in the report.
+        several by name, such as ``{"histories": None, "peaks": [peak("top")]}``. All predictions are scored where
+        `measured` has them. The error `SimulationFailed` of an event that could not be predicted names it there.
     discard : int
         Number of iterations to leave out at the beginning of the chain (burn-in).
     repeat : str
@@ -141,24 +121,25 @@ def write_page(
     repeat: str = "",
 ) -> Path:
     """Write the report of a run that was read, and perhaps `judged`; other parameters as for `report`."""
-    of_events = as_events({} if events is None else events)
-    known = measured
-    if isinstance(measured, Mapping):
-        known = {name: each for name, each in measured.items() if name not in of_events}
-    elif measured is not None and prediction is None and of_events:
+    given = {} if prediction is None else prediction if isinstance(prediction, Mapping) else {"Prediction": prediction}
+    if not isinstance(measured, Mapping | None) and not given and events:
         raise ValueError("measured must be a mapping of the names of events to their measurements")
-    predictions = _predictions(prediction, known)
+    known = measured if isinstance(measured, Mapping) else {} if measured is None else dict.fromkeys(given, measured)
+    predictions = as_events(given) | as_events({} if events is None else events)
+    if unknown := [name for name in known if name not in predictions]:
+        raise ValueError(
+            f"measured has {', '.join(unknown)}, but the predictions are {', '.join(predictions) or 'none'}, and no "
+            "event has this name"
+        )
     path.parent.mkdir(parents=True, exist_ok=True)
-    measurements = measured if isinstance(measured, Mapping) else {}
-    described = [describe_event(name, each, measurements.get(name)) for name, each in of_events.items()]
-    page = render(gather(run, predictions, described, title, repeat, judged))
+    described = [describe_event(name, each, known.get(name)) for name, each in predictions.items()]
+    page = render(gather(run, described, title, repeat, judged))
     path.write_text(page, encoding="utf-8")
     return path
 
 
 def gather(
     run: FinishedRun,
-    predictions: Mapping[str, tuple[Prediction, Measurements | None]],
     events: Sequence[OtherEvent] = (),
     title: str = "",
     repeat: str = "",
@@ -186,7 +167,6 @@ def gather(
             (fit.title, [*draw_fit(fit, fits.before, fits.after), *draw_residuals(fit)]) for fit in fits.fits
         ],
         "run_pictures": draw_run(run),
-        "predictions": [_predicted(name, *each) for name, each in predictions.items()],
         "events": list(events),
         "event_pictures": [draw_event(each) for each in events],
         "score_pictures": draw_scores_of_events(events),
@@ -249,36 +229,3 @@ def _shown(value: float, unit: str) -> str:
 
 def _percent(value: float) -> str:
     return f"{100.0 * value:.3g} %" if np.isfinite(value) else "–"
-
-
-def _predictions(prediction: Any, measured: Any) -> dict[str, tuple[Prediction, Measurements | None]]:
-    """Predictions with their measurements, by title; ValueError for other objects."""
-    named = {} if prediction is None else prediction if isinstance(prediction, Mapping) else {"Prediction": prediction}
-    known = measured if isinstance(measured, Mapping) else dict.fromkeys(named, measured)
-    for name, each in named.items():
-        if not isinstance(each, Prediction):
-            raise ValueError(f"prediction must be the result of propagate, or a mapping of such; {name!r} is {each!r}")
-    if unknown := [name for name in known if name not in named]:
-        raise ValueError(
-            f"measured has {', '.join(unknown)}, but the predictions are {', '.join(named) or 'none'}, and no "
-            "event has this name"
-        )
-    return {name: (each, known.get(name)) for name, each in named.items()}
-
-
-def _predicted(name: str, prediction: Prediction, measurements: Measurements | None) -> Predicted:
-    scores = _scores(prediction, measurements)
-    pictures = draw_prediction(prediction, measurements) if prediction.dt is not None else []
-    pictures += draw_scores(scores) if not isinstance(scores, str) else []
-    values, counts = tuple(predicted_values(prediction)), (prediction.n_samples, prediction.n_failed)
-    return Predicted(name, tuple(pictures), values, prediction.probabilities, *counts, str(scores), prediction.findings)
-
-
-def _scores(prediction: Prediction, measurements: Measurements | None) -> HistoryScores | QuantityScores | str:
-    """Scores of a prediction with noise; empty without measurements or noise, or why there are none."""
-    if measurements is None or not prediction.noise:
-        return ""
-    try:
-        return prediction.score(measurements)
-    except ValueError as error:
-        return f"no scores: {error}"

@@ -57,7 +57,7 @@ def notes_of(contents):
 def test_a_run_that_is_piled_up_against_failures_is_not_called_good():
     posterior = posterior_of([1.1003, 0.8])
     sampler = run(posterior)
-    contents = gather(read_run(sampler, posterior), {})
+    contents = gather(read_run(sampler, posterior))
     (row,) = contents["failures"].rows
     assert row.reason == "no convergence" and row.where.startswith("at stiffness above 1.1 (100 %")
     assert contents["failures"].count == posterior.report()["failure_count"]
@@ -94,7 +94,7 @@ def test_reasons_that_differ_in_their_numbers_are_one_row(tmp_path):
 def test_control_failures_far_from_the_samples_are_no_severe_doubt():
     posterior = posterior_of([1.05, 0.8])
     sampler = run(posterior)
-    contents = gather(read_run(sampler, posterior), {})
+    contents = gather(read_run(sampler, posterior))
     assert contents["failures"].count > 10 and contents["failures"].near.failed == 0
     assert "Failures border on the samples" not in notes_of(contents)
     assert contents["status"] != "do not use" and sampler.verdict.status != "not usable"
@@ -130,7 +130,7 @@ def test_a_run_without_a_result_leads_to_no_conclusion():
     chain = emcee.EnsembleSampler(24, 3, posterior, vectorize=True)
     chain.run_mcmc([1.0, 0.8, 0.002] * (1.0 + 0.01 * np.random.default_rng(1).standard_normal((24, 3))), 10)
     finished = read_run(chain, posterior, truth=[5.0, 5.0, 5.0])
-    contents = gather(finished, {})
+    contents = gather(finished)
     titles = notes_of(contents).keys()
     assert titles.isdisjoint({"Not informed by the data", "The errors are correlated", "Far from the prior"})
     assert "Nothing can be said about the parameters yet" in contents["summary"][2] and not contents["residuals"]

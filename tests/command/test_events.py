@@ -89,7 +89,7 @@ def test_events_are_predicted_and_scored(finished, run_once):
     assert all(row[5:7] == ["–", "not known"] for row in numbers[2:])
     histories = next(table for table in report.tables if table[0][-1] == "In the 90 % band")[1:]
     assert [row[0] for row in histories] == ["weaker", "weaker"]
-    assert sum(alt.startswith("Predicted histories") and "in the event" in alt for _, alt in report.images) == 2
+    assert sum(alt.startswith("Predicted histories") for _, alt in report.images) == 3  # with the calibrated event
     told = [title.removeprefix("weaker: ") for title in report.notes if title.startswith("weaker: ")]
     assert told and all(f"CAUTION: event weaker: {title}" in said for title in told)
     for text in ("with the noise", "without the noise", "The motion meets the structure before any other event"):

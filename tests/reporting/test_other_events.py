@@ -56,7 +56,7 @@ def test_events_have_tables_sentences_and_figures(vibrating, tmp_path):
     assert float(histories[1][5]) == pytest.approx(1e3 * scores.interval_score[0], rel=5e-3)
     assert histories[1][7] == f"{100 * scores.coverage[0]:.3g} %"
     drawn = [alt for _, alt in page.images]
-    assert sum("in the event" in alt for alt in drawn) == 3
+    assert sum(alt.startswith("Predicted histories of") for alt in drawn) == 3
     assert "Predicted intervals by measured values of same, larger." in drawn
     assert any(alt.startswith("Calibration, coverage and interval scores of the histories of same") for alt in drawn)
 

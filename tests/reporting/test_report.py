@@ -97,7 +97,7 @@ def test_the_page_needs_nothing_from_elsewhere(page):
     for png, alt in page.images:
         assert png.startswith(b"\x89PNG") and alt
     assert len(page.images) >= 5
-    assert sum(alt.startswith("Histogram of the probability integral") for _, alt in page.images) == 1  # not of peaks
+    assert sum(alt.startswith("Calibration, coverage and interval scores") for _, alt in page.images) == 1
 
 
 def test_texts_of_users_are_escaped_and_shown(page):
@@ -151,7 +151,7 @@ def test_what_a_reader_has_to_know_is_said(page, vibrating):
     assert "SMCSampler( 60, posterior.ndim, posterior, vectorize=True, seed=1, )" in page.text
     counts = dict(row for table in page.tables for row in table if len(row) == 2)
     assert int(counts["further simulations for fit and judgement"]) > 0  # fewer where other tests have made some
-    assert "Free vibration" in page.text and "Peaks" in page.text and "95 % quantile" in page.text
+    assert "Free vibration" in page.text and "Peaks" in page.text and "90 % interval" in page.text
     assert "CRPS" in page.text and "of 3 true values are within their 90 % intervals" in page.text
 
 
