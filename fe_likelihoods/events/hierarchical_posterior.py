@@ -31,14 +31,13 @@ from ..priors.multivariate import as_distribution
 from ..priors.points import as_points, complete_repr
 from ..priors.priors import Prior
 from .population_marginal import population_marginal
-from .scales import SCALES, scales_of
+from .scales import SCALES, Scales
 from .stored_posterior import StoredPosterior, describe
 
 __all__ = ["HierarchicalPosterior", "Varying"]
 
 _HYPER_NAMES = {"log": ("median", "sd_log"), "linear": ("mean", "sd")}
-_LARGEST = 1e100  # of a mean or a standard deviation, so that squares do not overflow
-_SMALLEST_SD = 1e-12  # of the posterior's, below which the population is a point
+_LARGEST = 1e100  # of a mean or a standard deviation, and its inverse the smallest: their squares are numbers
 
 
 @dataclass(frozen=True)
@@ -154,21 +153,13 @@ class HierarchicalPosterior:
             location, sd = _HYPER_NAMES[each.scale]
             distributions |= {f"{location}_{name}": each.location, f"{sd}_{name}": each.sd}
         self.prior = Prior(distributions | dict(common))
-        self.scales = scales_of([each.scale for each in varying.values()] + ["linear"] * len(common))
+        self.scales = Scales(np.array([each.scale == "log" for each in varying.values()] + [False] * len(common)))
         self.described = {}
         for name, test in self.tests.items():
             try:
                 self.described[name] = describe(test, [*varying, *common], self.scales)
             except ValueError as error:
                 raise ValueError(f"test {name!r}: {error}") from None
-        self._set_smallest_sd()
-
-    def _set_smallest_sd(self) -> None:
-        deviations = [
-            np.sqrt(np.cov(each.points.T, ddof=0).reshape(len(self.scales.is_log), -1).diagonal())
-            for each in self.described.values()
-        ]
-        self._smallest_sd = _SMALLEST_SD * np.min(deviations, axis=0)[: len(self.varying)]
 
     def __repr__(self) -> str:
         common = f"common {', '.join(self.common)}, " if self.common else ""
@@ -184,7 +175,6 @@ class HierarchicalPosterior:
         other = copy.copy(self)
         other.tests = {name: each for name, each in self.tests.items() if name != test}
         other.described = {name: each for name, each in self.described.items() if name != test}
-        other._set_smallest_sd()
         return other
 
     @property
@@ -277,12 +267,8 @@ class HierarchicalPosterior:
         end = points.shape[1] - len(self.common)
         center = np.concatenate([points[:, 0 : 2 * n : 2], points[:, end:]], axis=1)
         center = self.scales.to_scale(center)
-        deviations = np.clip(points[:, 1 : 2 * n : 2], self._smallest_sd, _LARGEST)
+        deviations = np.clip(points[:, 1 : 2 * n : 2], 1.0 / _LARGEST, _LARGEST)
         return np.clip(center, -_LARGEST, _LARGEST), deviations
-
-    def from_scale(self, values: np.ndarray) -> np.ndarray:
-        """Parameters (..., n_varying + n_common) from their values on the scales of the populations."""
-        return self.scales.from_scale(values)
 
 
 def _check(tests: Any, varying: Any, common: Any) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..checks.finding import labelled, warn
 from ..checks.transfer import check_new_test
-from ..priors.distributions import RandomState
+from ..priors.distributions import RandomState, as_generator
 from ..priors.points import as_points, complete_repr
 from ..text_tables import number, text_table
 from .hierarchical_posterior import HierarchicalPosterior
@@ -173,12 +173,12 @@ class Hierarchy:
         """
         if not isinstance(n, int | np.integer) or n < 1:
             raise ValueError(f"new_test: n must be a whole number, 1 or more; got {n!r}")
-        generator, posterior = _generator(rng), self.posterior
+        generator, posterior = as_generator(rng), self.posterior
         rows = generator.permutation(np.resize(generator.permutation(len(self.samples)), n))
         center, sd = posterior.population(self.samples[rows])
         varying = len(posterior.varying)
         center[:, :varying] += sd * generator.standard_normal((n, varying))
-        draws = posterior.from_scale(center)
+        draws = posterior.scales.from_scale(center)
         own = [*posterior.varying, *posterior.common]
         outside = np.zeros(draws.shape, dtype=bool)
         for each in posterior.described.values():
@@ -202,7 +202,7 @@ class Hierarchy:
         """
         center, _ = self.posterior.population(self.samples)
         names = [*self.posterior.varying, *self.posterior.common]
-        return dict(zip(names, self.posterior.from_scale(center.mean(axis=0)).tolist(), strict=True))
+        return dict(zip(names, self.posterior.scales.from_scale(center.mean(axis=0)).tolist(), strict=True))
 
     def draw_test(self, test: str, rng: RandomState = None) -> dict[str, np.ndarray]:
         """Draw the varying and common parameters of one test, one draw for each sample of the hyper-parameters.
@@ -231,9 +231,9 @@ class Hierarchy:
             known = ", ".join(map(repr, self.posterior.tests))
             raise ValueError(f"there is no test {test!r}; the tests are {known}")
         center, sd = self.posterior.population(self.samples)
-        draws = draw_parameters(self.posterior.described[test], center, sd, _generator(rng))
+        draws = draw_parameters(self.posterior.described[test], center, sd, as_generator(rng))
         names = [*self.posterior.varying, *self.posterior.common]
-        return dict(zip(names, self.posterior.from_scale(draws).T, strict=True))
+        return dict(zip(names, self.posterior.scales.from_scale(draws).T, strict=True))
 
     def _prior_draws(self, name: str, n: int, rng: np.random.Generator) -> np.ndarray:
         """Prior draws of a parameter that belongs to each test alone."""
@@ -250,13 +250,3 @@ class Hierarchy:
                 f"new_test: the prior of {name} differs between the tests; leave it out of names and draw it yourself"
             )
         return next(iter(priors.values())).rvs(n, rng)[:, 0]
-
-
-def _generator(rng: RandomState) -> np.random.Generator:
-    """A generator from a seed, a generator, or NumPy's global stream."""
-    if isinstance(rng, np.random.Generator):
-        return rng
-    if rng is None or isinstance(rng, np.random.RandomState):
-        stream = np.random if rng is None else rng  # as in Prior.rvs: np.random.seed makes it reproducible
-        return np.random.default_rng(stream.randint(2**31, size=4))
-    return np.random.default_rng(rng)

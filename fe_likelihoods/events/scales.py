@@ -1,11 +1,10 @@
 r"""Scales on which parameters of a population have a normal distribution: their logarithms, or themselves."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["SCALES", "Scales", "scales_of"]
+__all__ = ["SCALES", "Scales"]
 
 SCALES = ("log", "linear")
 
@@ -28,8 +27,3 @@ class Scales(NamedTuple):
     def log_jacobian(self, points: np.ndarray) -> np.ndarray:
         """Logarithms (..., dim) of the derivatives of the parameters at points on the scales."""
         return np.where(self.is_log, points, 0.0)
-
-
-def scales_of(kinds: Sequence[str]) -> Scales:
-    """Scales from their names."""
-    return Scales(np.array([kind == "log" for kind in kinds], dtype=bool))

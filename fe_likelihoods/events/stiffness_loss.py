@@ -17,7 +17,7 @@ from ..checks.finding import Finding, judge, labelled
 from ..checks.transfer import check_most, check_normal
 from ..priors.distributions import Distribution, HalfNormal, LogNormal
 from ..text_tables import text_table
-from .scales import scales_of
+from .scales import Scales
 from .stored_posterior import StoredPosterior, on_scale
 
 __all__ = ["StiffnessLoss", "stiffness_loss"]
@@ -200,7 +200,7 @@ class _State(NamedTuple):
 
 
 def _state(stored: StoredPosterior, names: tuple[str, ...]) -> _State:
-    prior, points = on_scale(stored, names, scales_of(["log"] * len(names)))
+    prior, points = on_scale(stored, names, Scales(np.ones(len(names), dtype=bool)))
     weights, n, d = np.exp(stored.log_weights), stored.effective_sample_size, len(names)
     mean = weights @ points
     apart = points - mean
