@@ -6,20 +6,17 @@ process does takes no time.
 """
 
 import heapq
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future
-from contextlib import ExitStack, contextmanager
-from queue import SimpleQueue
-from unittest.mock import patch
+import threading
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 
 import numpy as np
 
-from fe_likelihoods.likelihood import evaluation_queue, simulator
 from fe_likelihoods.simulation.executors import PoolExecutor
 
-__all__ = ["SimulatedCluster", "SimulatedPool"]
-
-take_without_clock = simulator.take_all
+__all__ = ["DelayedPool", "SimulatedCluster"]
 
 
 class SimulatedCluster:
@@ -80,64 +77,25 @@ class SimulatedCluster:
         self._running = []
 
 
-class SimulatedPool(PoolExecutor):
-    """A pool of a likelihood on simulated workers, which evaluates the responses of its model.
+class DelayedPool(PoolExecutor):
+    """Threads in which each simulation takes a random time of a millisecond on average.
 
-    `length` is a function of parameters (n_parameters,) that returns how long a simulation of the whole record, of
-    `n_steps`, takes; a part of it takes its share of the time, and counts as a fraction in `simulations`. Other
-    attributes are as of a `SimulatedCluster`.
+    `simulations` counts them; one of a part of the record, of `n_steps`, counts as a fraction.
     """
 
-    n_workers = 0
-    submits = True
-    other_processes = False
-
-    def __init__(self, workers: int, length: Callable[[np.ndarray], float], n_steps: int):
-        self.n_workers, self._length, self._n_steps = workers, length, n_steps
-        self.now = self.busy = self.simulations = 0.0
-        self._free = [0.0] * workers
-        self._running: list[tuple[float, int, Future, object]] = []
-        self._submitted = 0
-
-    @property
-    def utilisation(self) -> float:
-        """Share of the time of all workers in which they were busy."""
-        return self.busy / (self.n_workers * self.now)
+    def __init__(self, workers: int, seed: int, n_steps: int):
+        super().__init__(ThreadPoolExecutor(workers))
+        self._random, self._n_steps, self._lock = np.random.default_rng(seed), n_steps, threading.Lock()
+        self.simulations = 0.0
 
     def submit_all(self, function: Callable, items: Sequence[np.ndarray]) -> list[Future]:
-        """Futures that have a result when the clock has advanced to their end."""
-        futures = []
-        for item in items:
-            outcome, future = function(item), Future()
-            sent = getattr(function, "function", function)  # without the observer of opened files
-            share = sent.args[-1].n_steps / self._n_steps
-            length = share * float(self._length(np.asarray(item)))
-            end = max(heapq.heappop(self._free), self.now) + length
-            heapq.heappush(self._free, end)
-            self._submitted += 1
-            heapq.heappush(self._running, (end, self._submitted, future, outcome))
-            self.busy += length
-            self.simulations += share
-            futures.append(future)
-        return futures
+        """As `PoolExecutor.submit_all`."""
+        with self._lock:
+            self.simulations += len(items) * function.function.args[-1].n_steps / self._n_steps
+        return super().submit_all(partial(self._later, function), items)
 
-    def advance(self) -> None:
-        """Advance the clock to the end of the next simulation, and of all that end with it."""
-        self.now = self._running[0][0]
-        while self._running and self._running[0][0] == self.now:
-            _, _, future, outcome = heapq.heappop(self._running)
-            future.set_result(outcome)
-
-    @contextmanager
-    def clock(self) -> Iterator[None]:
-        """Whoever waits for a simulation advances the clock."""
-
-        def take_all(arrived: SimpleQueue, wait: bool) -> list:
-            while wait and arrived.empty():
-                self.advance()
-            return take_without_clock(arrived, wait)
-
-        with ExitStack() as stack:
-            for module in (simulator, evaluation_queue):
-                stack.enter_context(patch.object(module, "take_all", take_all))
-            yield
+    def _later(self, function: Callable, item: np.ndarray) -> object:
+        with self._lock:
+            seconds = self._random.exponential(1e-3)
+        time.sleep(seconds)
+        return function(item)

@@ -142,10 +142,9 @@ class DataSets:
             residuals[:, part.channels, part.samples] = np.nan
             if len(left) > 0:
                 own, simulator = thetas[np.ix_(left, part.structural)], part.likelihood.simulator
-                batch = simulator.simulate(own)
+                statistics[left, part.numbers], batch = simulator.run(own, full=True)
                 with np.errstate(over="ignore"):
                     residuals[left, part.channels, part.samples] = part.residuals(batch.response)
-                statistics[left, part.numbers] = simulator.statistics(own)
                 for row, reason in zip(left, batch.reasons, strict=True):
                     reasons[row] = reason
                 left = left[[not reason for reason in batch.reasons]]

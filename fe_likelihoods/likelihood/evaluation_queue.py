@@ -1,76 +1,44 @@
 """Evaluation of a posterior without barriers: points go out when they are submitted, and come back when they are done.
 
 A sampler that proposes points while others still run keeps all workers of a pool busy, however different the durations
-of the simulations are. A point passes through the parts of a `JointLikelihood` one after the other, as in a call of the
-posterior, and a part is not simulated where an earlier one is -inf.
+of the simulations are. Each point is evaluated in a thread, which waits for its simulations.
 """
 
-import logging
 import os
-import threading
-from collections.abc import Iterable, Sequence
-from concurrent.futures import as_completed
 from contextlib import suppress
-from queue import SimpleQueue
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from samplers.interrupts import interrupts_end_the_run
+from samplers.evaluation.asynchronous import PoolQueue
 
 from ..priors.points import as_points
-from ..priors.priors import Prior
+from ..simulation.local_pool import Threads
 from ..simulation.model import has_batch_method
-from .joint import JointLikelihood
-from .likelihood import FELikelihood
-from .simulator import Simulation, Simulator, take_all
 
 __all__ = ["EvaluationQueue"]
 
-logger = logging.getLogger(__name__)
+_MOST_THREADS = 200  # for a pool that does not say how many simulations run at once
 
 
-class _Point:
-    """A submitted point, and the sum of its log-likelihoods so far."""
-
-    __slots__ = ("log_likelihood", "log_prior", "row", "ticket")
-
-    def __init__(self, ticket: int, row: np.ndarray, log_prior: float) -> None:
-        self.ticket, self.row, self.log_prior = ticket, row, log_prior
-        self.log_likelihood = 0.0
-
-
-class _Part:
-    """One likelihood, whose parameters are `columns` of the points, and the points that wait for its simulations."""
-
-    def __init__(self, likelihood: FELikelihood, columns: list[int]) -> None:
-        self.likelihood, self.simulator, self.columns = likelihood, likelihood.simulator, columns
-        self.waiting: dict[bytes, tuple[Simulation, list[_Point]]] = {}
-
-    @property
-    def running(self) -> list[Simulation]:
-        """Simulations that are waited for."""
-        return [simulation for simulation, _ in self.waiting.values()]
-
-
-class EvaluationQueue:
+class EvaluationQueue(PoolQueue):
     """Queue of points at which a posterior is evaluated, see `Posterior.evaluation_queue`.
 
-    Its methods are called from one thread. With a pool of the likelihood, each simulation is sent to it when the point
-    is submitted, and duplicates are simulated once. Without a pool, or with one that has ``map`` only, `submit` waits
-    for the simulations. With `responses`, the likelihood caches these as well, for its `simulate`.
+    Its methods are called from one thread. Duplicates are simulated once. If a data set has no pool, or one that has
+    ``map`` only, `submit` waits for the simulations. With `responses`, the likelihood caches these as well, for its
+    `simulate`.
     """
 
-    def __init__(self, likelihood: FELikelihood | JointLikelihood, prior: Prior, responses: bool = False) -> None:
-        self._prior, self._responses = prior, responses
-        self._parts = [_Part(part, columns) for part, columns in likelihood.parts()]
-        self._arrived: SimpleQueue = SimpleQueue()
-        self._taken: list[Simulation] = []  # from the queue of arrivals
-        self._finished: list[tuple[int, float]] = []
-        self._collected: list[tuple[int, float]] = []  # last; the caller may not have received them
-        self._tickets = self._pending = 0
-        self._error: Exception | None = None
-        self._closed = False
+    def __init__(self, posterior: Any, responses: bool = False) -> None:
+        self._parts = [part for part, _ in posterior.likelihood.parts()]
+        self._names, self._closed = posterior.prior.names, False
+        self._evaluate = partial(_evaluate, posterior, responses)
+        self._streams = all(part.simulator.streams for part in self._parts)  # no model runs in threads of this process
+        threads = Threads(self._most_threads)
+        super().__init__(self._evaluate, threads, lambda rows: rows[:, None])
+        for part in self._parts if self._streams else ():  # failures may end sooner: points that wait may be successes
+            part.simulator.pending = lambda: threads.pending
 
     def __enter__(self) -> "EvaluationQueue":
         return self
@@ -84,138 +52,59 @@ class EvaluationQueue:
         pools = {id(part.simulator.pool): part.simulator.pool for part in self._parts}
         sizes = [getattr(pool, "n_workers", None) for pool in pools.values() if pool is not None]
         if not sizes:
-            return (os.cpu_count() or 1) if any(has_batch_method(part.likelihood.model) for part in self._parts) else 1
+            return (os.cpu_count() or 1) if any(has_batch_method(part.model) for part in self._parts) else 1
         return None if None in sizes else sum(sizes)
+
+    def _most_threads(self) -> int:
+        return (self.workers or _MOST_THREADS) if self._streams else 0
 
     def submit(self, coords: Any) -> list[int]:
         """Submit points (n, ndim); returns n tickets, each of which `collect` returns once.
 
-        Points outside the support of the prior, with impossible noise parameters, or whose simulations are cached, are
-        finished at once. ValueError for another shape, RuntimeError if the queue is closed.
+        ValueError for another shape, RuntimeError if the queue is closed.
         """
         self._require_open()
-        names = self._prior.names
-        rows = np.array(as_points(coords, names))
+        rows = np.array(as_points(coords, self._names))
         if rows.ndim != 2:
-            raise ValueError(f"submit: expected points of shape (n, {len(names)}); got shape {rows.shape}")
-        # row by row, so that the values are the same as for single points to the last bit
-        log_prior = np.array([float(np.atleast_1d(self._prior.logpdf(row[None]))[0]) for row in rows])
-        first, self._tickets = self._tickets, self._tickets + len(rows)
-        self._pending += len(rows)
-        possible = log_prior > -np.inf
-        for part in self._parts:
-            possible[possible] = part.likelihood.possible(rows[possible][:, part.columns])
-        self._finished += [(first + int(place), -np.inf) for place in np.flatnonzero(~possible)]
-        points = [_Point(first + int(place), rows[place], log_prior[place]) for place in np.flatnonzero(possible)]
-        try:
-            self._advance(0, points)
-        except Exception as error:  # raised by `collect`
-            self._error = self._error or error
-        return list(range(first, self._tickets))
+            raise ValueError(f"submit: expected points of shape (n, {len(self._names)}); got shape {rows.shape}")
+        if not self._streams and len(rows):
+            with suppress(Exception):  # raised by `collect`
+                self._evaluate(rows)  # together, which is faster; their simulations are known then
+        return super().submit(rows)
 
     def collect(self) -> list[tuple[int, float]]:
-        """Wait until a point is finished; tickets and log-probabilities in the order in which the points finished.
+        """Wait until a point is finished; tickets and log-probabilities of all finished points.
 
         They are what `log_prob` returns for each point alone, to the last bit. RuntimeError if no point is pending or
         the queue is closed. What ends a call of the posterior (`TooManyFailures`, `StaleCache`, `ChangedModel`) is
         raised after the points that were finished before have been returned; simulations that have ended are cached.
         """
         self._require_open()
-        if not self._pending:
+        if len(self._futures) == len(self._handed):
             raise RuntimeError("no point is pending: submit points before collect()")
-        self._receive(wait=False)
-        while not self._finished:
-            if self._error is not None:
-                raise self._error
-            for part in self._parts:
-                if part.waiting:
-                    part.simulator.check_failures()
-            self._receive(wait=True)
-        self._collected, self._finished = self._finished, []
-        self._pending -= len(self._collected)
-        return self._collected
-
-    def ended(self) -> list[tuple[int, float]]:
-        """Tickets and log-probabilities of points that have ended, including the last collected ones, without waiting.
-
-        For a run that Ctrl-C ends, before `close`, so that finished points are kept. Errors are raised by `collect`.
-        """
-        self._require_open()
-        for part in self._parts:
-            # not all of them may have announced their end
-            self._taken += [each for each in part.running if each.received or each.future.done()]
-        self._receive(wait=False)
-        return self._collected + self._finished
+        try:
+            return super().collect()
+        except RuntimeError as error:
+            raise error.__cause__ or error from None
 
     def close(self) -> None:
-        """Cancel points that the pool has not started; running ones are cached when they end. May be called twice."""
-        for part in () if self._closed else self._parts:
-            left = part.simulator.leave(part.running, running=False)
-            if left:
-                threading.Thread(target=_cache_rest, args=(part.simulator, left), daemon=True).start()
+        """Cancel points that have not begun; simulations that run are cached when they end. May be called twice."""
         self._closed = True
+        super().close()
+        for part in self._parts:
+            part.simulator.pending = None
 
     def _require_open(self) -> None:
         if self._closed:
             raise RuntimeError("the queue is closed: make another one with posterior.evaluation_queue()")
 
-    def _advance(self, stage: int, points: Sequence[_Point]) -> None:
-        """Evaluate points in one of the parts: at once if their simulations are cached, or cannot be submitted."""
-        if not points:
-            return
-        part, simulator = self._parts[stage], self._parts[stage].simulator
-        thetas = np.array([point.row[part.columns] for point in points])[:, : simulator.n_structural] + 0.0
-        if not simulator.streams:
-            if self._responses:
-                simulator.simulate(thetas)
-            self._pass_on(stage, points, simulator.statistics(thetas))
-            return
-        keys = [theta.tobytes() for theta in thetas]
-        new = [place for place, key in enumerate(keys) if key not in part.waiting]
-        found = dict(zip(new, simulator.request(thetas[new], self._responses, self._arrived), strict=True))
-        for place, (key, point) in enumerate(zip(keys, points, strict=True)):
-            if isinstance(found.get(place), np.ndarray):
-                self._pass_on(stage, [point], [found[place]])
-            else:
-                part.waiting.setdefault(key, (found.get(place), []))[1].append(point)
 
-    @interrupts_end_the_run()
-    def _receive(self, wait: bool) -> None:
-        """Take simulations that have ended; with `wait`, at least one."""
-        self._taken += take_all(self._arrived, wait=wait and not self._taken)
-        for stage, part in enumerate(self._parts):
-            running = set(part.running)
-            ended = [each for each in dict.fromkeys(self._taken) if each in running]
-            with suppress(Exception):  # which is the error of each simulation
-                part.simulator.receive(ended)
-            for simulation in ended:
-                _, points = part.waiting.pop(simulation.key)
-                try:
-                    if simulation.error is not None:
-                        raise simulation.error
-                    self._pass_on(stage, points, [simulation.statistics] * len(points))
-                except Exception as error:
-                    self._error = self._error or error
-        self._taken.clear()
-
-    def _pass_on(self, stage: int, points: Sequence[_Point], statistics: Iterable[np.ndarray]) -> None:
-        """Pass points on to the next part, from the statistics (n_numbers,) of their simulations."""
-        part, left = self._parts[stage], []
-        for point, row in zip(points, statistics, strict=True):
-            value = part.likelihood.of_statistics(point.row[None, part.columns], row[None])
-            point.log_likelihood += float(value[0])
-            if point.log_likelihood == -np.inf or stage + 1 == len(self._parts):
-                self._finished.append((point.ticket, float(point.log_prior + point.log_likelihood)))
-            else:
-                left.append(point)
-        self._advance(stage + 1, left)
-
-
-def _cache_rest(simulator: Simulator, left: list[Simulation]) -> None:
-    """Cache simulations of a closed queue when they end; in a thread."""
-    running = {each.future: each for each in left}
-    try:
-        for future in as_completed(running):
-            simulator.receive([running[future]])
-    except Exception as error:
-        logger.warning("simulations of a closed queue are not stored: %s", error)
+def _evaluate(posterior: Any, responses: bool, rows: np.ndarray) -> Any:
+    """Log-probability of a point (1, ndim), or those of points (n, ndim)."""
+    if responses:
+        left = rows[posterior.possible(rows)]
+        for part, columns in posterior.likelihood.parts():
+            failed = part.simulate(left[:, columns[: part.simulator.n_structural]]).reasons if len(left) else []
+            left = left[[not reason for reason in failed]]
+    values = posterior.log_prob(rows)
+    return values if len(values) > 1 else float(values[0])

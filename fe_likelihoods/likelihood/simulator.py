@@ -4,16 +4,16 @@ A request first takes what is known: statistics in memory and on disk, then resp
 the statistics are computed with the same bits as from a new simulation. The other simulations are sent to a pool to
 which single items can be submitted, and each is cached when it arrives, so that nothing waits for a batch. Without such
 a pool they are run in parts, and each part is cached when it has ended: in this process (compiled models on threads),
-or by the ``map`` of a pool.
+or by the ``map`` of a pool. Several threads may send requests.
 """
 
 import hashlib
 import os
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError, Future
-from functools import partial
+from contextlib import suppress
 from queue import Empty, SimpleQueue
 from typing import Any
 
@@ -47,7 +47,7 @@ from .checked_model import CheckedModel
 from .failure_log import FailureLog
 from .inputs import check_statistic, name_of_statistic
 
-__all__ = ["Simulation", "Simulator", "take_all"]
+__all__ = ["Simulator"]
 
 _SECONDS_PER_CHUNK = 5.0  # simulation time between two writes to the cache on disk
 _ROUNDS_PER_CHUNK = 8  # simulations per worker and chunk: at the end of a chunk, workers idle half a round on average
@@ -58,81 +58,40 @@ class _Request:
 
     For n `keys` (see `distinct_keys`): `thetas` (n, n_structural), `statistics` (n, n_numbers), NaN where not known,
     `reasons` of failures, `responses` (n, n_channels, n_steps) if requested, and whether the statistics are `known`,
-    nothing is to be simulated (`done`), and a result was read from the disk (`on_disk`).
+    and nothing is to be simulated (`done`). `ended` is set when no simulation runs for it any more.
     """
 
-    def __init__(self, keys: list[bytes], full: bool, run: VerifyingRun) -> None:
-        self.keys, self.run = keys, run
+    def __init__(self, keys: list[bytes], full: bool, run: VerifyingRun, statistics: np.ndarray, known: Any) -> None:
+        self.keys, self.run, self.statistics = keys, run, statistics
         self.thetas = thetas_of(keys, len(run.model.parameter_names))
         self.finite = np.isfinite(self.thetas).all(axis=1)
         self.reasons = ["" if fine else "the parameters are not finite" for fine in self.finite]
-        shape = len(keys), len(run.model.channels), run.model.n_steps
-        self.responses = np.full(shape, np.nan) if full else None
-        self.statistics = self.known = self.done = np.empty(0)
-        self.on_disk = np.zeros(len(keys), bool)
-
-    def fill(self, row: int, statistics: np.ndarray, reason: str, response: np.ndarray | None = None) -> None:
-        """Enter the result of one simulation."""
-        self.statistics[row], self.reasons[row], self.known[row], self.done[row] = statistics, reason, True, True
-        if self.responses is not None:
-            self.responses[row] = np.nan if reason or response is None else response
-
-
-class Simulation:
-    """A simulation that runs in the pool of a `Simulator`: row `row` of a request, whose result is filled in there.
-
-    It is `received` when it has ended or was cancelled, and then has an `error` if its result is not known.
-    """
-
-    __slots__ = ("error", "future", "received", "request", "row")
-
-    def __init__(self, request: _Request, row: int, future: Future) -> None:
-        self.request, self.row = request, row
-        self.future: Future | None = future  # until it is received
-        self.error: BaseException | None = None
-        self.received = False
-
-    @property
-    def key(self) -> bytes:
-        """Key of the parameters."""
-        return self.request.keys[self.row]
-
-    @property
-    def statistics(self) -> np.ndarray:
-        """Statistics (n_numbers,), when it has been received without an error."""
-        return self.request.statistics[self.row]
-
-
-def take_all(arrived: SimpleQueue, wait: bool) -> list[Simulation]:
-    """All items of a queue; with `wait`, at least one."""
-    items = [arrived.get()] if wait else []
-    try:
-        while True:
-            items.append(arrived.get_nowait())
-    except Empty:
-        return items
+        self.known = np.array(known, dtype=bool) | ~self.finite
+        self.done = self.known & ~np.isfinite(statistics).all(axis=1) if full else self.known.copy()
+        self.responses = None
+        if full:
+            self.responses = np.full((len(keys), len(run.model.channels), run.model.n_steps), np.nan)
+        self.ended = threading.Event()
 
 
 class _Running:
-    """What runs in a pool for one simulator, in one process."""
+    """What runs in a pool for one simulator, in one process: requests by the keys of their simulations."""
 
     def __init__(self) -> None:
         self.owner, self.lock = os.getpid(), threading.RLock()
-        self.simulations: set[Simulation] = set()
-        self.functions: dict[bool, tuple[Model, Callable]] = {}  # that are sent, so that each is pickled once
+        self.requests: dict[bytes, _Request] = {}
         self.counted_until = 0.0  # time of the last arrival [s]
 
 
 class Simulator:
     """A model's simulations, compared with measurements in the order of the model's channels; each is run once.
 
-    `run` waits for its simulations. `request`, `receive` and `leave` are for those who go on meanwhile, and need a pool
-    that `streams`. Options are those of `FELikelihood`; the statistic is the sums of squares by default. `measured` are
-    values (n_channels, n_steps), or a `Comparison` where samples are missing. `simulations`, `cache_hits` and
-    `disk_hits` count simulations run by this object in this process, cached rows, and rows from the disk; `failures`
-    include known ones from the disk. `chunk_size` simulations are run between two writes to the disk, adapted to their
-    duration; `when_simulated` is called with the number that have ended, in this process only. With `responses_only`
-    nothing was measured: a cache on disk gets the responses alone.
+    Options are those of `FELikelihood`; the statistic is the sums of squares by default. `measured` are values
+    (n_channels, n_steps), or a `Comparison` where samples are missing. `simulations`, `cache_hits` and `disk_hits`
+    count simulations run by this object in this process, cached rows, and rows from the disk; `failures` include known
+    ones from the disk. `chunk_size` simulations are run between two writes to the disk, adapted to their duration;
+    `when_simulated` is called with the number that have ended, in this process only. With `responses_only` nothing was
+    measured: a cache on disk gets the responses alone.
     """
 
     def __init__(
@@ -165,11 +124,10 @@ class Simulator:
         self._seconds = 0.0
         self.when_simulated: Callable[[int], None] | None = None
         self._in_pool: _Running | None = None
-        # responses of the last request to a model with derivatives, by its fingerprint and keys: a gradient may follow
-        self._latest: list[tuple[str, bytes, np.ndarray | str]] = []
+        self.pending: Callable[[], int] | None = None  # number of points of a queue that have not ended
 
     def __getstate__(self) -> dict:
-        return self.__dict__ | {"pool": None, "when_simulated": None, "_in_pool": None, "_latest": []}
+        return self.__dict__ | {"pool": None, "when_simulated": None, "_in_pool": None, "pending": None}
 
     # counts and identity ------------------------------------------------------------------------------------------
 
@@ -235,16 +193,15 @@ class Simulator:
 
         A point whose statistics are cached without its response is simulated again, unless it failed.
         """
-        request, which = self.run(as_rows(thetas, self.model.parameter_names), full=True)
-        return SimulationBatch(request.responses[which], [request.reasons[row] for row in which])
+        return self.run(as_rows(thetas, self.model.parameter_names), full=True)[1]
 
     def run(self, thetas: np.ndarray, possible: Callable[[], np.ndarray] | None = None, full: bool = False) -> Any:
         """Statistics (n, n_numbers) at structural parameters (n, n_structural), NaN if failed.
 
-        With `full`, the request with responses, and the row in it of each point. Duplicates are simulated once, results
-        are cached, cached ones are reused, and non-finite rows are skipped. Where `possible`, called unless all rows
-        are in memory, is False (n,), nothing is simulated and rows may be NaN. Raises `TooManyFailures`, `ChangedModel`
-        or `StaleCache`; simulations that have ended are cached, except after the model has changed.
+        With `full`, also a `SimulationBatch` of the responses. Duplicates are simulated once, results are cached,
+        cached ones are reused, and non-finite rows are skipped. Where `possible`, called unless all rows are in memory,
+        is False (n,), nothing is simulated and rows may be NaN. Raises `TooManyFailures`, `ChangedModel` or
+        `StaleCache`; simulations that have ended are cached, except after the model has changed.
         """
         keys, which = distinct_keys(thetas)
         if not full:
@@ -257,11 +214,8 @@ class Simulator:
             if wanted.any():
                 statistics[wanted] = self.run(thetas[wanted])
             return statistics
-        request = self._look_up(keys, which, full)
+        request = self._run_in_pool(keys, which, full) if self.streams else self._look_up(keys, which, full)
         left = (~request.done).nonzero()[0]
-        if len(left) and self.streams:
-            self._run_in_pool(request, left)
-            left = left[:0]
         while len(left):
             self._check_before(request.run)
             some, start = left[: self._chunk(len(left), full)], time.perf_counter()
@@ -278,9 +232,10 @@ class Simulator:
                 4 * len(some), 1 + int(_SECONDS_PER_CHUNK * len(some) / (time.perf_counter() - start))
             )
             left = left[len(some) :]
-        if full:
-            return request, which
-        return request.statistics if len(keys) == len(which) else request.statistics[which]
+        statistics = request.statistics if len(keys) == len(which) else request.statistics[which]
+        if not full:
+            return statistics
+        return statistics, SimulationBatch(request.responses[which], [request.reasons[row] for row in which])
 
     def recall(self, thetas: np.ndarray, statistics: np.ndarray, reasons: Sequence[str]) -> None:
         """Cache statistics (n, n_numbers) of an earlier run in memory, at structural parameters (n, n_structural).
@@ -298,99 +253,84 @@ class Simulator:
 
     # known simulations --------------------------------------------------------------------------------------------
 
-    def _look_up(self, keys: list[bytes], which: list[int], full: bool) -> _Request:
+    def _look_up(self, keys: list[bytes], which: Sequence[int], full: bool) -> _Request:
         """What is known of distinct keys, which is counted; `which` has the key of every requested row."""
-        request, latest = _Request(keys, full, self._run), self._latest
-        self._latest = []
-        for fingerprint, key, outcome in latest if full else ():
-            self.response_memory.store(fingerprint, [key], [outcome])
-        request.statistics, known = self.memory_cache.look_up(keys, self.n_numbers)
-        request.known = np.array(known, dtype=bool) | ~request.finite
-        request.done = request.known.copy()
-        try:
-            self._fill(request, full)
-        except StaleCache:
-            self._clear()
-            raise
-        counts = np.bincount(which, minlength=len(keys))
-        self.cache_hits += int(counts[request.done & request.finite].sum())
-        self.disk_hits += int(counts[request.on_disk].sum())
+        with self._running.lock:
+            request = _Request(keys, full, self._run, *self.memory_cache.look_up(keys, self.n_numbers))
+            for row in (request.done & request.finite).nonzero()[0] if full else ():
+                request.reasons[row] = self.memory_cache.reason(keys[row]) or "the simulation failed before"
+            try:
+                on_disk = self._fill_from_disk(request) + self._fill_from_responses(request)
+            except StaleCache:  # results in memory may belong to another model
+                self._clear()
+                raise
+            counts = np.bincount(which, minlength=len(keys))
+            self.cache_hits += int(counts[request.done & request.finite].sum())
+            self.disk_hits += int(counts[on_disk].sum())
         return request
 
-    def _fill(self, request: _Request, full: bool) -> None:
-        """Fill in what caches contain, also in their responses; rows of the disk may be simulated to verify them."""
-        if full:
-            self._set_done(request, ~request.finite)
-            self._fill_from_responses(request)
-            self._set_done(request, request.done)
-        stored, new = self._checked.rows, (~(request.done | request.known)).nonzero()[0]
-        if stored is not None and len(new) and not self._responses_only:
-            done = request.done.copy()
-            rows = stored.look_up(self._key, request.thetas[new], request.run)
-            known, reasons = rows.known.nonzero()[0], rows.reasons
-            if len(known):
-                self._enter(request, new[known].tolist(), rows.values[known], [reasons[place] for place in known])
-                request.on_disk[new[known]] = True
-            if full:
-                self._set_done(request, done)
-        if not full:
-            self._fill_from_responses(request)
+    def _fill_from_disk(self, request: _Request) -> list[int]:
+        """Fill in stored statistics, unless responses are wanted, and return their rows; some are verified by runs."""
+        stored, new = self._checked.rows, (~request.done).nonzero()[0]
+        if stored is None or not len(new) or request.responses is not None or self._responses_only:
+            return []
+        rows = stored.look_up(self._key, request.thetas[new], request.run)
+        found, reasons = rows.known.nonzero()[0], rows.reasons
+        if len(found):
+            self._enter_known(request, new[found], rows.values[found], [reasons[place] for place in found])
+        return new[found].tolist()
 
-    def _set_done(self, request: _Request, done: np.ndarray) -> None:
-        """Let those rows be done (n,) whose responses are known, and known failures, which need no response."""
-        failed = ~np.isfinite(request.statistics).all(axis=1) & request.known
-        request.done = done | failed
-        for row in failed.nonzero()[0]:
-            reason = request.reasons[row] or self.memory_cache.reason(request.keys[row])
-            request.reasons[row] = reason or "the simulation failed before"
-
-    def _fill_from_responses(self, request: _Request) -> None:
-        """Fill in rows whose responses are cached, and their statistics where these are not known."""
-        if self._checked.rows is None and not len(self.response_memory):
-            return
+    def _fill_from_responses(self, request: _Request) -> list[int]:
+        """Fill in rows whose responses are cached, and statistics that are not known; returns rows from the disk."""
+        stored, full, on_disk = self._checked.rows, request.responses is not None, []
+        if stored is None and not len(self.response_memory):
+            return []
         left, size = (~request.done).nonzero()[0].tolist(), most_responses(self.model)
         for start in range(0, len(left), size):
-            self._fill_rows_from_responses(request, left[start : start + size])
+            rows, fingerprint = left[start : start + size], request.run.fingerprint
+            outcomes = self.response_memory.look_up(fingerprint, [request.keys[row] for row in rows])
+            outcomes = {row: outcome for row, outcome in zip(rows, outcomes, strict=True) if outcome is not None}
+            missing = [row for row in rows if row not in outcomes]
+            if stored is not None and missing:
+                read = zip(missing, stored.look_up_responses(request.thetas[missing], request.run), strict=True)
+                read = {row: outcome for row, outcome in read if outcome is not None}
+                on_disk += list(read)
+                outcomes |= read
+                if full and read:
+                    self.response_memory.store(fingerprint, [request.keys[row] for row in read], list(read.values()))
+            if full:
+                for row, outcome in outcomes.items():
+                    request.responses[row] = np.nan if isinstance(outcome, str) else outcome
+            request.done[list(outcomes)] = True
+            if new := [row for row in outcomes if not request.known[row]]:
+                nothing = np.full((len(self.model.channels), self.model.n_steps), np.nan)
+                failed = [outcomes[row] if isinstance(outcomes[row], str) else "" for row in new]
+                responses = [nothing if reason else outcomes[row] for row, reason in zip(new, failed, strict=True)]
+                batch = SimulationBatch(np.array(responses), failed)
+                statistics, reasons = misfit_of_responses(self.model, batch, self.measured, self.statistic)
+                self._enter_known(request, new, statistics, reasons)
+                if stored is not None and not self._responses_only:
+                    stored.store(self._key, request.thetas[new], statistics, reasons, None, request.run)
+        return on_disk
 
-    def _fill_rows_from_responses(self, request: _Request, rows: list[int]) -> None:
-        stored, run, full = self._checked.rows, request.run, request.responses is not None
-        in_memory = self.response_memory.look_up(run.fingerprint, [request.keys[row] for row in rows])
-        outcomes = {row: outcome for row, outcome in zip(rows, in_memory, strict=True) if outcome is not None}
-        left = [row for row in rows if row not in outcomes]
-        if stored is not None and left:
-            read = zip(left, stored.look_up_responses(request.thetas[left], run), strict=True)
-            from_disk = {row: outcome for row, outcome in read if outcome is not None}
-            request.on_disk[list(from_disk)] = True
-            outcomes |= from_disk
-            if full and from_disk:
-                keys = [request.keys[row] for row in from_disk]
-                self.response_memory.store(run.fingerprint, keys, list(from_disk.values()))
-        if full:
-            for row, outcome in outcomes.items():
-                request.responses[row] = np.nan if isinstance(outcome, str) else outcome
-        request.done[list(outcomes)] = True
-        if new := [row for row in outcomes if not request.known[row]]:
-            nothing = np.full((len(self.model.channels), self.model.n_steps), np.nan)
-            failed = [outcomes[row] if isinstance(outcomes[row], str) else "" for row in new]
-            responses = [nothing if reason else outcomes[row] for row, reason in zip(new, failed, strict=True)]
-            batch = SimulationBatch(np.array(responses), failed)
-            statistics, reasons = misfit_of_responses(self.model, batch, self.measured, self.statistic)
-            self._enter(request, new, statistics, reasons)
-            if stored is not None and not self._responses_only:
-                stored.store(self._key, request.thetas[new], statistics, reasons, None, run)
-
-    def _enter(self, request: _Request, rows: list[int], statistics: np.ndarray, reasons: list[str]) -> None:
-        """Fill in known statistics (n, n_numbers), cache them in memory, and count failures."""
-        for row, values, reason in zip(rows, statistics, reasons, strict=True):
-            request.fill(row, values, reason, None if request.responses is None else request.responses[row].copy())
-        self._checked.has_results = True
+    def _enter_known(self, request: _Request, rows: Sequence[int], statistics: np.ndarray, reasons: list[str]) -> None:
+        """Enter known statistics, and log the remark that is stored with them."""
         if self.cache is not None:
             self.cache.repeat_remark(self.model, request.run.fingerprint)
         self.failures.count_outcomes(request.thetas[rows], reasons)
+        self._enter(request, rows, statistics, reasons)
+
+    def _enter(self, request: _Request, rows: Sequence[int], statistics: np.ndarray, reasons: list[str]) -> None:
+        """Fill in statistics (n, n_numbers) and reasons of failures, and cache them in memory."""
+        request.statistics[rows], request.known[rows], request.done[rows] = statistics, True, True
+        for row, reason in zip(rows, reasons, strict=True):
+            request.reasons[row] = reason
+            if reason and request.responses is not None:
+                request.responses[row] = np.nan
         self.memory_cache.store([request.keys[row] for row in rows], statistics, reasons)
+        self._checked.has_results = True
 
     def _clear(self) -> None:
-        """Empty the caches in memory, because their results may belong to another model."""
         self.memory_cache.clear()
         self.response_memory.clear()
 
@@ -401,9 +341,14 @@ class Simulator:
         """Whether simulations can be submitted to the pool one by one, and not for several data sets at once."""
         return bool(getattr(self.pool, "submits", False)) and not hasattr(self.model, "simulate_together")
 
-    def check_failures(self) -> None:
-        """Raise `TooManyFailures` if too many simulations have failed, even if all that run succeed."""
-        self.failures.check(0 if self._in_pool is None else len(self._running.simulations))
+    @property
+    def _running(self) -> _Running:
+        if self._in_pool is None or self._in_pool.owner != os.getpid():  # or in a process that was forked
+            self._in_pool = _Running()
+        return self._in_pool
+
+    def _check_failures(self) -> None:
+        self.failures.check(max(len(self._running.requests), 0 if self.pending is None else self.pending()))
 
     def _chunk(self, n: int, full: bool) -> int:
         """Number of simulations, of n, between two writes to the cache on disk, or two reports of progress."""
@@ -416,127 +361,84 @@ class Simulator:
         return min(max(smallest, self.chunk_size), most)
 
     @interrupts_end_the_run()
-    def _run_in_pool(self, request: _Request, rows: Sequence[int]) -> None:
-        """Run rows of a request in the pool, and record each as it arrives."""
-        arrived: SimpleQueue = SimpleQueue()
-        left = dict.fromkeys(self._send(request, rows, arrived))
+    def _run_in_pool(self, keys: list[bytes], which: Sequence[int], full: bool) -> _Request:
+        """Run what is not known in the pool, and record each as it arrives; wait for what runs for another request."""
+        running, arrived = self._running, SimpleQueue()
+        with running.lock:  # so that nothing arrives between the two
+            request = self._look_up(keys, which, full)
+            rows = (~request.done).nonzero()[0].tolist()
+            others = {row: running.requests[keys[row]] for row in rows if keys[row] in running.requests}
+            left = self._send(request, [row for row in rows if row not in others], arrived)
         try:
             while left:
-                ended = take_all(arrived, wait=True)
-                self.receive(ended)
-                for simulation in ended:
-                    if simulation.error is not None:
-                        raise simulation.error
-                    del left[simulation]
+                self._receive(request, left, take_all(arrived))
                 if left:
-                    self.check_failures()
+                    self._check_failures()
         except BaseException:
-            self.leave(left, running=True)
+            self.pool.give_up(list(left))
+            with suppress(Exception):  # simulations that have ended are cached
+                self._receive(request, left, [each for each in left if each.done() and not each.cancelled()])
             raise
+        finally:
+            with running.lock:
+                running.requests = {key: each for key, each in running.requests.items() if each is not request}
+            request.ended.set()
+        for other in others.values():
+            other.ended.wait()
+        if others:
+            places = list(others)
+            found = self.run(request.thetas[places], full=full)
+            request.statistics[places], batch = found if full else (found, None)
+            request.done[places] = True
+            if full:
+                request.responses[places] = batch.response
+                for row, reason in zip(places, batch.reasons, strict=True):
+                    request.reasons[row] = reason
+        return request
 
-    def request(self, thetas: np.ndarray, full: bool, arrived: SimpleQueue) -> list[Simulation | np.ndarray]:
-        """Statistics (n_numbers,) at each of n structural parameters if known, else the simulation that runs for it.
-
-        Simulations will come through the queue `arrived` when they have ended: pass them to `receive`, or to `leave` if
-        they are not needed any more. Duplicates are one object. Raises the errors of `run`.
-        """
-        keys, which = distinct_keys(thetas)
-        request = self._look_up(keys, which, full)
-        left = (~request.done).nonzero()[0].tolist()
-        sent = dict(zip(left, self._send(request, left, arrived), strict=True))
-        return [sent.get(row, request.statistics[row]) for row in which]
-
-    def _send(self, request: _Request, rows: Sequence[int], arrived: SimpleQueue) -> list[Simulation]:
-        """Submit rows of a request to the pool."""
-        if not len(rows):
-            return []
+    def _send(self, request: _Request, rows: Sequence[int], arrived: SimpleQueue) -> dict[Future, int]:
+        """Submit rows of a request to the pool; their futures will come through a queue."""
+        if not rows:
+            return {}
         self._check_before(request.run)
         running = self._running
-        with running.lock:
-            if not running.simulations:
-                running.functions.clear()
-                running.counted_until = time.perf_counter()
-            function = self._sent_function(request.responses is not None)
-            futures = self.pool.submit_all(function, list(request.thetas[rows]))
-            sent = [Simulation(request, int(row), future) for row, future in zip(rows, futures, strict=True)]
-            running.simulations.update(sent)
-        for simulation in sent:
-            simulation.future.add_done_callback(partial(_arrive, arrived, simulation))
-        return sent
+        if not running.requests:
+            running.counted_until = time.perf_counter()
+        measured = () if self._returns_responses(request.responses is not None) else (self.measured, self.statistic)
+        function = Observed(sent_simulation(self.model, *measured))
+        futures = self.pool.submit_all(function, list(request.thetas[rows]))
+        running.requests |= {request.keys[row]: request for row in rows}
+        for future in futures:
+            future.add_done_callback(arrived.put)
+        return dict(zip(futures, rows, strict=True))
 
-    def receive(self, ended: Iterable[Simulation]) -> None:
-        """Count and cache simulations that have ended in the pool; sets the `error` of each without a result.
+    def _receive(self, request: _Request, left: dict[Future, int], ended: Sequence[Future]) -> None:
+        """Record simulations that have ended, which are taken from those that are `left`; raises the error of one.
 
         `ChangedModel` if the model has changed; these simulations, and all since the last comparison, are not stored.
         """
-        running = self._running
-        with running.lock:
-            of_requests: dict[_Request, list[tuple[Simulation, tuple]]] = {}
-            for simulation in ended:
-                if simulation.received:
-                    continue
-                simulation.received, future = True, simulation.future
-                simulation.future = None  # it holds the simulation: the pool would outlive the likelihood
-                running.simulations.discard(simulation)
+        rows, results, reasons, error = [], [], [], None
+        with self._running.lock:
+            for future in ended:
+                row = left.pop(future)
+                del self._running.requests[request.keys[row]]
                 try:
-                    outcome, opened = unpack(future.result(), self.pool)
+                    (result, reason), opened = unpack(future.result(), self.pool)
                     self._checked.label.add(opened)
-                    of_requests.setdefault(simulation.request, []).append((simulation, outcome))
+                    rows, results, reasons = [*rows, row], [*results, result], [*reasons, reason]
                 except CancelledError:
-                    simulation.error = RuntimeError("the pool was closed before a simulation had finished")
-                except BaseException as error:
-                    simulation.error = error
-            try:
-                for request, pairs in of_requests.items():
-                    self._record_arrived(request, *zip(*pairs, strict=True))
-            except BaseException as error:
-                for pairs in of_requests.values():
-                    for simulation, _ in pairs:
-                        simulation.error = error
-                raise
-
-    def _record_arrived(self, request: _Request, ended: tuple[Simulation, ...], outcomes: tuple[tuple, ...]) -> None:
-        """Record simulations of one request that the pool has run."""
-        now = time.perf_counter()
-        seconds, self._running.counted_until = now - self._running.counted_until, now
-        responses = self._returns_responses(request.responses is not None)
-        shape = (len(self.model.channels), self.model.n_steps) if responses else (self.n_numbers,)
-        values = np.full((len(ended), *shape), np.nan)
-        for row, (result, _) in zip(values, outcomes, strict=True):
-            if result is not None:
-                row[...] = result
-        self._record(request, [each.row for each in ended], values, [reason for _, reason in outcomes], seconds)
-
-    def leave(self, simulations: Iterable[Simulation], running: bool) -> list[Simulation]:
-        """Stop waiting: ended simulations are cached, others are cancelled; with `running`, also those that have begun.
-
-        Returns the simulations that go on.
-        """
-        in_pool = self._running
-        with in_pool.lock:
-            left = [each for each in simulations if not each.received]
-            if unended := [each.future for each in left if not each.future.done()]:
-                self.pool.give_up(unended, running)
-            for each in left:
-                if each.future.cancelled():
-                    each.received, each.future = True, None
-                    in_pool.simulations.discard(each)
-            self.receive([each for each in left if not each.received and each.future.done()])
-            return [each for each in left if not each.received]
-
-    @property
-    def _running(self) -> _Running:
-        if self._in_pool is None or self._in_pool.owner != os.getpid():  # or in a process that was forked
-            self._in_pool = _Running()
-        return self._in_pool
-
-    def _sent_function(self, full: bool) -> Callable:
-        """What is sent to the workers: the same object while simulations run, so that it is pickled once."""
-        functions, with_response = self._running.functions, self._returns_responses(full)
-        if with_response not in functions or functions[with_response][0] is not self.model:
-            measured = () if with_response else (self.measured, self.statistic)
-            functions[with_response] = self.model, Observed(sent_simulation(self.model, *measured))
-        return functions[with_response][1]
+                    error = error or RuntimeError("the pool was closed before a simulation had finished")
+                except BaseException as raised:
+                    error = error or raised
+            if rows:
+                now = time.perf_counter()
+                seconds, self._running.counted_until = now - self._running.counted_until, now
+                responses = self._returns_responses(request.responses is not None)
+                shape = (len(self.model.channels), self.model.n_steps) if responses else (self.n_numbers,)
+                values = np.array([np.full(shape, np.nan) if each is None else each for each in results])
+                self._record(request, rows, values, reasons, seconds)
+        if error is not None:
+            raise error
 
     def _returns_responses(self, full: bool) -> bool:
         return full or has_jacobian(self.model) or (self.cache is not None and self.cache.responses)
@@ -546,35 +448,35 @@ class Simulator:
     ) -> None:
         """Count new simulations, record failures, compare the model if that is due, and cache the results.
 
-        The values are responses or statistics; responses are kept if they were requested or are stored on disk.
+        The values are responses or statistics; responses are kept if they were requested, if a gradient may follow, or
+        if they are stored on disk.
         """
-        thetas, keys, full = request.thetas[rows], [request.keys[row] for row in rows], request.responses is not None
+        thetas, full = request.thetas[rows], request.responses is not None
         responses, statistics, why = None, values, reasons
         if values.ndim == 3:
-            batch, responses = SimulationBatch(values, reasons), values if self._returns_responses(full) else None
-            statistics, reasons = misfit_of_responses(self.model, batch, self.measured, self.statistic)
-        self._seconds += seconds
-        self.simulations += len(thetas)
-        self.failures.count_outcomes(thetas, reasons)
-        if self.when_simulated is not None:
-            self.when_simulated(len(thetas))
-        run = request.run if request.run.model is self.model else self._run  # the model may have been replaced
-        self._drop_if_changed(self._checked.after, run, thetas, statistics, reasons, self._earlier_point)
-        self._checked.has_results = True
-        self.memory_cache.store(keys, statistics, reasons)
-        if full:
-            outcomes = [reason or response for reason, response in zip(why, responses, strict=True)]
-            self.response_memory.store(run.fingerprint, keys, outcomes)
-        elif has_jacobian(self.model) and len(self._latest) < most_responses(self.model):
-            outcomes = [reason or response for reason, response in zip(why, responses, strict=True)]
-            self._latest += zip([run.fingerprint] * len(keys), keys, outcomes, strict=True)
-        if self.cache is not None:
-            kept = None if self._responses_only else statistics
-            stored = responses if full or self.cache.responses else None
-            self._checked.rows.store(self._key, thetas, kept, reasons, stored, run)
-            self.cache.store_remark(self.model)
-        for place, row in enumerate(rows):
-            request.fill(row, statistics[place], reasons[place], responses[place] if full else None)
+            responses = values
+            statistics, why = misfit_of_responses(
+                self.model, SimulationBatch(values, reasons), self.measured, self.statistic
+            )
+        with self._running.lock:
+            self._seconds += seconds
+            self.simulations += len(thetas)
+            self.failures.count_outcomes(thetas, why)
+            if self.when_simulated is not None:
+                self.when_simulated(len(thetas))
+            run = request.run if request.run.model is self.model else self._run  # the model may have been replaced
+            self._drop_if_changed(self._checked.after, run, thetas, statistics, why, self._earlier_point)
+            if full:
+                request.responses[rows] = responses
+            self._enter(request, rows, statistics, why)
+            if full or has_jacobian(self.model):
+                outcomes = [reason or response for reason, response in zip(reasons, responses, strict=True)]
+                self.response_memory.store(run.fingerprint, [request.keys[row] for row in rows], outcomes)
+            if self.cache is not None:
+                kept = None if self._responses_only else statistics
+                stored = responses if full or self.cache.responses else None
+                self._checked.rows.store(self._key, thetas, kept, why, stored, run)
+                self.cache.store_remark(self.model)
 
     # the model ----------------------------------------------------------------------------------------------------
 
@@ -585,8 +487,9 @@ class Simulator:
 
     def _check_before(self, run: VerifyingRun) -> None:
         """Check failures and the model before simulations, not after them, so that finished simulations are stored."""
-        self.check_failures()
-        self._drop_if_changed(self._checked.before, run)
+        with self._running.lock:
+            self._check_failures()
+            self._drop_if_changed(self._checked.before, run)
 
     def _earlier_point(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Parameters and statistics of a successful simulation in memory, if there is one, to be run again."""
@@ -606,5 +509,10 @@ class Simulator:
             raise
 
 
-def _arrive(arrived: SimpleQueue, simulation: Simulation, _: Any) -> None:
-    arrived.put(simulation)
+def take_all(arrived: SimpleQueue) -> list[Future]:
+    """All items of a queue, at least one."""
+    items = [arrived.get()]
+    with suppress(Empty):
+        while True:
+            items.append(arrived.get_nowait())
+    return items

@@ -27,6 +27,8 @@ from typing import Any, overload
 import numpy as np
 from tqdm import tqdm
 
+from samplers.evaluation.values import most_common_reasons
+
 from ..cache.simulation_cache import SimulationCache
 from ..checks.finding import warn
 from ..checks.screening import check_gaps
@@ -278,7 +280,7 @@ def _prediction(accumulator: Accumulator, probabilities: tuple[float, ...], effe
         np.sort(np.concatenate([np.zeros(0, dtype=int), *samples]))
         for samples in (accumulator.failed, accumulator.collapsed)
     )
-    frequent = "; ".join(f"{count}: {reason}" for reason, count in accumulator.reasons.most_common(3))
+    frequent = most_common_reasons(accumulator.reasons)
     histories, noise = accumulator.quantity.rows is not None, accumulator.noise
     alone = len(failed) == n
     if alone and (histories or accumulator.shape is None or not len(collapsed)):

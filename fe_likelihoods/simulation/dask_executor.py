@@ -5,14 +5,14 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from functools import cache, partial
 from queue import Empty, SimpleQueue
 from typing import Any
 
 from .faults import TransientReason
-from .local_pool import Outcome, results_of
+from .local_pool import Outcome
 from .pool_executor import PoolExecutor, resolve
 
 __all__ = ["DaskExecutor", "wait_for_nanny"]
@@ -87,10 +87,6 @@ class DaskExecutor(PoolExecutor):
     def n_workers(self) -> int | None:
         """Number of simulations that run at once on the present workers."""
         return sum(self.pool.nthreads().values()) or None
-
-    def map(self, function: Callable[[Any], Outcome], items: Iterable[Any]) -> list[Outcome]:
-        """As `PoolExecutor.map`."""
-        return results_of(self.submit_all(function, list(items)), self)
 
     def submit_all(self, function: Callable[[Any], Outcome], items: Sequence[Any]) -> list[Future]:
         """As `PoolExecutor.submit_all`."""

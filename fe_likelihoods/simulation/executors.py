@@ -5,8 +5,8 @@ The rule for ``pool=``:
 * None: in this process.
 * a whole number: a `LocalPool` of that many processes.
 * an object with ``gather`` (a client of dask.distributed): ``map(function, items, pure=False)``.
-* any other object with ``map``: ``list(pool.map(function, items))``, and for single items ``submit`` or
-  ``apply_async``. This covers the executors of concurrent.futures, loky and mpi4py.futures and the pools of
+* any other object with ``map``: ``list(pool.map(function, items))``, and for single items ``submit`` if it has that.
+  This covers the executors of concurrent.futures, loky and mpi4py.futures and the pools of
   multiprocessing and schwimmbad.
 
 The function (model and measurements) is sent by value (`fe_likelihoods.simulation.by_value`): by a `LocalPool` to each

@@ -18,7 +18,7 @@ from .by_value import Pickled
 from .faults import RunFailed
 from .worker import LoadingFailed, Worker, Workers
 
-__all__ = ["LocalPool", "Outcome", "results_of"]
+__all__ = ["LocalPool", "Outcome", "Submitting", "Threads"]
 
 MAX_ATTEMPTS = 3
 _LINGER = 0.1  # [s] that a thread waits for another item before it ends; a new thread costs as much as a short item
@@ -28,15 +28,94 @@ Outcome = tuple[Any, str]
 """Result and an empty reason, or None and the reason of a failure; mapped functions return this."""
 
 
-def results_of(futures: Sequence[Future], executor: Any) -> list[Any]:
-    """Results of futures; at the first exception, which is raised, and at Ctrl-C, the other futures are given up."""
-    try:
-        for future in wait_for(futures, return_when=FIRST_EXCEPTION).done:
-            future.result()
-        return [future.result() for future in futures]
-    except BaseException:
-        executor.give_up(futures)
-        raise
+class Submitting:
+    """Base class of executors: `map` and `submit` by `submit_all` and `give_up`."""
+
+    def map(self, function: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
+        """Results of a function for every item, in order.
+
+        An item that killed every process that ran it gets the `Outcome` ``(None, reason)``.
+
+        Raises
+        ------
+        ValueError
+            If the function or an item cannot be sent to the processes, or the function cannot be loaded there.
+        RuntimeError
+            If three processes of a `LocalPool` in succession die before they are given an item.
+        Exception
+            The first exception that `function` raises; no further items are started. At Ctrl-C, too, the other items
+            are given up.
+        """
+        futures = self.submit_all(function, list(items))
+        try:
+            for future in wait_for(futures, return_when=FIRST_EXCEPTION).done:
+                future.result()
+            return [future.result() for future in futures]
+        except BaseException:
+            self.give_up(futures)
+            raise
+
+    def submit(self, function: Callable[[Any], Any], item: Any) -> Future:
+        """Future with the result of a function for one item, as returned by `map`.
+
+        ``cancel()`` has an effect until the item is sent to a process, if the pool can cancel.
+        """
+        return self.submit_all(function, [item])[0]
+
+
+class Threads:
+    """Daemon threads that call functions, at most ``most()`` at once; Python does not wait for them at its end.
+
+    With 0 threads, a function is called at once. `pending` counts the functions that have not ended.
+    """
+
+    def __init__(self, most: Callable[[], int]) -> None:
+        self._most, self._changed = most, threading.Condition()
+        self._waiting: deque[tuple[Future, Callable, Any]] = deque()
+        self._threads: set[threading.Thread] = set()
+        self._n_idle = self.pending = 0
+
+    def submit(self, function: Callable[[Any], Any], item: Any, future: Future | None = None) -> Future:
+        """Future of a function of an item, which `cancel` prevents until a thread takes it."""
+        future, most = Future() if future is None else future, self._most()
+        with self._changed:
+            self.pending += 1
+            self._waiting.append((future, function, item))
+            self._changed.notify()
+            if len(self._threads) < most and self._n_idle < len(self._waiting):
+                thread = threading.Thread(target=self._work, args=(_LINGER,), name="fe_likelihoods", daemon=True)
+                self._threads.add(thread)
+                thread.start()
+        if not most:
+            self._work(0.0)
+        return future
+
+    def has_this_one(self) -> bool:
+        """Whether the present thread is one of them."""
+        return threading.current_thread() in self._threads
+
+    def _work(self, linger: float) -> None:
+        """Call functions one after the other, until none has been waiting for a time [s]."""
+        while True:
+            with self._changed:
+                self._n_idle += 1
+                self._changed.wait_for(lambda: self._waiting, linger)
+                self._n_idle -= 1
+                if not self._waiting:
+                    self._threads.discard(threading.current_thread())
+                    return
+                future, function, item = self._waiting.popleft()
+            if future.set_running_or_notify_cancel():
+                try:
+                    result, error = function(item), None
+                except BaseException as raised:
+                    result, error = None, raised
+                if error is None:
+                    future.set_result(result)
+                else:
+                    future.set_exception(error)
+            with self._changed:
+                self.pending -= 1
 
 
 class _Job(Future):
@@ -49,7 +128,7 @@ class _Job(Future):
         self.given_up = False
 
 
-class LocalPool:
+class LocalPool(Submitting):
     """Pool of local processes.
 
     The processes start with the first item. They end with `close`, when this object is garbage-collected, or when this
@@ -85,11 +164,9 @@ class LocalPool:
         self._set_up()
 
     def _set_up(self) -> None:
-        self._owner, self._changed = os.getpid(), threading.Condition(threading.RLock())
-        self._waiting: deque[_Job] = deque()
-        self._running: set[_Job] = set()
-        self._threads: set[threading.Thread] = set()
-        self._n_idle = 0  # threads that wait for an item
+        self._owner, self._lock = os.getpid(), threading.Lock()
+        self._jobs: set[_Job] = set()  # that have not ended
+        self._threads = Threads(lambda most=self.workers: most)
         self._workers = Workers(environment=self._environment)
 
     def __enter__(self) -> "LocalPool":
@@ -109,48 +186,30 @@ class LocalPool:
     def close(self) -> None:
         """Give up all items and end the processes; a later item starts new processes."""
         self._notice_fork()
-        with self._changed:
-            left = [*self._waiting, *self._running]
-        self.give_up(left)
+        self.give_up(list(self._jobs))
         self._workers.close()
-
-    def map(self, function: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
-        """Results of a function for every item, in order; these items run before items that were submitted.
-
-        An item whose process died three times gets the `Outcome` ``(None, reason)``.
-
-        Raises
-        ------
-        ValueError
-            If the function or an item cannot be sent to the processes, or the function cannot be loaded there.
-        RuntimeError
-            If three processes in succession die before they are given an item.
-        Exception
-            The first exception that `function` raises; no further items are started.
-        """
-        return results_of(self._enqueue(function, list(items), first=True), self)
-
-    def submit(self, function: Callable[[Any], Any], item: Any) -> Future:
-        """Future with the result of a function for one item, as returned by `map`.
-
-        ``cancel()`` has an effect until the item is sent to a process.
-        """
-        return self.submit_all(function, [item])[0]
 
     def submit_all(self, function: Callable[[Any], Any], items: Sequence[Any]) -> list[Future]:
         """Futures as from `submit`, for several items; ValueError if the function cannot be sent to the processes."""
-        return self._enqueue(function, items)
+        self._notice_fork()
+        pickled = Pickled.of(function)  # each time: the values that it uses may have changed
+        jobs = [_Job(pickled, item) for item in items]
+        self._jobs.update(jobs)
+        for job in jobs:
+            job.add_done_callback(self._jobs.discard)
+            self._threads.submit(self._result, job, job)
+        return jobs
 
     def give_up(self, futures: Sequence[Future], running: bool = True) -> None:
         """Cancel items; with `running`, also kill the processes that run them. Items with results keep them."""
         self._notice_fork()
         started = [job for job in futures if not job.cancel() and running and not job.done()]
         for job in started:
-            with self._changed:
+            with self._lock:
                 job.given_up, worker = True, job.worker
             if worker is not None:
                 worker.kill()
-        if threading.current_thread() not in self._threads:
+        if not self._threads.has_this_one():
             wait_for(started)
 
     def _notice_fork(self) -> None:
@@ -158,59 +217,11 @@ class LocalPool:
         if self._owner != os.getpid():
             self._set_up()
 
-    def _enqueue(self, function: Any, items: Sequence[Any], first: bool = False) -> list[_Job]:
-        self._notice_fork()
-        pickled = Pickled.of(function)  # each time: the values that it uses may have changed
-        jobs = [_Job(pickled, item) for item in items]
-        with self._changed:
-            if first:
-                self._waiting.extendleft(reversed(jobs))
-            else:
-                self._waiting.extend(jobs)
-            self._changed.notify_all()
-            for _ in range(min(self.workers - len(self._threads), len(self._waiting) - self._n_idle)):
-                thread = threading.Thread(target=self._work, name="LocalPool", daemon=True)
-                self._threads.add(thread)
-                thread.start()
-        return jobs
-
-    # in a thread per worker -----------------------------------------------------------------------------------------
-
-    def _work(self) -> None:
-        """Run items one after the other, until none is waiting."""
-        while (job := self._next()) is not None:
-            try:
-                result, error = self._result(job), None
-            except BaseException as raised:
-                result, error = None, raised
-            with self._changed:
-                self._running.discard(job)
-                job.worker = None
-            if error is None:
-                job.set_result(result)
-            else:
-                job.set_exception(error)
-
-    def _next(self) -> _Job | None:
-        """The next item; None if the thread ends."""
-        with self._changed:
-            while True:
-                self._n_idle += 1
-                self._changed.wait_for(lambda: self._waiting, _LINGER)
-                self._n_idle -= 1
-                if not self._waiting:
-                    self._threads.discard(threading.current_thread())
-                    return None
-                job = self._waiting.popleft()
-                if job.set_running_or_notify_cancel():
-                    self._running.add(job)
-                    return job
-
     def _result(self, job: _Job) -> Any:
         """Result of an item, from another process if its process dies."""
 
         def watch(worker: Worker | None) -> None:
-            with self._changed:
+            with self._lock:
                 job.worker = worker
             if job.given_up:
                 raise CancelledError

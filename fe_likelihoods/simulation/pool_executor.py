@@ -10,7 +10,7 @@ from typing import Any
 from samplers.interrupts import Ended, SentFunction
 
 from .by_value import Pickled, Recent
-from .local_pool import Outcome
+from .local_pool import Outcome, Submitting
 
 __all__ = ["PoolExecutor", "resolve"]
 
@@ -22,7 +22,7 @@ class _Task(Future):
 
     def cancel(self) -> bool:
         """Cancel the item unless the pool has started it, or cannot cancel anything."""
-        if self.inner is not None and not (hasattr(self.inner, "cancel") and self.inner.cancel()):
+        if self.inner is not None and not self.inner.cancel():
             return False
         return super().cancel()
 
@@ -39,7 +39,7 @@ def resolve(future: Future, result: Any = None, error: BaseException | None = No
         future.set_exception(error)
 
 
-class PoolExecutor:
+class PoolExecutor(Submitting):
     """Executor for any object with ``map(function, items)``.
 
     A `multiprocessing.Pool` replaces a process that dies but does not run its item again, so the call never returns.
@@ -56,8 +56,8 @@ class PoolExecutor:
 
     @property
     def submits(self) -> bool:
-        """Whether the pool can run single items: it has ``submit`` or ``apply_async``."""
-        return hasattr(self.pool, "submit") or isinstance(self.pool, Pool)
+        """Whether the pool can run single items: it has ``submit``."""
+        return hasattr(self.pool, "submit")
 
     @property
     def n_workers(self) -> int | None:
@@ -67,25 +67,19 @@ class PoolExecutor:
 
     def map(self, function: Callable[[Any], Outcome], items: Iterable[Any]) -> list[Outcome]:
         """Outcomes of a function for every item, in order; ValueError if a worker cannot load the function."""
+        if self.submits:
+            return super().map(function, items)
         outcomes = list(self.pool.map(self._by_value(function), list(items)))
         for outcome in outcomes:
             if isinstance(outcome, Ended):
                 raise outcome.error
         return outcomes
 
-    def submit(self, function: Callable[[Any], Outcome], item: Any) -> Future:
-        """Future with the outcome of a function for one item; raises the errors of `map`.
-
-        ``cancel()`` has an effect until the pool starts the item, if the pool can cancel.
-        """
-        return self.submit_all(function, [item])[0]
-
     def submit_all(self, function: Callable[[Any], Outcome], items: Sequence[Any]) -> list[Future]:
         """Futures as from `submit`, for several items; ValueError if the pool only has ``map``."""
         if not self.submits:
             raise ValueError(
-                f"{type(self.pool).__name__} has map, and neither submit nor apply_async: its items cannot be "
-                "submitted one by one; use map"
+                f"{type(self.pool).__name__} has map and no submit: its items cannot be submitted one by one; use map"
             )
         sent, tasks = self._by_value(function), []
         try:
@@ -119,12 +113,8 @@ class PoolExecutor:
             else:
                 resolve(task, inner.result())
 
-        if hasattr(self.pool, "submit"):
-            task.inner = self.pool.submit(sent, item)
-            task.inner.add_done_callback(ended)
-        else:
-            failed = partial(resolve, task, None)
-            task.inner = self.pool.apply_async(sent, (item,), callback=partial(resolve, task), error_callback=failed)
+        task.inner = self.pool.submit(sent, item)
+        task.inner.add_done_callback(ended)
 
 
 class _ByValue:

@@ -10,7 +10,7 @@ from samplers import SMCSampler, TMCMCSampler
 from tests.contract.targets import Gaussian
 from tests.emulation.problems import symmetric
 from tests.faults.records import blocks, cut
-from tests.simulated_cluster import SimulatedPool
+from tests.simulated_cluster import DelayedPool
 from tests.tempering.guides import FixedGuide
 
 N, WORKERS = 40, 12
@@ -20,15 +20,13 @@ pytestmark = pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
 
 def finished(path, order=0, workers=WORKERS, **settings):
     """A run on two modes, with searches on parts of the record; `order` is the seed of the run lengths."""
-    posterior, lengths = symmetric(), np.random.default_rng(order)
+    posterior = symmetric()
     likelihood = posterior.likelihood
-    likelihood.simulator.pool = pool = SimulatedPool(
-        workers, lambda theta: lengths.exponential(), likelihood.model.n_steps
-    )
+    likelihood.simulator.pool = pool = DelayedPool(workers, order, likelihood.model.n_steps)
     settings = {"seed": 5, "guide": posterior.guide(4), "asynchronous": True, **settings}
     backend = emcee.backends.HDFBackend(str(path))
     sampler = SMCSampler(N, 2, posterior, vectorize=True, backend=backend, **settings)
-    with pool.clock():
+    with pool.pool:
         sampler.run_mcmc(None, 1 - sampler.iteration)
     sampler._record.close()
     return sampler, pool

@@ -100,6 +100,11 @@ def test_sys_exit_in_a_worker_is_a_failed_simulation(make, in_pool, pool):
     check_failure(simulate_batch(make(leave_with_another_error), THETAS, pool), "ValueError: the solver ended")
 
 
+def test_sys_exit_in_a_function_of_a_pool_does_not_end_this_process(pool):
+    with pytest.raises(RuntimeError, match="SystemExit: bye"):
+        pool.map(lambda item: leave(), [1])
+
+
 @pytest.mark.parametrize("make", [Plain, of_function, isolated])
 def test_keyboard_interrupt_in_a_worker_ends_the_run(make, pool):
     with pytest.raises(KeyboardInterrupt):

@@ -254,7 +254,7 @@ def test_failures_are_counted_and_left_out(rng, caplog):
 
 
 def test_all_failed():
-    with pytest.raises(SimulationFailed, match="all 3 samples failed .3: the offset is far too small"):
+    with pytest.raises(SimulationFailed, match="all 3 samples failed .3 x the offset is far too small"):
         quiet(Line(fails=True), np.zeros((3, 2)))
 
 
