@@ -63,7 +63,7 @@ def read_modal_data(
         hertz.
     variables : mapping of str to str, optional
         Names of the MATLAB variables: ``{"frequencies": "f", "shapes": "Phi", "damping": "xi"}``, without those that
-        do not exist.
+        do not exist; ``"modal.f"`` is the field of a structure.
     **options
         Of `ModalData`, such as ``frequency_cv``.
 
@@ -274,11 +274,13 @@ def _of_matlab(
     from scipy.io import loadmat  # slow to import
 
     try:
-        content = {name: value for name, value in loadmat(path).items() if not name.startswith("__")}
+        found = {name: each for name, each in loadmat(path, simplify_cells=True).items() if not name.startswith("__")}
     except (NotImplementedError, OSError, ValueError) as error:
         raise ValueError(
             f"{path}: cannot be read as a MATLAB file up to version 7.2: {error}; save it again with '-v7'"
         ) from None
+    fields = {f"{name}.{key}": each[key] for name, each in found.items() if isinstance(each, dict) for key in each}
+    content = {name: each for name, each in found.items() if not isinstance(each, dict)} | fields
     missing = [name for name in variables.values() if name not in content]
     if missing or not {"frequencies"} <= set(variables) <= {"frequencies", "shapes", "damping"}:
         raise ValueError(

@@ -143,6 +143,11 @@ def test_a_matlab_file(tmp_path):
     for variables in ({}, {"frequencies": "fn"}, {"frequencies": "f", "modes": "Phi"}):
         with pytest.raises(ValueError, match="the file has f, Phi, xi"):
             read_modal_data(path, unit="Hz", variables=variables)
+    savemat(path, {"modal": {"f": [[1.0], [3.0]], "Phi": SHAPES.T}})
+    data = read_modal_data(path, list("abc"), unit="Hz", variables={"frequencies": "modal.f", "shapes": "modal.Phi"})
+    np.testing.assert_allclose(data.shapes[0], UNIT, rtol=1e-12)
+    with pytest.raises(ValueError, match="the file has modal.f, modal.Phi"):
+        read_modal_data(path, unit="Hz", variables={"frequencies": "modal"})
     savemat(path, {"f": [1.0, 3.0], "Phi": SHAPES})
     with pytest.raises(ValueError, match="transpose the shapes"):
         read_modal_data(path, ["a", "b", "c"], unit="Hz", variables={"frequencies": "f", "shapes": "Phi"})
