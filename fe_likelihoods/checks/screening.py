@@ -18,7 +18,6 @@ __all__ = [
     "Screened",
     "check_data",
     "check_gaps",
-    "check_noise_prior",
     "check_phases",
     "check_sensors",
     "check_steps_of_mass",
@@ -221,14 +220,6 @@ def check_gaps(noise: Any) -> list[Finding]:
         f"{noise.title} refers to the others, and is too large if the strong part is missing."
     )
     return [Finding("Gaps in the data", CARE, text, "Use local=1, whose level is taken from samples near by.", large)]
-
-
-def check_noise_prior(channel: str, unit: str, expected: float, largest: float) -> list[Finding]:
-    """Whether the noise that a prior expects exceeds every measured value of a channel [SI]."""
-    text = f"The prior expects a noise that is larger than every measured value of {channel}."
-    action = f'A number without a unit is in SI units; give one, such as "half-normal(5 {unit})".'
-    numbers = {"ratio": expected / largest if largest else np.inf}
-    return [Finding("A prior of the noise is large", CARE, text, action, numbers)] if expected > largest else []
 
 
 def check_steps_of_mass(names: Sequence[str], step: float) -> list[Finding]:

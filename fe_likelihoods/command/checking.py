@@ -10,14 +10,14 @@ import numpy as np
 from ..cache.simulation_cache import SimulationCache
 from ..checks.finding import NOTE, labelled
 from ..checks.rehearsal import ModelCheck, check_model
-from ..checks.screening import check_noise_prior, repair_lines, screen
+from ..checks.screening import repair_lines, screen
 from ..information.identifiability import identifiability
 from ..likelihood.posterior import Posterior
 from ..signals.error_measures import rrmse
 from ..units import from_si
 from .events import Event, read_events
 from .job import Job, read_job
-from .models import Problem, make_problem, noise_channels_of
+from .models import Problem, make_problem
 from .results import names_of
 from .runs import CACHE, default_folder, is_free, make_sampler
 
@@ -71,7 +71,6 @@ def _say_data(problem: Problem, say: Callable[[str], None]) -> None:
         say(f"Record: {record.name}, {record.n_steps} samples at {record.dt:g} s, peak {peak:.3g} g")
         if record.source:
             say(f"  from {record.source}")
-    channels, largest = {}, {}
     for likelihood, _ in posterior.likelihood.parts():
         measured, model, modal = likelihood.measurements, likelihood.model, likelihood.is_modal
         say(f"Measurements: {measured.description or 'without a description'}")
@@ -84,9 +83,6 @@ def _say_data(problem: Problem, say: Callable[[str], None]) -> None:
             say(f"  {channel.name}: {len(shown)} {what}{missing}, peak {np.abs(shown).max():.3g} {channel.unit}")
         inner = getattr(model, "model", model) if modal else model
         say(f"Model: {type(getattr(inner, 'parts', inner)).__name__}, {len(model.parameter_names)} parameters")
-        for name, channel in noise_channels_of(likelihood).items():
-            channels[name] = channel
-            largest[name] = float(np.nanmax(np.abs(measured.channel(channel.name))))
     say(f"{posterior.ndim} parameters with the noise:")
     width = max(len(parameter.label) for parameter in posterior.parameters)
     for parameter in posterior.parameters:
@@ -94,11 +90,6 @@ def _say_data(problem: Problem, say: Callable[[str], None]) -> None:
         mean, sd = (parameter.shown(value) for value in prior.moments)
         note = " (assumed: not in the file)" if parameter.name in problem.assumed else ""
         say(f"  {parameter.label:<{width}}  prior mean {mean:.3g}, standard deviation {sd:.3g}{note}")
-        channel = channels.get(parameter.name)
-        if channel is not None:
-            expected = float(prior.moments[0])
-            for line in labelled(check_noise_prior(channel.name, channel.unit, expected, largest[parameter.name])):
-                say(f"  {line}")
 
 
 def _cache_of_the_run(job: Job, folder: Path) -> SimulationCache | None:

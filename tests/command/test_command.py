@@ -474,7 +474,7 @@ def test_priors_of_gains_and_lags_make_sensors(folder):
 
 
 def test_check_warns_of_what_is_likely_wrong(folder):
-    text = OSCILLATOR.replace("half-normal(5 mm)", "half-normal(10)").replace("guide = true", "")
+    text = OSCILLATOR.replace("guide = true", "")
     lines = (folder / "top.csv").read_text().splitlines()
     lines[5:15] = [line.rpartition(",")[0] + ",nan" for line in lines[5:15]]
     lines[100:120] = [
@@ -484,9 +484,6 @@ def test_check_warns_of_what_is_likely_wrong(folder):
     (folder / "oscillator.toml").write_text(text.replace("[prediction]", "[budget]\nmax_simulations = 5\n[prediction]"))
     output = call("check", "oscillator.toml")
     assert "displacement: 291 samples, 10 missing" in output
-    assert (
-        "larger than every measured value of displacement" in output and output.count("The prior expects a noise") == 1
-    )
     assert "will probably end before beta = 1" in output
     times = [float(lines[k].split(",")[0]) for k in (100, 119)]
     assert "CAUTION: A sensor was stuck: acceleration stands still at" in output
