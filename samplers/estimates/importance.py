@@ -9,12 +9,10 @@ The equations are in ``docs/theory/guided`` and ``docs/theory/evidence``.
 """
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from scipy import stats
-from scipy.special import gammaln
 
 from ..proposals.mixture import Mixture, draw
 from .pareto import LARGEST_SHAPE, pareto_shape, tail_size
@@ -28,9 +26,7 @@ __all__ = [
     "add_round",
     "draw_inside",
     "evidence_from_weights",
-    "expected_efficiency",
     "fewest_points",
-    "fits_poorly",
     "log_mixture",
     "pool_rounds",
     "round_shares",
@@ -47,14 +43,8 @@ ONE_AND_TWO_SD = (0.8413, 0.9772)
 LARGEST_ERROR = 0.35
 # Fewer effective points, or fewer per parameter (and one more), do not determine means and covariances.
 FEWEST_POINTS, POINTS_PER_DIMENSION = 20.0, 3.0
-# Efficiency of a fitted proposal divided by the efficiency expected for Gaussian modes, below which the fit misses a
-# part: nearly Gaussian posteriors, also at bounds or with several modes, have 0.9 to 1.1, bent posteriors without a
-# shear 0.4 to 0.93.
-POOR_FIT = 0.85
 FEW_WEIGHTS = 10.0
 ROUNDS = 50
-# points of the quadrature over the squared radius of a Gaussian
-QUANTILES = 2000
 
 
 class EvidenceCheck(NamedTuple):
@@ -136,36 +126,6 @@ def evidence_from_weights(log_weights: np.ndarray, made: int) -> EvidenceCheck:
     log_normal = np.expm1(min((two - one) ** 2, np.log1p(made))) / made if one > -np.inf else 0.0
     error = float(np.sqrt(max(1.0 / effective - 1.0 / made, log_normal)))
     return EvidenceCheck(log_evidence, error, effective, pareto_shape(log_weights), len(log_weights))
-
-
-def expected_efficiency(ndim: int, dof: float, components: int, points: float) -> float:
-    r"""Expected effective sample size per draw, between 0 and 1, of a mixture fitted to draws from as many Gaussians.
-
-    Without fitting noise it is :math:`1 / \mathrm{E}[p / q]` for a Gaussian p and the maximum-likelihood Student t q
-    with the same degrees of freedom as the mixture. With K components of d dimensions and n effective `points`, each
-    fitted number costs about 1 / n: the efficiency is divided by :math:`1 + K d (d + 3) / (2 n)`.
-    """
-    return _efficiency_without_noise(ndim, dof) / (1.0 + components * ndim * (ndim + 3) / (2.0 * points))
-
-
-def fits_poorly(check: EvidenceCheck, mixture: Mixture, points: float) -> bool:
-    """Whether the effective share of fresh draws is below 85 % of the expected share for Gaussian modes."""
-    components, ndim = mixture.means.shape
-    expected = expected_efficiency(ndim, mixture.dof, components, points)
-    return check.effective_sample_size / max(check.evaluations, 1) < POOR_FIT * expected
-
-
-@lru_cache
-def _efficiency_without_noise(ndim: int, dof: float) -> float:
-    """1 / E[p / q] for a standard Gaussian p and the Student t q of maximum likelihood."""
-    radii = stats.chi2.ppf((np.arange(QUANTILES) + 0.5) / QUANTILES, ndim)  # squared
-    scale = 1.0  # squared
-    for _ in range(100):  # expectation-maximisation
-        scale = float(np.mean((dof + ndim) / (dof + radii / scale) * radii)) / ndim
-    log_p = -0.5 * (ndim * np.log(2.0 * np.pi) + radii)
-    log_q = gammaln(0.5 * (dof + ndim)) - gammaln(0.5 * dof) - 0.5 * ndim * np.log(dof * np.pi * scale)
-    log_q -= 0.5 * (dof + ndim) * np.log1p(radii / (dof * scale))
-    return float(1.0 / np.mean(np.exp(log_p - log_q)))
 
 
 # ---------------------------------------------------------------- rounds

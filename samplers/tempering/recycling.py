@@ -36,7 +36,6 @@ from ..estimates.importance import (
     EvidenceCheck,
     draw_inside,
     evidence_from_weights,
-    fits_poorly,
     round_shares,
     tail_variance,
 )
@@ -238,7 +237,7 @@ def recycle(
             log_evidence, error = _evidence(points.log_weights(beta), inherited)
         reason = doubt_recycling(check, log_evidence, beta, efficiencies)
         # draws that contradict a fit also improve it: check again, as long as that is cheap
-        independent = checking and not reason and _suffice(drawn, start, check, mixture, size)
+        independent = checking and not reason and _suffice(drawn, start, size)
         ends = independent or checks == MOST_CHECKS if checking else bool(reason)
         if ends:
             if not checking:
@@ -336,13 +335,10 @@ def _result(drawn: Sequence[_Drawn], start: StartingDensity, beta: float) -> tup
     return np.concatenate([c for c, _ in parts]), np.concatenate([r for _, r in parts]), np.concatenate(scaled)
 
 
-def _suffice(
-    drawn: Sequence[_Drawn], start: StartingDensity, check: EvidenceCheck, mixture: Mixture, size: int
-) -> bool:
+def _suffice(drawn: Sequence[_Drawn], start: StartingDensity, size: int) -> bool:
     """Whether `size` points resampled from the draws at beta = 1 are as good as independent draws of the posterior."""
     weights = normalised_weights(_result(drawn, start, 1.0)[2])
-    distinct = np.minimum(size * weights, 1.0).sum()
-    return distinct >= ENOUGH_DISTINCT * size and not fits_poorly(check, mixture, size)
+    return bool(np.minimum(size * weights, 1.0).sum() >= ENOUGH_DISTINCT * size)
 
 
 def _evidence(log_weights: np.ndarray, inherited: float) -> tuple[float, float]:
