@@ -81,8 +81,6 @@ def test_resampling_is_unbiased(rng, name):
     assert np.max(np.abs(counts.mean(axis=0) - n * weights) / error) < 4.5
     if name == "systematic":
         assert np.max(np.abs(counts - n * weights)) < 1
-    if name == "residual":
-        assert np.all(counts >= np.floor(n * weights))
 
 
 def test_evidence_error_of_independent_points_is_that_of_importance_sampling(rng):
