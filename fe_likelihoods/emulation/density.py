@@ -84,9 +84,9 @@ class EmulatedPosterior:
     """Density of the emulated posterior, from regions with emulators, and a weighted sample of it, the pool.
 
     `log_evidence` is the log of the integral over the emulated density, with an error from the importance sampling in
-    memory; `top` is the largest log-density in the pool, `effective_share` its effective sample size divided by its
-    size, and `largest_weight` the largest normalised weight in it; `of_runs` are log-densities (n,) of the simulations
-    by their responses, and by the emulators; `regions` are those given, with their moments.
+    memory; `effective_share` is the effective sample size of the pool divided by its size, and `largest_weight` the
+    largest normalised weight in it; `of_runs` are log-densities (n,) of the simulations by their responses, and by the
+    emulators; `regions` are those given, with their moments.
     """
 
     def __init__(self, target: ResponseTarget, regions: Sequence[Region], random: np.random.RandomState) -> None:
@@ -235,8 +235,6 @@ class EmulatedPosterior:
             raise np.linalg.LinAlgError("none is inside the support of the prior and within reach of an emulator")
         # outside the support of the prior, coordinates are infinite
         self._pool[self._log_weights == -np.inf] = 0.0
-        highest = np.argsort(-self._log_weights)[:1000]
-        self.top = float(self.log_density(self._pool[highest]).max())
         self._weights = normalised_weights(self._log_weights)
         self.log_evidence = log_mean_weight(self._log_weights)
         effective = effective_sample_size(self._log_weights)

@@ -67,7 +67,6 @@ _MOST_RUNS = 300
 _WITHIN = 36.0  # squared Mahalanobis distance per dimension within which runs train the emulator of a region
 _DEPTH = 40.0, 8.0  # log-density below the best within which runs train an emulator: constant, per dimension
 _ALWAYS = 5  # best runs per dimension that train in any case
-_IMPLAUSIBLE = 10.0  # emulated log-density above all runs, besides 1 per dimension, at which a fit is refused
 _LARGE = 10.0  # error of an emulated log-likelihood, beyond which its size does not matter
 _CLEARLY = 0.75  # ratio of such errors at which the emulators take a function of the parameters
 
@@ -91,8 +90,6 @@ class ResponseGuide:
     simulations : float
         Simulations run by the guide itself, parts of a record counted as fractions; a call of the model's ``jacobian``
         counts as one.
-    log_density_error : float
-        Standard error of the log normalising constant of `log_density`.
 
     Examples
     --------
@@ -116,7 +113,6 @@ class ResponseGuide:
         self.search: ModeSearch | None = None
         self.simulations = 0.0
         self._regions: list[Region] = []
-        self._best = -np.inf  # largest log-density of a run, in standard normal coordinates
         self._emulated: EmulatedPosterior | None = None
         self._wide: Mixture | None = None
         self._fitted: Mixture | None = None  # to weighted draws
@@ -182,10 +178,6 @@ class ResponseGuide:
         return tuple(region.emulator for region in self._regions if region.emulator is not None)
 
     @property
-    def log_density_error(self) -> float:
-        return 0.0 if self._emulated is None else self._emulated.log_evidence_error
-
-    @property
     def known_density(self) -> KnownDensity | None:
         """The emulated posterior, whose expectations cost no simulation; None before there is an emulator."""
         return None if self._emulated is None else self._emulated.known_density
@@ -200,7 +192,7 @@ class ResponseGuide:
         modes = self.search.modes
         self._regions = [Region(mode.coords, mode.covariance, None, mode.log_evidence) for mode in modes]
         if modes:
-            self._best, self._wide = max(mode.log_density for mode in modes), self._wide_mixture()
+            self._wide = self._wide_mixture()
         archive = self._target.archive
         runs = archive.numbers
         if len(runs) > 1 and all(np.array_equal(*map(archive.residuals, (runs[0], other))) for other in runs):
@@ -249,31 +241,24 @@ class ResponseGuide:
         latest = np.where(alive, np.where(alive, log_prob, 0.0) - self.log_density(parameters), -np.inf)
         drawn = session.weighted()
         fitted = None if drawn is None else self._fit_draws(latest, *drawn)
-        coords = self._target.coordinates(parameters[alive])
-        density = log_prob[alive] - self._posterior.log_prior(parameters[alive]) + self._target.log_prior(coords)
-        self._best = max(self._best, density.max(initial=-np.inf))
         self._emulate(session.random)
         self._fitted = fitted
 
     # ------------------------------------------------------------------ parts
 
     def _emulate(self, random: np.random.RandomState) -> None:
-        """Fit emulators to all runs, and the emulated posterior; an implausible one is not used."""
+        """Fit emulators to all runs, and the emulated posterior."""
         if not self.emulators:
             self._choose_scale()
         self._fit_emulators()
         ready = [region for region in self._regions if region.emulator is not None]
         if ready and len(ready) == len(self._regions):
             try:
-                emulated = EmulatedPosterior(self._target, self._regions, random)
+                self._emulated = EmulatedPosterior(self._target, self._regions, random)
             except np.linalg.LinAlgError as error:
                 logger.info("no draws of the emulated posterior could be made: %s", error)
                 return
-            if emulated.top > self._best + _IMPLAUSIBLE + self._target.ndim:
-                logger.info("the emulators have a top (%.1f) far above all runs (%.1f)", emulated.top, self._best)
-                return
-            self._emulated = emulated
-            self._regions = emulated.regions
+            self._regions = self._emulated.regions
             self._wide = self._wide_mixture()
 
     def _choose_scale(self) -> None:
@@ -335,10 +320,8 @@ class ResponseGuide:
         if effective_sample_size(latest) >= _EVEN * len(latest) or len(log_weights) < 2.0 * enough:
             return None
         weights = normalised_weights(tempered(log_weights, enough))
-        fitted, wider = (
-            fit_mixture(self._target.coordinates(parameters), weights, len(self._regions)),
-            np.sqrt(_WIDENED),
-        )
+        fitted = fit_mixture(self._target.coordinates(parameters), weights, len(self._regions))
+        wider = np.sqrt(_WIDENED)
         return fitted._replace(roots=wider * fitted.roots, inverses=fitted.inverses / wider)
 
     def _wide_mixture(self) -> Mixture:

@@ -299,13 +299,13 @@ def log_mixture(rounds: Sequence[Round], coords: np.ndarray) -> np.ndarray:
     return np.logaddexp.reduce(parts)
 
 
-def pool_rounds(rounds: Sequence[Round], log_density_error: float = 0.0) -> PooledRounds:
+def pool_rounds(rounds: Sequence[Round]) -> PooledRounds:
     r"""Combine one or more rounds: each draw is weighted by the mixture of all their densities (`add_round`).
 
     The variance of the log-evidence is the sum of three parts: of the mean weights, :math:`\sum_r n_r s_r^2 / \hat Z^2`
     with the sample variances :math:`s_r^2` of the weights in each round, or, if it is larger, that of n draws like the
     latest ones, since proposals that were fitted to earlier draws make their weights too even; `tail_variance`; and the
-    square of `log_density_error`, the standard error of the proposal's log normalising constant.
+    square of the standard error of the known density's log normalising constant.
     """
     parts = [
         np.where(alive, np.where(alive, r.records["log_prob"], 0.0) - r.log_mixture, -np.inf)
@@ -321,6 +321,7 @@ def pool_rounds(rounds: Sequence[Round], log_density_error: float = 0.0) -> Pool
     weights = [np.exp(part - log_evidence) for part in parts]
     variance = sum(len(each) * float(np.var(each, ddof=1)) if len(each) > 1 else np.inf for each in weights)
     fresh = (1.0 / max(rounds[-1].effective_share, np.finfo(float).tiny) - 1.0) / len(log_weights)
-    variance = max(variance, fresh) + tail_variance(log_weights) + log_density_error**2
+    known = max((r.known.log_density_error for r in rounds if r.known is not None), default=0.0)
+    variance = max(variance, fresh) + tail_variance(log_weights) + known**2
     effective = effective_sample_size(log_weights)
     return PooledRounds(coords, records, log_weights, log_evidence, float(np.sqrt(variance)), effective, shape)

@@ -21,7 +21,6 @@ UNKNOWN = "it has no attribute findings, so it is not known whether the posterio
 # does not say whether parts of the posterior may be missing is doubted.
 DEFAULTS = {
     "simulations": 0.0,
-    "log_density_error": 0.0,
     "findings": (find_missing_part(UNKNOWN),),
     "basis": "",
     "observe": None,
@@ -88,8 +87,6 @@ class Guide(Protocol):
         A function like `log_density` that does not change when the guide learns; by default of a deep copy.
     ``simulations`` : float
         Simulations made by `prepare` and `refine`; parts of a simulation count as fractions.
-    ``log_density_error`` : float
-        Standard error of the density's log normalising constant.
     ``findings`` : sequence of Finding
         Reasons why parts of the posterior may be missing, such as modes that were not searched for
         (`samplers.judgement.guides.find_missing_part`); their severity limits the verdict. A missing attribute counts

@@ -254,7 +254,7 @@ def draw_rounds(
             outcome = None
             while batches and batches[0].pending.complete:
                 rounds = add_round(rounds, batches.pop(0).as_round())
-                pooled = pool_rounds(rounds, guide.log_density_error)
+                pooled = pool_rounds(rounds)
                 population = population._replace(effective_sample_size=pooled.effective_sample_size)
                 yield population, _report(rounds[-1], pooled)
                 yield tick(f"round {len(rounds)}", True)
@@ -270,7 +270,7 @@ def draw_rounds(
     yield from asked(guide.prepare(session), "search")
     while True:
         yield tick(f"round {len(rounds) + len(batches) + 1}", False)
-        coords = guide.draw(_next_size(rounds, batches, size, guide), random)
+        coords = guide.draw(_next_size(rounds, batches, size), random)
         batch = submit_batch(coords, density, guide, session)
         refused = batch.pending.refused
         if len(batch) > 0:
@@ -340,17 +340,17 @@ def _too_few(rounds: Sequence[Round], batches: Sequence[Batch], size: int, guide
     if len(rounds) + len(batches) >= MOST_ROUNDS:
         return False
     if rounds and is_reliable(rounds[-1]):
-        return _missing(rounds, batches, size, guide) > 0.0
+        return _missing(rounds, batches, size) > 0.0
     return guide.learns_from_parts and (not all_impossible(rounds) or any(batch.possible for batch in batches))
 
 
-def _missing(rounds: Sequence[Round], batches: Sequence[Batch], size: int, guide: AdaptedGuide) -> float:
+def _missing(rounds: Sequence[Round], batches: Sequence[Batch], size: int) -> float:
     """Missing effective draws, if the running draws have the effective share of the last round."""
     expected = rounds[-1].effective_share * sum(len(batch) for batch in batches)
-    return size - pool_rounds(rounds, guide.log_density_error).effective_sample_size - expected
+    return size - pool_rounds(rounds).effective_sample_size - expected
 
 
-def _next_size(rounds: Sequence[Round], batches: Sequence[Batch], size: int, guide: AdaptedGuide) -> int:
+def _next_size(rounds: Sequence[Round], batches: Sequence[Batch], size: int) -> int:
     """Number of draws in the next batch; only the number of draws in the running `batches` matters."""
     first = max(FEWEST_DRAWS, int(np.ceil(FIRST_ROUND_SHARE * size)))
     if not rounds and not batches:
@@ -358,7 +358,7 @@ def _next_size(rounds: Sequence[Round], batches: Sequence[Batch], size: int, gui
     if rounds and all_impossible(rounds):  # perhaps all simulations fail: find out with few more
         return FEWEST_DRAWS
     if rounds and is_reliable(rounds[-1]):
-        missing = _missing(rounds, batches, size, guide)
+        missing = _missing(rounds, batches, size)
         return int(np.clip(np.ceil(missing / rounds[-1].effective_share), first, max(size, first)))
     return max(FEWEST_DRAWS, int(np.ceil(ROUND_SHARE * size)))
 
