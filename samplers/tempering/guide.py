@@ -176,7 +176,15 @@ class AdaptedGuide:
     def frozen(self) -> Callable[[np.ndarray], np.ndarray]:
         """The log-density as it is now, whatever the guide learns later."""
         frozen = getattr(self.guide, "frozen", None)
-        return copy.deepcopy(self.guide).log_density if frozen is None else frozen()
+        if frozen is not None:
+            return frozen()
+        try:
+            return copy.deepcopy(self.guide).log_density
+        except Exception as error:
+            raise ValueError(
+                f"{type(self.guide).__name__} cannot be copied ({error}): give the guide a method frozen(), which "
+                "returns a function like log_density that does not change when the guide learns"
+            ) from error
 
     def refine(self, coords: np.ndarray, log_prob: np.ndarray, session: GuideSession) -> Generator:
         """Let the guide learn from the latest draws."""

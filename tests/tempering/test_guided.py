@@ -107,6 +107,14 @@ def test_a_useless_guide_leads_to_recycling_with_a_warning():
     assert abs(sampler.log_evidence - posterior.log_evidence) < 4.0 * sampler.log_evidence_error
 
 
+class Uncopied(FixedGuide):
+    def fresh(self):
+        return self
+
+    def __deepcopy__(self, memo):
+        raise TypeError("it holds a lock")
+
+
 def test_what_a_guide_must_be():
     posterior = Gaussian()
 
@@ -128,6 +136,11 @@ def test_what_a_guide_must_be():
         setattr(guide, name, wrong)
         with pytest.raises(ValueError, match=match):
             run(posterior, guide)
+    guide = laplace(posterior, guide=Uncopied)
+    with pytest.raises(ValueError, match=r"method frozen\(\)"):
+        run(posterior, guide)
+    guide.frozen = lambda: guide.log_density  # it does not learn
+    run(posterior, guide)
 
 
 def test_points_are_observed_once_before_they_are_evaluated():
