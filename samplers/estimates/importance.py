@@ -29,6 +29,7 @@ __all__ = [
     "fewest_points",
     "log_mixture",
     "pool_rounds",
+    "recent_share",
     "round_shares",
     "tail_growth",
     "tail_shape",
@@ -279,6 +280,11 @@ def tail_variance(log_weights: np.ndarray) -> float:
     return (largest * max(shape, 0.0) / (1.0 - shape)) ** 2
 
 
+def recent_share(rounds: Sequence[Round]) -> float:
+    """Mean effective share of the last three rounds."""
+    return max(float(np.mean([r.effective_share for r in rounds[-3:]])), np.finfo(float).tiny)
+
+
 def add_round(rounds: Sequence[Round], latest: Round) -> list[Round]:
     """Rounds and a further one, each with the mixture of the densities of all of them at its draws."""
     count, alive = np.log(len(latest.coords)), latest.log_weights > -np.inf
@@ -304,8 +310,8 @@ def pool_rounds(rounds: Sequence[Round]) -> PooledRounds:
 
     The variance of the log-evidence is the sum of three parts: of the mean weights, :math:`\sum_r n_r s_r^2 / \hat Z^2`
     with the sample variances :math:`s_r^2` of the weights in each round, or, if it is larger, that of n draws like the
-    latest ones, since proposals that were fitted to earlier draws make their weights too even; `tail_variance`; and the
-    square of the standard error of the known density's log normalising constant.
+    latest ones (`recent_share`), since proposals that were fitted to earlier draws make their weights too even;
+    `tail_variance`; and the square of the standard error of the known density's log normalising constant.
     """
     parts = [
         np.where(alive, np.where(alive, r.records["log_prob"], 0.0) - r.log_mixture, -np.inf)
@@ -320,7 +326,7 @@ def pool_rounds(rounds: Sequence[Round]) -> PooledRounds:
         return PooledRounds(coords, records, log_weights, log_evidence, float("inf"), 0.0, shape)
     weights = [np.exp(part - log_evidence) for part in parts]
     variance = sum(len(each) * float(np.var(each, ddof=1)) if len(each) > 1 else np.inf for each in weights)
-    fresh = (1.0 / max(rounds[-1].effective_share, np.finfo(float).tiny) - 1.0) / len(log_weights)
+    fresh = (1.0 / recent_share(rounds) - 1.0) / len(log_weights)
     known = max((r.known.log_density_error for r in rounds if r.known is not None), default=0.0)
     variance = max(variance, fresh) + tail_variance(log_weights) + known**2
     effective = effective_sample_size(log_weights)

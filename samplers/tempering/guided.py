@@ -40,6 +40,7 @@ from ..estimates.importance import (
 from ..estimates.pareto import LARGEST_SHAPE
 from ..judgement.rounds import (
     LIGHT_TAILS,
+    RELIABLE_SHARE,
     UNREACHED,
     UNSETTLED,
     all_impossible,
@@ -320,8 +321,8 @@ def _report(last: Round, pooled: PooledRounds) -> GuidedRound:
 def _outcome(rounds: Sequence[Round], pooled: PooledRounds, size: int) -> RoundsOfGuide | None:
     """How the rounds end; None if they continue."""
     last, enough = rounds[-1], pooled.effective_sample_size >= size
-    if enough and is_reliable(last) and is_even(pooled):
-        light = tails_are_light([r for r in rounds if is_reliable(r)])
+    if enough and is_reliable(rounds) and is_even(pooled):
+        light = tails_are_light([r for r in rounds if r.effective_share >= RELIABLE_SHARE])
         return RoundsOfGuide("", LIGHT_TAILS if light else "", pooled, rounds)
     if reason := hopeless(rounds):
         return RoundsOfGuide(reason, "", pooled, rounds)
@@ -339,7 +340,7 @@ def _too_few(rounds: Sequence[Round], batches: Sequence[Batch], size: int, guide
     """
     if len(rounds) + len(batches) >= MOST_ROUNDS:
         return False
-    if rounds and is_reliable(rounds[-1]):
+    if rounds and is_reliable(rounds):
         return _missing(rounds, batches, size) > 0.0
     return guide.learns_from_parts and (not all_impossible(rounds) or any(batch.possible for batch in batches))
 
@@ -357,7 +358,7 @@ def _next_size(rounds: Sequence[Round], batches: Sequence[Batch], size: int) -> 
         return first
     if rounds and all_impossible(rounds):  # perhaps all simulations fail: find out with few more
         return FEWEST_DRAWS
-    if rounds and is_reliable(rounds[-1]):
+    if rounds and is_reliable(rounds):
         missing = _missing(rounds, batches, size)
         return int(np.clip(np.ceil(missing / rounds[-1].effective_share), first, max(size, first)))
     return max(FEWEST_DRAWS, int(np.ceil(ROUND_SHARE * size)))
