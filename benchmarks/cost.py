@@ -1,7 +1,6 @@
 """Overhead of the samplers per evaluation, measured with a vectorised likelihood of negligible cost.
 
-CPU time of the process for plain moves, mixture moves and recycling. The overhead of a file is measured in `storage`,
-the growth with walkers and parameters in `growth`.
+CPU time of the process for plain moves, mixture moves and recycling.
 """
 
 import tempfile

@@ -25,14 +25,14 @@ def test_target_counts_every_point_of_the_likelihood_and_none_outside_the_prior(
 
 
 def test_options_are_those_of_the_functions():
-    names, options = parsed(["truth", "job", "walkers=250,500", "limit=5"])
-    assert names == ["truth", "job"]
-    assert options == {"truth": {"walkers": (250, 500)}, "job": {"limit": 5.0}}
+    names, options = parsed(["truth", "screening", "walkers=250,500", "every=5"])
+    assert names == ["truth", "screening"]
+    assert options == {"truth": {"walkers": (250, 500)}, "screening": {"every": 5}}
     assert parsed([])[0] == list(BENCHMARKS)
     for words, message in (
         (["no_such"], "expected names among"),
-        (["job", "walkers=5"], "no such option: walkers. Options of job: every, limit"),
-        (["job", "every=many"], "many"),
+        (["screening", "walkers=5"], "no such option: walkers. Options of screening: every"),
+        (["screening", "every=many"], "many"),
     ):
         with pytest.raises(ValueError, match=message):
             parsed(words)
