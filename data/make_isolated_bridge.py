@@ -16,12 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from fe_likelihoods import IsolatedBridge, Measurements, Record
-from fe_likelihoods.problems import (
-    ISOLATED_BRIDGE_NOISE,
-    ISOLATED_BRIDGE_OUTPUTS,
-    ISOLATED_BRIDGE_TRUTH,
-    table_motion,
-)
+from fe_likelihoods.models.isolated_bridge_channels import CHANNEL_SETS
+from fe_likelihoods.problems import table_motion
 from fe_likelihoods.signals.datasets import write_dataset
 
 SEED = 1994
@@ -29,12 +25,23 @@ NOISE_SEED = 1999
 """One of four seeds, of nine, for which the estimates of all parameters lie within two posterior standard deviations
 of the truth. Tests of calibration use many draws of the noise."""
 
+_DEVICES = ("fmin_1", "df_1", "a_1", "fmin_2", "df_2", "a_2", "Kd_1", "C0_1", "Kd_2", "C0_2")
+TRUTH = {
+    "twin": dict(zip(_DEVICES, (1.15, 0.85, 1.2, 0.9, 1.1, 0.8, 0.8, 1.25, 1.3, 0.9), strict=True)),
+    "means": dict.fromkeys(_DEVICES, 1.0) | {"df_1": 0.8, "df_2": 1.2},
+}
+"""Multiples of the nominal values (assumed)."""
+
+OUTPUTS = {"twin": CHANNEL_SETS[10], "means": ("mean_Ub", "mean_Fb", "mean_drift", "mean_shear", "mean_acc_p")}
+NOISE = {"twin": 0.05, "means": 0.10}
+"""Standard deviations of the noise, in root mean squares of each channel (assumed)."""
+
 
 def bridge_measurements(record: Record, data: str, seed: int) -> Measurements:
     """Make the response with a small step at the truth of a bundled test, plus its white noise."""
-    step, noise = 0.05e-3, ISOLATED_BRIDGE_NOISE[data]
-    model = IsolatedBridge(record, outputs=ISOLATED_BRIDGE_OUTPUTS[data], step=step, every=2)
-    values = model.simulate([ISOLATED_BRIDGE_TRUTH[data][name] for name in model.parameter_names])
+    step, noise = 0.05e-3, NOISE[data]
+    model = IsolatedBridge(record, outputs=OUTPUTS[data], step=step, every=2)
+    values = model.simulate([TRUTH[data][name] for name in model.parameter_names])
     rms = np.sqrt(np.mean(values**2, axis=1, keepdims=True))
     values = values + noise * rms * np.random.default_rng(seed).standard_normal(values.shape)
     description = (
@@ -51,7 +58,7 @@ def main() -> None:
         measurements = bridge_measurements(record, data, NOISE_SEED)
         attributes = {
             "title": "Synthetic test of an isolated bridge: NOT measured data, nominal values assumed",
-            "truth": dict(ISOLATED_BRIDGE_TRUTH[data]) | {"sigma": ISOLATED_BRIDGE_NOISE[data]},
+            "truth": dict(TRUTH[data]) | {"sigma": NOISE[data]},
             "seed": SEED,
             "noise_seed": NOISE_SEED,
             "made_by": "data/make_isolated_bridge.py",

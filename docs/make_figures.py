@@ -179,7 +179,7 @@ def correlated_errors() -> dict[str, Figure]:
 def column_update() -> dict:
     """The column of the published study, updated with EQ1 and a stronger EQ2."""
     posterior = problems.bridge_column(data="eq1-eq2")
-    truth = [*problems.BRIDGE_COLUMN_MEANS.values(), *problems.BRIDGE_COLUMN_SENSOR_NOISE.values()]
+    truth = problems.bridge_column_data("eq1-eq2").attributes["truth"]
     sampler = SMCSampler(100, posterior.ndim, posterior, vectorize=True, seed=SEED, guide=posterior.guide())
     sampler.run_mcmc(None, 1)
     print(sampler.verdict)

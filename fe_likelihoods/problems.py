@@ -50,10 +50,6 @@ from .units import to_si
 __all__ = [
     "BRIDGE_COLUMN_MEANS",
     "BRIDGE_COLUMN_NOISE",
-    "BRIDGE_COLUMN_SENSOR_NOISE",
-    "ISOLATED_BRIDGE_NOISE",
-    "ISOLATED_BRIDGE_OUTPUTS",
-    "ISOLATED_BRIDGE_TRUTH",
     "bridge_column",
     "bridge_column_data",
     "bridge_column_prior",
@@ -72,10 +68,6 @@ BRIDGE_COLUMN_NOISE = MappingProxyType(
 )
 """Noise levels of Ramancha et al. (2022), Table 2 [SI]: standard deviations of the white noise in the data."""
 
-BRIDGE_COLUMN_SENSOR_NOISE = MappingProxyType({name: 0.25 * level for name, level in BRIDGE_COLUMN_NOISE.items()})
-"""Noise levels of the bundled set of two events [SI], **assumed**: a quarter of those of the paper, which also contain
-the error of its model. 0.005 g and 0.57 mm."""
-
 SHORT_SUBSTEPS = 2
 """Integration steps per sample of the short record."""
 
@@ -84,6 +76,7 @@ _COLUMN_FILES = {
     "eq1-eq2": "bridge_column_events.h5",
     "short": "bridge_column_short.h5",
 }
+_BRIDGE_FILES = {"twin": "isolated_bridge.h5", "means": "isolated_bridge_means.h5"}
 
 
 def _bundled(name: str) -> Dataset:
@@ -191,28 +184,6 @@ def bridge_column(
     return Posterior(likelihood, prior)
 
 
-# ------------------------------------------------------------------ isolated bridge
-
-_DEVICES = ("fmin_1", "df_1", "a_1", "fmin_2", "df_2", "a_2", "Kd_1", "C0_1", "Kd_2", "C0_2")
-ISOLATED_BRIDGE_TRUTH = MappingProxyType(
-    {
-        "twin": MappingProxyType(
-            dict(zip(_DEVICES, (1.15, 0.85, 1.2, 0.9, 1.1, 0.8, 0.8, 1.25, 1.3, 0.9), strict=True))
-        ),
-        "means": MappingProxyType(dict.fromkeys(_DEVICES, 1.0) | {"df_1": 0.8, "df_2": 1.2}),
-    }
-)
-"""Multiples of the nominal values with which the two synthetic data sets were made (assumed)."""
-
-ISOLATED_BRIDGE_OUTPUTS = MappingProxyType(
-    {"twin": CHANNEL_SETS[10], "means": ("mean_Ub", "mean_Fb", "mean_drift", "mean_shear", "mean_acc_p")}
-)
-"""Channels of the two synthetic data sets."""
-
-ISOLATED_BRIDGE_NOISE = MappingProxyType({"twin": 0.05, "means": 0.10})
-"""Standard deviation of the noise of the two synthetic data sets, in root mean squares of each channel (assumed)."""
-
-
 def _vibrate(theta: np.ndarray, n_steps: int = 200) -> np.ndarray:
     """Displacement [m] of a free vibration, (1, n_steps) at 0.01 s: multiples of 2 Hz squared and of 2 % damping."""
     time = 0.01 * np.arange(n_steps)
@@ -292,11 +263,9 @@ def isolated_bridge_data(data: str = "twin") -> Dataset:
     ValueError
         If the name is unknown.
     """
-    if data not in ISOLATED_BRIDGE_TRUTH:
-        raise ValueError(
-            f'expected data="twin" or "means"; got {data!r}; for your own data give record= and measurements='
-        )
-    return _bundled("isolated_bridge.h5" if data == "twin" else "isolated_bridge_means.h5")
+    if data not in _BRIDGE_FILES:
+        raise ValueError(f'expected data="twin" or "means"; got {data!r}; for your own data give a Dataset')
+    return _bundled(_BRIDGE_FILES[data])
 
 
 def isolated_bridge(

@@ -175,10 +175,8 @@ def test_the_data_of_the_bridge_say_that_they_are_synthetic(name):
     assert "SYNTHETIC" in record.source
     assert measurements.description.startswith("SYNTHETIC, nominal values assumed")
     assert "NOT measured data, nominal values assumed" in attributes["title"]
-    truth = problems.ISOLATED_BRIDGE_TRUTH[name]
-    assert attributes["truth"] == pytest.approx(dict(truth) | {"sigma": problems.ISOLATED_BRIDGE_NOISE[name]})
-    assert set(truth.values()) != {1.0}
-    assert [c.name for c in measurements.channels] == list(problems.ISOLATED_BRIDGE_OUTPUTS[name])
+    assert set(attributes["truth"]) == set(problems.isolated_bridge(data=name).parameter_names)
+    assert attributes["truth"]["sigma"] == {"twin": 0.05, "means": 0.1}[name]
     assert (record.dt, measurements.dt, measurements.n_steps) == (0.005, 0.01, 1501)
     np.testing.assert_allclose(record.acceleration, problems.table_motion().acceleration, atol=1e-11)
 
@@ -221,7 +219,8 @@ def test_channels_and_noise_of_the_bridge_can_be_chosen():
 def test_the_means_do_not_distinguish_the_piers():
     posterior = problems.isolated_bridge(data="means")
     model = posterior.likelihood.model
-    truth = np.array(list(problems.ISOLATED_BRIDGE_TRUTH["means"].values()))
+    values = problems.isolated_bridge_data("means").attributes["truth"]
+    truth = np.array([values[name] for name in model.parameter_names])
     other = exchange_piers(model, truth)
     assert np.abs(other - truth).max() > 0.4
     at = [posterior.log_likelihood(np.append(theta, 0.1)) for theta in (truth, other, 0.5 * (truth + other))]

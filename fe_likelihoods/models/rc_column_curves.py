@@ -28,50 +28,24 @@ _POINTS = 200  # samples from one reversal to the next
 
 
 class MaterialCurve(NamedTuple):
-    """Stress of a material under a history of strain.
+    """Stress of a material under a history of strain, both positive in tension."""
 
-    Attributes
-    ----------
-    name : str
-        "core concrete", "cover concrete" or "steel".
-    strain : ndarray[n]
-        Strain, positive in tension.
-    stress : ndarray[n]
-        Stress, positive in tension [Pa].
-    """
-
-    name: str
-    strain: np.ndarray
-    stress: np.ndarray
+    name: str  # "core concrete", "cover concrete" or "steel"
+    strain: np.ndarray  # (n,)
+    stress: np.ndarray  # (n,) [Pa]
 
 
 class MomentCurvature(NamedTuple):
-    """Moment of a section under a history of curvature and a constant axial force.
+    """Moment of a section under a history of curvature and a constant axial force."""
 
-    Attributes
-    ----------
-    curvature : ndarray[n]
-        Curvature, positive where the column bends towards positive displacements [1/m].
-    moment : ndarray[n]
-        Bending moment, with the sign of the curvature in the elastic range [N m].
-    axial_strain : ndarray[n]
-        Strain at the axis, positive in tension.
-    axial_force : float
-        Axial force, positive in tension [N].
-    """
-
-    curvature: np.ndarray
-    moment: np.ndarray
-    axial_strain: np.ndarray
-    axial_force: float
+    curvature: np.ndarray  # (n,) positive where the column bends towards positive displacements [1/m]
+    moment: np.ndarray  # (n,) with the sign of the curvature in the elastic range [N m]
+    axial_strain: np.ndarray  # (n,) at the axis, positive in tension
+    axial_force: float  # positive in tension [N]
 
 
 def material_curves(
-    column: RCColumn,
-    theta: np.ndarray,
-    *,
-    concrete: Sequence[float] | None = None,
-    steel: Sequence[float] | None = None,
+    column: RCColumn, theta: np.ndarray, strains: Sequence[float] | None = None
 ) -> tuple[MaterialCurve, MaterialCurve, MaterialCurve]:
     """Compute the stress of core concrete, cover concrete and steel under cyclic strains.
 
@@ -81,7 +55,7 @@ def material_curves(
         The column.
     theta : ndarray[n_parameters]
         Multiples of its nominal parameters.
-    concrete, steel : sequence of float, optional
+    strains : sequence of float, optional
         Strains at which the loading reverses, in order; it starts at zero and is linear between them. Default: cycles
         of the concrete to 0.25, 0.5, 1 and 1.5 times the strain at the confined strength, with cracks between them, and
         of the steel to 0.4, 1, 2 and 3 times the strain at the onset of hardening.
@@ -106,25 +80,19 @@ def material_curves(
     """
     made, values = make_column(column, check_theta(theta, column.parameters), 1, 2)
     sections = made.sections
-    core_peak = -sections.concrete[0, concrete04.E0]
-    crack = 5.0 * values["ft"] / values["Ec"]
-    if concrete is None:
-        concrete = [strain for level in (0.25, 0.5, 1.0, 1.5) for strain in (-level * core_peak, crack)]
-    if steel is None:
-        steel = [sign * level * column.steel.hardening_strain for level in (0.4, 1.0, 2.0, 3.0) for sign in (1.0, -1.0)]
-    curves = []
-    path = _path("concrete", concrete)
-    for name, constants in zip(("core concrete", "cover concrete"), sections.concrete, strict=True):
-        stress = np.empty_like(path)
-        concrete04.stress_history(path, constants, stress)
-        curves.append(MaterialCurve(name, path, stress))
-    path = _path("steel", steel)
-    stress, memory = np.empty_like(path), np.zeros(sections.steel_memory.shape[-1])
+    peak, crack = sections.concrete[0, concrete04.E0], 5.0 * values["ft"] / values["Ec"]
+    hardening = column.steel.hardening_strain
+    path = _path(strains, [strain for level in (0.25, 0.5, 1.0, 1.5) for strain in (level * peak, crack)])
+    curves = [MaterialCurve(f"{part} concrete", path, np.empty_like(path)) for part in ("core", "cover")]
+    for curve, constants in zip(curves, sections.concrete, strict=True):
+        concrete04.stress_history(path, constants, curve.stress)
+    path = _path(strains, [sign * level * hardening for level in (0.4, 1.0, 2.0, 3.0) for sign in (1.0, -1.0)])
+    steel, memory = MaterialCurve("steel", path, np.empty_like(path)), np.zeros(sections.steel_memory.shape[-1])
     if sections.failure.size:
-        bar_fatigue.stress_history(path, memory, sections.steel, sections.failure, stress)
+        bar_fatigue.stress_history(path, memory, sections.steel, sections.failure, steel.stress)
     else:
-        reinforcing_steel.stress_history(path, memory, sections.steel, stress)
-    return (*curves, MaterialCurve("steel", path, stress))
+        reinforcing_steel.stress_history(path, memory, sections.steel, steel.stress)
+    return (*curves, steel)
 
 
 def moment_curvature(
@@ -183,16 +151,16 @@ def _advance(
 ) -> float:
     """Go from one curvature to another, in halves if need be, and commit the fibers; return the axial strain there."""
     found = _balance(sections, axial, end, axial_force, tolerance)
-    if found is None and not halvings:
+    if found is not None:
+        commit(found, -end, 0, sections)  # the second axis of the element points against the direction of loading
+        return found
+    if not halvings:
         raise SimulationFailed(
             f"the section cannot carry the axial force {axial_force:.4g} N at the curvature {end:.4g} 1/m"
         )
-    if found is None:
-        middle = 0.5 * (start + end)
-        axial = _advance(sections, axial, start, middle, axial_force, tolerance, halvings - 1)
-        return _advance(sections, axial, middle, end, axial_force, tolerance, halvings - 1)
-    commit(found, -end, 0, sections)  # the second axis of the element points against the direction of loading
-    return found
+    middle = 0.5 * (start + end)
+    axial = _advance(sections, axial, start, middle, axial_force, tolerance, halvings - 1)
+    return _advance(sections, axial, middle, end, axial_force, tolerance, halvings - 1)
 
 
 def _balance(sections: Sections, start: float, curvature: float, axial_force: float, tolerance: float) -> float | None:
@@ -213,9 +181,9 @@ def _balance(sections: Sections, start: float, curvature: float, axial_force: fl
     return found if abs(excess(found)) <= tolerance else None  # else a jump of the stress, such as from crushed cover
 
 
-def _path(name: str, reversals: Sequence[float]) -> np.ndarray:
-    """Strains from zero through `reversals`, linear between them."""
-    ends = np.array([0.0, *np.ravel(reversals)], dtype=float)
+def _path(given: Sequence[float] | None, default: Sequence[float]) -> np.ndarray:
+    """Strains from zero through the reversals of the loading, linear between them."""
+    ends = np.array([0.0, *np.ravel(default if given is None else given)], dtype=float)
     if len(ends) < 2 or not np.isfinite(ends).all() or np.abs(ends).max() >= 0.9:
-        raise invalid(f"strains of the {name} between -0.9 and 0.9", reversals, "give strains, not per cent")
+        raise invalid("strains between -0.9 and 0.9", given, "give strains, not per cent")
     return np.interp(np.arange((len(ends) - 1) * _POINTS + 1) / _POINTS, np.arange(len(ends)), ends)

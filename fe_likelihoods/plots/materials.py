@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from itertools import cycle
 from typing import TYPE_CHECKING
 
 from ..units import from_si
@@ -47,13 +48,8 @@ def plot_material(*curves: MaterialCurve, axes: Axes | None = None, stress_unit:
     """
     if not curves:
         raise ValueError("expected one or more curves; got none; give the results of material_curves(column, theta)")
-    axes = _with_origin(new_axes(axes, (5.4, 4.0)))
-    for curve, colour in zip(curves, _cycle(len(curves)), strict=True):
-        stress = from_si(curve.stress, stress_unit, "stress")
-        axes.plot(100.0 * curve.strain, stress, color=colour, linewidth=1.1, label=curve.name)
-    axes.set(xlabel="strain [%]", ylabel=f"stress [{stress_unit}]")
-    axes.legend(frameon=False, fontsize="small")
-    return axes
+    lines = [(100.0 * curve.strain, from_si(curve.stress, stress_unit, "stress"), curve.name) for curve in curves]
+    return _loops(axes, lines, "strain [%]", f"stress [{stress_unit}]")
 
 
 def plot_moment_curvature(curves: MomentCurvature | Mapping[str, MomentCurvature], axes: Axes | None = None) -> Axes:
@@ -76,22 +72,21 @@ def plot_moment_curvature(curves: MomentCurvature | Mapping[str, MomentCurvature
     >>> axes = plot_moment_curvature(moment_curvature(column, np.ones(5), np.linspace(0.0, 0.03, 50)))
     """
     many = dict(curves) if isinstance(curves, Mapping) else {"": curves}
-    axes = _with_origin(new_axes(axes, (5.4, 4.0)))
-    for (name, curve), colour in zip(many.items(), _cycle(len(many)), strict=True):
+    lines = []
+    for name, curve in many.items():
         force = f"axial force {1e-3 * curve.axial_force:.5g} kN"
-        label = f"{name}, {force}" if name else force
-        axes.plot(curve.curvature, 1e-3 * curve.moment, color=colour, linewidth=1.3, label=label)
-    axes.set(xlabel="curvature [1/m]", ylabel="moment [kN m]")
-    axes.legend(frameon=False, fontsize="small", loc="best")
-    return axes
+        lines.append((curve.curvature, 1e-3 * curve.moment, f"{name}, {force}" if name else force))
+    return _loops(axes, lines, "curvature [1/m]", "moment [kN m]")
 
 
-def _with_origin(axes: Axes) -> Axes:
+def _loops(axes: Axes | None, lines: Sequence[tuple], xlabel: str, ylabel: str) -> Axes:
+    """Plot lines (x, y, label) about the origin."""
+    axes = new_axes(axes, (5.4, 4.0))
     for line in (axes.axhline, axes.axvline):
         line(0.0, color="0.75", linewidth=0.7, zorder=0)
     axes.grid(alpha=0.25)
+    for (x, y, label), colour in zip(lines, cycle(_COLOURS), strict=False):
+        axes.plot(x, y, color=colour, linewidth=1.2, label=label)
+    axes.set(xlabel=xlabel, ylabel=ylabel)
+    axes.legend(frameon=False, fontsize="small")
     return axes
-
-
-def _cycle(n: int) -> list[str]:
-    return [_COLOURS[i % len(_COLOURS)] for i in range(n)]

@@ -31,10 +31,10 @@ def test_strengths_and_strains_of_the_materials(column):
     assert cover.strain[cover.stress.argmin()] == pytest.approx(-peak, rel=0.02)
     assert -core.stress.min() == pytest.approx(column.confinement.strength_ratio * column.concrete.fc, rel=1e-6)
     assert core.stress.max() == pytest.approx(column.concrete.ft, rel=0.02)  # it cracks between the cycles
-    _, _, steel = material_curves(column, np.ones(3), steel=[0.005, column.steel.ultimate_strain])
+    _, _, steel = material_curves(column, np.ones(3), [0.005, column.steel.ultimate_strain])
     assert steel.stress[200] == pytest.approx(column.steel.fy, rel=1e-3)  # on the plateau
     assert steel.stress[-1] == pytest.approx(column.steel.fu, rel=1e-9)
-    stiffer = material_curves(column, [1.0, 1.2, 1.0], steel=[1e-5])[2]
+    stiffer = material_curves(column, [1.0, 1.2, 1.0], [1e-5])[2]
     assert stiffer.stress[-1] == pytest.approx(1.2 * column.steel.es * 1e-5, rel=5e-3)
 
 
@@ -68,7 +68,7 @@ def test_wrong_arguments(column):
         moment_curvature(column, np.ones(3), [[0.01]])
     with pytest.raises(ValueError, match="vector of finite curvatures"):
         moment_curvature(column, np.ones(3), [np.nan])
-    with pytest.raises(ValueError, match="strains of the steel"):
-        material_curves(column, np.ones(3), steel=[5.0])
+    with pytest.raises(ValueError, match="strains between"):
+        material_curves(column, np.ones(3), [5.0])
     with pytest.raises(ValueError, match="one value for each"):
         material_curves(replace(column), np.ones(2))

@@ -184,7 +184,7 @@ def test_stresses_are_of_the_nearest_fiber():
         position = float(name.partition(":")[2])
         y = fibers[np.abs(fibers[:, 0] + position).argmin(), 0]
         stress, strain = replace(column, outputs=(name, f"strain@{height}:{-y}")).simulate([1.0])
-        law = material_curves(column, [1.0], concrete=[strain[1]], steel=[strain[1]])[material]
+        law = material_curves(column, [1.0], [strain[1]])[material]
         assert stress[1] == pytest.approx(law.stress[-1], rel=1e-9) and strain[1] != 0.0, name
         if name.endswith(str(-bar)):
             assert strain[2] > 2.0 * column.steel.fy / column.steel.es

@@ -30,8 +30,9 @@ def sampled(data: str) -> tuple[Posterior, np.ndarray]:
 
 
 def test_the_truth_is_found():
-    _, samples = sampled("twin")
-    truth = np.append(list(problems.ISOLATED_BRIDGE_TRUTH["twin"].values()), problems.ISOLATED_BRIDGE_NOISE["twin"])
+    posterior, samples = sampled("twin")
+    values = problems.isolated_bridge_data("twin").attributes["truth"]
+    truth = np.array([values[name] for name in posterior.parameter_names])
     z = (samples.mean(axis=0) - truth) / samples.std(axis=0)
     print(np.round(z, 2), samples[:, -1].mean())
     assert np.all(np.abs(z) < 3.0), z
