@@ -56,7 +56,6 @@ class CacheInfo(NamedTuple):
     failures: int  # among the stored simulations
     responses: int
     response_bytes: int  # of the stored responses [bytes]
-    file_bytes: int  # without its write-ahead log [bytes]
 
 
 class SimulationCache:
@@ -300,10 +299,8 @@ class SimulationCache:
             "SELECT total(size IS NULL), total(size IS NULL AND length(reason) > 0), total(size > 0), total(size) "
             "FROM rows"
         )
-        with self.file.lock:
-            counted = (self.file.select(query) or [(0,) * 4])[0]
-            size = self.path.stat().st_size if self.path.exists() else 0
-            return CacheInfo(self.path, *map(int, counted), size)
+        counted = (self.file.select(query) or [(0,) * 4])[0]
+        return CacheInfo(self.path, *map(int, counted))
 
     def forget(self, *fingerprints: str) -> int:
         """Delete all rows with these fingerprints, in all generations, for all users of the file; returns their number.

@@ -276,7 +276,7 @@ class ExecutableModel(UserModel):
         def watch(seconds: float) -> float:
             if seconds > self.time_limit:
                 text = f"stopped at the time limit of {self.time_limit:g} s"
-                raise RunFailed(TransientReason(text, time_limit=self.time_limit), seconds)
+                raise RunFailed(TransientReason(text), seconds)
             if _size(place) > self.max_output:
                 raise RunFailed(TransientReason(f"stopped because it wrote more than {self.max_output} bytes"), seconds)
             return min(_WATCH_INTERVAL, self.time_limit - seconds + 1e-3)

@@ -155,9 +155,8 @@ class UMBridgeModel(ExternalModel):
                     return answer
                 answer.raise_for_status()
             except requests.RequestException as error:
-                limit = self.time_limit if isinstance(error, requests.ReadTimeout) else 0.0
-                if limit or attempt == self.retries:
-                    raise SimulationFailed(TransientReason(f"{error} (attempt {attempt + 1})", limit)) from error
+                if isinstance(error, requests.ReadTimeout) or attempt == self.retries:
+                    raise SimulationFailed(TransientReason(f"{error} (attempt {attempt + 1})")) from error
                 time.sleep(min(self.retry_wait * 2.0**attempt, 60.0))
 
 

@@ -56,20 +56,7 @@ class ChangedModel(UnusableModel):
 
 
 class TransientReason(str):
-    """Reason of a failure whose cause is not the model.
-
-    `time_limit` is the limit that stopped the simulation [s]; 0 for other causes.
-    """
-
-    time_limit: float
-
-    def __new__(cls, text: str, time_limit: float = 0.0) -> "TransientReason":
-        reason = super().__new__(cls, text)
-        reason.time_limit = float(time_limit)
-        return reason
-
-    def __getnewargs__(self) -> tuple[str, float]:
-        return str(self), self.time_limit
+    """Reason of a failure whose cause is not the model."""
 
 
 class MisfitReason(str):
@@ -100,4 +87,4 @@ def shortened(reason: str) -> str:
 
 def reworded(reason: str, text: str) -> str:
     """A reason of the same kind in other words."""
-    return TransientReason(text, reason.time_limit) if isinstance(reason, TransientReason) else type(reason)(text)
+    return type(reason)(text)

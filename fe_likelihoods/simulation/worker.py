@@ -147,7 +147,7 @@ class Worker:
                 self._connection.send_bytes(message)
             if (answer := self._receive(start + seconds)) is not None:
                 return answer
-            reason = TransientReason(slow.format(seconds), time_limit=seconds)
+            reason = TransientReason(slow.format(seconds))
         except RunFailed as error:
             reason = error.reason
         raise RunFailed(reworded(reason, reason + self.kill(reason)), time.monotonic() - start)

@@ -231,7 +231,7 @@ def test_time_limit_is_a_transient_failure():
     with serve(waits, port=0, block=False) as server:
         with pytest.raises(SimulationFailed, match=r"timed out.*0\.2") as failed:
             remote(server, time_limit=0.2).simulate([1.0, 1.0])
-        assert failed.value.reason.time_limit == 0.2
+        assert isinstance(failed.value.reason, TransientReason)
         release.set()
         np.testing.assert_array_equal(remote(server, time_limit=60.0).simulate([1.0, 1.0]), line([1.0, 1.0]))
 

@@ -154,7 +154,7 @@ def test_a_simulation_stopped_at_a_time_limit_is_run_again(tmp_path):
         assert likelihood.simulator.failures.count == likelihood.simulator.failures.transient == failed
         return likelihood.simulations, failed
 
-    stopped = SimulationFailed(TransientReason("stopped at the time limit of 5 s", 5.0))
+    stopped = SimulationFailed(TransientReason("stopped at the time limit of 5 s"))
     assert runs(Faulty(stopped, 5.0)) == runs(Faulty(stopped, 5.0)) == (1, True)
     assert runs(Faulty(time_limit=5.0)) == (1, False)
     assert runs(Faulty(stopped, 2.0)) == (0, False)
