@@ -4,9 +4,12 @@ Friction. The slider resists the motion with mu(v) W Z, where the friction coeff
 
     mu(v) = f_min + df (1 - exp(-a |v|))
 
-and Z in [-1, 1] replaces the sign of v. By the law of Bouc and Wen with exponent 2 and A = beta + gamma = 1 it follows
-the displacement U over the yield displacement Y, ``Y Z' = v [1 - Z^2 (gamma sgn(v Z) + beta)]``. This equation is
-rate-independent, so that a monotone increment of U integrates exactly: tanh while Z grows, tan while it returns.
+and Z in [-1, 1] replaces the sign of v. There are two laws for Z.
+
+* Regularised (Bouc-Wen with exponent 2 and A = beta + gamma = 1): Z follows the displacement U over the yield
+  displacement Y, ``Y Z' = v [1 - Z^2 (gamma sgn(v Z) + beta)]``. This equation is rate-independent, so that a monotone
+  increment of U integrates exactly: tanh while Z grows, tan while it returns.
+* Exact (Coulomb): Z is the sign of v, or any value in [-1, 1] at rest.
 
 Rubber. With s = U / s_u, an odd polynomial F(s) is the skeleton, and an even polynomial D(s) is half the distance
 between the loading and unloading branches::
@@ -35,13 +38,19 @@ from typing import NamedTuple
 from .jit import kernel
 
 __all__ = [
+    "BOUC_WEN",
+    "COULOMB",
     "RubberLaw",
     "Slider",
     "bouc_wen",
+    "coulomb",
     "friction",
     "regularised",
     "rubber",
 ]
+
+BOUC_WEN = 0
+COULOMB = 1
 
 
 class Slider(NamedTuple):
@@ -146,3 +155,40 @@ def regularised(increment, displacement, velocity, z, weight, slider, c, law):
     force, stiffness, half_loop, slope = rubber(displacement, law)
     bound = mu * weight + half_loop
     return bound * z + force, bound * dz + stiffness + slope * z, dmu * weight * z, z
+
+
+@kernel(inline=True)
+def coulomb(total, displacement, velocity, pull, weight, slider, law):
+    """Evaluate a set-valued slider and a rubber device at a trial force.
+
+    The trial force of the set-valued part plus `pull` times the velocity decides: the bearing sticks while this sum is
+    within the bound at rest, and slides beyond.
+
+    Parameters
+    ----------
+    total : float
+        Trial force, without the linear part of the rubber [N].
+    displacement, velocity : float
+        Bearing displacement [m] and velocity [m/s].
+    pull : float
+        Positive factor that turns a velocity into a force [N s/m].
+    weight : float
+        Normal load [N].
+    slider : Slider
+    law : RubberLaw
+
+    Returns
+    -------
+    sticks : bool
+    force, stiffness, viscosity : float
+        F [N], dF/dU [N/m] and dF/dv [N s/m], valid where the bearing slides.
+    z : float
+    """
+    mu, dmu = friction(velocity, slider)
+    force, stiffness, half_loop, slope = rubber(displacement, law)
+    at_rest = slider.f_min * weight + half_loop
+    trial = total - force + pull * velocity
+    if abs(trial) <= at_rest:
+        return True, force, 0.0, 0.0, (total - force) / at_rest if at_rest > 0.0 else 0.0
+    sign = 1.0 if trial > 0.0 else -1.0
+    return False, (mu * weight + half_loop) * sign + force, stiffness + slope * sign, dmu * weight * sign, sign

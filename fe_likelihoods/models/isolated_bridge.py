@@ -33,6 +33,7 @@ from .base import History, remark_on_range
 from .isolated_bridge_channels import ALL_CHANNELS, CHANNEL_SETS, CHANNELS
 from .isolated_bridge_parts import Bearing, Damper, Pier, Rubber
 from .isolated_bridge_system import (
+    FORMS,
     BridgeMatrices,
     BridgeRun,
     PreparedBridge,
@@ -99,6 +100,9 @@ class IsolatedBridge(ThreadedModel):
         and ``Ub_2``, 10 for the channels of both piers. None: all twelve channels that are not means.
     parameters : tuple of str
         Names of the parameters that make up theta, in this order (`IsolatedBridge` lists them).
+    friction : str
+        "bouc-wen" (regularised, the default), or "coulomb" (exact stick and slip, whose instants are located within a
+        step).
     step : float, optional
         Integration step [s]; it divides the step of the record. Default: the longest such step up to 0.25 ms (accuracy:
         ``docs/theory/time_integration.rst``).
@@ -116,7 +120,8 @@ class IsolatedBridge(ThreadedModel):
     Notes
     -----
     At the default step, displacements, forces and peaks have errors below 0.05 % of the peak of a channel
-    (``docs/theory/time_integration.rst``).
+    (``docs/theory/time_integration.rst``). With "coulomb" forces and accelerations jump when a bearing begins or ceases
+    to stick; steps are halved there until the instant is known within h/64.
 
     The channels of the two piers and of the deck are:
 
@@ -159,6 +164,7 @@ class IsolatedBridge(ThreadedModel):
     outputs: tuple[str, ...] | int | None = None
     parameters: tuple[str, ...] = PARAMETERS
     _nominal_units: ClassVar[dict[str, str]] = _NOMINAL_UNITS
+    friction: str = "bouc-wen"
     step: float | None = None
     every: int = 1
     vertical: Record | None = None
@@ -321,6 +327,8 @@ class IsolatedBridge(ThreadedModel):
         """Raise ValueError for settings of the integration that are out of range."""
         check_fields(self, positive=("deck_mass", "step"), optional=("step",))
         check_integer("every", self.every, 1, max(1, self.record.n_steps - 1))
+        if self.friction not in FORMS:
+            raise invalid(f"friction out of {tuple(FORMS)}", self.friction, 'the default is "bouc-wen"')
         ratio = self.record.dt / self.integration_step
         if ratio < 0.999 or abs(ratio - round(ratio)) > 1e-6 * ratio:
             whole = self.record.dt / max(1, math.ceil(ratio))

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.sparse import csr_array
 
-from ..kernels.bearings import RubberLaw, Slider
+from ..kernels.bearings import BOUC_WEN, COULOMB, RubberLaw, Slider
 from ..kernels.exponential import matrix_exponential
 from ..kernels.isolated_bridge import N_OUT, N_STATES, Isolators, StepMatrices, step_isolated
 from ..simulation.model import SimulationFailed
@@ -27,11 +27,14 @@ from .isolated_bridge_channels import OF_A_PIER, at_pier
 from .isolated_bridge_parts import Damper, Pier, Rubber
 from .validation import check_values
 
-__all__ = ["BridgeMatrices", "BridgeRun", "PreparedBridge", "channel_matrix", "prepare_bridge", "run_bridge"]
+__all__ = ["FORMS", "BridgeMatrices", "BridgeRun", "PreparedBridge", "channel_matrix", "prepare_bridge", "run_bridge"]
 
 GRAVITY = 9.81  # [m/s²]
 TOLERANCE = 1e-5  # largest last correction of the isolator forces, as a multiple of the smaller bearing load
 MAX_ITERATIONS = 50  # of Newton's method per step
+FORMS = {"bouc-wen": BOUC_WEN, "coulomb": COULOMB}
+COULOMB_HALVINGS = 6
+"""How often a step with Coulomb's law is halved to find the instant at which a bearing begins or ceases to stick."""
 
 _MAY_BE_ZERO = ("df_1", "a_1", "df_2", "a_2")
 
@@ -109,12 +112,23 @@ class BridgeStateSpace(NamedTuple):
         inputs[5:10, 1:] = -inverse @ b.T
         return cls(a, inputs, b)
 
-    def step_matrices(self, dampers: Sequence[Damper], step: float) -> StepMatrices:
-        """Matrices of a step [s] with these dampers, one per pier."""
-        a, inputs = self.system.copy(), self.inputs
-        for i, damper in enumerate(dampers):
-            a[10 + i, 5:10] = damper.count * damper.stiffness * self.kinematics[i]
-            a[10 + i, 10 + i] = -damper.stiffness / damper.viscosity
+    def step_matrices(self, dampers: Sequence[Damper], step: float, halvings: int | None = None) -> StepMatrices:
+        """Matrices of the steps [s] with these dampers, one per pier.
+
+        `halvings`: how often the step of Coulomb's law is halved, for kinds of steps with F constant or linear in time
+        (`StepMatrices`): a set-valued force that is linear in time would oscillate about rest. None: one kind.
+        """
+        if halvings is None:
+            return StepMatrices(*(part[None] for part in self._of_size(dampers, step, [(True, True)])[0]))
+        holds = [(False, False), (True, False), (False, True), (True, True)]
+        kinds = [kind for k in range(halvings + 1) for kind in self._of_size(dampers, 0.5**k * step, holds)]
+        return StepMatrices(*(np.stack(parts) for parts in zip(*kinds, strict=True)))
+
+    def _of_size(
+        self, dampers: Sequence[Damper], step: float, linear: Sequence[tuple[bool, bool]]
+    ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """The arrays of `StepMatrices` for one size of step; each of `linear` says which forces are linear in time."""
+        a, inputs = self._with_dampers(dampers), self.inputs
         n, m = inputs.shape
         augmented = np.zeros((n + 2 * m, n + 2 * m))
         augmented[:n, :n], augmented[:n, n : n + m] = a * step, inputs * step
@@ -127,14 +141,45 @@ class BridgeStateSpace(NamedTuple):
         exponential = np.empty_like(augmented)
         matrix_exponential(augmented / units[:, None] * units, exponential, np.empty((2, *augmented.shape)))
         exponential *= units[:, None] / units
-        phi, whole, second = exponential[:n, :n], exponential[:n, n : n + m], exponential[:n, n + m :].copy()
-        at_start, ends = whole - second, second[:, 1:]
-        advance = np.column_stack([phi, at_start[:, 0], second[:, 0], phi @ ends + at_start[:, 1:]])
-        q = np.zeros((4, n))
-        q[:2, :5] = q[2:, 5:10] = self.kinematics
-        return StepMatrices(
-            np.ascontiguousarray(np.vstack([advance, q @ advance]).T), np.ascontiguousarray(ends), q @ ends
-        )
+        phi, whole, second = exponential[:n, :n], exponential[:n, n : n + m], exponential[:n, n + m :]
+        found = []
+        for each in linear:
+            at_end = second.copy()
+            for bearing in range(2):
+                if not each[bearing]:
+                    at_end[:, 1 + bearing] = whole[:, 1 + bearing]
+            at_start, ends = whole - at_end, at_end[:, 1:]
+            advance = np.column_stack([phi, at_start[:, 0], at_end[:, 0], phi @ ends + at_start[:, 1:]])
+            q = np.zeros((4, n))
+            q[:2, :5] = q[2:, 5:10] = self.kinematics
+            found.append(
+                (np.ascontiguousarray(np.vstack([advance, q @ advance]).T), np.ascontiguousarray(ends), q @ ends)
+            )
+        return found
+
+    def hold_stuck_bearings(self, dampers: Sequence[Damper], ground: np.ndarray, values: np.ndarray) -> None:
+        """Replace the forces of bearings that stick, in `values` (n_steps, 16), by the forces that keep them at rest at
+        each sample, under the table acceleration `ground` (n_steps,) [m/s²]. The kernel computes their mean over a
+        step.
+        """
+        b, inputs = self.kinematics, self.inputs[5:10]
+        acceleration = values[:, :12] @ (b @ self._with_dampers(dampers)[5:10]).T + np.outer(ground, b @ inputs[:, 0])
+        by_force, force = b @ inputs[:, 1:], values[:, 12:14]
+        stuck = np.abs(values[:, 14:16]) < 1.0
+        for first, second in ((0, 1), (1, 0)):
+            alone = stuck[:, first] & ~stuck[:, second]
+            rest = acceleration[alone, first] + by_force[first, second] * force[alone, second]
+            force[alone, first] = -rest / by_force[first, first]
+        both = stuck.all(axis=1)
+        force[both] = -np.linalg.solve(by_force, acceleration[both].T).T
+
+    def _with_dampers(self, dampers: Sequence[Damper]) -> np.ndarray:
+        """A (12, 12) with the dampers."""
+        a = self.system.copy()
+        for i, damper in enumerate(dampers):
+            a[10 + i, 5:10] = damper.count * damper.stiffness * self.kinematics[i]
+            a[10 + i, 10 + i] = -damper.stiffness / damper.viscosity
+        return a
 
 
 class PreparedBridge(NamedTuple):
@@ -181,7 +226,8 @@ def run_bridge(model: Any, prepared: PreparedBridge, theta: np.ndarray) -> Bridg
     check_values(v, _MAY_BE_ZERO)
     dampers = [Damper(v[f"Kd_{i}"], v[f"C0_{i}"], damper.count) for i, damper in enumerate(model.dampers, 1)]
     step = model.integration_step
-    matrices = prepared.linear.step_matrices(dampers, step)
+    coulomb = model.friction == "coulomb"
+    matrices = prepared.linear.step_matrices(dampers, step, COULOMB_HALVINGS if coulomb else None)
     sliders = tuple(
         Slider(
             f_min=float(v[f"fmin_{i}"]),
@@ -197,7 +243,7 @@ def run_bridge(model: Any, prepared: PreparedBridge, theta: np.ndarray) -> Bridg
     n_sub = round(model.record.dt / step)
     status, iterations = step_isolated(
         matrices,
-        Isolators(sliders, prepared.law, c),
+        Isolators(sliders, prepared.law, c, FORMS[model.friction]),
         ground,
         prepared.weights,
         n_sub,
@@ -209,4 +255,6 @@ def run_bridge(model: Any, prepared: PreparedBridge, theta: np.ndarray) -> Bridg
     if status:
         n_steps = n_sub * (ground.size - 1)
         raise SimulationFailed(f"step {status} of {n_steps} (t = {status * step:.4g} s) did not converge")
+    if coulomb:
+        prepared.linear.hold_stuck_bearings(dampers, ground, out)
     return BridgeRun(out.T, np.vstack([out.T[:14], ground]), iterations / max(1, n_sub * (ground.size - 1)))
