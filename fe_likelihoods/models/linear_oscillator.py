@@ -82,6 +82,14 @@ class LinearOscillator(StructuralModel):
             raise ValueError(f"LinearOscillator: expected a Record as excitation; got {type(record).__name__}")
         return type(self)(record, self.period, self.damping_ratio)
 
+    def first(self, seconds: float) -> LinearOscillator:
+        """Return the same oscillator under the first part of its record.
+
+        `seconds` is the time of the last sample of the response [s]. ValueError if it is not within the response, or
+        fewer than two samples remain.
+        """
+        return self.with_record(self.record.trim(0.0, seconds))
+
     def jacobian(self, theta: ArrayLike) -> np.ndarray:
         """Exact derivatives (2, 2, n_steps) of the response [SI] by parameter, channel and sample."""
         frequency, damping_ratio = self._frequency_and_damping(check_theta(theta, self.parameter_names))
