@@ -5,13 +5,15 @@ of the simulations are. Each point is evaluated in a thread, which waits for its
 """
 
 import os
+import threading
+from concurrent.futures import Future
 from contextlib import suppress
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from samplers.evaluation.asynchronous import PoolQueue
+from samplers.interrupts import interrupts_end_the_run
 
 from ..priors.points import as_points
 from ..simulation.local_pool import Threads
@@ -22,7 +24,7 @@ __all__ = ["EvaluationQueue"]
 _MOST_THREADS = 200  # for a pool that does not say how many simulations run at once
 
 
-class EvaluationQueue(PoolQueue):
+class EvaluationQueue:
     """Queue of points at which a posterior is evaluated, see `Posterior.evaluation_queue`.
 
     Its methods are called from one thread. Duplicates are simulated once. If a data set has no pool, or one that has
@@ -36,7 +38,9 @@ class EvaluationQueue(PoolQueue):
         self._evaluate = partial(_evaluate, posterior, responses)
         self._streams = all(part.simulator.streams for part in self._parts)  # no model runs in threads of this process
         threads = Threads(self._most_threads)
-        super().__init__(self._evaluate, threads, lambda rows: rows[:, None])
+        self._threads, self._arrived, self._submitted = threads, threading.Event(), 0
+        self._futures: dict[int, Future] = {}  # of points that were not collected, by ticket
+        self._handed: list[int] = []  # what the last `collect` returned: the caller may not have received it
         for part in self._parts if self._streams else ():  # failures may end sooner: points that wait may be successes
             part.simulator.pending = lambda: threads.pending
 
@@ -70,8 +74,14 @@ class EvaluationQueue(PoolQueue):
         if not self._streams and len(rows):
             with suppress(Exception):  # raised by `collect`
                 self._evaluate(rows)  # together, which is faster; their simulations are known then
-        return super().submit(rows)
+        tickets = list(range(self._submitted, self._submitted + len(rows)))
+        self._submitted += len(rows)
+        for ticket, row in zip(tickets, rows, strict=True):
+            self._futures[ticket] = self._threads.submit(self._evaluate, row[None])
+            self._futures[ticket].add_done_callback(lambda _: self._arrived.set())
+        return tickets
 
+    @interrupts_end_the_run()
     def collect(self) -> list[tuple[int, float]]:
         """Wait until a point is finished; tickets and log-probabilities of all finished points.
 
@@ -82,15 +92,31 @@ class EvaluationQueue(PoolQueue):
         self._require_open()
         if len(self._futures) == len(self._handed):
             raise RuntimeError("no point is pending: submit points before collect()")
-        try:
-            return super().collect()
-        except RuntimeError as error:
-            raise error.__cause__ or error from None
+        while self._handed:
+            self._futures.pop(self._handed.pop(), None)
+        while not any(future.done() for future in self._futures.values()):
+            self._arrived.wait()
+            self._arrived.clear()
+        collected = self.ended()
+        if not collected:
+            raise next(future.exception() for future in self._futures.values() if future.done())
+        self._handed = [ticket for ticket, _ in collected]
+        return collected
+
+    def ended(self) -> list[tuple[int, float]]:
+        """Tickets and log-probabilities of points that have ended, including the last collected ones, without waiting.
+
+        For a run that Ctrl-C ends, before `close`, so that finished points are kept. Errors are raised by `collect`.
+        """
+        done = [(ticket, future) for ticket, future in self._futures.items() if future.done()]
+        return [(ticket, future.result()) for ticket, future in done if future.exception() is None]
 
     def close(self) -> None:
         """Cancel points that have not begun; simulations that run are cached when they end. May be called twice."""
         self._closed = True
-        super().close()
+        for future in self._futures.values():
+            future.cancel()
+        self._futures = {}
         for part in self._parts:
             part.simulator.pending = None
 

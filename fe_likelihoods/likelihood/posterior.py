@@ -19,6 +19,7 @@ from ..priors.distributions import Distribution, RandomState
 from ..priors.points import as_points, complete_repr
 from ..priors.priors import Prior
 from ..simulation.model import has_jacobian
+from .evaluation_queue import EvaluationQueue
 from .gradient import likelihood_gradient, slopes_along
 from .joint import JointLikelihood
 from .likelihood import FELikelihood
@@ -27,7 +28,6 @@ from .predictive_draws import MeasuredData, PredictiveDraws, measured_data, pred
 
 if TYPE_CHECKING:
     from ..emulation.guide import ResponseGuide
-    from .evaluation_queue import EvaluationQueue
     from .posterior_modes import PosteriorModes
 
 __all__ = ["Posterior"]
@@ -490,7 +490,7 @@ class Posterior:
         self._check_models("a prediction")
         return predictive_draws(self.likelihood, as_points(samples, self.prior.names), block, seed)
 
-    def evaluation_queue(self, responses: bool = False) -> "EvaluationQueue":
+    def evaluation_queue(self, responses: bool = False) -> EvaluationQueue:
         """A queue of points whose log-probabilities are returned in the order in which their simulations end.
 
         Samplers that propose points while others still run keep all workers of a pool busy with it. The values are the
@@ -516,8 +516,6 @@ class Posterior:
         True
         """
         self._check_models("asynchronous work")
-        from .evaluation_queue import EvaluationQueue  # emcee is slow to import
-
         return EvaluationQueue(self, responses)
 
     def when_simulated(self, callback: Callable[[float], None] | None) -> None:
