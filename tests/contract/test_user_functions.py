@@ -1,7 +1,5 @@
 """Functions that a user can get wrong: shapes, a log-likelihood in place of a log-posterior, and the reverse."""
 
-from types import SimpleNamespace
-
 import emcee
 import numpy as np
 import pytest
@@ -9,6 +7,7 @@ import pytest
 from samplers import SamplingWarning, SMCSampler, TemperedSampler, TMCMCSampler
 from tests.contract.targets import Box, Gaussian, WithBlobs
 from tests.covering import covering
+from tests.faults.resumable_run import InOrder
 
 N = 24
 SAMPLERS = [SMCSampler, TMCMCSampler]
@@ -178,8 +177,10 @@ def functions_of(how, wrap):
         settings["parameter_names"] = ["a", "b", "c"]
     if how == "args":
         settings["args"] = (1.0,)
-    if how == "pool":
-        settings["pool"] = SimpleNamespace(map=map)
+    if how == "asynchronous":
+        settings |= {"asynchronous": True, "recycle": True}
+    if how in ("pool", "asynchronous"):
+        settings["pool"] = InOrder()
     if how == "likelihood":
         return None, settings | {"log_likelihood_fn": wrap(posterior.log_likelihood)}
     return wrap(named(posterior)), settings
@@ -188,7 +189,7 @@ def functions_of(how, wrap):
 WAYS = ("point", "batch", "names", "args", "pool", "likelihood")
 
 
-@pytest.mark.parametrize(("Sampler", "how"), covering(SAMPLERS, WAYS, strength=1))
+@pytest.mark.parametrize(("Sampler", "how"), [*covering(SAMPLERS, WAYS, strength=1), (SMCSampler, "asynchronous")])
 def test_a_function_that_changes_its_argument_changes_no_point(Sampler, how, tmp_path):
     """Nor a run that is stopped and goes on from its file."""
     function, settings = functions_of(how, lambda function: lambda x, *args: function(x))

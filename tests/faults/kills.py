@@ -26,7 +26,7 @@ import h5py
 
 import samplers.evaluation.evaluator
 import samplers.record
-from tests.faults.resumable_run import BURN_IN, KINDS, STEPS, calls, go_on, make, outcome
+from tests.faults.resumable_run import BURN_IN, KINDS, STEPS, N, calls, go_on, make, outcome
 
 COMPARED = 2  # points by which a new sampler compares its function with the record
 
@@ -162,7 +162,8 @@ def evaluated_again(log, kind):
     for made in by_process.values():
         points = {point for call in made for point in call}
         lost += max(len((points & seen) - running) - COMPARED, 0)
-        last = {"map": 8}.get(kind, 1)
+        # all points of a submission, or those that have ended while the sampler computed proposals
+        last = {"asynchronous": 4 * N, "map": 8}.get(kind, 1)
         running |= {point for call in made[-last:] for point in call}
         seen |= points
     return lost

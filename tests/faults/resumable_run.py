@@ -2,6 +2,7 @@
 
 import os
 import time
+from concurrent.futures import Executor, Future
 from pathlib import Path
 
 import emcee
@@ -14,13 +15,22 @@ from tests.tempering.guides import SearchingGuide
 N, NDIM, STEPS, BURN_IN = 40, 3, 4, 2
 
 
+class InOrder(Executor):
+    """An executor that evaluates a point when it is submitted, so that the order of arrival is no matter of chance."""
+
+    def submit(self, function, *args):
+        future = Future()
+        future.set_result(function(*args))
+        return future
+
+
 KINDS = {
     "smc": (SMCSampler, {"recycle": True}),
     "moves": (SMCSampler, {"recycle": False}),
     "tmcmc": (TMCMCSampler, {}),
     "guided": (SMCSampler, {"guide": SearchingGuide}),
     "map": (SMCSampler, {"recycle": True}),
-    "asynchronous": (SMCSampler, {"recycle": True, "asynchronous": True}),
+    "asynchronous": (SMCSampler, {"recycle": True, "asynchronous": True, "pool": InOrder}),
     "asynchronous, guided": (SMCSampler, {"guide": SearchingGuide, "asynchronous": True}),
     "limit": (SMCSampler, {"recycle": True}),
     "reset": (SMCSampler, {"recycle": False}),
@@ -101,7 +111,9 @@ def make(path, kind, seconds=0.0, sd=0.01, log=None, event=None, **changes):
     settings = {"seed": 5, **settings, **changes}
     if "guide" in settings:
         settings["guide"] = settings["guide"](posterior)
-    return Sampler(N, NDIM, posterior, vectorize=kind != "map", backend=backend, **settings)
+    if "pool" in settings:
+        settings["pool"] = settings["pool"]()
+    return Sampler(N, NDIM, posterior, vectorize=kind not in ("map", "asynchronous"), backend=backend, **settings)
 
 
 def go_on(sampler, kind="smc", steps=STEPS):

@@ -79,6 +79,17 @@ def test_killed_anywhere_a_run_goes_on_and_its_record_repeats_it(every, tmp_path
     assert state_of(repeated(tmp_path / "whole.h5", tmp_path, order=98)[0]) == state_of(whole)
 
 
+def test_threads_take_single_points():
+    """The result is that of the posterior."""
+    posterior = Gaussian(NDIM, sd=0.05)
+    with ThreadPoolExecutor(2) as pool:
+        sampler = SMCSampler(N, NDIM, posterior, pool=pool, seed=3, recycle=True, asynchronous=True)
+        sampler.run_mcmc(None, 1)
+    assert abs(sampler.log_evidence - posterior.log_evidence) < 4 * sampler.log_evidence_error
+    mean, sd = sampler.get_chain(flat=True).mean(axis=0), posterior.sd / np.sqrt(N)
+    assert np.all(np.abs(mean - posterior.mean) < 4 * sd)
+
+
 def test_a_limit_of_simulations_counts_points_that_are_running(tmp_path):
     """No more than the limit is submitted, all of that is used, and a larger limit goes on."""
     sampler, cluster = make(tmp_path / "run.h5", max_simulations=150)
@@ -93,9 +104,7 @@ def test_what_cannot_be_asynchronous_is_refused():
     posterior = Gaussian(NDIM)
     with pytest.raises(ValueError, match="evaluation_queue"):
         SMCSampler(300, NDIM, posterior, vectorize=True, asynchronous=True)
-    with pytest.raises(ValueError, match="no pool to the sampler"), ThreadPoolExecutor(1) as pool:
-        SMCSampler(N, NDIM, posterior, pool=pool, recycle=True, asynchronous=True)
-    with pytest.raises(ValueError, match="moves wait"):
-        SMCSampler(N, NDIM, posterior, vectorize=True, recycle=False, asynchronous=True)
+    with pytest.raises(ValueError, match="moves wait"), ThreadPoolExecutor(1) as pool:
+        SMCSampler(N, NDIM, posterior, pool=pool, recycle=False, asynchronous=True)
     with pytest.raises(ValueError, match="True or False"):
         SMCSampler(300, NDIM, posterior, vectorize=True, asynchronous=1)
