@@ -192,12 +192,10 @@ def limit_states(measures: DamageMeasures) -> tuple[LimitState, ...]:
     beyond repair Park-Ang index 0.4
     collapse Park-Ang index 1.0
     """
-    states = _ASSUMED
-    if np.isfinite(measures.yield_strain):
-        states = (LimitState("bar yield", "bar tension", measures.yield_strain, "nominal fy/Es of the steel"), *states)
-    if not len(measures.heights):  # limits of drift are for lengths that were divided by a height
-        states = tuple(state for state in states if state.measure != "residual drift" or measures.height != 1.0)
-    return tuple(state for state in states if state.measure in measures.names)
+    # the strains are of a column, and the limit of drift is for a length that was divided by its height
+    of_column = set(measures.names) if np.isfinite(measures.yield_strain) else {"Park-Ang index"} & set(measures.names)
+    bar_yield = LimitState("bar yield", "bar tension", measures.yield_strain, "nominal fy/Es of the steel")
+    return tuple(state for state in (bar_yield, *_ASSUMED) if state.measure in of_column)
 
 
 def damage(

@@ -128,7 +128,6 @@ def damage_measures(
     measures: Sequence[str] | None = None,
     displacement: str = "",
     force: str = "",
-    height: float = 1.0,
     park_ang: ParkAng | None = None,
     settle: float = 5.0,
 ) -> DamageMeasures:
@@ -144,10 +143,8 @@ def damage_measures(
         "cover compression" (``docs/damage.rst``). Default: all for a column; for another model, all measures whose
         channels are named.
     displacement, force : str
-        Channels of a model that is not a column: relative displacement [m], and the restoring force that does work on
-        it [N].
-    height : float
-        Length by which displacements of another model are divided [m]. 1: they remain displacements.
+        Channels of a model that is not a column: relative displacement [m], which its drifts are, and the restoring
+        force that does work on it [N].
     park_ang : ParkAng, optional
         Constants of the damage index. Default for a column: `park_ang_constants` at nominal parameters.
     settle : float
@@ -166,20 +163,20 @@ def damage_measures(
 
     Examples
     --------
-    >>> measures = damage_measures(model, displacement="displacement", measures=["peak drift"], height=3.0)
+    >>> measures = damage_measures(model, displacement="displacement", measures=["peak drift"])
     >>> predicted = propagate(posterior, samples, quantity=measures)
     >>> measures.split(predicted.mean)["peak drift"].round(4)  # doctest: +SAMPLED
-    array([0.0275])
+    array([0.0825])
     """
     from ..models.rc_column import RCColumn
 
-    if not all(isinstance(x, Real) and 0.0 < x < math.inf for x in (settle, height)):
-        raise ValueError(f"settle and height must be positive; got {settle!r} s and {height!r} m")
-    is_column, heights, places, yield_strain = isinstance(model, RCColumn), np.zeros(0), (), math.nan
+    if not isinstance(settle, Real) or not 0.0 < settle < math.inf:
+        raise ValueError(f"settle must be positive [s]; got {settle!r}")
+    is_column, height, yield_strain = isinstance(model, RCColumn), 1.0, math.nan
+    heights, places = _places(model) if is_column else (np.zeros(0), ())
     if is_column:
-        if displacement or force or height != 1.0:
-            raise ValueError("channels and height of an RCColumn are known; leave these arguments out")
-        heights, places = _places(model)
+        if displacement or force:
+            raise ValueError("the channels of an RCColumn are known; leave these arguments out")
         displacement, force, height = "displacement", "base_shear", model.height
         yield_strain = model.steel.fy / model.steel.es
     place = {"displacement": displacement, "force": force}

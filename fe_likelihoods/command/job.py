@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from . import sections
-from .keys import Key, did_you_mean, keys_of, read_keys
-from .priors import parse_prior
+from .keys import Key, did_you_mean, keys_of, parse_prior, read_keys
 from .sections import FREE_SECTIONS, MODEL_KINDS, SECTIONS, USER_MODELS, model_keys, part_keys
 
 __all__ = ["Job", "parse_job", "read_job"]

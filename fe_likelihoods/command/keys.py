@@ -1,4 +1,4 @@
-"""Keys of the TOML file and their values: kinds, checks, quantities with units, and the reading of one section.
+"""Keys of the TOML file and their values: kinds, checks, quantities with units, priors, and the reading of one section.
 
 A key is a `Key`, or a field of a frozen dataclass that `key` makes. Messages name the file, the section and the key,
 and propose the nearest known key for an unknown one.
@@ -13,19 +13,21 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from ..priors.distributions import Distribution, HalfNormal, LogNormal, TruncatedNormal, Uniform
 from ..signals.tables import is_clock
 from ..units import DIMENSIONS, to_si
 
 __all__ = [
+    "FORMS",
     "KINDS",
     "Key",
     "did_you_mean",
     "key",
     "keys_of",
+    "parse_prior",
     "read_by_channel",
     "read_keys",
     "read_quantity",
-    "split_number",
 ]
 
 SMALLEST_STRESS = 1e4  # [Pa]; a smaller plain number is in another unit
@@ -168,7 +170,7 @@ def did_you_mean(given: str, known: Sequence[str]) -> str:
     return f"did you mean {names[0]}?" if names else f"known are {', '.join(known)}"
 
 
-def split_number(text: str) -> tuple[str, str]:
+def _split_number(text: str) -> tuple[str, str]:
     """Number and unit of a text, with or without a space between them."""
     match = re.match(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", text.strip())
     number, unit = text.strip().partition(" ")[::2] if match is None else (match[0], text.strip()[match.end() :])
@@ -204,7 +206,7 @@ def read_quantity(value: Any, dimension: str) -> float:
             )
         return float(value)
     example = f"a number in {DIMENSIONS[dimension]}, or a text with a unit such as {_EXAMPLES.get(dimension, '1')!r}"
-    number, unit = split_number(value) if isinstance(value, str) else ("", "")
+    number, unit = _split_number(value) if isinstance(value, str) else ("", "")
     try:
         found = float(number)
     except ValueError:
@@ -270,3 +272,47 @@ def _read_value(value: Any, kind: str, where: str) -> Any:
     if not fits(value):
         raise ValueError(f"{where}: expected {expected}; got {value!r}")
     return value
+
+
+FORMS = {
+    "normal": ("normal(mean, sd) or normal(mean, sd, lower, upper); without bounds it is positive", (2, 4)),
+    "half-normal": ("half-normal(sd), sd before taking the absolute value", (1,)),
+    "uniform": ("uniform(low, high)", (2,)),
+    "log-normal": ("log-normal(median, sd of the natural logarithm)", (2,)),
+}
+_MAKE = {"normal": TruncatedNormal, "half-normal": HalfNormal, "uniform": Uniform, "log-normal": LogNormal}
+
+
+def parse_prior(text: str, dimension: str | None = None) -> Distribution:
+    """Make a distribution from its text, such as ``half-normal(0.1 g)``; numbers without a unit are in SI units.
+
+    Units must have the dimension, a key of `fe_likelihoods.units.DIMENSIONS`. ValueError for an unknown name, another
+    number of arguments, or values that the distribution refuses.
+    """
+    forms = "; ".join(form for form, _ in FORMS.values())
+    match = re.fullmatch(r"\s*([A-Za-z-]+)\s*\(([^()]*)\)\s*", text) if isinstance(text, str) else None
+    if match is None or match[1].lower() not in FORMS:
+        raise ValueError(
+            f'expected a distribution in quotes, such as "normal(1, 0.3)"; got {text!r}; known are {forms}'
+        )
+    name = match[1].lower()
+    arguments = [argument for argument in match[2].split(",") if argument.strip()]
+    form, counts = FORMS[name]
+    if len(arguments) not in counts:
+        raise ValueError(f"expected {form}; got {text!r}")
+    if name == "log-normal" and _split_number(arguments[1])[1]:
+        raise ValueError(f"expected {form}, which has no unit; got {text!r}")
+    return _MAKE[name](*(_number(argument, text, dimension) for argument in arguments))
+
+
+def _number(argument: str, text: str, dimension: str | None) -> float:
+    number, unit = _split_number(argument)
+    try:
+        value = float(number)
+    except ValueError:
+        raise ValueError(
+            f"expected a number, or a number with a unit such as '0.1 g'; got {argument!r} in {text!r}"
+        ) from None
+    if math.isnan(value):
+        raise ValueError(f"expected a number; got {argument!r} in {text!r}")
+    return to_si(value, unit, dimension).item() if unit else value

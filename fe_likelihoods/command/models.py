@@ -4,13 +4,21 @@ import math
 import re
 from collections import defaultdict
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from ..cache.simulation_cache import SimulationCache
 from ..likelihood.joint import JointLikelihood
 from ..likelihood.likelihood import FELikelihood
 from ..likelihood.parameters import channels_of_deviations
 from ..likelihood.posterior import Posterior
+from ..modal.load_cases import LoadTest, read_load_test
+from ..modal.modal_data import ModalData
+from ..modal.modal_likelihood import ModalLikelihood
+from ..modal.modal_readers import read_modal_data
+from ..modal.mode_models import FunctionModes, modal_channels
 from ..modal.paired_modes import SLOPE
 from ..models.one_run import one_run
 from ..models.sensed import SensedModel, Sensor
@@ -22,9 +30,7 @@ from ..signals.records import Record
 from ..simulation.model import Model
 from .data import is_dataset, read_base_motion, read_bundled, read_measured, reduce_data
 from .job import Job
-from .keys import did_you_mean, read_by_channel
-from .modes_and_loads import STRUCTURES, modal_likelihood, modes_of_user, read_load_cases, read_modes
-from .priors import parse_prior
+from .keys import did_you_mean, parse_prior, read_by_channel
 from .sections import USER_MODELS
 from .structure import built_in, linear_parts, load_function, user_channels, user_model
 
@@ -35,6 +41,9 @@ TEMPERATURE_SLOPE = (
     2e-3  # [1/K], its standard deviation without a prior (assumed): -1e-4 to -5e-4 in concrete, more if frozen
 )
 NOISE_SCALE = 0.3  # half-normal prior of a sigma without one in the file, in root mean squares of the channel (assumed)
+
+
+STRUCTURES = "frame", "bridge deck"  # built-in ones that have modes
 
 
 class Problem(NamedTuple):
@@ -128,9 +137,9 @@ def _modes(job: Job, cache: SimulationCache | None) -> _DataSet:
     _check_kind(job, "modes", STRUCTURES)
     if job.noise is not None:
         raise ValueError(f"{job.where('noise')} modes have no such errors: give frequency_cv and others in [modes]")
-    data, held_out = read_modes(job)
+    data, held_out = _read_modes(job)
     numbers = (data.n_modes, *data.mode_numbers, *(held_out.mode_numbers if held_out else ()))
-    make, channels, n_modes = modes_of_user(job, numbers) if job.kind in USER_MODELS else (None, (), 0)
+    make, channels, n_modes = _modes_of_user(job, numbers) if job.kind in USER_MODELS else (None, (), 0)
 
     def make_model() -> Any:
         if job.kind in STRUCTURES:
@@ -139,7 +148,7 @@ def _modes(job: Job, cache: SimulationCache | None) -> _DataSet:
         return user_model(job, channels, make=make, **steps)
 
     def make_likelihood(model: Model, pool: Any) -> FELikelihood:
-        return modal_likelihood(job, model, data, held_out, pool, cache)
+        return _modal_likelihood(job, model, data, held_out, pool, cache)
 
     return _DataSet(job, make_model, make_likelihood, (channels, 1.0, n_modes))
 
@@ -147,7 +156,7 @@ def _modes(job: Job, cache: SimulationCache | None) -> _DataSet:
 def _load_test(job: Job, cache: SimulationCache | None) -> _DataSet:
     _check_kind(job, "load_test", ())
     channels = user_channels(job)
-    test = read_load_cases(job, channels)
+    test = _read_load_cases(job, channels)
     response = channels, 1.0, len(test.cases)
 
     def make_likelihood(model: Model, pool: Any) -> FELikelihood:
@@ -157,6 +166,73 @@ def _load_test(job: Job, cache: SimulationCache | None) -> _DataSet:
     return _DataSet(
         job, lambda: user_model(job, channels, dt=1.0, n_steps=response[2]), make_likelihood, response, test.known
     )
+
+
+def _read_modes(job: Job) -> tuple[ModalData, ModalData | None]:
+    """The data of ``[modes]``, and the modes that are held out."""
+    given = job.modes
+    if given.n_modes is not None and job.kind in STRUCTURES:
+        raise ValueError(f"n_modes: a {job.kind} has a mode for each storey or shape; leave it out")
+    columns = given.columns or {}
+    sensors = tuple(columns if given.variables else columns.values())
+    data = read_modal_data(job.path("modes", "file", given.file), sensors, **given.given("unit", "variables"))
+    data = replace(data, sensors=tuple(columns)) if columns and not given.variables else data
+    data = replace(data, **given.given("temperatures"))
+    data = data.mean() if given.mean else data
+    errors = given.given("frequency_cv", "covariance", "shape_error")
+    every = {  # errors of all modes of the file, which those held out have as well
+        name: errors.pop(name)
+        for name in ("frequency_cv", "shape_error")
+        if name in errors and "covariance" not in errors and np.size(errors[name]) in (1, data.n_modes)
+    }
+    data = replace(data, **every)
+    held_out = None if given.held_out is None else data.select(given.held_out)
+    if both := set(given.held_out or ()) & set(given.modes or ()):
+        raise ValueError(f"held_out: the modes {sorted(both)} are in modes too: leave them out of one of them")
+    compared = given.modes or [each for each in data.mode_numbers if each not in (given.held_out or ())]
+    if "covariance" in errors:  # instead of a column of the file
+        errors = {"frequency_cv": None} | errors
+    return replace(data.select(compared), **errors), held_out
+
+
+def _modes_of_user(job: Job, numbers: tuple[int, ...]) -> tuple[Callable | None, tuple[Channel, ...], int]:
+    """What makes the model of a function (None for others), channels of the response, and its number of modes.
+
+    `numbers` are those of the measured modes.
+    """
+    sensors = job.model.get("sensors")
+    if sensors is None or "channels" in job.model:
+        raise ValueError(
+            f"{job.where('model')} sensors: with [modes], give sensors = {{top = 0}} with the rows of the matrices "
+            "that the function returns, or a list of names, and no channels"
+        )
+    n_modes = job.modes.n_modes or 2 * max(numbers)
+
+    def modes_of(function: Callable, names: Any, _: Any, **options: Any) -> FunctionModes:
+        return FunctionModes(function, names, sensors, n_modes, **options)
+
+    return modes_of if job.kind == "function" else None, modal_channels(tuple(sensors)), n_modes
+
+
+def _modal_likelihood(
+    job: Job, model: Any, data: ModalData, held_out: ModalData | None, pool: Any, cache: SimulationCache | None
+) -> ModalLikelihood:
+    """The likelihood of ``[modes]``."""
+    unknown, options = job.modes.unknown_errors, job.modes.given("close", "student_t")
+    return ModalLikelihood(model, data, unknown, unknown, pool, cache=cache, held_out=held_out, **options)
+
+
+def _read_load_cases(job: Job, channels: tuple[Channel, ...]) -> LoadTest:
+    """The data of ``[load_test]``."""
+    errors = read_by_channel(job.load_test.errors or {}, channels, "errors")
+    path = job.path("load_test", "file", job.load_test.file)
+    test = read_load_test(path, channels, errors=errors, **job.load_test.given("columns", "units", "cases"))
+    if not np.isfinite(test.values).any():
+        raise ValueError(f"file: {path} has no value")
+    for key, value in (("dt", 1.0), ("n_steps", n := len(test.cases))):
+        if job.model.get(key, value) != value:
+            raise ValueError(f"{job.where('model')} {key}: a load test has {n} load cases and no time: leave it out")
+    return test
 
 
 def _make_noise(job: Job, channels: tuple[Channel, ...]) -> Any:

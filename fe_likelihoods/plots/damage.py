@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .style import select_names
+from .style import new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,7 +28,7 @@ _EXTENT = (
 """Measures that are written beside the columns: name, label, factor, unit."""
 
 
-def plot_damage(damage: Damage, events: Sequence[str] | None = None) -> Figure:
+def plot_damage(damage: Damage) -> Figure:
     """Draw the column after each event with the probabilities of its limit states.
 
     Each row is an event and each column a limit state of strains. The two sides of every section are coloured by the
@@ -40,8 +40,6 @@ def plot_damage(damage: Damage, events: Sequence[str] | None = None) -> Figure:
     ----------
     damage : Damage
         The result of `fe_likelihoods.damage` for a column.
-    events : sequence of str, optional
-        Names of the events to draw. Default: all.
 
     Returns
     -------
@@ -51,7 +49,7 @@ def plot_damage(damage: Damage, events: Sequence[str] | None = None) -> Figure:
     Raises
     ------
     ValueError
-        If there are no limit states of strains, or an event is unknown.
+        If there are no limit states of strains.
 
     Examples
     --------
@@ -62,7 +60,6 @@ def plot_damage(damage: Damage, events: Sequence[str] | None = None) -> Figure:
     >>> predicted = propagate(complete, np.ones((3, 5)), quantity=damage_measures(complete))
     >>> figure = plot_damage(damage(predicted, noise=False))
     """
-    import matplotlib.pyplot as plt
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LinearSegmentedColormap, Normalize
 
@@ -72,15 +69,11 @@ def plot_damage(damage: Damage, events: Sequence[str] | None = None) -> Figure:
             "the figure needs probabilities at sections: damage of an RCColumn with the measures 'bar tension' and "
             "'cover compression' and limit states of them; use damage.table() otherwise"
         )
-    shown = select_names(events, damage.events, list(damage.events))
     colours = LinearSegmentedColormap.from_list("probability", _COLOURS)
     widths = [*[1.0] * len(located), 2.2]
-    size = (1.5 * sum(widths) + 0.6, 2.75 * len(shown) + 1.0)
-    figure, panels = plt.subplots(
-        len(shown), len(widths), figsize=size, squeeze=False, layout="constrained", width_ratios=widths
-    )
-    for row, name in zip(panels, shown, strict=True):
-        event = damage.events.index(name)
+    size = (1.5 * sum(widths) + 0.6, 2.75 * len(damage.events) + 1.0)
+    figure, panels = new_figure(len(damage.events), len(widths), size, grid=False, width_ratios=widths)
+    for event, (row, name) in enumerate(zip(panels, damage.events, strict=True)):
         for axes, state in zip(row, located, strict=False):
             _draw_column(axes, damage, state, event, colours)
         row[0].set_ylabel(f"{name}\nheight [m]")

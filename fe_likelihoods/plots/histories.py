@@ -1,4 +1,4 @@
-"""Figures of records, response spectra, channel histories, loops and residuals, in display units."""
+"""Figures of records, response spectra, channel histories and residuals, in display units."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ import numpy as np
 from ..checks.fit import describe_residuals
 from ..noise.residuals import autocorrelation, residual_checks
 from ..signals.channels import Channel, Measurements
-from ..units import find_unit, from_si
+from ..units import from_si
 from .style import (
     BLUE,
     GREY,
     ORANGE,
+    add_legend,
     channel_label,
     marker_of,
     new_axes,
-    select_names,
+    new_figure,
     set_time_axis,
     stack_axes,
 )
@@ -30,14 +31,13 @@ if TYPE_CHECKING:
 
     from ..signals.records import Record
 
-__all__ = ["plot_histories", "plot_loop", "plot_record", "plot_residuals", "plot_spectrum"]
+__all__ = ["plot_histories", "plot_record", "plot_residuals", "plot_spectrum"]
 
 _SHADES = (BLUE, ORANGE, "#5b8c5a", "#b03a48", GREY)
-_SPECTRUM_UNITS = {"pseudo_acceleration": "g", "pseudo_velocity": "cm/s", "displacement": "cm"}
 
 
-def plot_record(record: Record, axes: Axes | None = None, unit: str = "g") -> Axes:
-    """Plot ground acceleration against time, with a mark at the peak.
+def plot_record(record: Record, axes: Axes | None = None) -> Axes:
+    """Plot ground acceleration [g] against time, with a mark at the peak.
 
     Parameters
     ----------
@@ -45,35 +45,28 @@ def plot_record(record: Record, axes: Axes | None = None, unit: str = "g") -> Ax
         The ground motion, such as `fe_likelihoods.Record`.
     axes : matplotlib Axes, optional
         Where to draw. Default: a new figure.
-    unit : str
-        Unit of acceleration in the figure, a name in `fe_likelihoods.units.UNITS`.
 
     Returns
     -------
     matplotlib Axes
         The axes with the figure.
 
-    Raises
-    ------
-    ValueError
-        If the unit is unknown or is not a unit of acceleration.
-
     Examples
     --------
     >>> axes = plot_record(record)
     """
-    shown = from_si(record.acceleration, unit, "acceleration")
+    shown = from_si(record.acceleration, "g")
     axes = new_axes(axes, (8.0, 2.6))
     peak = int(np.argmax(np.abs(shown)))
     axes.plot(record.time, shown, color=BLUE, linewidth=0.7)
-    label = f"peak {abs(shown[peak]):.3g} {unit} at {record.time[peak]:.4g} s"
+    label = f"peak {abs(shown[peak]):.3g} g at {record.time[peak]:.4g} s"
     axes.plot(record.time[peak], shown[peak], "o", color=ORANGE, markersize=6, fillstyle="none", label=label)
-    axes.set(xlabel="time [s]", ylabel=f"ground acceleration [{unit}]", title=record.name)
+    axes.set(xlabel="time [s]", ylabel="ground acceleration [g]", title=record.name)
     axes.set_xlim(0.0, record.duration)
     # The extra room below is for the legend, which would cover the peak if it were above.
     reach = 1.1 * np.abs(shown).max() or 1.0
     axes.set_ylim(-1.35 * reach, reach)
-    axes.legend(frameon=False, fontsize="small", loc="lower right")
+    add_legend(axes, loc="lower right")
     axes.grid(alpha=0.25)
     return axes
 
@@ -83,10 +76,8 @@ def plot_spectrum(
     periods: Sequence[float] | np.ndarray | None = None,
     damping_ratios: Sequence[float] = (0.02, 0.05, 0.1),
     axes: Axes | None = None,
-    quantity: str = "pseudo_acceleration",
-    unit: str | None = None,
 ) -> Axes:
-    """Plot response spectra of a record against period, one line per damping ratio.
+    """Plot response spectra (pseudo-acceleration) of a record against period, one line per damping ratio.
 
     Parameters
     ----------
@@ -98,10 +89,6 @@ def plot_spectrum(
         Fractions of critical damping, one line each.
     axes : matplotlib Axes, optional
         Where to draw. Default: a new figure.
-    quantity : {"pseudo_acceleration", "pseudo_velocity", "displacement"}
-        The quantity on the vertical axis.
-    unit : str, optional
-        Unit of the quantity in the figure. Default: g, cm/s and cm, respectively.
 
     Returns
     -------
@@ -111,98 +98,56 @@ def plot_spectrum(
     Raises
     ------
     ValueError
-        If there is no damping ratio, `quantity` is not one of the three, or the unit has another dimension; as
-        `Record.spectrum`.
+        If there is no damping ratio, and as `Record.spectrum`.
 
     Examples
     --------
     >>> axes = plot_spectrum(record, np.geomspace(0.1, 3.0, 50), damping_ratios=[0.05])
     """
-    if quantity not in _SPECTRUM_UNITS or not len(damping_ratios):
-        raise ValueError(
-            f"expected one damping ratio or more and one of the quantities {', '.join(_SPECTRUM_UNITS)}; got "
-            f"{len(damping_ratios)} damping ratios and {quantity!r}"
-        )
+    if not len(damping_ratios):
+        raise ValueError(f"expected one damping ratio or more; got {damping_ratios!r}")
     spectra = [record.spectrum(periods, ratio) for ratio in damping_ratios]
-    unit = _SPECTRUM_UNITS[quantity] if unit is None else unit
-    find_unit(unit, quantity.removeprefix("pseudo_"))
     axes = new_axes(axes, (6.0, 3.8))
     for i, spectrum in enumerate(spectra):
-        values = {
-            "pseudo_acceleration": spectrum.pseudo_acceleration,
-            "pseudo_velocity": spectrum.pseudo_velocity,
-            "displacement": spectrum.displacement,
-        }[quantity]
-        label = f"{100 * spectrum.damping_ratio:g} %"
-        shade = _SHADES[i % len(_SHADES)]
-        axes.plot(spectrum.periods, from_si(values, unit), color=shade, linewidth=1.3, label=label)
+        values, label = from_si(spectrum.pseudo_acceleration, "g"), f"{100 * spectrum.damping_ratio:g} %"
+        axes.plot(spectrum.periods, values, color=_SHADES[i % len(_SHADES)], linewidth=1.3, label=label)
     axes.set_xscale("log")
     axes.xaxis.set_major_formatter("{x:g}")
-    axes.set(xlabel="period [s]", ylabel=f"{quantity.replace('_', '-')} [{unit}]", title=record.name)
+    axes.set(xlabel="period [s]", ylabel="pseudo-acceleration [g]", title=record.name)
     axes.set_xlim(min(s.periods.min() for s in spectra), max(s.periods.max() for s in spectra))
     axes.set_ylim(bottom=0.0)
-    axes.legend(frameon=False, fontsize="small", title="damping ratio", title_fontsize="small")
+    add_legend(axes, title="damping ratio", title_fontsize="small")
     axes.grid(alpha=0.25, which="both")
     return axes
 
 
-def plot_histories(
-    measurements: Measurements, channels: Sequence[str] | None = None, time_label: str = "time [s]"
-) -> Figure:
+def plot_histories(measurements: Measurements) -> Figure:
     """Plot the histories of channels above one another; `plot_fit` compares measurements with responses.
 
     Parameters
     ----------
     measurements : Measurements
         The histories, measured or simulated.
-    channels : sequence of str, optional
-        Names of the channels to draw. Default: all.
-    time_label : str
-        Label of the horizontal axis, for example "step" for a test without time.
 
     Returns
     -------
     matplotlib Figure
         The figure, one axes per channel.
 
-    Raises
-    ------
-    ValueError
-        If a channel does not exist.
-
     Examples
     --------
-    >>> figure = plot_histories(measurements, channels=["displacement"])
+    >>> figure = plot_histories(measurements.select(["displacement"]))
     """
-    known = {channel.name: channel for channel in measurements.channels}
-    names = select_names(channels, known, list(known))
-    figure, rows = stack_axes(len(names))
-    for axes, name in zip(rows, names, strict=True):
-        values = from_si(measurements.channel(name), known[name].unit)
+    figure, rows = stack_axes(len(measurements.channels))
+    for axes, channel in zip(rows, measurements.channels, strict=True):
+        values = from_si(measurements.channel(channel.name), channel.unit)
         style = {"color": BLUE, "linewidth": 0.8, "marker": marker_of(values), "markersize": 2.0}
-        axes.plot(measurements.times(name), values, **style)
-        axes.set_ylabel(channel_label(known[name]))
-        axes.grid(alpha=0.25)
-    set_time_axis(rows, max(measurements.times(name)[-1] for name in names), time_label)
+        axes.plot(measurements.times(channel.name), values, **style)
+        axes.set_ylabel(channel_label(channel))
+    set_time_axis(rows, max(measurements.times(each.name)[-1] for each in measurements.channels))
     if measurements.description:
         figure.suptitle(measurements.description, fontsize="small", wrap=True)
     return figure
-
-
-def plot_loop(
-    x: np.ndarray, y: np.ndarray, axes: Axes | None = None, *, x_label: str = "", y_label: str = "", title: str = ""
-) -> Axes:
-    """Plot a hysteresis loop, such as force (n_steps,) against displacement, in new axes by default. A dot marks its
-    end.
-    """
-    axes = new_axes(axes, (5.0, 4.0))
-    for line in (axes.axhline, axes.axvline):
-        line(0.0, color="0.75", linewidth=0.7, zorder=0)
-    axes.plot(x, y, color=BLUE, linewidth=0.7)
-    axes.plot(x[-1], y[-1], "o", color=ORANGE, markersize=4)
-    axes.set(xlabel=x_label, ylabel=y_label, title=title)
-    axes.grid(alpha=0.25)
-    return axes
 
 
 def plot_residuals(residuals: np.ndarray, channels: Sequence[Channel], dt: float) -> Figure:
@@ -235,7 +180,6 @@ def plot_residuals(residuals: np.ndarray, channels: Sequence[Channel], dt: float
     --------
     >>> figure = plot_residuals(likelihood.residuals([1.1, 0.9]), model.channels, model.dt)
     """
-    import matplotlib.pyplot as plt
     from scipy.special import ndtri
 
     checks = residual_checks(residuals, channels if len(channels) == len(residuals) else ())
@@ -243,14 +187,7 @@ def plot_residuals(residuals: np.ndarray, channels: Sequence[Channel], dt: float
     n_channels, n = correlation.shape
     if len(channels) != n_channels:
         raise ValueError(f"expected one channel for each row of residuals; got {len(channels)} and {n_channels} rows")
-    figure, rows = plt.subplots(
-        n_channels,
-        3,
-        squeeze=False,
-        figsize=(12.0, 1.0 + 2.5 * n_channels),
-        layout="constrained",
-        width_ratios=(2, 1, 1),
-    )
+    figure, rows = new_figure(n_channels, 3, (12.0, 1.0 + 2.5 * n_channels), width_ratios=(2, 1, 1))
     for k, (history, lags, quantiles) in enumerate(rows):
         values = from_si(np.asarray(residuals[k], dtype=float), channels[k].unit)
         history.plot(np.arange(n) * dt, values, color=BLUE, linewidth=0.7, marker=marker_of(values), markersize=2.0)
@@ -272,8 +209,6 @@ def plot_residuals(residuals: np.ndarray, channels: Sequence[Channel], dt: float
         quantiles.set_title("line: normal", fontsize="small")
         quantiles.plot(normal, values.mean() + values.std() * normal, color=GREY, linewidth=0.9)
         quantiles.plot(normal, values, ".", color=BLUE, markersize=2)
-        for axes in (history, lags, quantiles):
-            axes.grid(alpha=0.25)
     for axes, text in zip(rows[-1], ("time [s]", "lag [s]", "quantile of a standard normal [-]"), strict=True):
         axes.set_xlabel(text)
     return figure

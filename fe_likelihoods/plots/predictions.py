@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..units import from_si
-from .style import BLUE, GREY, ORANGE, add_legend_row, channel_label, marker_of, select_names, set_time_axis, stack_axes
+from .style import (
+    BLUE,
+    GREY,
+    ORANGE,
+    add_legend,
+    add_legend_row,
+    channel_label,
+    marker_of,
+    new_figure,
+    set_time_axis,
+    stack_axes,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -20,11 +30,7 @@ if TYPE_CHECKING:
 __all__ = ["plot_bands", "plot_fragility"]
 
 
-def plot_bands(
-    prediction: Prediction,
-    measurements: Measurements | None = None,
-    channels: Sequence[str] | None = None,
-) -> Figure:
+def plot_bands(prediction: Prediction, measurements: Measurements | None = None) -> Figure:
     """Plot the mean of predicted histories, the band between the outermost quantiles, and measurements.
 
     Parameters
@@ -33,8 +39,6 @@ def plot_bands(
         Prediction of histories, such as the result of `fe_likelihoods.propagate`.
     measurements : Measurements, optional
         Measurements, drawn at their own times. Channels that were not measured are drawn without measurements.
-    channels : sequence of str, optional
-        Names of the channels to draw. Default: all channels of the prediction.
 
     Returns
     -------
@@ -44,7 +48,7 @@ def plot_bands(
     Raises
     ------
     ValueError
-        If the prediction has no histories, or a channel does not exist.
+        If the prediction has no histories.
 
     Examples
     --------
@@ -52,28 +56,21 @@ def plot_bands(
     >>> figure.savefig("bands.png")
     """
     time = prediction.time
-    names = [channel.name for channel in prediction.channels]
-    wanted = select_names(channels, names, names)
-    measured = set()
-    if measurements is not None:
-        measured = {channel.name for channel in measurements.channels}
+    measured = () if measurements is None else {channel.name for channel in measurements.channels}
     low, high = (min(prediction.probabilities), max(prediction.probabilities)) if prediction.probabilities else (0, 0)
 
-    figure, rows = stack_axes(len(wanted))
-    for axes, name in zip(rows, wanted, strict=True):
-        k = names.index(name)
-        channel = prediction.channels[k]
+    figure, rows = stack_axes(len(prediction.channels))
+    for k, (axes, channel) in enumerate(zip(rows, prediction.channels, strict=True)):
         if low < high:
             band = [from_si(prediction.quantile(p)[k], channel.unit) for p in (low, high)]
             label = f"{100 * low:g}-{100 * high:g} %" + (" with noise" if prediction.noise else "")
             axes.fill_between(time, *band, color=BLUE, alpha=0.3, linewidth=0.0, label=label)
-        if name in measured:
-            values = from_si(measurements.channel(name), channel.unit)
+        if channel.name in measured:
+            values = from_si(measurements.channel(channel.name), channel.unit)
             drawn = {"color": ORANGE, "linewidth": 2.2, "alpha": 0.6, "label": "measured"}
-            axes.plot(measurements.times(name), values, marker=marker_of(values), markersize=3.0, **drawn)
+            axes.plot(measurements.times(channel.name), values, marker=marker_of(values), markersize=3.0, **drawn)
         axes.plot(time, from_si(prediction.mean[k], channel.unit), color=BLUE, linewidth=0.8, label="mean")
         axes.set_ylabel(channel_label(channel))
-        axes.grid(alpha=0.25)
     add_legend_row(rows[0], 3)
     set_time_axis(rows, time[-1])
     return figure
@@ -105,12 +102,11 @@ def plot_fragility(fragility: Fragility, label: str = "peak ground acceleration"
     >>> ratios = EventRatios([0.93, 1.10, 1.02, 0.99])
     >>> figure = plot_fragility(fragility(peaks, strongest, 8.0, unit="cm", ratios=ratios))
     """
-    import matplotlib.pyplot as plt
 
     def shown(values):
         return values if unit is None else from_si(values, unit)
 
-    figure, axes = plt.subplots(figsize=(6.0, 4.0), layout="constrained")
+    figure, ((axes,),) = new_figure(1, 1, (6.0, 4.0))
     found = fragility.exceedance
     reach = np.stack([found.probability - found.lower, found.upper - found.probability])
     axes.errorbar(
@@ -131,6 +127,5 @@ def plot_fragility(fragility: Fragility, label: str = "peak ground acceleration"
     axes.set_xlabel(label if unit is None else f"{label} [{unit}]")
     axes.set_ylabel("probability of exceedance [-]")
     axes.set_ylim(-0.02, 1.02)
-    axes.grid(alpha=0.25)
-    axes.legend(frameon=False, fontsize="small")
+    add_legend(axes)
     return figure

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..units import from_si
-from .style import BLUE, GREY, ORANGE
+from .style import BLUE, GREY, ORANGE, add_legend, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -60,8 +60,6 @@ def plot_scores(
     --------
     >>> figure = plot_scores(prediction.score(measurements))
     """
-    import matplotlib.pyplot as plt
-
     events = dict(scores) if isinstance(scores, Mapping) else {"": scores}
     histories = {hasattr(each, "coverage") for each in events.values()}
     if len(histories) != 1 or len({each.level for each in events.values()}) != 1:
@@ -70,12 +68,12 @@ def plot_scores(
             f"got {[(name, type(each).__name__, getattr(each, 'level', None)) for name, each in events.items()]}"
         )
     if histories == {True}:
-        figure, axes = plt.subplots(1, 3, figsize=(12.0, 3.8), layout="constrained")
-        _history_axes(axes, events)
+        figure, axes = new_figure(1, 3, (12.0, 3.8))
+        _history_axes(axes[0], events)
         return figure
     rows = sum(len(each.names) for each in events.values())
     size = (11.0, max(3.6, 1.3 + (0.24 if rows <= 30 else 0.15) * rows))
-    figure, axes = plt.subplots(1, 3, figsize=size, layout="constrained", width_ratios=(1.0, 1.6, 0.8))
+    figure, (axes,) = new_figure(1, 3, size, width_ratios=(1.0, 1.6, 0.8))
     _number_axes(axes, events)
     for each, ratio in ((axes[0], 0.9), (axes[2], 1.2)):  # as tall as they are for few events
         if rows > 12:
@@ -116,12 +114,10 @@ def _history_axes(axes: np.ndarray, events: Mapping[str, HistoryScores]) -> None
     axes[1].set_xlim(min(level - 0.1, axes[1].dataLim.xmin - 0.02), 1.03)
     axes[2].set_xlabel("interval score / RMS measured [-]")
     axes[2].set_title(f"sharpness: score of the {level:.0%} band", fontsize="medium")
-    axes[2].legend(frameon=False, fontsize="small", ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.2))
+    add_legend(axes[2], ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.2))
     for each in axes[1:]:
         each.set_yticks(range(len(found)), found)
         each.set_ylim(len(found) - 0.4, -0.6)
-    for each in axes:
-        each.grid(alpha=0.25)
 
 
 def _number_axes(axes: np.ndarray, events: Mapping[str, QuantityScores]) -> None:
@@ -156,7 +152,7 @@ def _number_axes(axes: np.ndarray, events: Mapping[str, QuantityScores]) -> None
     axes[1].set_yticks(places, labels, fontsize="x-small")
     axes[1].set_ylim(-0.7, n - 0.3)
     axes[1].set_xlabel("predicted / measured [-]")
-    axes[1].legend(frameon=False, fontsize="small", ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    add_legend(axes[1], ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
 
     for k, probability in enumerate((0.5, level)):
         low, high = _chance(n, probability)
@@ -170,8 +166,6 @@ def _number_axes(axes: np.ndarray, events: Mapping[str, QuantityScores]) -> None
     axes[2].set_xlim(-0.6, 1.6)
     axes[2].set_ylim(-0.03, 1.03)
     axes[2].set(xlabel="interval", ylabel="share of measured values within [-]")
-    for each in axes:
-        each.grid(alpha=0.25)
 
 
 def _label(event: str, scores: QuantityScores, k: int) -> str:
@@ -198,7 +192,7 @@ def _draw_histogram(axes: Axes, shares: np.ndarray, independent: float) -> None:
 def _add_room_for_legend(axes: Axes) -> None:
     """A legend of one row above the bars."""
     axes.set_ylim(0.0, 1.18 * max(axes.dataLim.ymax, 1e-9))
-    axes.legend(frameon=False, fontsize="small", ncols=2, loc="upper center", columnspacing=1.0, borderaxespad=0.1)
+    add_legend(axes, ncols=2, loc="upper center", columnspacing=1.0, borderaxespad=0.1)
 
 
 def _chance(n: int, probability: float) -> tuple[float, float]:

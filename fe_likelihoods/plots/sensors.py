@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .style import BLUE, GREY, ORANGE
+from .style import BLUE, GREY, ORANGE, add_legend, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -35,11 +35,9 @@ def plot_ranking(ranking: SensorRanking) -> Figure:
     --------
     >>> figure = plot_ranking(rank_sensors(model, prior, draws=20))
     """
-    import matplotlib.pyplot as plt
-
     with_target = bool(np.isfinite(ranking.target_left).all())
     size = (10.0 if with_target else 6.5, 1.4 + 0.45 * len(ranking.chosen))
-    figure, axes = plt.subplots(1, 1 + with_target, sharey=True, squeeze=False, figsize=size, layout="constrained")
+    figure, axes = new_figure(1, 1 + with_target, size, sharey=True)
     rows, places = np.arange(len(ranking.chosen)), [ranking.candidates.index(name) for name in ranking.chosen]
     first = axes[0, 0]
     alone = ranking.alone[places], ranking.errors["alone"][places]
@@ -48,12 +46,10 @@ def plot_ranking(ranking: SensorRanking) -> Figure:
     first.set_yticks(rows, ranking.chosen)
     first.invert_yaxis()
     first.set_xlabel("expected information [nat]")
-    figure.legend(loc="outside upper center", ncols=2, frameon=False, fontsize="small")
+    add_legend(figure, loc="outside upper center", ncols=2)
     if with_target:
         share, error = 100.0 * ranking.target_left, 100.0 * ranking.errors["target_left"]
         axes[0, 1].errorbar(share, rows, xerr=error, color=ORANGE, marker="o", capsize=3.0)
         axes[0, 1].set_xlabel("variance of the target that is left [%]")
         axes[0, 1].set_xlim(0.0, None)
-    for each in axes[0]:
-        each.grid(axis="x", alpha=0.25)
     return figure

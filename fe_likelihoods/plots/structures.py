@@ -14,8 +14,7 @@ import numpy as np
 
 from ..models.isolated_bridge import IsolatedBridge
 from ..units import from_si
-from .histories import plot_loop
-from .style import BLUE, GREY, ORANGE, new_axes
+from .style import BLUE, GREY, ORANGE, add_legend, new_axes, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -79,9 +78,7 @@ def plot_section(column: RCColumn, axes: Axes | None = None) -> Axes:
     title = f"diameter {2.0 * radius:.4g} {unit}, clear cover {from_si(column.cover, unit):.3g} {unit}"
     axes.set_title(title, fontsize="medium")
     handles = [cover, core, mesh, steel]
-    axes.legend(
-        handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.1), frameon=False, fontsize="small", ncols=2
-    )
+    add_legend(axes, handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=2)
     return axes
 
 
@@ -248,30 +245,25 @@ def plot_hysteresis(model: RCColumn | IsolatedBridge, theta: np.ndarray) -> Figu
     return _column_loops(model, model.history(theta))
 
 
+def _draw_loop(axes: Axes, x: np.ndarray, y: np.ndarray, x_label: str, y_label: str, title: str) -> None:
+    """Draw a hysteresis loop, such as force (n_steps,) against displacement, with a dot at its end."""
+    for line in (axes.axhline, axes.axvline):
+        line(0.0, color="0.75", linewidth=0.7, zorder=0)
+    axes.plot(x, y, color=BLUE, linewidth=0.7)
+    axes.plot(x[-1], y[-1], "o", color=ORANGE, markersize=4)
+    axes.set(xlabel=x_label, ylabel=y_label, title=title)
+
+
 def _column_loops(column: RCColumn, history: History) -> Figure:
     """Base moment against curvature, and force against displacement of the top, from the histories [SI]."""
-    import matplotlib.pyplot as plt
-
     length, force = _length_unit(column), dict(column.units).get("force", "kN")
     one_length, one_force = 1.0 / from_si(1.0, length), 1.0 / from_si(1.0, force)
     displacement = "displacement" if "displacement" in history.names else "relative displacement"
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9.6, 4.2), layout="constrained")
-    plot_loop(
-        history["base curvature"] * one_length,
-        history["base moment"] / (one_force * one_length),
-        left,
-        x_label=f"curvature [1/{length}]",
-        y_label=f"moment [{force} {length}]",
-        title="base section",
-    )
-    plot_loop(
-        from_si(history[displacement], length),
-        from_si(history["force"], force),
-        right,
-        x_label=f"displacement [{length}]",
-        y_label=f"restoring force [{force}]",
-        title="top",
-    )
+    figure, ((left, right),) = new_figure(1, 2, (9.6, 4.2))
+    curvature, moment = history["base curvature"] * one_length, history["base moment"] / (one_force * one_length)
+    _draw_loop(left, curvature, moment, f"curvature [1/{length}]", f"moment [{force} {length}]", "base section")
+    moved, restoring = from_si(history[displacement], length), from_si(history["force"], force)
+    _draw_loop(right, moved, restoring, f"displacement [{length}]", f"restoring force [{force}]", "top")
     left.ticklabel_format(axis="x", style="sci", scilimits=(-2, 3))
     figure.suptitle(column.loading.name, fontsize="small")
     return figure
@@ -327,18 +319,11 @@ def plot_bridge(bridge: IsolatedBridge, axes: Axes | None = None) -> Axes:
 
 def _bearing_loops(history: History) -> Figure:
     """Isolator force against bearing displacement of both piers, from "Ub_1", "Ub_2", "Fb_1" and "Fb_2" [SI]."""
-    import matplotlib.pyplot as plt
-
-    figure, pair = plt.subplots(1, 2, figsize=(9.6, 4.2), sharex=True, sharey=True, layout="constrained")
+    figure, (pair,) = new_figure(1, 2, (9.6, 4.2), sharex=True, sharey=True)
     for i, axes in enumerate(pair, 1):
-        plot_loop(
-            from_si(history[f"Ub_{i}"], "mm"),
-            from_si(history[f"Fb_{i}"], "kN"),
-            axes,
-            x_label="bearing displacement [mm]",
-            y_label="isolator force [kN]" if i == 1 else "",
-            title=f"pier {i}",
-        )
+        y_label = "isolator force [kN]" if i == 1 else ""
+        moved, force = from_si(history[f"Ub_{i}"], "mm"), from_si(history[f"Fb_{i}"], "kN")
+        _draw_loop(axes, moved, force, "bearing displacement [mm]", y_label, f"pier {i}")
     return figure
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ..units import from_si
-from .style import BLUE, GREY, ORANGE, channel_label
+from .style import BLUE, GREY, ORANGE, add_figure_legend, channel_label, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -60,8 +60,6 @@ def plot_points(
     matplotlib Figure
         With one axes for each unit, or for each channel where points are numbers or many.
     """
-    import matplotlib.pyplot as plt
-
     drawn = dict(responses or {})
     reach = None
     if prediction is not None:
@@ -73,9 +71,7 @@ def plot_points(
             drawn = {f"predicted mean, {low:g} to {high:g} %": prediction.mean}
     numeric = all(isinstance(each, int | float) for each in measurements.points)
     panels = _panels(measurements, numeric)
-    figure, rows = plt.subplots(
-        len(panels), 1, squeeze=False, figsize=(8.0, 1.2 + 2.6 * len(panels)), layout="constrained"
-    )
+    figure, rows = new_figure(len(panels), 1, (8.0, 1.2 + 2.6 * len(panels)))
     for axes, panel in zip(rows[:, 0], panels, strict=True):
         channel = measurements.channels[panel.rows[0]]
 
@@ -97,13 +93,11 @@ def plot_points(
         axes.errorbar(places, shown(measurements.values), error, fmt="o", color=ORANGE, markersize=5, label=text)
         axes.set_ylabel(panel.label)
         axes.axhline(0.0, color="0.75", linewidth=0.7, zorder=0)
-        axes.grid(alpha=0.25)
         if numeric:
             axes.set_xlabel(measurements.axis)
         else:
             _name(axes, panel.names)
-    handles, labels = rows[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize="small")
+    add_figure_legend(figure, 3)
     if measurements.description:
         figure.suptitle(measurements.description, fontsize="small", wrap=True)
     return figure
@@ -206,9 +200,7 @@ def plot_modes(
         _name(axes, list(data.sensors), width / columns)
         axes.tick_params(labelbottom=place + columns >= len(shaped))  # names below the lowest of each column alone
         axes.grid(alpha=0.25)
-    found = [axes.get_legend_handles_labels() for axes in figure.axes]
-    unique = {text: handle for handles, texts in found for handle, text in zip(handles, texts, strict=True)}
-    figure.legend(unique.values(), unique, loc="outside lower center", ncols=4, frameon=False, fontsize="small")
+    add_figure_legend(figure, 4)
     return figure
 
 

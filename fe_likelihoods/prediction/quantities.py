@@ -7,7 +7,6 @@ displacement.
 .. math:: I_A = \frac{\pi}{2 g} \int a^2\, dt, \qquad W = \int F\, du.
 """
 
-import functools
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -37,6 +36,7 @@ __all__ = [
 
 _WORK = {"force": ("energy", "kJ"), "moment": ("energy", "kJ"), "stress": ("stress", "MPa")}  # dimension and unit
 
+_FAILED = 0.8  # of the largest force, below which a structure has failed
 _AS_FAR, _MOVED = 0.97, 0.01  # of the largest displacement so far, as far as which an excursion goes; of all, at rest
 
 
@@ -204,11 +204,11 @@ def dissipated_energy(force: str, displacement: str | ArrayLike, part: slice = s
     return ChannelQuantity(force, _work, part, (displacement,), describe=_of_force, name="energy")
 
 
-def displacement_before_failure(force: str, displacement: str | ArrayLike, loss: float = 0.2) -> ChannelQuantity:
+def displacement_before_failure(force: str, displacement: str | ArrayLike) -> ChannelQuantity:
     """Return the quantity "largest displacement before the force fails to reach 80 % of its peak".
 
     A structure has failed in the first excursion (between two changes of sign of the displacement) that goes as far as
-    any before it, comes after the largest force, and reaches less than ``1 - loss`` times this force. A structure that
+    any before it, comes after the largest force, and reaches less than 80 % of this force. A structure that
     does not fail has the largest displacement of the whole history: continue the history to see more. Under a large
     axial load the force also falls by P-Delta, without any damage: use the base moment divided by the height
     (``geometry="linear"`` of `RCColumn`).
@@ -220,14 +220,12 @@ def displacement_before_failure(force: str, displacement: str | ArrayLike, loss:
     displacement : str or (n_steps,) array_like
         Name of the displacement channel that belongs to it, or the imposed displacement of a test [m], with one value
         per force sample.
-    loss : float
-        Lost share of the largest force, between 0 and 1.
 
     Raises
     ------
     ValueError
-        If the displacement is neither a name nor finite values (n_steps,), or the loss is not between 0 and 1. When the
-        quantity is used: if the channel is no force, or has another number of samples.
+        If the displacement is neither a name nor finite values (n_steps,). When the quantity is used: if the channel is
+        no force, or has another number of samples.
 
     Examples
     --------
@@ -240,11 +238,8 @@ def displacement_before_failure(force: str, displacement: str | ArrayLike, loss:
     value                                 unit  mean  MC error  sd  5 %  50 %  95 %
     displacement before failure of force    mm   287         0   0  287   287   287
     """
-    if not 0.0 < loss < 1.0:
-        raise ValueError(f"displacement_before_failure: loss must be between 0 and 1; got {loss!r}")
     displacement = _displacement(displacement, "displacement_before_failure")
-    function = functools.partial(_before_failure, loss=loss)
-    return ChannelQuantity(force, function, others=(displacement,), describe=_of_failure, name="failure")
+    return ChannelQuantity(force, _before_failure, others=(displacement,), describe=_of_failure, name="failure")
 
 
 def final_value(channel: str, samples: int = 1) -> ChannelQuantity:
@@ -334,7 +329,7 @@ def _work(force: np.ndarray, displacement: np.ndarray) -> float:
     return float(0.5 * (force[1:] + force[:-1]) @ np.diff(displacement))
 
 
-def find_failure(force: np.ndarray, displacement: np.ndarray, loss: float = 0.2) -> int:
+def find_failure(force: np.ndarray, displacement: np.ndarray) -> int:
     """First sample of the excursion in which a structure fails (`displacement_before_failure`); n_steps if none.
 
     Examples
@@ -351,14 +346,14 @@ def find_failure(force: np.ndarray, displacement: np.ndarray, loss: float = 0.2)
     for start, stop in itertools.pairwise(ends):
         largest = size[start:stop].max()
         if largest > _AS_FAR * reached and reached > _MOVED * size.max() and start > np.argmax(np.abs(force)):
-            if np.abs(force[start:stop]).max() < (1.0 - loss) * largest_force:
+            if np.abs(force[start:stop]).max() < _FAILED * largest_force:
                 return int(start)
         reached = max(reached, largest)
     return len(displacement)
 
 
-def _before_failure(force: np.ndarray, displacement: np.ndarray, loss: float) -> float:
-    return float(np.abs(displacement[: find_failure(force, displacement, loss)]).max())
+def _before_failure(force: np.ndarray, displacement: np.ndarray) -> float:
+    return float(np.abs(displacement[: find_failure(force, displacement)]).max())
 
 
 def _displacement(displacement: str | ArrayLike, of: str) -> str | np.ndarray:

@@ -4,8 +4,7 @@ import re
 from collections.abc import Collection, Iterable
 from pathlib import Path
 
-from fe_likelihoods.command.keys import Key, keys_of
-from fe_likelihoods.command.priors import FORMS
+from fe_likelihoods.command.keys import FORMS, Key, keys_of
 from fe_likelihoods.command.sections import (
     MODEL_KINDS,
     SECTIONS,

@@ -16,10 +16,9 @@ from click.testing import CliRunner
 
 from fe_likelihoods import Channel, SimulationCache, read_columns, read_record
 from fe_likelihoods.command.job import parse_job, read_job
-from fe_likelihoods.command.keys import KINDS, read_quantity
+from fe_likelihoods.command.keys import KINDS, parse_prior, read_quantity
 from fe_likelihoods.command.main import TEMPLATES, _plain_warnings, main
 from fe_likelihoods.command.models import make_problem
-from fe_likelihoods.command.priors import parse_prior
 from fe_likelihoods.command.sections import MODEL_KINDS, model_keys, part_keys
 from fe_likelihoods.models.isolated_bridge_parts import Bearing, Damper, Pier
 from fe_likelihoods.models.rc_column import RCColumn

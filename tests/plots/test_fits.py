@@ -50,8 +50,8 @@ def test_rows_are_channels_and_columns_responses(measured):
 
 
 def test_short_histories_and_single_responses_have_no_window(measured):
-    assert len(plot_fit(measured, measured, "drift", window=None).axes) == 1
-    (axes,) = plot_fit(measured.trim(0.0, 6.0), {"model": measured.trim(0.0, 6.0)}, ["drift"]).axes
+    drift = measured.select(["drift"]).trim(0.0, 6.0)
+    (axes,) = plot_fit(drift, {"model": drift}).axes
     assert axes.get_title() == "model, RRMSE 0.0 %" and axes.get_xlim() == (0.0, 6.0)
     figure = plot_fit(measured, 0.5 * measured.values, title="")
     assert figure.axes[0].get_title() == "model, RRMSE 50 %" and figure.get_suptitle() == ""
@@ -82,7 +82,3 @@ def test_wrong_arguments_are_refused(measured):
         plot_fit(measured, {"before": np.zeros((2, 4))})
     with pytest.raises(ValueError, match="no response to draw"):
         plot_fit(measured, {})
-    with pytest.raises(ValueError, match="channels must be some of top, drift"):
-        plot_fit(measured, measured, ["roof"])
-    with pytest.raises(ValueError, match="window must be a positive number"):
-        plot_fit(measured, measured, window=-1.0)

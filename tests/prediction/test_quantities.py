@@ -166,14 +166,11 @@ def test_the_displacement_before_failure_is_the_largest_one_with_80_percent_of_t
             quantity = displacement_before_failure("f", given)
             assert quantity.evaluate([force, displacement], 1.0) == pytest.approx(expected, rel=1e-2)
         assert find_failure(force, displacement) <= len(force)
-    assert displacement_before_failure("f", "u", loss=0.05).evaluate([force, displacement], 1.0) == pytest.approx(2.0)
     measured = Measurements([Channel("f", "lateral force", "kN")], 1.0, [force])
     assert measured_quantity(displacement_before_failure("f", displacement), measured) == pytest.approx(3.0)
     with pytest.raises(ValueError, match="needs a force; channel 'f' is 'displacement'"):
         shown = Measurements([Channel("f", "displacement", "mm")], 1.0, [force])
         measured_quantity(displacement_before_failure("f", displacement), shown)
-    with pytest.raises(ValueError, match="loss must be between 0 and 1; got 20"):
-        displacement_before_failure("f", "u", 20)
     with pytest.raises(ValueError, match="displacement_before_failure: expected the name of a channel, or finite"):
         displacement_before_failure("f", [[1.0]])
 
