@@ -64,6 +64,7 @@ def test_a_new_environment_runs_the_readme(tmp_path):
         shutil.copytree(ROOT / name, source / name, ignore=ignored)
     for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
+    given = {path.name for path in source.iterdir()}
     environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
 
     def run(*command):
@@ -77,6 +78,8 @@ def test_a_new_environment_runs_the_readme(tmp_path):
     python = tmp_path / "new" / "bin" / "python"
     run(python, "-m", "pip", "install", "--quiet", "build")
     run(python, "-m", "build", "--outdir", tmp_path / "dist", source)  # the wheel is made from the source distribution
+    run(python, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", tmp_path / "again", source)
+    assert {path.name for path in source.iterdir()} == given  # nothing is left behind
     (wheel,) = (tmp_path / "dist").glob("*.whl")
     assert (tmp_path / "dist" / f"fe_likelihoods-{VERSION}.tar.gz").is_file()
     with zipfile.ZipFile(wheel) as archive:
