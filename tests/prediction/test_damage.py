@@ -206,35 +206,42 @@ def test_constants_of_the_index_are_those_of_the_pushed_column(column):
     assert constants.yield_force == pytest.approx(at_yield, rel=2e-3) and "hoops" in constants.source
 
 
-def test_what_the_outputs_do_not_show_is_refused_with_the_output_that_is_needed(column, prediction):
-    plain = replace(column, outputs=None)
-    with pytest.raises(ValueError, match=r"lacks the outputs base_shear, strain@0:.*damage_outputs"):
-        damage_measures(plain)
-    with pytest.raises(ValueError, match="lacks the outputs base_shear that peak drift, dissipated energy need"):
-        damage_measures(plain, measures=("peak drift", "dissipated energy"))
+def test_what_cannot_be_measured_or_judged_is_refused(column, prediction):
+    plain, imposed = replace(column, outputs=None), DisplacementHistory("push", [0.0, 0.1])
     assert damage_measures(plain, measures=("peak drift",)).measures == ("peak drift",)
-    with pytest.raises(ValueError, match="measures must be some of"):
-        damage_measures(column, measures=("crack width",))
-    of_loop = {"Park-Ang index": {"force": "f"}, "dissipated energy": {}, "bar tension": {}}
-    for name, given in of_loop.items():  # without constants, a force, sections
-        with pytest.raises(ValueError, match=r"some of peak drift, residual drift.*no RCColumn.*force=.*ParkAng"):
-            damage_measures(Loop(), measures=(name,), displacement="u", **given)
-    with pytest.raises(ValueError, match="its channels are a, f, u"):
-        damage_measures(Loop(), measures=("peak drift",), displacement="w")
-    with pytest.raises(ValueError, match="under a Record"):
-        damage_measures(RCColumn.lhpost(DisplacementHistory("push", [0.0, 0.1]), parameters=("Ec",)))
-    with pytest.raises(ValueError, match="propagate"):
-        damage(replace(prediction, quantity=None))
-    with pytest.raises(ValueError, match="different names"):
-        damage(prediction, [LimitState("a", "peak drift", 1.0)] * 2)
-    other = Record("short", column.dt, np.zeros(20))
+    state, two = LimitState("x", "peak drift", 0.1), EventRatios([[1.0, 1.1]] * 2)
+    energy, other = {"measures": ("peak drift", "dissipated energy")}, {"measures": ("bar tension",)}
+    wrong = (
+        (r"lacks the outputs base_shear, strain@0:.*damage_outputs", plain, {}),
+        ("lacks the outputs base_shear that peak drift, dissipated energy need", plain, energy),
+        ("measures must be some of", column, {"measures": ("crack width",)}),
+        ("under a Record", RCColumn.lhpost(imposed, parameters=("Ec",)), {}),
+        ("settle must be positive .s.; got '2 s'", column, {"park_ang": CONSTANTS, "settle": "2 s"}),
+        ("ultimate_displacement of ParkAng .*got '0.3 m'", column, {"park_ang": ParkAng("0.3 m", 5e5)}),
+        (r"some of peak drift, residual drift.*force=.*ParkAng", Loop(), {"displacement": "u"} | energy),
+        (r"some of peak drift, residual drift.*force=.*ParkAng", Loop(), {"displacement": "u"} | other),
+        ("its channels are a, f, u", Loop(), {"displacement": "w", "measures": ("peak drift",)}),
+    )
+    for message, model, options in wrong:
+        with pytest.raises(ValueError, match=message):
+            damage_measures(model, **options)
+    listed = "limits must be a sequence of LimitState"
+    for message, options in (
+        *((listed, {"limits": each}) for each in (state, "bar yield", [tuple(state)], 0.1, [0.1])),
+        ("different names", {"limits": [state] * 2}),
+        ("the limit of 'x' must be a positive number.*got '0.2 %'", {"limits": [state._replace(limit="0.2 %")]}),
+        ("ratios of strain; the measures are", {"ratios": {"strain": EventRatios([1.0, 1.1])}}),
+        ("must be EventRatios of one quantity", {"ratios": two}),
+        ("noise of sensors does no damage", {"noise": True}),
+    ):
+        with pytest.raises(ValueError, match=message):
+            damage(prediction, **options)
+    for message, changes in (("propagate", {"quantity": None}), ("noise of sensors does no damage", {"noise": True})):
+        with pytest.raises(ValueError, match=message):
+            damage(replace(prediction, **changes))
+    short = {"record": Record("short", column.dt, np.zeros(20)), "from_state": "virgin", "progress": False}
     with pytest.raises(ValueError, match="is for responses of .* samples, got 20"):
-        propagate(column, TRUTH[None], quantity=prediction.quantity, record=other, from_state="virgin", progress=False)
-
-
-def test_noise_is_no_damage(prediction):
-    with pytest.raises(ValueError, match="noise of sensors does no damage"):
-        damage(replace(prediction, noise=True))
+        propagate(column, TRUTH[None], quantity=prediction.quantity, **short)
 
 
 def test_default_limits_have_sources(prediction):
@@ -325,23 +332,6 @@ def test_a_limit_with_a_distribution_is_integrated_over():
     )
 
 
-@pytest.mark.parametrize(
-    "limits", [LimitState("x", "peak drift", 0.1), "bar yield", [("x", "peak drift", 0.1)], 0.1, [0.1]]
-)
-def test_limits_that_are_no_limit_states_are_refused(prediction, limits):
-    with pytest.raises(ValueError, match="limits must be a sequence of LimitState"):
-        damage(prediction, limits)
-
-
-def test_settings_of_another_type_are_refused(column, prediction):
-    with pytest.raises(ValueError, match="settle must be positive .s.; got '2 s'"):
-        damage_measures(column, park_ang=CONSTANTS, settle="2 s")
-    with pytest.raises(ValueError, match="ultimate_displacement of ParkAng must be positive .*got '0.3 m'"):
-        damage_measures(column, park_ang=ParkAng("0.3 m", 5e5))
-    with pytest.raises(ValueError, match="the limit of 'x' must be a positive number.*got '0.2 %'"):
-        damage(prediction, [LimitState("x", "peak drift", "0.2 %")])
-
-
 def test_ratios_add_the_error_of_the_model_to_limit_states_and_extent():
     model, rng = Loop(), np.random.default_rng(1)
     measures = damage_measures(model, displacement="u")
@@ -387,9 +377,3 @@ def test_an_error_of_the_model_that_is_left_out_is_told(prediction):
         warnings.simplefilter("error")
         damage(prediction, noise=False)
         damage(prediction, ratios=EventRatios([1.0, 1.1]))
-    with pytest.raises(ValueError, match="ratios of strain; the measures are"):
-        damage(prediction, ratios={"strain": EventRatios([1.0, 1.1])})
-    with pytest.raises(ValueError, match="must be EventRatios of one quantity"):
-        damage(prediction, ratios=EventRatios([[1.0, 1.1]] * 2))
-    with pytest.raises(ValueError, match="noise of sensors does no damage"):
-        damage(prediction, noise=True)

@@ -1,12 +1,14 @@
 """Uncertainty propagation: closed forms, batches against direct computation, failing models."""
 
 import logging
+from dataclasses import replace
 from multiprocessing.pool import ThreadPool
 
 import numpy as np
 import pytest
 from scipy import stats
 
+from fe_likelihoods.checks.finding import CARE, Finding
 from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.likelihood.posterior import Posterior
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
@@ -278,6 +280,9 @@ def test_average_of_two_models_is_their_mixture(rng):
     average = average_predictions(predictions, {"two": 0.6, "one": 0.4})
     mixture = quiet(Line(), np.vstack([first, second]))  # 800 : 1200
     assert np.allclose(average.mean, mixture.mean) and np.allclose(average.variance, mixture.variance)
+    found = tuple(Finding(text, CARE, "Why.") for text in ("Far away", "Few samples"))
+    named = {"one": replace(predictions["one"], findings=found[:1]), "two": replace(predictions["two"], findings=found)}
+    assert average_predictions(named, {"two": 0.6, "one": 0.4}).findings == found  # of each model, once
     errors = np.stack([p.standard_error for p in predictions.values()])
     assert np.allclose(average.standard_error, np.hypot(0.4 * errors[0], 0.6 * errors[1]))
     with pytest.raises(ValueError, match="sum to one"):
