@@ -1,4 +1,4 @@
-"""Make data/bridge_column_short.h5: ten seconds of synthetic data for the first examples of the bridge column.
+"""Make templates/bridge_column_short.h5: ten seconds of synthetic data for the first examples of the bridge column.
 
 The truth is **assumed** and lies within the priors of Ramancha et al. (2022). Of the published means, one is six
 standard deviations away from its prior mean. The responses are those of the model that is updated, so that they differ
@@ -40,7 +40,7 @@ def main() -> None:
         "seed": SEED,
         "made_by": "data/make_bridge_column_short.py",
     }
-    write_dataset(Path(__file__).with_name("bridge_column_short.h5"), record, measurements, attributes)
+    write_dataset(Path(__file__).parent / "templates" / "bridge_column_short.h5", record, measurements, attributes)
 
 
 if __name__ == "__main__":

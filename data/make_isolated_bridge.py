@@ -1,4 +1,4 @@
-"""Make data/isolated_bridge.h5 and data/isolated_bridge_means.h5: synthetic tests of the isolated bridge.
+"""Make templates/isolated_bridge.h5 and isolated_bridge_means.h5: synthetic tests of the isolated bridge.
 
 The records and responses of the tests are not public, and most nominal values of the model are assumed. The table
 motion is stochastic and **assumed** (`table_motion`). The responses are those of the model with a fifth of the
@@ -63,7 +63,8 @@ def main() -> None:
             "noise_seed": NOISE_SEED,
             "made_by": "data/make_isolated_bridge.py",
         }
-        write_dataset(Path(__file__).with_name(f"{name}.h5"), record, measurements, attributes)
+        folder = Path(__file__).parent / ("templates" if name == "isolated_bridge" else "")  # a template reads it
+        write_dataset(folder / f"{name}.h5", record, measurements, attributes)
 
 
 if __name__ == "__main__":

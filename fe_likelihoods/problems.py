@@ -74,9 +74,9 @@ SHORT_SUBSTEPS = 2
 _COLUMN_FILES = {
     "eq1": "bridge_column_eq1.h5",
     "eq1-eq2": "bridge_column_events.h5",
-    "short": "bridge_column_short.h5",
+    "short": "templates/bridge_column_short.h5",
 }
-_BRIDGE_FILES = {"twin": "isolated_bridge.h5", "means": "isolated_bridge_means.h5"}
+_BRIDGE_FILES = {"twin": "templates/isolated_bridge.h5", "means": "isolated_bridge_means.h5"}
 
 
 def _bundled(name: str) -> Dataset:

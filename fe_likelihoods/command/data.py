@@ -19,7 +19,6 @@ __all__ = [
     "FEWEST_SAMPLES",
     "is_dataset",
     "read_base_motion",
-    "read_bundled",
     "read_measured",
     "read_supports",
     "reduce_data",
@@ -29,31 +28,20 @@ __all__ = [
 _HDF5 = (".h5", ".hdf5")
 
 
-def read_bundled(job: Job, section: str) -> Dataset:
-    """The bundled data set that a section names: ``column-eq1`` is the column's with the motion ``eq1``."""
-    from .. import problems
-
-    structure, _, name = getattr(job, section).bundled.partition("-")
-    return {"column": problems.bridge_column_data, "bridge": problems.isolated_bridge_data}[structure](name)
-
-
 def is_dataset(job: Job, section: str) -> bool:
     """Whether the file of a section is a data set in HDF5, which has record and measurements."""
     given = getattr(job, section)
-    return given is not None and (given.bundled is not None or Path(given.file or "").suffix.lower() in _HDF5)
+    return given is not None and Path(given.file or "").suffix.lower() in _HDF5
 
 
 def _dataset(job: Job, section: str) -> Dataset | None:
-    """The data set that a section names, bundled or a file; None for other files."""
-    given = getattr(job, section)
-    if (given.file is None) == (given.bundled is None):
-        found = "both" if given.file else "none"
-        raise ValueError(f"{job.where(section)} file: expected file = ... or bundled = ...; got {found} of them")
+    """The data set that a section names; None for other files, ValueError without a file."""
+    file = getattr(job, section).file
+    if file is None:
+        raise ValueError(f"{job.where(section)} file: this key is missing; it names the data")
     if not is_dataset(job, section):
         return None
-    if given.bundled is not None:
-        return read_bundled(job, section)
-    return job.located(section, lambda: read_dataset(job.path(section, "file", given.file)))
+    return job.located(section, lambda: read_dataset(job.path(section, "file", file)))
 
 
 def read_base_motion(job: Job) -> Record | None:
@@ -85,7 +73,7 @@ def read_base_motion(job: Job) -> Record | None:
 
 def read_supports(job: Job) -> list[Record]:
     """The motions of several supports, as `read_base_motion`."""
-    if more := job.record.given("file", "bundled", "column"):
+    if more := job.record.given("file", "column"):
         raise ValueError(
             f"{job.where('record')} {[*more][0]}: leave it out with supports, which name files and columns"
         )

@@ -55,7 +55,7 @@ def _read_event(job: Job, problem: Problem, name: str) -> Event:
     where, model = own.where("record"), _histories_of(problem)[0].model
     if not hasattr(model, "with_record"):
         raise ValueError(f"{where} a model of kind {job.kind} without [record] has one excitation: leave this out")
-    if given.file is None and given.bundled is None:
+    if given.file is None:
         raise ValueError(f"{where} file: this key is missing; it is the base motion of the event")
     record = read_base_motion(own)
     try:

@@ -83,7 +83,7 @@ class Job:
             usual = {} if self.measurements is None else self.measurements.given()
             if event.measured.lower().endswith((".h5", ".hdf5")):
                 usual = {}
-            kept = {key: value for key, value in usual.items() if key not in ("bundled", "baseline")}
+            kept = {key: value for key, value in usual.items() if key != "baseline"}
             if "missing" in kept:  # times are those of the other file
                 kept["missing"] = [each for each in kept["missing"] if not isinstance(each, list)]
             measured = sections.Measured(**kept | event.given("zero") | {"file": event.measured})

@@ -23,8 +23,8 @@ NOT_USABLE = 3
 _FILE = click.Path(path_type=Path)
 _DATA = ("synthetic_record.csv", "synthetic_measured.csv")
 TEMPLATES = {
-    "column": ("column.toml",),
-    "bridge": ("bridge.toml",),
+    "column": ("column.toml", "bridge_column_short.h5"),
+    "bridge": ("bridge.toml", "isolated_bridge.h5"),
     "function": ("function.toml", "my_function.py", *_DATA),
     "opensees": ("opensees.toml", "my_opensees.py", *_DATA),
     "modal": ("modal.toml", "synthetic_modes.csv"),

@@ -28,7 +28,7 @@ from ..priors.distributions import Distribution, HalfNormal, LogNormal, Truncate
 from ..signals.channels import Channel, Measurements
 from ..signals.records import Record
 from ..simulation.model import Model
-from .data import is_dataset, read_base_motion, read_bundled, read_measured, reduce_data
+from .data import is_dataset, read_base_motion, read_measured, reduce_data
 from .job import Job
 from .keys import did_you_mean, parse_prior, read_by_channel
 from .sections import USER_MODELS
@@ -52,7 +52,6 @@ class Problem(NamedTuple):
     posterior: Posterior
     record: Record | None  # excitation as it is used
     assumed: dict[str, Distribution]  # priors of noise parameters that the file does not give
-    truth: dict[str, float] | None = None  # parameter values of bundled synthetic data
 
 
 class _DataSet(NamedTuple):
@@ -85,7 +84,7 @@ def make_problem(job: Job, cache: SimulationCache | None = None) -> Problem:
     priors, assumed = _make_priors(job, likelihood, known)
     posterior = Posterior(likelihood, priors)
     posterior = job.located("noise", posterior.marginal) if job.marginal else posterior
-    return Problem(posterior, record, assumed, _truth(job, posterior, record) if len(sets) == 1 else None)
+    return Problem(posterior, record, assumed)
 
 
 def _workers(job: Job) -> int | None:
@@ -277,18 +276,6 @@ def _of_one_run(job: Job, sets: Mapping[str, _DataSet]) -> Mapping[str, Any]:
 def runs_code_of_user(job: Job) -> bool:
     """Whether one of the models is a user's function, script or program."""
     return any(each.kind in USER_MODELS for each in job.data_sets().values())
-
-
-def _truth(job: Job, posterior: Posterior, record: Record | None) -> dict[str, float] | None:
-    """True values of bundled data: multiples of the nominal values of the built-in structure, where it has these."""
-    if job.measurements is None or job.measurements.bundled is None or job.kind not in ("column", "bridge"):
-        return None
-    model = posterior.likelihood.model
-    model = model.model if isinstance(model, SensedModel) else model
-    usual = type(model).lhpost(record) if job.kind == "column" else type(model)(record)
-    truth = read_bundled(job, "measurements").attributes["truth"]
-    changed = {name for name, value in usual.nominal.items() if not math.isclose(model.nominal[name], value)}
-    return {name: truth[name] for name in posterior.parameter_names if name in truth and name not in changed} or None
 
 
 def _with_sensors(job: Job, model: Model) -> Model:

@@ -197,7 +197,7 @@ def _write(
     from ..reporting.report import write_page
 
     sampler = samplers[0]
-    run = read_run(sampler, problem.posterior, truth=problem.truth)
+    run = read_run(sampler, problem.posterior)
     drawn = _drawn(job, problem, sampler)
     prediction = _predict(job, problem, drawn, progress)
     predicted = predict_events(job, events, problem, drawn, progress)

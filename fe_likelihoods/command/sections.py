@@ -130,10 +130,6 @@ class Motion(Table):
         "text",
         "Acceleration of the base: AT2, V1, V2, SMC, GeoNet, K-NET, ESM, miniSEED, SAC, CSV, Excel, a data set (.h5)",
     )
-    bundled: Any = key(
-        "one of column-short, column-eq1, column-eq1-eq2, bridge-twin, bridge-means",
-        "A bundled synthetic motion, instead of a file",
-    )
     column: Any = key("text", "Column of a CSV file or workbook, component (GeoNet), or file in an archive (V2)")
     channel: Any = key("whole number", "Channel of a V2 file")
     units: Any = key("text", "Unit of the acceleration, if the file does not state it")
@@ -168,10 +164,6 @@ class Measured(Table):
     """``[measurements]``."""
 
     file: Any = key("text", "Measured response: CSV, Excel, V2 and other files as in [record], or a data set (.h5)")
-    bundled: Any = key(
-        "one of column-short, column-eq1, column-eq1-eq2, bridge-twin, bridge-means",
-        "Bundled synthetic measurements, instead of a file",
-    )
     columns: Any = key("table of texts or numbers", "Channel = name of its column in the file, or number in a V2 file")
     units: Any = key("table of texts", "Channel = unit, if the file does not state it")
     reversed: Any = key("texts", "Channels whose sensor counts the other way round: they are multiplied by -1")
