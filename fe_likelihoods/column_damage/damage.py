@@ -304,7 +304,11 @@ def damage(
         guess = "state a guess, such as EventRatios([1.0], prior_sd=0.3, prior_events=10)"
         warn_of_missing_error(f"damage ({', '.join(without)})", guess)
     rng, probabilities = np.random.default_rng(seed), prediction.probabilities
-    quantiles = _extent(measures.split(prediction.values), probabilities, errors, rng) if probabilities else {}
+    quantiles = (
+        _extent(measures.split(prediction.values), probabilities, errors, rng)
+        if probabilities and prediction.n_samples
+        else {}
+    )
     return Damage(states, presence, location, quantiles, _contents(states, errors), prediction)
 
 

@@ -33,7 +33,7 @@ from .prediction import Prediction
 from .propagation import propagate
 from .quantities import ChannelQuantity, Quantity, evaluator, measured_quantity
 
-__all__ = ["at_parameters", "event_ratios", "predict_new_event", "under_motion"]
+__all__ = ["event_ratios", "predict_new_event"]
 
 
 def event_ratios(
@@ -172,7 +172,7 @@ def predict_new_event(
         If the posterior of an event is missing, a parameter has no median, the quantity is neither a history nor a
         positive number of a channel, and as `Hierarchy.new_test`, `EventRatios` and `propagate`.
     SimulationFailed
-        If the simulation at the median parameters fails, or all simulations of the histories.
+        If the simulation at the median parameters fails, other than by collapse, or all simulations of the histories.
 
     Warns
     -----
@@ -220,7 +220,22 @@ def predict_new_event(
             raise ValueError("predict_new_event: numbers contain the errors of measurements already; noise=False")
         ratios = event_ratios(hierarchy, posteriors, quantity, spread=spread, prior_events=prior_events)
         probabilities = settings.pop("quantiles", (0.05, 0.5, 0.95))
-        prediction, values, ratios = under_motion(predictor, ratios, record, quantity, **settings)
+        prediction, values, ratios = _under_motion(predictor, ratios, record, quantity, **settings)
+        if 0 in prediction.collapsed:  # as it would in every draw
+            unknown, every = np.full(values.shape[1:], np.nan), np.arange(n)
+            moments = dict.fromkeys(("mean", "variance", "standard_error"), unknown)
+            return replace(
+                prediction,
+                values=prediction.values[:0],
+                n_samples=0,
+                effective_sample_size=float(n),
+                failed=every,
+                collapsed=every,
+                noise=True,
+                ratios=ratios,
+                predicted=np.full(values.shape[1:], np.inf),
+                **moments,
+            )
         if np.isnan(values[0]).any():
             raise SimulationFailed(f"the simulation at the median parameters fails: {[*prediction.failure_reasons]}")
         return _corrected(prediction, values[0], ratios, n, probabilities, np.random.default_rng(seed))
@@ -241,7 +256,7 @@ def predict_new_event(
 def _event(likelihood: FELikelihood, at: Mapping[str, float], quantity: Any, spread: Mapping[str, float]) -> tuple:
     """Ratio of measured to predicted value of one event, the predicted one, and the variances of the log ratio."""
     model, measured = likelihood.model, measured_quantity(quantity, likelihood.measurements)
-    rows = spread_rows(at_parameters(at, model.parameter_names), model.parameter_names, spread)
+    rows = spread_rows(_at_parameters(at, model.parameter_names), model.parameter_names, spread)
     responses, reasons = likelihood.simulate(rows)
     if reasons[0]:
         raise SimulationFailed(reasons[0])
@@ -268,7 +283,7 @@ def _is_number(quantity: Any) -> bool:
     return callable(quantity) or (is_list and any(isinstance(each, ChannelQuantity) for each in several))
 
 
-def at_parameters(parameters: Mapping[str, float], names: Sequence[str]) -> list[float]:
+def _at_parameters(parameters: Mapping[str, float], names: Sequence[str]) -> list[float]:
     """Values of a model's parameters; ValueError for parameters without a value."""
     if missing := [name for name in names if name not in parameters]:
         raise ValueError(
@@ -278,7 +293,7 @@ def at_parameters(parameters: Mapping[str, float], names: Sequence[str]) -> list
     return [parameters[name] for name in names]
 
 
-def under_motion(
+def _under_motion(
     predictor: Any, ratios: EventRatios, record: Any, quantity: Quantity, **settings: Any
 ) -> tuple[Prediction, np.ndarray, EventRatios]:
     """Prediction at `ratios.at` and at its spread, the values (1 + 2 m, ...), NaN for failures, and ratios for them.
@@ -286,7 +301,7 @@ def under_motion(
     The ratios have the scatter of the parameters that this motion makes of the number.
     """
     names = read_source(predictor).model.parameter_names
-    rows = spread_rows(at_parameters(ratios.at, names), names, ratios.spread or {})
+    rows = spread_rows(_at_parameters(ratios.at, names), names, ratios.spread or {})
     prediction = propagate(predictor, rows, record=record, quantity=quantity, quantiles=(), **settings)
     values = np.full((len(rows), *prediction.mean.shape), np.nan)
     values[np.setdiff1d(np.arange(len(rows)), prediction.failed)] = prediction.values

@@ -85,6 +85,10 @@ def test_collapsed_columns_reach_every_limit_state(prediction):
         np.testing.assert_allclose(found.presence[name].probability, (6.0 + 12.0 * each.probability) / 18.0)
     assert all(each.probability.min() >= 1.0 / 3.0 for each in found.location.values())
     assert "6 of 19 structures collapsed" in str(found) and "1 of 19 samples failed" in str(found)
+    options = {"values": prediction.values[:0], "n_samples": 0, "failed": np.arange(5), "collapsed": np.arange(5)}
+    every = damage(replace(prediction, **options), noise=False)
+    assert all((each.probability == 1.0).all() for each in every.presence.values()) and every.extent == {}
+    assert "5 of 5 structures collapsed" in str(every)
 
 
 def test_energy_drifts_and_index_of_a_loop():

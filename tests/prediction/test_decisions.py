@@ -26,6 +26,7 @@ from fe_likelihoods.priors.distributions import HalfNormal, LogNormal
 from fe_likelihoods.priors.priors import Prior
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record
+from fe_likelihoods.simulation.model import SimulationFailed
 from tests.prediction.flexible import DISPERSION, MEDIAN, Flexible, strongest, under
 from tests.prediction.test_new_event import Amplified, hierarchy  # noqa: F401  a fixture
 
@@ -58,6 +59,18 @@ class Sharp(Wave):
 
     def with_record(self, record):
         return Sharp(record)
+
+
+class Falling(Wave):
+    """Collapses beyond an acceleration of 0.9."""
+
+    def respond(self, theta):
+        if np.abs(self.record.acceleration).max() > 0.9:
+            raise SimulationFailed("collapse")
+        return super().respond(theta)
+
+    def with_record(self, record):
+        return Falling(record)
 
 
 @pytest.fixture
@@ -182,6 +195,13 @@ def test_each_record_has_the_scatter_that_it_makes_of_the_parameters(wave, rng):
         assert found.exceedance.probability[k] == float(exceedance(new, 0.9).probability)
         assert new.ratios.new_sd == pytest.approx(np.sqrt(0.3**2 + ratios.remainder), rel=0.05)
         assert new.ratios.new_sd > 2.0 * ratios.new_sd  # control: the mean of the calibrated events
+    falling = Falling(wave.record)
+    predicted = [predict_new_event(known, posteriors, each, model=falling, **given, **options) for each in records]
+    found = fragility(predicted, strongest(records), 0.9)
+    assert found.exceedance.probability[1] == found.exceedance.lower[1] == 1.0 > found.exceedance.probability[0]
+    assert found.n_collapsed.tolist() == [0, 500] and "500 of 500 structures collapsed" in str(
+        exceedance(predicted[1], 0.9)
+    )
 
 
 def test_error_of_the_model_has_the_level_of_the_noise_and_the_spectrum_of_the_response(wave):
