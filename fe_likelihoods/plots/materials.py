@@ -7,7 +7,7 @@ from itertools import cycle
 from typing import TYPE_CHECKING
 
 from ..units import from_si
-from .style import BLUE, GREY, ORANGE, new_axes
+from .style import BLUE, GREY, ORANGE, add_legend, new_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -88,5 +88,5 @@ def _loops(axes: Axes | None, lines: Sequence[tuple], xlabel: str, ylabel: str) 
     for (x, y, label), colour in zip(lines, cycle(_COLOURS), strict=False):
         axes.plot(x, y, color=colour, linewidth=1.2, label=label)
     axes.set(xlabel=xlabel, ylabel=ylabel)
-    axes.legend(frameon=False, fontsize="small")
+    add_legend(axes)
     return axes
