@@ -29,7 +29,9 @@ Outcome = tuple[Any, str]
 
 
 class Submitting:
-    """Base class of executors: `map` and `submit` by `submit_all` and `give_up`."""
+    """Base class of executors: `map` and `submit` by `submit_all`, which `map` may give options, and `give_up`."""
+
+    _of_map: dict[str, Any] = {}
 
     def map(self, function: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
         """Results of a function for every item, in order.
@@ -46,7 +48,7 @@ class Submitting:
             The first exception that `function` raises; no further items are started. At Ctrl-C, too, the other items
             are given up.
         """
-        futures = self.submit_all(function, list(items))
+        futures = self.submit_all(function, list(items), **self._of_map)
         try:
             for future in wait_for(futures, return_when=FIRST_EXCEPTION).done:
                 future.result()
@@ -75,12 +77,14 @@ class Threads:
         self._threads: set[threading.Thread] = set()
         self._n_idle = self.pending = 0
 
-    def submit(self, function: Callable[[Any], Any], item: Any, future: Future | None = None) -> Future:
-        """Future of a function of an item, which `cancel` prevents until a thread takes it."""
+    def submit(
+        self, function: Callable[[Any], Any], item: Any, future: Future | None = None, first: bool = False
+    ) -> Future:
+        """Future of a function of an item, which `cancel` prevents until a thread takes it; `first`: before others."""
         future, most = Future() if future is None else future, self._most()
         with self._changed:
             self.pending += 1
-            self._waiting.append((future, function, item))
+            (self._waiting.appendleft if first else self._waiting.append)((future, function, item))
             self._changed.notify()
             if len(self._threads) < most and self._n_idle < len(self._waiting):
                 thread = threading.Thread(target=self._work, args=(_LINGER,), name="fe_likelihoods", daemon=True)
@@ -150,6 +154,7 @@ class LocalPool(Submitting):
 
     other_processes = True
     submits = True
+    _of_map = {"first": True}  # a verification does not wait for a batch of long runs
 
     def __init__(self, workers: int) -> None:
         if not isinstance(workers, Integral) or isinstance(workers, bool) or workers < 1:
@@ -189,15 +194,15 @@ class LocalPool(Submitting):
         self.give_up(list(self._jobs))
         self._workers.close()
 
-    def submit_all(self, function: Callable[[Any], Any], items: Sequence[Any]) -> list[Future]:
+    def submit_all(self, function: Callable[[Any], Any], items: Sequence[Any], first: bool = False) -> list[Future]:
         """Futures as from `submit`, for several items; ValueError if the function cannot be sent to the processes."""
         self._notice_fork()
         pickled = Pickled.of(function)  # each time: the values that it uses may have changed
         jobs = [_Job(pickled, item) for item in items]
         self._jobs.update(jobs)
-        for job in jobs:
+        for job in reversed(jobs) if first else jobs:
             job.add_done_callback(self._jobs.discard)
-            self._threads.submit(self._result, job, job)
+            self._threads.submit(self._result, job, job, first)
         return jobs
 
     def give_up(self, futures: Sequence[Future], running: bool = True) -> None:
