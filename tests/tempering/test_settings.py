@@ -142,7 +142,7 @@ def test_a_setting_of_the_other_sampler_is_refused(Sampler):
         (TMCMCSampler, {"chains": "leaders", "moves": emcee.moves.StretchMove()}, 'several walkers.*chains="equal"'),
         (TMCMCSampler, {"chains": "leaders", "moves": [(emcee.moves.DEMove(), 1.0)]}, "need several walkers"),
     ],
-    ids=lambda value: str(value),
+    ids=lambda value: value if isinstance(value, str) else None,
 )
 def test_a_setting_that_cannot_act_is_refused(Sampler, settings, match):
     with pytest.raises(ValueError, match=match):
