@@ -8,8 +8,6 @@ import pytest
 
 from fe_likelihoods.simulation import dask_executor
 from fe_likelihoods.simulation.executors import DaskExecutor
-from samplers.evaluation.asynchronous import PoolQueue
-from tests.clusters.noted import Gate
 from tests.faults.treacherous import Gated, Treacherous, posterior_of
 
 pytestmark = pytest.mark.skipif(
@@ -82,23 +80,3 @@ def test_workers_that_the_cluster_has_given_up_are_started_again(cluster, tmp_pa
     while len(set(client.scheduler_info()["workers"]) - before) < 1:
         assert time.monotonic() < stop
         time.sleep(0.01)
-
-
-def test_a_closed_queue_of_a_sampler_cancels_what_has_not_been_started(cluster, tmp_path):
-    client = cluster(0.0)
-    client.cluster.scale(1)
-    client.wait_for_workers(1)
-    pool = DaskExecutor(client)
-    queue = PoolQueue(Gate(tmp_path), pool, list)
-    for item in range(20, 40):  # tasks of their own
-        queue.submit([item])
-    stop = time.monotonic() + 30.0
-    while not (tmp_path / "20").exists():
-        assert time.monotonic() < stop
-        time.sleep(0.01)
-    queue.close()
-    (tmp_path / "go").touch()
-    assert pool.map(Gate(tmp_path), [7]) == [7]
-    # a worker has received a few before it starts them, more of them on a busy machine; without close, all 20 start
-    begun = {path.name for path in tmp_path.iterdir()}
-    assert {"20", "7", "go"} <= begun and len(begun - {"7", "go"}) <= 8
