@@ -242,6 +242,11 @@ class SimulationCache:
             self.write(pack_rows(model.fingerprint, nothing, nothing, [text], 0, of_model=True))
             self._remark = text
 
+    def look_up_remark(self, model: Model) -> str:
+        """The stored remark of a model; empty if there is none."""
+        rows = self.rows_of(simulation_keys(model.fingerprint, np.zeros((1, 0)), 0))
+        return reason_of(rows[0]) if rows else ""
+
     def repeat_remark(self, model: Model, fingerprint: str) -> None:
         """Log a model's stored remark, once per process, unless the model has just made a remark itself.
 
@@ -250,9 +255,9 @@ class SimulationCache:
         """
         if hasattr(model, "range_remark") and (str(self.path), fingerprint) not in _repeated:
             _repeated.add((str(self.path), fingerprint))
-            rows = self.rows_of(simulation_keys(fingerprint, np.zeros((1, 0)), 0))
-            if rows and not model.range_remark:
-                logger.warning("simulations of this model in %s: %s", self.path, reason_of(rows[0]))
+            text = self.look_up_remark(model)
+            if text and not model.range_remark:
+                logger.warning("simulations of this model in %s: %s", self.path, text)
 
     # the file -----------------------------------------------------------------------------------------------------
 

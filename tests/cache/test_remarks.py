@@ -7,8 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fe_likelihoods import DisplacementHistory, FELikelihood, Measurements, RCColumn, SimulationCache
+from fe_likelihoods import (
+    DisplacementHistory,
+    FELikelihood,
+    HalfNormal,
+    Measurements,
+    Posterior,
+    RCColumn,
+    SimulationCache,
+    TruncatedNormal,
+    check_result,
+)
 from fe_likelihoods.models.rc_column_analysis import expect_fracture
+from samplers import SMCSampler
 
 THETAS = np.array([[1.0], [1.1]])
 
@@ -54,6 +65,21 @@ def test_a_model_that_has_warned_does_not_repeat_itself(path, caplog):
     first.simulator.memory_cache.clear()
     first.misfit(THETAS)
     assert first.simulator.disk_hits == 2 and len(caplog.records) == 1
+
+
+@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
+@pytest.mark.parametrize("drift", [0.2, 0.05])
+def test_a_stored_remark_is_a_finding_of_the_result(drift, path):
+    """The second run takes all simulations from the file, so that its model has made no remark."""
+    for _ in range(2):
+        run = likelihood(path, drift)
+        sigmas = {name: HalfNormal(1e6) for name in run.noise.parameter_names}
+        posterior = Posterior(run, {"fy": TruncatedNormal(1.0, 0.05)} | sigmas)
+        sampler = SMCSampler(24, posterior.ndim, posterior, vectorize=True, seed=1, min_moves=1, max_moves=1)
+        sampler.run_mcmc(None, 1)
+        titles = [finding.kind for finding in check_result(sampler).findings]
+        assert ("Beyond the range of a law of the model" in titles) == (drift > 0.1)
+    assert run.simulations == 0
 
 
 def test_a_model_that_expects_fracture_has_no_remark(path, caplog):
