@@ -133,7 +133,8 @@ def _stuck(x: np.ndarray) -> tuple[tuple[int, int], ...]:
                     found = np.minimum(sides[first - beside], sides[after])
                     noisy = ratio == VANISHED or _correlation(x[first:after]) < WHITE
                     still[first:after] |= bool(np.isfinite(found) and found >= least * level and noisy)
-    return tuple((first, stop - 1) for first, stop in runs_of(still))
+    # a quiet start, as of a shake table, is no fault
+    return tuple((first, stop - 1) for first, stop in runs_of(still) if first > 0 or stop == len(x))
 
 
 def _moving_deviation(x: np.ndarray, length: int) -> np.ndarray:

@@ -255,7 +255,8 @@ def discard(process: int, reason: str = "") -> str:
         if os.path.isdir(place):
             for run in Path(place).glob("run_*") if reason and os.environ.get(KEEP) else ():
                 kept = keep_folder(run, os.environ[KEEP], reason)
-            shutil.rmtree(place, ignore_errors=True)
+            with of_this_library():  # which may run in a simulation's thread
+                shutil.rmtree(place, ignore_errors=True)
     return "" if kept is None else f" (its folder is {kept})"
 
 

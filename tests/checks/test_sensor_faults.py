@@ -89,12 +89,14 @@ def test_right_channels_of_other_kinds_are_left_alone():
         digits,
         gaps,
         np.zeros(N),
+        np.where(TIME < 3.0, 0.0, x),  # a quiet start
         np.full(N, np.nan),
         np.where(np.arange(N) % 2, x, np.nan),
         x[:40],
     ):
         assert find_sensor_faults(values, "displacement") == ()
     assert find_sensor_faults(5.0 * peak + x, "force") == ()  # a dead load
+    assert [each.kind for each in find_sensor_faults(np.where(TIME > 8.0, 0.0, x), "displacement")] == ["stuck"]
     box, pulse = np.where((TIME > 2.0) & (TIME < 4.0), 1.0, 0.0), np.where(TIME == 2.0, 1.0, 0.0)
     for motion in (
         padded,
