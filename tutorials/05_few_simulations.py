@@ -71,11 +71,12 @@ print(sampler.verdict)
 # known at thousands of points, which the simulated draws correct. The dotted lines in the figure are the prior: where
 # they are close to the posterior, the data say little about a parameter.
 
-truth = problems.isolated_bridge_data("twin").attributes["truth"]
+stored = problems.isolated_bridge_data("twin").attributes["truth"]
+truth = {name: stored[name] for name in posterior.parameter_names}  # the noise levels are integrated out
 signed = sampler.signed_sample
 mean, sd = signed.expectation(), signed.standard_deviation()
-for i, name in enumerate(posterior.parameter_names):
-    print(f"{name:<8} truth {truth[name]:.3f}, mean {mean.value[i]:.4f} +- {mean.error[i]:.4f}, sd {sd.value[i]:.4f}")
+for i, (name, true) in enumerate(truth.items()):
+    print(f"{name:<8} truth {true:.3f}, mean {mean.value[i]:.4f} +- {mean.error[i]:.4f}, sd {sd.value[i]:.4f}")
 draws = signed.draw(4000, seed=1)
 plot_marginals(draws, posterior, truths=truth, title="synthetic data, assumed nominal values").savefig("marginals.png")
 
