@@ -59,8 +59,9 @@ MAX_TRUSTS = 32
 DIFFER = "stored simulations of this %s differ from new ones; they stay in the file and are not used"
 CHANGED = (
     "Something has changed that neither its declared identity nor its label contains, or the model does not repeat its "
-    "results. Delete its rows with likelihood.simulator.cache.forget(*likelihood.simulator.cache_keys), or give the "
-    "model a new version= (or depends_on=)"
+    "results (make it depend on its parameters alone, for example with a fixed seed). Delete its rows with "
+    "likelihood.simulator.cache.forget(*likelihood.simulator.cache_keys), or give the model a new version= (or "
+    "depends_on=)"
 )
 
 

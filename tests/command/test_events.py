@@ -5,6 +5,7 @@ import csv
 import re
 import shutil
 import warnings
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -101,12 +102,13 @@ def test_report_makes_events_again_without_simulations(finished, monkeypatch):
     first = (finished / "r" / "events.csv").read_text()
     simulated, one = [], linear_oscillator.respond
     monkeypatch.setattr(linear_oscillator, "respond", lambda *args: simulated.append(args) or one(*args))
-    for most in (19, 4):  # at first some rows of the file are verified; samples that were in memory alone are stored
+    for most in (19, 3):  # at first more rows of the file are verified; samples that were in memory alone are stored
         simulated.clear()
         (finished / "r" / "events.csv").unlink()
         said = call("report", "r")
         assert "events.csv" in said and (finished / "r" / "events.csv").read_text() == first
-        assert 0 < len(simulated) <= most  # none of the 20 of each event or of the 20 samples: the mean, for checks
+        motions = Counter(len(motion) for motion, *_ in simulated)  # each has 20 predictions, the measured one samples
+        assert 0 < max(motions.values()) <= most
 
 
 @pytest.mark.slow
