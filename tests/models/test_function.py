@@ -162,9 +162,8 @@ def test_failures_are_in_the_report_with_their_duration(pool):
         "stopped at the time limit of 0.5 s": 1,
         "the worker process died (signal 11)": 1,
     }
-    assert {"offset": bad.HANGS + 0.5, "slope": 0.1} in [entry["parameters"] for entry in report["failures"]]
-    assert all(entry["seconds"] >= 0.0 for entry in report["failures"])
-    assert report["failures"][1]["seconds"] >= 0.5
+    (stopped,) = (each for each in report["failures"] if each["parameters"]["offset"] == bad.HANGS + 0.5)
+    assert all(entry["seconds"] >= 0.0 for entry in report["failures"]) and stopped["seconds"] >= 0.5
 
 
 @pytest.mark.parametrize(
