@@ -126,10 +126,10 @@ def screen(measurements: Measurements) -> list[Screened]:
 
 
 def screen_motion(motion: Record) -> list[Screened]:
-    """Faults of a motion; zeros before and after it, and white noise, are usual."""
-    ends, found = {0, motion.n_steps - 1}, []
+    """Faults of a motion; zeros after it, and white noise, are usual."""
+    found = []
     for fault in find_sensor_faults(motion.acceleration, "acceleration"):
-        padding = fault.kind == "stuck" and all(ends & set(span) for span in fault.spans)
+        padding = fault.kind == "stuck" and all(last == motion.n_steps - 1 for _, last in fault.spans)
         found += [] if padding or fault.kind == "noise" else [fault]
     return [Screened(motion.name, "m/s²", motion.dt, 0.0, tuple(found), is_motion=True)]
 
