@@ -176,7 +176,10 @@ class Verdict(_Stored):
 
     @property
     def summary(self) -> str:
-        """One sentence: status, modes, evidence, effective sample size and failures."""
+        """One sentence: status, modes, evidence, effective sample size and failures.
+
+        The evidence is ``sampler.log_evidence``; the estimates that it was chosen from follow in parentheses.
+        """
         if len(self.modes) == 1:
             found = "one mode"
         else:
@@ -184,18 +187,21 @@ class Verdict(_Stored):
             found = f"{len(self.modes)} modes with shares {shares}"
         run = self._parts
         result, check = run.result, run.result.check
-        estimates = [("stages", result.log_evidence_ladder, result.ladder[-1].log_evidence_error, "")]
+        stated = "{:.2f} +- {:.2g}".format(*result.evidence)
+        others = []
         if check is not None:
-            estimates.append(("check", *check[:2], "" if check.reliable else " (uneven weights)"))
+            others = [("stages", result.log_evidence_ladder, result.ladder[-1].log_evidence_error, "")]
+            others.append(("check", *check[:2], "" if check.reliable else ", uneven weights"))
         if result.rounds and result.start is not None and not result.start.used:
             last = result.rounds[-1]
-            estimates.append(("guide", last.log_evidence, last.log_evidence_error, " (uneven weights)"))
-        evidences = ", ".join(f"{source} {value:.2f} +- {error:.2g}{note}" for source, value, error, note in estimates)
+            others.append(("guide", last.log_evidence, last.log_evidence_error, ", uneven weights"))
+        if others:
+            stated += f" ({'; '.join(f'{name} {x:.2f} +- {error:.2g}{note}' for name, x, error, note in others)})"
         failed = f"{run.failures} of {run.evaluations} evaluations failed" if run.failures else "no failed evaluations"
         if run.failed_simulations:
             failed = f"{run.failed_simulations} simulations failed"
         return (
-            f"{self.status.capitalize()}: {found}; log-evidence by {evidences}; effective sample size "
+            f"{self.status.capitalize()}: {found}; log-evidence {stated}; effective sample size "
             f"{self.effective_sample_size:.0f}; {failed}."
         )
 

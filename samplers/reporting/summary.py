@@ -222,12 +222,10 @@ def ladder_table(sampler: Any) -> str:
         f"log evidence {sampler.log_evidence:.3f} +- {sampler.log_evidence_error:.3f}; "
         f"{evaluations} evaluations in {seconds:.3g} s"
     )
-    check = sampler.log_evidence_check
-    if check is not None:
+    if (check := sampler.log_evidence_check) is not None:
         rows.append(
-            f"log evidence of the ladder {sampler.log_evidence_ladder:.3f} +- {stages[-1].log_evidence_error:.3f}; "
-            f"of {check.evaluations} independent draws {check.log_evidence:.3f} +- {check.error:.3f} "
-            f"(effective sample size {check.effective_sample_size:.0f}, Pareto shape {check.pareto_shape:.2f})"
+            f"check by {check.evaluations} independent draws: effective sample size {check.effective_sample_size:.0f}, "
+            f"Pareto shape {check.pareto_shape:.2f}"
         )
     if (sample := sampler.signed_sample) is not None:
         error = np.nanmax(sample.expectation().error / sample.standard_deviation().value, initial=0.0)

@@ -44,12 +44,29 @@ def test_sentence_and_what_it_is_made_of(sampler):
     found = sampler.verdict
     assert found.summary.startswith(f"{sampler.verdict.status.capitalize()}: 2 modes with shares 0.7")
     assert "no failed evaluations" in found.summary
-    assert f"by stages {sampler.log_evidence_ladder:.2f} +- " in found.summary
-    assert f", check {sampler.log_evidence_check.log_evidence:.2f} +- " in found.summary
     assert found.pareto_shape == sampler.log_evidence_check.pareto_shape
     assert len(found.unknown) == 1 and "another seed" in found.unknown[0]
     assert found.summary in ladder_table(sampler)
     assert found.summary in str(compare_models({"a": sampler, "b": (-3.0, 0.1)}))
+
+
+@pytest.mark.parametrize("higher", [-3.0, 0.0, 3.0])
+def test_the_summary_begins_with_the_evidence_that_counts(higher, sampler):
+    """The estimates that it was chosen from come later, by their names; a reliable check that is higher counts."""
+    check = sampler.log_evidence_check._replace(error=0.02, pareto_shape=0.1)
+    check = check._replace(log_evidence=sampler.log_evidence_ladder + higher)
+    result = sampler._result._replace(check=check)
+    text = sampler.verdict.of(sampler.verdict._parts._replace(result=result)).summary
+    value, error = result.evidence
+    assert f"; log-evidence {value:.2f} +- {error:.2g} (stages {sampler.log_evidence_ladder:.2f} +- " in text
+    assert f"; check {check.log_evidence:.2f} +- 0.02)" in text
+    assert higher < 0.0 or (value, error) == (check.log_evidence, 0.02)
+
+
+def test_the_summary_without_a_check_has_one_evidence(two_modes):
+    sampler = run(two_modes, 100, check_draws=0)
+    stated = f"log-evidence {sampler.log_evidence:.2f} +- {sampler.log_evidence_error:.2g};"
+    assert stated in sampler.verdict.summary and "stages" not in sampler.verdict.summary
 
 
 def test_modes_need_a_chain(two_modes):
