@@ -68,12 +68,13 @@ class EvaluatedBatch(NamedTuple):
     log_prob: np.ndarray  # (n,), NaN where the evaluation failed
     blobs: np.ndarray | None  # (n, ...)
     reasons: dict[int, str]  # of each failure, by row
+    counted: dict[int, str] = {}  # of failures that the function counts itself; log_prob is -inf there
 
     def rows(self, rows: Sequence[int]) -> "EvaluatedBatch":
         """The batch of some rows."""
-        reasons = {new: self.reasons[old] for new, old in enumerate(rows) if old in self.reasons}
+        said = [{new: each[old] for new, old in enumerate(rows) if old in each} for each in self[3:]]
         blobs = None if self.blobs is None else self.blobs[rows]
-        return EvaluatedBatch(self.coords[rows], self.log_prob[rows], blobs, reasons)
+        return EvaluatedBatch(self.coords[rows], self.log_prob[rows], blobs, *said)
 
 
 def merge_batches(batches: Sequence[EvaluatedBatch]) -> EvaluatedBatch:
@@ -83,9 +84,12 @@ def merge_batches(batches: Sequence[EvaluatedBatch]) -> EvaluatedBatch:
         shape, dtype = blobs.shape[1:], blobs.dtype
         blobs = joined([np.zeros((len(b.coords), *shape), dtype) if b.blobs is None else b.blobs for b in batches])
     first = np.cumsum([0, *(len(batch.coords) for batch in batches)]).tolist()
-    reasons = {start + row: text for start, b in zip(first, batches, strict=False) for row, text in b.reasons.items()}
+    said = [
+        {start + row: text for start, b in zip(first, batches, strict=False) for row, text in b[column].items()}
+        for column in (3, 4)
+    ]
     coords, log_prob = (np.concatenate([batch[column] for batch in batches]) for column in (0, 1))
-    return EvaluatedBatch(coords, log_prob, blobs, reasons)
+    return EvaluatedBatch(coords, log_prob, blobs, *said)
 
 
 class RunStart(NamedTuple):
@@ -143,7 +147,7 @@ class Record:
             self.check_blobs(batch.blobs.dtype)
         blobs = [] if batch.blobs is None else [batch.blobs]
         with deferred_interrupts():
-            self._write(b"EVAL", [batch.coords, batch.log_prob, _text(batch.reasons), *blobs])
+            self._write(b"EVAL", [batch.coords, batch.log_prob, _text(batch.reasons | batch.counted), *blobs])
             self._enter(batch)
 
     def check_blobs(self, dtype: np.dtype) -> None:
@@ -377,9 +381,11 @@ class Record:
         try:
             first, *arrays = _arrays_of(content)
             if kind == b"EVAL":
-                log_prob, reasons, *blobs = arrays
-                reasons = {int(row): text for row, text in json.loads(reasons.tobytes()).items()}
-                self._enter(EvaluatedBatch(first, log_prob, blobs[0] if blobs else None, reasons))
+                log_prob, said, *blobs = arrays
+                said = {int(row): text for row, text in json.loads(said.tobytes()).items()}
+                reasons = {row: text for row, text in said.items() if np.isnan(log_prob[row])}
+                counted = {row: text for row, text in said.items() if row not in reasons}
+                self._enter(EvaluatedBatch(first, log_prob, blobs[0] if blobs else None, reasons, counted))
             elif kind == b"RUN ":
                 header, name, *rest = json.loads(first.tobytes())
                 self._begin(RunStart(header, arrays[0], (name, arrays[1], *rest)))

@@ -190,6 +190,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
             raise ValueError(f"ess_floor={given.ess_floor} must be below nwalkers={nwalkers}")
         target.parameter_names = self.parameter_names if self.params_are_named else None
         self._evaluator = self._make_evaluator()
+        if self._reopened and self._record.start.header["log_prob_fn"] == getattr(target.function, "fingerprint", None):
+            target.recall(self._record.latest(self._record.count))
         self._drawn: np.ndarray | None = None  # a start that need not be tested
         self._seed = None if seed is None else np.ravel(seed).tolist()
         # also drawn where it is not used, so that a script draws the same numbers after a restart

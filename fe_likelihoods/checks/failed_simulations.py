@@ -60,7 +60,7 @@ def failures(run: FinishedRun) -> Failures:
         return _of_function(run)
     parts = run.likelihood.parts()
     sources = [_of_likelihood(*part) for part in parts]
-    attempts = sum(each.simulations for part, _ in parts for each in (part, *part.shortened))
+    attempts = sum(each.simulator.failures.outcomes for part, _ in parts for each in (part, *part.shortened))
     here = all(_was_here(run, part, source) for (part, _), source in zip(parts, sources, strict=True))
     unknown = "Not known: simulations of this run were made in another process, or are no longer in memory."
     return _joined(run, sources, attempts, "" if here else unknown)
@@ -128,9 +128,8 @@ def _are_among(points: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 
 def _was_here(run: FinishedRun, likelihood: FELikelihood, source: _Source) -> bool:
-    """Whether this process simulated the samples: half of them suffice, since a cache drops old simulations."""
-    distinct = np.unique(run.samples[:, source.columns], axis=0)
-    return likelihood.simulations >= len(distinct) or _are_among(distinct, source.succeeded).mean() >= 0.5
+    """Whether this process simulated, read or recalled as many points as there are samples."""
+    return likelihood.simulator.failures.outcomes >= len(np.unique(run.samples[:, source.columns], axis=0))
 
 
 def _where(run: FinishedRun, source: _Source, failed: np.ndarray) -> str:

@@ -102,6 +102,15 @@ class FunctionLikelihood(SumOfParts):
         self._failures.count_outcomes(rows, reasons)
         return values
 
+    def failures_at(self, x: Any) -> list[str]:
+        """Reasons of failures at points, of those that the report lists."""
+        known = {tuple(each["parameters"].values()): each["reason"] for each in self._failures.records}
+        return [known.get(tuple(row), "") for row in np.atleast_2d(as_points(x, self.parameter_names)).tolist()]
+
+    def recall_failures(self, x: Any, reasons: Sequence[str]) -> None:
+        """Count failures of an earlier process, see `Posterior.recall_failures`."""
+        self._failures.count_outcomes(np.atleast_2d(as_points(x, self.parameter_names)), reasons)
+
     def possible(self, rows: np.ndarray) -> np.ndarray:
         """Whether each of the points (n, ndim) is finite."""
         return np.isfinite(rows).all(axis=1)

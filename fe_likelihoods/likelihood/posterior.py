@@ -8,7 +8,7 @@ density is zero.
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from numbers import Real
 from typing import TYPE_CHECKING, Any
@@ -548,6 +548,21 @@ class Posterior:
             Empty where there was no fault of the infrastructure.
         """
         return self.likelihood.fault(x)
+
+    def failures_at(self, x: Any) -> list[str]:
+        """Reasons of the failed simulations at points (n, ndim) evaluated in this process, empty for others.
+
+        Samplers record them, since the log-probability is -inf there, as at impossible parameters.
+        """
+        return self.likelihood.failures_at(x)
+
+    def recall_failures(self, x: Any, reasons: Sequence[str]) -> None:
+        """Count what an earlier process has simulated at points (n, ndim), so that `report` has its failures.
+
+        `reasons` are those of `failures_at`. A sampler that goes on from a file calls this; points whose simulations
+        are known here are not counted again.
+        """
+        self.likelihood.recall_failures(x, reasons)
 
     def report(self) -> dict:
         """Summary of the simulations that this object has requested in this process.

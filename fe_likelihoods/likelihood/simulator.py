@@ -121,7 +121,7 @@ class Simulator:
         self._key = self.simulation_key
         self.chunk_size = 1
         self.simulations = self.cache_hits = self.disk_hits = 0
-        self._seconds = 0.0
+        self._seconds, self._recalled = 0.0, set[bytes]()
         self.when_simulated: Callable[[int], None] | None = None
         self._in_pool: _Running | None = None
         self.pending: Callable[[], int] | None = None  # number of points of a queue that have not ended
@@ -237,19 +237,23 @@ class Simulator:
             return statistics
         return statistics, SimulationBatch(request.responses[which], [request.reasons[row] for row in which])
 
-    def recall(self, thetas: np.ndarray, statistics: np.ndarray, reasons: Sequence[str]) -> None:
+    def recall(self, thetas: np.ndarray, statistics: np.ndarray | None, reasons: Sequence[str]) -> None:
         """Cache statistics (n, n_numbers) of an earlier run in memory, at structural parameters (n, n_structural).
 
         Failures (with a reason) are recorded, and all rows count for `max_failure_share`. Rows that are cached already
-        are not changed. Nothing is written to the cache on disk.
+        are not changed. Nothing is written to the cache on disk. Without statistics, only failures are cached.
         """
         keys, which = distinct_keys(thetas)
         known = self.memory_cache.look_up(keys, self.n_numbers)[1]
         last = dict(zip(which, range(len(thetas)), strict=True))
         rows = [row for place, row in last.items() if not known[place] and np.isfinite(thetas[row]).all()]
-        new = [reasons[row] for row in rows]
-        self.memory_cache.store([keys[which[row]] for row in rows], statistics[rows], new)
-        self.failures.count_outcomes(thetas[rows], new)
+        new = [row for row in rows if keys[which[row]] not in self._recalled]
+        self._recalled.update(keys[which[row]] for row in new)
+        self.failures.count_outcomes(thetas[new], [reasons[row] for row in new])
+        if statistics is None:
+            rows = [row for row in rows if reasons[row]]
+            statistics = np.full((len(thetas), self.n_numbers), np.nan)
+        self.memory_cache.store([keys[which[row]] for row in rows], statistics[rows], [reasons[row] for row in rows])
 
     # known simulations --------------------------------------------------------------------------------------------
 

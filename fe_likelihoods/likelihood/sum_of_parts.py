@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, ClassVar, Self
 
@@ -130,13 +130,32 @@ class SumOfParts:
         str
             Empty where the simulations succeeded, or a failure is an answer of the model.
         """
-        point = as_points(x, self.parameter_names)
-        for part, columns in self.parts():
-            simulator = part.simulator
-            reason = simulator.memory_cache.reason((point[columns][: simulator.n_structural] + 0.0).tobytes())
-            if isinstance(reason, TransientReason):
-                return split_seconds(reason)[0]
-        return ""
+        _, reason = self._failure_at(as_points(x, self.parameter_names))
+        return split_seconds(reason)[0] if isinstance(reason, TransientReason) else ""
+
+    def _failure_at(self, point: np.ndarray) -> tuple[str, str]:
+        """The data set whose simulation has failed at a point (ndim,), and the reason; empty texts if none has."""
+        for key, part in self.likelihoods.items():
+            own = point[self._columns[key]][: part.simulator.n_structural] + 0.0
+            if reason := part.simulator.memory_cache.reason(own.tobytes()):
+                return key, reason
+        return "", ""
+
+    def failures_at(self, x: Any) -> list[str]:
+        """Reasons of failed simulations at points, after the name of the data set, see `Posterior.failures_at`."""
+        found = map(self._failure_at, np.atleast_2d(as_points(x, self.parameter_names)))
+        return [f"{key}: {reason}" if key else reason for key, reason in found]
+
+    def recall_failures(self, x: Any, reasons: Sequence[str]) -> None:
+        """Count simulations of an earlier process, see `Posterior.recall_failures`."""
+        points, reasons = np.atleast_2d(as_points(x, self.parameter_names)), np.array(reasons, dtype=object)
+        for key, part in self.likelihoods.items():
+            name = f"{key}: " if key else ""
+            own = [each[len(name) :] if each.startswith(name) else "" for each in reasons]
+            thetas = points[:, self._columns[key]][:, : part.simulator.n_structural]
+            part.simulator.recall(thetas, None, own)
+            left = [not each for each in own]  # later data sets were not simulated where this one failed
+            points, reasons = points[left], reasons[left]
 
     # description --------------------------------------------------------------------------------------------------
 

@@ -82,6 +82,7 @@ class Target:
             )
         self.ndim, self.vectorize, self.blobs_dtype = ndim, vectorize, blobs_dtype
         self.caught = Caught(function, args, kwargs, vectorize)
+        self._owner = function if owner is None else owner  # of optional methods
         names, stated = getattr(function, "parameter_names", None) or (), getattr(function, "ndim", None)
         if isinstance(stated, Integral) and stated != ndim:
             listed = f" ({', '.join(map(str, names))})" if names else ""
@@ -134,6 +135,18 @@ class Target:
             logger.warning("the verdict takes all points as possible: possible must return bool of shape %s", shape)
         return np.ones(shape, dtype=bool)
 
+    def recall(self, batch: EvaluatedBatch) -> None:
+        """Tell a function that counts failures itself what an earlier process has evaluated, by `recall_failures`."""
+        if hasattr(self._owner, "recall_failures"):
+            rows = [row for row in range(len(batch.coords)) if row in batch.counted or batch.log_prob[row] > -np.inf]
+            reasons = [batch.counted.get(row, "") for row in rows]
+            self._owner.recall_failures(self._as_columns(batch.coords[rows]), reasons)
+
+    def _as_columns(self, coords: np.ndarray) -> Any:
+        """Points (n, ndim) as an array, or as values by name."""
+        named = self.parameter_names
+        return coords if named is None else {name: coords[:, place] for name, place in named.items()}
+
     # ------------------------------------------------------------------ functions of arrays
 
     def as_points(self, coords: np.ndarray) -> Any:
@@ -163,7 +176,11 @@ class Target:
         log_prob, blobs, reasons = outcomes(results, len(coords), self.blobs_dtype, self.name)
         if self.is_likelihood:
             log_prob = log_prob + self.log_prior(coords)
-        return EvaluatedBatch(coords, log_prob, blobs, reasons)
+        counted, impossible = {}, np.flatnonzero(log_prob == -np.inf)
+        if len(impossible) > 0 and hasattr(self._owner, "failures_at"):
+            said = self._owner.failures_at(self._as_columns(coords[impossible]))
+            counted = {int(row): text for row, text in zip(impossible, said, strict=True) if text}
+        return EvaluatedBatch(coords, log_prob, blobs, reasons, counted)
 
     def sample_prior(self, n: int, random: np.random.RandomState) -> np.ndarray:
         """Draws (n, ndim) of the prior; ValueError without the method of the function."""

@@ -3,12 +3,15 @@
 import emcee
 import numpy as np
 import pytest
+from emcee.backends import HDFBackend
 
 from fe_likelihoods import (
     Channel,
     FELikelihood,
+    FunctionLikelihood,
     FunctionModel,
     HalfNormal,
+    JointLikelihood,
     Measurements,
     Posterior,
     SimulationFailed,
@@ -113,6 +116,38 @@ def test_failures_that_are_not_counted_are_not_known(tmp_path):
     assert "Not known: neither the sampler nor the log-density counts failures" in page.text
     assert "No simulation failed" not in page.text
     assert "-inf" in failures(read_run(run(target), target)).sentence
+
+
+@pytest.mark.parametrize("what", ["model", "models", "function"])
+def test_a_reopened_run_counts_the_failures_of_its_record(what, tmp_path):
+    def opened():
+        prior = {name: TruncatedNormal(1.0, 0.3) for name in ("stiffness", "damping")}
+        likelihood = posterior_of([1.0, 0.8]).likelihood
+        if what == "models":
+            likelihood = JointLikelihood({"one": likelihood, "two": posterior_of([1.0, 0.8]).likelihood})
+        if what == "function":
+            likelihood = FunctionLikelihood(
+                lambda x: np.nan if x[0] > 1.1 else -5.0 * np.sum((x - 1.0) ** 2), list(prior)
+            )
+        else:
+            prior["sigma_top"] = HalfNormal(0.01)
+        posterior, backend = Posterior(likelihood, prior), HDFBackend(tmp_path / "run.h5")
+        return posterior, SMCSampler(
+            20, posterior.ndim, posterior, vectorize=True, seed=1, max_moves=3, backend=backend
+        )
+
+    posterior, sampler = opened()
+    sampler.run_mcmc(None, 1)
+    count, before = posterior.report()["failure_count"], failures(read_run(sampler, posterior))
+    again, reopened = opened()
+    assert count > 5 and f"{count} simulations failed" in reopened.verdict.summary
+    reopened.run_mcmc(None, 0)
+    report = again.report()
+    assert report["simulations"] == 0 and f"{count} simulations failed" in reopened.verdict.summary
+    assert report["failure_count"] == count and report["failures"] == posterior.report()["failures"]
+    found = failures(read_run(reopened, again))
+    assert (found.count, found.attempts, found.unknown) == (before.count, before.attempts, before.unknown)
+    assert [row.reason for row in found.rows] == [row.reason for row in before.rows]
 
 
 def test_failures_in_the_first_parts_of_the_record_count():
