@@ -15,11 +15,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from samplers.evaluation.point_queue import PointQueue
+
 from ..priors.distributions import Distribution, RandomState
 from ..priors.points import as_points, complete_repr
 from ..priors.priors import Prior
 from ..simulation.model import has_jacobian
-from .evaluation_queue import EvaluationQueue
+from .evaluation_queue import evaluation_queue
 from .gradient import likelihood_gradient, slopes_along
 from .joint import JointLikelihood
 from .likelihood import FELikelihood
@@ -490,7 +492,7 @@ class Posterior:
         self._check_models("a prediction")
         return predictive_draws(self.likelihood, as_points(samples, self.prior.names), block, seed)
 
-    def evaluation_queue(self, responses: bool = False) -> EvaluationQueue:
+    def evaluation_queue(self, responses: bool = False) -> PointQueue:
         """A queue of points whose log-probabilities are returned in the order in which their simulations end.
 
         Samplers that propose points while others still run keep all workers of a pool busy with it. The values are the
@@ -504,7 +506,7 @@ class Posterior:
 
         Returns
         -------
-        EvaluationQueue
+        samplers.evaluation.point_queue.PointQueue
             Its own points only; every queue of a posterior uses the same caches and the same pool.
 
         Examples
@@ -516,7 +518,7 @@ class Posterior:
         True
         """
         self._check_models("asynchronous work")
-        return EvaluationQueue(self, responses)
+        return evaluation_queue(self, responses)
 
     def when_simulated(self, callback: Callable[[float], None] | None) -> None:
         """Announce simulations as they end, also within a batch: samplers show their progress with it.

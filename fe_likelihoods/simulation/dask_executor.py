@@ -83,11 +83,6 @@ class DaskExecutor(PoolExecutor):
         self._no_workers: RuntimeError | None = None
         self._absent: dict[Any, int] = {}  # checks in which a job that has started had no worker
 
-    @property
-    def n_workers(self) -> int | None:
-        """Number of simulations that run at once on the present workers."""
-        return sum(self.pool.nthreads().values()) or None
-
     def submit_all(self, function: Callable[[Any], Outcome], items: Sequence[Any]) -> list[Future]:
         """As `PoolExecutor.submit_all`."""
         sent = partial(_run, self._by_value(function))

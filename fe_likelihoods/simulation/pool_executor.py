@@ -7,6 +7,7 @@ from functools import cached_property, partial
 from multiprocessing.pool import Pool, ThreadPool
 from typing import Any
 
+from samplers.evaluation.point_queue import workers_of
 from samplers.interrupts import Ended, SentFunction
 
 from .by_value import Pickled, Recent
@@ -62,8 +63,7 @@ class PoolExecutor(Submitting):
     @property
     def n_workers(self) -> int | None:
         """Number of items that run at once; None if the pool does not say."""
-        sizes = (getattr(self.pool, name, None) for name in ("n_workers", "_max_workers", "_processes", "size"))
-        return next((size for size in sizes if isinstance(size, int) and size > 0), None)
+        return workers_of(self.pool)
 
     def map(self, function: Callable[[Any], Outcome], items: Iterable[Any]) -> list[Outcome]:
         """Outcomes of a function for every item, in order; ValueError if a worker cannot load the function."""

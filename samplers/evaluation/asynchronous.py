@@ -4,34 +4,27 @@ The record of the run contains the finished points and, for each decision of the
 which points had arrived before it, so that an interrupted run, when repeated, makes the same decisions. Points that
 were running when the process ended are submitted again.
 
-A queue, ``posterior.evaluation_queue()`` or `PoolQueue`, has the methods ``submit(coords)``, which returns a ticket for
-each point, ``collect()``, which waits for a finished point and returns tickets and values of all finished ones,
-``close()``, and perhaps ``ended()``, which returns those of all that have ended without waiting. ``workers`` is the
-number of points that are evaluated at once, None if it is not known.
+A queue, that of ``posterior.evaluation_queue()`` or of a pool, is a `samplers.evaluation.point_queue.PointQueue` or has
+its methods ``submit(coords)``, ``collect()``, ``close()``, perhaps ``ended()``, and its attribute ``workers``.
 """
 
 import hashlib
 import logging
-import threading
-from asyncio import CancelledError
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from ..interrupts import Ended, SentFunction, deferred_interrupts, interrupts_end_the_run
+from ..interrupts import deferred_interrupts
 from ..record import Remember, merge_batches
 from ..tempering.pending_points import PendingPoints
 from .evaluator import Evaluator
+from .point_queue import pool_queue
 from .user_target import Target
-from .values import Failed
 
-__all__ = ["AsynchronousEvaluator", "PoolQueue", "check_asynchronous"]
+__all__ = ["AsynchronousEvaluator", "check_asynchronous"]
 
 logger = logging.getLogger(__name__)
-
-SIZES = ("n_workers", "_max_workers", "_processes", "size")  # attributes of pools with the number of workers
-SECONDS_TO_FETCH = 10.0  # longest wait for the value of a point that has ended, when the run ends
 
 
 def _has_queue(target: Target, pool: Any) -> bool:
@@ -78,7 +71,7 @@ class AsynchronousEvaluator(Evaluator):
                 raise ValueError(
                     "this sampler was begun with a pool, which is not stored with it: set its attribute pool"
                 )
-            self._queue = PoolQueue(self.target.caught, self.pool, self.target.as_points)
+            self._queue = pool_queue(self.target.caught, self.pool, self.target.as_points)
         return self._queue
 
     @property
@@ -173,100 +166,3 @@ class AsynchronousEvaluator(Evaluator):
             self.budget.closed()
             if queue is not None:
                 queue.close()
-
-
-class PoolQueue:
-    """A function of one point in a pool: a `concurrent.futures.Executor`, as mpi4py and loky have, or a dask client.
-
-    The function can be sent to the workers; `as_items` converts points (n, ndim) to its arguments.
-    """
-
-    def __init__(self, function: Callable, pool: Any, as_items: Callable[[Any], Sequence]):
-        self._function, self._pool, self._as_items = SentFunction(function), pool, as_items
-        self._futures: dict[int, Any] = {}  # of points that were not collected, by ticket
-        self._handed: list[int] = []  # what the last `collect` returned: the caller may not have received it
-        self._arrived = threading.Event()
-        self._submitted = 0
-
-    @property
-    def workers(self) -> int | None:
-        """Number of points that are evaluated at once, if the pool states it."""
-        threads = getattr(self._pool, "nthreads", None)  # of a dask client
-        if callable(threads):
-            return sum(threads().values()) or None
-        sizes = (getattr(self._pool, name, None) for name in SIZES)
-        return next((size for size in sizes if isinstance(size, int) and size > 0), None)
-
-    def submit(self, coords: Any) -> list[int]:
-        """Begin to evaluate points (n, ndim) without waiting; returns a number for each."""
-        items = self._as_items(coords)
-        tickets = list(range(self._submitted, self._submitted + len(items)))
-        self._submitted += len(items)
-        if hasattr(self._pool, "gather"):  # dask sends the function once with all points
-            futures = self._pool.map(self._function, items, pure=False)
-        else:
-            futures = (self._pool.submit(self._function, item) for item in items)
-        for ticket, future in zip(tickets, futures, strict=True):
-            self._futures[ticket] = future
-            future.add_done_callback(lambda _: self._arrived.set())
-        return tickets
-
-    @interrupts_end_the_run()
-    def collect(self) -> list[tuple[int, Any]]:
-        """Wait for a finished point; returns numbers and values of all finished points.
-
-        Raises KeyboardInterrupt or SystemExit if the function has raised it, and RuntimeError if the pool cannot
-        continue. Points that finished before are returned first.
-        """
-        while self._handed:
-            self._futures.pop(self._handed.pop(), None)
-        while not any(future.done() for future in self._futures.values()):
-            self._arrived.wait()
-            self._arrived.clear()
-        collected, error = self._fetch()
-        if not collected and isinstance(error, KeyboardInterrupt | SystemExit):
-            raise error
-        if not collected:
-            raise RuntimeError(
-                f"the pool cannot go on: {type(error).__name__}: {error}. Evaluations that have arrived are kept where "
-                "the sampler has a file: start the same script again with a new pool"
-            ) from error
-        self._handed = [ticket for ticket, _ in collected]
-        return collected
-
-    def ended(self) -> list[tuple[int, Any]]:
-        """Numbers and values of all points that have ended, without waiting, including the last collected points."""
-        return self._fetch(SECONDS_TO_FETCH)[0]
-
-    def _fetch(self, seconds: float | None = None) -> tuple[list[tuple[int, Any]], BaseException | None]:
-        """Numbers and values of the points that have ended, and an error that no point has caused, if any."""
-        fetched, fault = [], None
-        for ticket, future in list(self._futures.items()):
-            if not future.done():
-                continue
-            value = None
-            try:  # `exception` does not raise what the function raised, which may be KeyboardInterrupt
-                error = future.exception(seconds)
-                value = future.result(seconds) if error is None else None
-            except (Exception, CancelledError) as raised:
-                error = raised
-                if seconds is not None and isinstance(raised, TimeoutError):
-                    break  # nothing can be fetched from this pool any more
-            if type(error).__name__ == "KilledWorker":
-                error, value = None, Failed("every process that evaluated this point died")
-            if isinstance(value, Ended):
-                error = value.error
-            if error is None:
-                fetched.append((ticket, value))
-            else:
-                fault = fault or error
-        return fetched, fault
-
-    def close(self) -> None:
-        """Cancel the points that have not been started."""
-        futures, self._futures = list(self._futures.values()), {}
-        if hasattr(self._pool, "give_up"):  # an executor of fe_likelihoods, whose tasks consist of several items
-            self._pool.give_up(futures, running=False)
-            return
-        for future in futures:
-            future.cancel()

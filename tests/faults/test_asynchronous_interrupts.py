@@ -95,8 +95,7 @@ def test_points_beside_one_that_ends_the_run_are_kept(kind, tmp_path):
     path, posterior = tmp_path / "run.h5", Ends()
     with Threads() as pool:
         sampler = make(path, posterior, pool)
-        message = "the pool cannot go on: RuntimeError: changed" if kind is RuntimeError else "changed"
-        with pytest.raises(kind, match=message):
+        with pytest.raises(kind, match="changed"):
             sampler.run_mcmc(None, 1)
         sampler._record.close()
         known = points_of(path)
