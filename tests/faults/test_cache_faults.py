@@ -253,7 +253,7 @@ def test_a_damaged_file_is_set_aside(filled, thetas, expected, caplog, damage, b
     assert (again.simulations, again.simulator.disk_hits) == (0, len(thetas))
 
 
-@pytest.mark.parametrize(("page", "n"), [("leaf", 400), ("index", 400), ("index", 40)])
+@pytest.mark.parametrize(("page", "n"), [("leaf", 400), ("index", 400), ("index", 40), ("first", 400)])
 def test_a_bad_page_loses_its_own_rows_only(path, thetas, expected, caplog, page, n):
     """The others are copied to the new cache with their label, and counted."""
     thetas, expected, filled = thetas[:n], expected[:n], path
@@ -264,9 +264,9 @@ def test_a_bad_page_loses_its_own_rows_only(path, thetas, expected, caplog, page
         ((rows,),) = connection.execute("SELECT count(*) FROM rows").fetchall()
     connection.close()
     data = bytearray(filled.read_bytes())
-    kind = {"leaf": 0x0D, "index": 0x0A}[page]
+    kind = {"leaf": 0x0D, "index": 0x0A, "first": None}[page]
     pages = [start for start in range(4096, len(data), 4096) if data[start] == kind]
-    place = pages[len(pages) // 2]
+    place = 0 if page == "first" else pages[len(pages) // 2]
     data[place : place + 4096] = b"\xa5" * 4096
     filled.write_bytes(data)
     likelihood = likelihood_of(filled)
@@ -274,7 +274,7 @@ def test_a_bad_page_loses_its_own_rows_only(path, thetas, expected, caplog, page
     (message,) = (r.getMessage() for r in caplog.records if "were salvaged" in r.getMessage())
     (kept,) = (int(word) for word in message.split() if word.isdigit())
     assert kept >= likelihood.simulator.disk_hits
-    assert likelihood.simulator.disk_hits == len(thetas) if page == "index" else 0 < kept < rows
+    assert 0 < kept < rows if page == "leaf" else likelihood.simulator.disk_hits == len(thetas)
 
 
 @pytest.mark.parametrize("damage", [no_database, *DAMAGES], ids=lambda damage: damage.__name__)
