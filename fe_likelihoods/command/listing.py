@@ -1,12 +1,9 @@
 """What a file of data holds, as text, and the lines of a TOML file that read it."""
 
-import datetime
 import json
 import re
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,10 +13,13 @@ from ..checks.sensor_faults import find_sensor_faults
 from ..signals.datasets import read_dataset
 from ..signals.read import read_record, recognise_format
 from ..signals.records import Record
-from ..signals.strong_motion import find_v2_channels, parse_geonet, parse_v2
+from ..signals.strong_motion import find_channels
 from ..signals.tables import (
+    Statements,
     Table,
+    clock_text,
     column_values,
+    dimension_of,
     read_table,
     row_times,
     stated_unit,
@@ -29,7 +29,6 @@ from ..signals.tables import (
     uniform_times,
     value_columns,
 )
-from ..signals.text_files import Statements, dimension_of, read_text
 from ..text_tables import number, text_table
 from ..units import from_si, to_si
 
@@ -55,8 +54,8 @@ def describe_data(path: Path) -> str:
         found = _dataset(path)
     else:
         form = recognise_format(path)
-        describe = {None: _table, "v2": _v2, "geonet": _geonet}.get(form, _single)
-        found = describe(path)
+        single = _table if form is None else _single
+        found = _several(path, form) if form in ("v2", "geonet") else single(path)
     lines = [f"{path}: {found.text[0]}", *found.text[1:], "", "# lines for the TOML file"]
     for section, given in (("record", found.record), ("measurements", found.measured)):
         if given is not None:
@@ -97,62 +96,42 @@ def _texts(channels: list[Screened]) -> list[str]:
     return [f"CAUTION: {each.kind}: {each.text}" for each in check_sensors(channels)]
 
 
-class _Series(NamedTuple):
-    """One acceleration of a file that has several."""
-
-    column: str | int  # by which the readers know it
-    name: str  # for a channel
-    cells: tuple[str, ...]  # of the table, before and after those of `_HEAD`
-    after: tuple[str, ...]
-    parse: Callable[[], Any]
-
-
-def _v2(path: Path) -> _Lines:
-    channels, found = find_v2_channels(path), []
-    numbers = [channel.channel for channel in channels]
-    for channel in channels:
-        file = channel.file.removeprefix(f"{path}/") if channel.file != str(path) else path.name
-        alone = channel.channel is not None and numbers.count(channel.channel) == 1
-        column, name = (channel.channel, f"ch{channel.channel}") if alone else (file, file)
-        cells = (str(channel.channel or "-"),), (channel.label, file)
-        found.append(_Series(column, name, *cells, partial(parse_v2, channel)))
-    return _several("channels", ("channel", *_HEAD, "label", "file"), found)
-
-
-def _geonet(path: Path) -> _Lines:
-    components = parse_geonet(read_text(path), str(path))
-    found = [_Series(name, name, (name,), (), lambda series=series: series) for name, series in components]
-    return _several("components", ("component", *_HEAD), found)
-
-
-def _several(what: str, head: tuple[str, ...], series: list[_Series]) -> _Lines:
+def _several(path: Path, form: str) -> _Lines:
     """Several accelerations, which readers know by numbers or names."""
-    given, taken = [each.column for each in series], set[str]()
-    rows, columns, refused, screened = [head], [], [], list[Screened]()
-    for each in series:
+    channels, taken = find_channels(path, form), set[str]()
+    files = [each.file.removeprefix(f"{path}/") if each.file != str(path) else path.name for each in channels]
+    numbers = [each.channel for each in channels]
+    given = [  # a V2 file without a number of its own is known by its name
+        each.channel if form != "v2" or (each.channel is not None and numbers.count(each.channel) == 1) else file
+        for each, file in zip(channels, files, strict=True)
+    ]
+    rows, columns, refused, screened = [("channel", *_HEAD, "label", "file")], [], [], list[Screened]()
+    for each, column, file in zip(channels, given, files, strict=True):
         try:
             parsed = each.parse()
-            values, times = to_si(parsed.values, parsed.unit, "acceleration"), getattr(parsed, "times", None)
-            step = parsed.dt if times is None else uniform_times(times, None, str(each.column)).step
+            values, times = to_si(parsed.values, parsed.unit, "acceleration"), parsed.times
+            step = parsed.dt if times is None else uniform_times(times, None, str(column)).step
         except ValueError as error:
             refused.append(f"not read: {error}")
             continue
-        rows.append((*each.cells, *_cells(values, step), *each.after))
+        rows.append((str(each.channel or "-"), *_cells(values, step), each.label, file))
         if times is not None:
-            refused.append(f"uneven times in channel {each.column}: give resample = {step:.6g}")
-        if (count := given.count(each.column)) > 1:
-            refused.append(f"{each.column!r} is there {count} times, and no number tells them apart")
+            refused.append(f"uneven times in channel {column}: give resample = {step:.6g}")
+        if (count := given.count(column)) > 1:
+            refused.append(f"{column!r} is there {count} times, and no number tells them apart")
             continue
-        columns.append((_name_of_channel(each.name, taken), each.column))
+        columns.append((_name_of_channel(f"ch{column}" if isinstance(column, int) else column, taken), column))
         screened += _screen(columns[-1][0], from_si(values, "g"), "g", step) if times is None else []
-    text = [f"{len(columns)} {what} of acceleration", text_table(rows), *dict.fromkeys(refused), *_texts(screened)]
+    text = [f"{len(columns)} channels of acceleration", text_table(rows), *dict.fromkeys(refused), *_texts(screened)]
     if len({row[1:3] for row in rows[1:]}) > 1:
-        text.append(f"The {what} differ in samples or step: they may be of several recorders, whose clocks may differ.")
+        text.append(
+            "The channels differ in samples or step: they may be of several recorders, whose clocks may differ."
+        )
     if not columns:
         return _Lines(text)
     first = columns[0][1]
     line = f"channel = {first}" if isinstance(first, int) else f"column = {_quoted(first)}"
-    measured = [f"columns = {_inline(columns)}    # channel of the model = {what} of the file"]
+    measured = [f"columns = {_inline(columns)}    # channel of the model = channel of the file"]
     return _Lines(text, [f"{line}    # the base motion"], measured + repair_lines(screened))
 
 
@@ -215,7 +194,7 @@ def _table(path: Path) -> _Lines:
             values = np.where(np.isin(values, list(marks)), np.nan, values)
             if any(each.startswith("resample") for each in options):
                 values = uniform_times(row_times(table), None, table.file).interpolate(values)
-            start = table_start(table, step, 0.0 if table.clock is None else _clock_text(table))
+            start = table_start(table, step, 0.0 if table.clock is None else clock_text(table.clock))
             screened += _screen(columns[-1][0], values, unit or "", step, start)
         if unit is None or dimension_of(unit) is None:
             unstated.append((columns[-1][0], "?"))
@@ -227,20 +206,15 @@ def _table(path: Path) -> _Lines:
     if unstated:
         measured.append(f"units = {_inline(unstated)}    # write them: the file does not state them")
     if table.clock is not None:
-        measured.append(f'zero = "{_clock_text(table)}"    # or when the base motion begins, if it is in another file')
+        measured.append(
+            f'zero = "{clock_text(table.clock)}"    # or when the base motion begins, if it is in another file'
+        )
     if not columns:
         return _Lines(text)
     base = [f"column = {_quoted(columns[0][1])}    # the base motion, if it is in this file"]
     if unstated and columns[0][0] == unstated[0][0]:
         base.append('units = "?"    # write it: the file does not state it')
     return _Lines(text, [*base, *options], measured + repairs)
-
-
-def _clock_text(table: Table) -> str:
-    """The first clock time of a table, as `zero` takes it."""
-    clock = table.clock
-    text = str((datetime.datetime.min + datetime.timedelta(seconds=clock.seconds)).time())
-    return text if clock.day is None else f"{datetime.date.fromordinal(clock.day)} {text}"
 
 
 def _sampling(table: Table) -> tuple[list[str], list[str], float | None]:
@@ -271,5 +245,5 @@ def _sampling(table: Table) -> tuple[list[str], list[str], float | None]:
         return [f"resample = {even.step:.6g}"], [text], even.step
     column = None if table.time is None else table.columns[table.time]
     start = "" if column is None else f", from {column.values[0]:.10g} in column {column.name!r}"
-    start += "" if table.clock is None else f", first clock time {_clock_text(table)}"
+    start += "" if table.clock is None else f", first clock time {clock_text(table.clock)}"
     return [], [f"times: step {step:g} s ({1 / step:g} per second){start}"], step

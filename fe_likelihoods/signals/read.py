@@ -4,33 +4,27 @@
 the file or the arguments; ValueError is raised if neither states them or if they disagree.
 """
 
-import io
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..units import to_si
 from . import strong_motion
 from .channels import Channel, Measurements
 from .records import DisplacementHistory, Record
+from .strong_motion import Series
 from .tables import (
     WORKBOOKS,
-    Table,
-    column_unit,
-    column_values,
+    agree_on_unit,
     read_table,
     row_times,
     table_start,
     table_step,
+    table_values,
     uniform_times,
-    value_column,
-    warn_if_absent,
 )
-from .text_files import Series, agree_on_unit, read_bytes, read_text
 
 __all__ = [
     "ImposedTest",
@@ -134,39 +128,28 @@ def read_record(
     if channel is not None and column is not None:
         raise ValueError(f"{path}: give channel= or column=, not both; they name the same")
     channel = column if channel is None else channel
-    if inventory is not None and recognise_format(path) != "obspy":
+    form, file = recognise_format(path), str(path)
+    if inventory is not None and form != "obspy":
         raise ValueError(f"{path}: inventory= is for miniSEED, SAC and GSE2 files; leave it out")
-    form, file, name = recognise_format(path), str(path), Path(path).stem
-    table = {"time": time, "time_unit": time_unit, "skip": skip, "missing": missing}
+    options = {"time": time, "time_unit": time_unit, "skip": skip, "missing": missing}
     if form is None:
         try:
-            series, dt = _table_series(path, units, dt, channel, resample, **table), None
+            series = _table_series(path, units, dt, channel, resample, **options)
         except ValueError as error:
             if Path(path).suffix.lower() in _TABLES:
                 raise
             raise ValueError(
                 f"{error}. The file has no known format of ground motions and was read as a table"
             ) from error
-    elif unused := ", ".join(name for name, option in table.items() if option is not None):
+        dt = units = None  # the table has them
+    elif unused := ", ".join(name for name, option in options.items() if option is not None):
         raise ValueError(f"{path}: a file of format {form} states its times and samples; leave {unused} out")
-    elif form == "v2":
-        block = _v2_channel(path, channel, member)
-        series, file = strong_motion.parse_v2(block), block.file
-    elif form == "obspy":
-        series = strong_motion.parse_obspy(path, channel, inventory)
-    elif form == "geonet":
-        series = _geonet_component(path, channel)
     else:
-        series = getattr(strong_motion, f"parse_{form}")(read_text(path), file)
-    unit = agree_on_unit(series.unit, units, "acceleration", file)
+        series = strong_motion.read_series(path, form, channel, member, inventory)
+    unit = agree_on_unit(series.unit, units, "acceleration", series.file or file)
     # The source has the file name without its folder, because it is written into data sets that are shared.
-    source, step, values = Path(file).name + (f": {series.title}" if series.title else ""), series.dt, series.values
-    if form in ("v2", "geonet", "obspy"):
-        name = series.title
-    elif form == "knet":  # the ending is the direction
-        name = Path(path).name
-    if form == "v2":
-        source = file.removeprefix(f"{Path(path).parent}/")
+    source = series.source or Path(file).name + (f": {series.title}" if series.title else "")
+    step, values, file = series.dt, series.values, series.file or file
     if series.times is not None:
         even = uniform_times(series.times, resample, file)
         if resample is None:
@@ -180,20 +163,15 @@ def read_record(
         raise ValueError(
             f"{file} states a step of {step:g} s but dt = {dt!r} was given; leave dt out, or correct the file"
         )
-    return Record(name, step, to_si(values, unit, "acceleration"), source)
+    return Record(series.name or Path(path).stem, step, to_si(values, unit, "acceleration"), source)
 
 
 def recognise_format(path: str | Path) -> str | None:
-    """Return the format of a file or zip archive, such as "v2" or "at2"; None for a table (CSV, Excel).
+    """The format of a file or zip archive, such as "v2" or "at2"; None for a table (CSV, Excel).
 
-    Raises ValueError if the file cannot be read, or has a known format that is not read.
+    ValueError if the file cannot be read, or has a known format that is not read.
     """
-    content = read_bytes(path)
-    if Path(path).suffix.lower() in WORKBOOKS:
-        return None
-    if zipfile.is_zipfile(io.BytesIO(content)):
-        return "v2"
-    name, form = strong_motion.recognise(content)
+    name, form = ("", None) if Path(path).suffix.lower() in WORKBOOKS else strong_motion.recognise(path)
     if name and form is None:
         article = "an" if name.startswith("HDF5") else "a"
         raise ValueError(
@@ -202,51 +180,22 @@ def recognise_format(path: str | Path) -> str | None:
     return form
 
 
-def _v2_channel(path: str | Path, channel: int | str | None, member: str | None) -> strong_motion.Block:
-    """The channel with a number; a text is a number too, or the name of a file in the archive."""
-    if isinstance(channel, str):
-        channel, member = (int(channel), member) if channel.isdecimal() else (None, channel)
-    candidates = strong_motion.find_v2_channels(path, member)
-    chosen = [each for each in candidates if channel is None or each.channel == channel]
-    if len(chosen) != 1:
-        listing = "\n  ".join(f"channel {each.channel}: {each.label} [{each.file}]" for each in chosen or candidates)
-        raise ValueError(
-            f"{path}: expected one channel with channel = {channel}, member = {member!r}, found {len(chosen)}; "
-            "choose with channel= and member=, or in a TOML file with the end of a file name as column, among\n  "
-            f"{listing}"
-        )
-    return chosen[0]
-
-
-def _geonet_component(path: str | Path, component: int | str | None) -> Series:
-    found = strong_motion.parse_geonet(read_text(path), str(path))
-    chosen = [series for name, series in found if component is None or name.lower() == str(component).lower()]
-    if len(chosen) != 1:
-        raise ValueError(
-            f"{path}: expected one component with component = {component!r}, found {len(chosen)}; the components are "
-            f"{', '.join(name for name, _ in found)}"
-        )
-    return chosen[0]
-
-
 def _table_series(
     path: str | Path,
     units: str | None,
     dt: float | None,
     column: int | str | None,
     resample: float | None,
-    time: int | str | None = None,
-    time_unit: str | None = None,
-    skip: int | None = None,
-    missing: Sequence[float] | None = None,
+    time: int | str | None,
+    time_unit: str | None,
+    skip: int | None,
+    missing: Sequence[float] | None,
 ) -> Series:
     """One column of a table, checked against what the file states."""
     table = read_table(path, skip, time_unit, time, along_rows=column == "rows")
     rows = column == "rows" and "rows" not in [each.name for each in table.columns]
-    place = value_column(table, None if rows else column)
-    values = column_values(table, place, missing)
-    unit = column_unit(table, place, values, units, "acceleration", table.file)
-    warn_if_absent(table, [place], missing, stacklevel=3)
+    wanted = (None if rows else column, "acceleration", units, table.file)
+    ((values, unit),) = table_values(table, [wanted], missing, stacklevel=3)
     absent = np.flatnonzero(np.isnan(values))
     if absent.size:
         raise ValueError(
@@ -335,6 +284,7 @@ def read_columns(
     >>> measured.values  # m
     array([[0.    , 0.0015, 0.002 ]])
     """
+    wanted = _wanted(path, channels, columns, units)
     if (form := recognise_format(path)) is not None:
         if not all(option is None for option in (units, dt, time, time_unit, skip, missing)):
             raise ValueError(
@@ -343,8 +293,7 @@ def read_columns(
             )
         return _recorded(path, channels, columns, description, zero, resample)
     table = read_table(path, skip, time_unit, time)
-    values = _channel_values(table, channels, columns, units, missing)
-    warn_if_absent(table, [value_column(table, column) for column in columns], missing, stacklevel=2)
+    values = np.array([to_si(*each) for each in table_values(table, wanted, missing, stacklevel=2)])
     if resample is None:
         step = table_step(table, dt)
     else:
@@ -363,8 +312,6 @@ def _recorded(
     resample: float | None,
 ) -> Measurements:
     """Measured accelerations in a file of a strong-motion network or a zip archive of such files."""
-    if isinstance(columns, str) or len(channels) != len(columns):
-        raise ValueError(f"expected one channel of {path} for each of {len(channels)} channels, got {columns!r}")
     if isinstance(zero, str):
         raise ValueError(f"{path} has no clock times; give zero in seconds after its first sample, got {zero!r}")
     if other := next((channel for channel in channels if channel.dimension != "acceleration"), None):
@@ -420,33 +367,25 @@ def read_imposed_test(
     >>> test.history.displacement  # m
     array([ 0.  ,  0.01, -0.01])
     """
-    table = read_table(path, skip)
-    imposed = Channel(displacement, "displacement", displacement_unit or "m")
-    (history,) = _channel_values(table, (imposed,), (displacement,), displacement_unit, missing)
-    values = _channel_values(table, channels, columns, units, missing)
-    places = [value_column(table, column) for column in (displacement, *columns)]
-    warn_if_absent(table, places, missing, stacklevel=2)
+    imposed = (displacement, "displacement", displacement_unit, f"{path}, column {displacement!r}")
+    wanted = [imposed, *_wanted(path, channels, columns, units)]
+    found = table_values(read_table(path, skip), wanted, missing, stacklevel=2)
+    history, *values = (to_si(*each) for each in found)
     measurements = Measurements(tuple(channels), 1.0, values, description)
     return ImposedTest(DisplacementHistory(Path(path).stem, history, Path(path).name), measurements)
 
 
-def _channel_values(
-    table: Table,
-    channels: Sequence[Channel],
-    columns: Sequence[str],
-    units: str | Sequence[str] | None,
-    missing: Sequence[float] | None,
-) -> NDArray[np.float64]:
-    """Columns of a table in SI units (n_channels, n_rows)."""
+def _wanted(
+    path: str | Path, channels: Sequence[Channel], columns: Sequence[str | int], units: str | Sequence[str] | None
+) -> list[tuple[str | int | None, str, str | None, str]]:
+    """Columns as `table_values` takes them."""
     given = [units] * len(columns) if units is None or isinstance(units, str) else list(units)
     if isinstance(columns, str) or not len(channels) == len(columns) == len(given):
         raise ValueError(
             f"expected one column and one unit for each of {len(channels)} channels, got columns {columns!r}, "
             f"units {units!r}; the unit of the times is given by time_unit="
         )
-    rows = []
-    for channel, column, unit in zip(channels, columns, given, strict=True):
-        place = value_column(table, column)
-        values, where = column_values(table, place, missing), f"{table.file}, column {column!r}"
-        rows.append(to_si(values, column_unit(table, place, values, unit, channel.dimension, where)))
-    return np.array(rows)
+    return [
+        (column, channel.dimension, unit, f"{path}, column {column!r}")
+        for channel, column, unit in zip(channels, columns, given, strict=True)
+    ]

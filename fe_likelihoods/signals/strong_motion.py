@@ -45,7 +45,8 @@ import re
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -53,68 +54,98 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..units import to_si
-from .tables import is_clock
-from .text_files import (
+from .tables import (
     LINE_END,
     NUMBER,
-    Series,
     agree_on_unit,
     check_count,
     check_peaks,
     decimals_of,
     decode_text,
+    is_clock,
     is_number,
     number_cells,
     parse_count,
     parse_number,
     read_bytes,
     read_statements,
+    read_text,
 )
 
-__all__ = [
-    "Block",
-    "find_v2_channels",
-    "parse_at2",
-    "parse_esm",
-    "parse_geonet",
-    "parse_knet",
-    "parse_obspy",
-    "parse_smc",
-    "parse_v2",
-    "recognise",
-]
+__all__ = ["Found", "Series", "find_channels", "read_series", "recognise"]
 
-_LOOK = 40  # lines in which a format is recognised
-_FORMS = {
-    "PEER AT2": "at2",
-    "CSMIP or COSMOS V1": "v2",
-    "CSMIP or COSMOS V2": "v2",
-    "USGS SMC": "smc",
-    "GeoNet": "geonet",
-    "K-NET or KiK-net": "knet",
-    "ESM or ITACA": "esm",
-    "miniSEED": "obspy",
-    "GSE2": "obspy",
-    "SAC": "obspy",
-}
+
+class Series(NamedTuple):
+    """Samples (n_steps,) as they are in a file, before any conversion; unit None if the file states none."""
+
+    title: str
+    dt: float  # [s], NaN with uneven times
+    unit: str | None
+    values: NDArray[np.float64]
+    times: NDArray[np.float64] | None = None  # [s], if they are uneven
+    name: str = ""  # of the record, if it is not the name of the file
+    file: str = ""  # in an archive, with the archive
+    source: str = ""  # if it is not the name of the file with the title
+
+
+class Found(NamedTuple):
+    """One acceleration in a file that may hold several."""
+
+    channel: int | str | None  # number at the station, or direction
+    label: str
+    file: str  # with the archive
+    parse: Callable[[], Series]
+
+
+def read_series(
+    path: str | Path, form: str, channel: int | str | None, member: str | None, inventory: str | Path | None
+) -> Series:
+    """The samples of the only channel with a number or name in a file of a format that `recognise` names.
+
+    ValueError if there are several, which lists them. A text for V2 files is a number too, or the end of a file's name.
+    """
+    if form == "obspy":
+        return parse_obspy(path, channel, inventory)
+    if form not in ("v2", "geonet"):
+        series = {"at2": parse_at2, "smc": parse_smc, "knet": parse_knet, "esm": parse_esm}[form](
+            read_text(path), str(path)
+        )
+        return series._replace(name=Path(path).name) if form == "knet" else series  # the ending is the direction
+    if form == "v2" and isinstance(channel, str):
+        channel, member = (int(channel), member) if channel.isdecimal() else (None, channel)
+    candidates = find_channels(path, form, member)
+    chosen = [each for each in candidates if channel is None or str(each.channel).lower() == str(channel).lower()]
+    if len(chosen) != 1:
+        listing = "\n  ".join(f"channel {each.channel}: {each.label} [{each.file}]" for each in chosen or candidates)
+        raise ValueError(
+            f"{path}: expected one channel with channel = {channel}, member = {member!r}, found {len(chosen)}; "
+            "choose with channel= and member=, or in a TOML file with the end of a file name as column, among\n  "
+            f"{listing}"
+        )
+    file, series = chosen[0].file, chosen[0].parse()
+    source = file.removeprefix(f"{Path(path).parent}/") if form == "v2" else ""
+    return series._replace(name=series.title, file=file, source=source)
 
 
 # which format ---------------------------------------------------------------------------------------------------------
 
+_LOOK = 40  # lines in which a format is recognised
 
-def recognise(content: bytes) -> tuple[str, str | None]:
-    """Return the name of a file's format (empty if unknown), and its parser (None if it is not read)."""
-    start, encoding = content[:8000], "latin-1"  # of binary files, one letter per byte
+
+def recognise(path: str | Path) -> tuple[str, str | None]:
+    """The name of a file's format (empty if unknown), and its kind for `read_series` (None if it is not read)."""
+    content, encoding = read_bytes(path), "latin-1"  # of binary files, one letter per byte
+    if zipfile.is_zipfile(io.BytesIO(content)):
+        return "zip", "v2"
     for mark, name in (
         (codecs.BOM_UTF8, "utf-8-sig"),
         (codecs.BOM_UTF16_LE, "utf-16"),
         (codecs.BOM_UTF16_BE, "utf-16"),
     ):
-        encoding = name if start.startswith(mark) else encoding
-    text = start.decode(encoding, errors="replace")
+        encoding = name if content.startswith(mark) else encoding
+    text = content[:8000].decode(encoding, errors="replace")
     lines = LINE_END.sub("\n", text).splitlines()
-    name = "" if _is_table(lines) else _name_of(lines[:_LOOK], text)
-    return name, _FORMS.get(name)
+    return ("", None) if _is_table(lines) else _form_of(lines[:_LOOK], text)
 
 
 def _is_table(lines: list[str]) -> bool:
@@ -130,7 +161,7 @@ def _is_table(lines: list[str]) -> bool:
     return False
 
 
-def _name_of(lines: list[str], text: str) -> str:
+def _form_of(lines: list[str], text: str) -> tuple[str, str | None]:
     first, head = next((line.strip() for line in lines), ""), "\n".join(lines)
     version = text[304:308].encode("latin-1", "replace")  # in the header of SAC, 632 bytes
 
@@ -138,31 +169,31 @@ def _name_of(lines: list[str], text: str) -> str:
         return bool(re.match(pattern, first, re.IGNORECASE))
 
     rules = (
-        ("HDF5", text.startswith("\x89HDF")),
-        ("K-NET or KiK-net", first.startswith("Origin Time") and "Scale Factor" in head),
-        ("ESM or ITACA", first.startswith("EVENT_NAME:") and "SAMPLING_INTERVAL_S:" in head),
-        ("USGS SMC", bool(re.match(r"[0-9] +(UN)?CORRECTED ACCELEROGRAM", first))),
-        ("USGS SMC without acceleration", bool(re.match(r"[0-9] +(VELOCITY|DISPLACEMENT|RESPONSE|UNKNOWN)", first))),
-        ("GeoNet", begins(r"(un)?corrected accelerogram") and any(line.startswith("Site ") for line in lines[1:2])),
-        ("COSMOS V0 (raw acceleration)", begins("raw acc") and "Format v0" in first),
-        ("CSMIP or COSMOS V1", begins(r"uncorrected acceler(ation\b|ogram)")),
-        ("CSMIP or COSMOS V2", begins("corrected acc")),
-        ("CSMIP V3 (spectra)", begins("response and fourier")),
-        ("BHRC V1", first.startswith("* VOL1DS FILE")),
-        ("LabVIEW TDMS", text.startswith("TDSm")),
-        ("MATLAB", text.startswith("MATLAB 5.0 MAT-file")),
-        ("gzip", text.startswith("\x1f\x8b")),
-        ("PDF", text.startswith("%PDF")),
-        ("damaged zip", text.startswith("PK")),
-        ("web page (HTML)", begins(r"<(!doctype )?html\b")),
-        ("miniSEED", bool(re.match(r"\d{6}[DRQM][ \0]|MS\x03", text))),
-        ("GSE2", text.startswith("WID2 ")),
-        ("SAC", len(text) > 632 and b"\0\0\0" in (version[1:], version[:3]) and 6 in version[:1] + version[-1:]),
-        ("PEER AT2", bool(re.search(r"NPTS\s*(=|,)", head)) and "DT" in head and not first.startswith("#")),
-        ("Taiwan CWB or SMART", first.startswith("#StationCode")),
-        ("binary", "\0" in text.rstrip("\0\x1a\r\n ")),
+        ("HDF5", None, text.startswith("\x89HDF")),
+        ("K-NET or KiK-net", "knet", first.startswith("Origin Time") and "Scale Factor" in head),
+        ("ESM or ITACA", "esm", first.startswith("EVENT_NAME:") and "SAMPLING_INTERVAL_S:" in head),
+        ("USGS SMC", "smc", re.match(r"[0-9] +(UN)?CORRECTED ACCELEROGRAM", first)),
+        ("USGS SMC without acceleration", None, re.match(r"[0-9] +(VELOCITY|DISPLACEMENT|RESPONSE|UNKNOWN)", first)),
+        ("GeoNet", "geonet", begins("(un)?corrected accelerogram") and any(x.startswith("Site ") for x in lines[1:2])),
+        ("COSMOS V0 (raw acceleration)", None, begins("raw acc") and "Format v0" in first),
+        ("CSMIP or COSMOS V1", "v2", begins(r"uncorrected acceler(ation\b|ogram)")),
+        ("CSMIP or COSMOS V2", "v2", begins("corrected acc")),
+        ("CSMIP V3 (spectra)", None, begins("response and fourier")),
+        ("BHRC V1", None, first.startswith("* VOL1DS FILE")),
+        ("LabVIEW TDMS", None, text.startswith("TDSm")),
+        ("MATLAB", None, text.startswith("MATLAB 5.0 MAT-file")),
+        ("gzip", None, text.startswith("\x1f\x8b")),
+        ("PDF", None, text.startswith("%PDF")),
+        ("damaged zip", None, text.startswith("PK")),
+        ("web page (HTML)", None, begins(r"<(!doctype )?html\b")),
+        ("MSEED", "obspy", re.match(r"\d{6}[DRQM][ \0]|MS\x03", text)),  # the names that obspy gives these three
+        ("GSE2", "obspy", text.startswith("WID2 ")),
+        ("SAC", "obspy", len(text) > 632 and b"\0\0\0" in (version[1:], version[:3]) and 6 in version[::3]),
+        ("PEER AT2", "at2", re.search(r"NPTS\s*(=|,)", head) and "DT" in head and not first.startswith("#")),
+        ("Taiwan CWB or SMART", None, first.startswith("#StationCode")),
+        ("binary", None, "\0" in text.rstrip("\0\x1a\r\n ")),
     )
-    return next((name for name, fits in rules if fits), "")
+    return next(((name, form) for name, form, fits in rules if fits), ("", None))
 
 
 # numbers in Fortran columns -------------------------------------------------------------------------------------------
@@ -278,7 +309,7 @@ _UNITS_OF = re.compile(r"UNITS?\s*(?:OF|ARE|IS|:|=)\s*[(\[]?\s*([^\s,;()\[\]]+?)
 
 
 def parse_at2(text: str, file: str) -> Series:
-    """Return the samples of a PEER AT2 file, in the new or old form of its header."""
+    """The samples of a PEER AT2 file, in the new or old form of its header."""
     lines = text.splitlines()
     index, stated = next(((i, found) for i, line in enumerate(lines) if (found := _at2_header(line))), (None, None))
     if index is None:
@@ -341,8 +372,10 @@ _ZIP_DAMAGE = (zipfile.BadZipFile, RuntimeError, NotImplementedError, OSError, E
 )
 
 
-def find_v2_channels(path: str | Path, member: str | None = None) -> list[Block]:
-    """Return the channels with acceleration in a V1 or V2 file, or in the V2, else V1 files of an archive."""
+def find_channels(path: str | Path, form: str, member: str | None = None) -> list[Found]:
+    """The accelerations in a GeoNet file, a V1 or V2 file, or the V2, else V1 files of an archive."""
+    if form == "geonet":
+        return parse_geonet(read_text(path), str(path))
     content = read_bytes(path)
     files = [(str(path), content)]
     if zipfile.is_zipfile(io.BytesIO(content)):
@@ -363,7 +396,8 @@ def find_v2_channels(path: str | Path, member: str | None = None) -> list[Block]
             f"...', 'N acceleration pts ...' or 'Uncorrected accelerogram', found none in {len(files)} file(s)"
             + (f" named {member!r}" if member else "")
         )
-    return sorted(channels, key=lambda each: (each.channel is None, each.channel or 0))
+    found = [Found(each.channel, each.label, each.file, partial(parse_v2, each)) for each in channels]
+    return sorted(found, key=lambda each: (each.channel is None, each.channel or 0))
 
 
 def _unzip(content: bytes, name: str, archive: str, left: list[int], depth: int = 1) -> Iterator[tuple[str, bytes]]:
@@ -423,7 +457,7 @@ def _is_v1(lines: list[str]) -> bool:
 
 
 def parse_v2(block: Block) -> Series:
-    """Return the acceleration of one channel."""
+    """The acceleration of one channel."""
     where, lines = block.file, block.lines
     if _is_v1(lines):
         return _parse_v1(block)
@@ -525,7 +559,7 @@ _GEONET_UNIT = re.compile(rf"in\s+units\s+of\s+({NUMBER})\s*mm/s/s", re.IGNORECA
 
 
 def parse_smc(text: str, file: str) -> Series:
-    """Return the samples of a USGS SMC file, uncorrected or corrected."""
+    """The samples of a USGS SMC file, uncorrected or corrected."""
     block = Block(file, text.splitlines())
     title = block.lines[0].strip() if block.lines else ""
     number, _, kind = title.partition(" ")
@@ -558,14 +592,14 @@ def parse_smc(text: str, file: str) -> Series:
     return Series(re.sub(r"\s+", " ", station) + note, math.nan if uneven else 1.0 / rate, "cm/s2", values, times)
 
 
-def parse_geonet(text: str, file: str) -> list[tuple[str, Series]]:
-    """Return the directions, such as ``"S16W"`` or ``"Up"``, and samples of a GeoNet V1A or V2A file."""
+def parse_geonet(text: str, file: str) -> list[Found]:
+    """The components of a GeoNet V1A or V2A file, with directions such as ``"S16W"`` or ``"Up"``."""
     block, place, found = Block(file, text.splitlines()), 0, []
     while any(line.strip() for line in block.lines[place : place + 3]):
         if len(found) >= _MOST_COMPONENTS:
             raise ValueError(f"{file}: expected at most {_MOST_COMPONENTS} components")
         component, series, place = _geonet_component(block, place)
-        found.append((component, series))
+        found.append(Found(component, series.title, file, lambda series=series: series))
     if not found:
         raise ValueError(f"{file}: expected a GeoNet V1A or V2A file, got an empty one")
     return found
@@ -627,7 +661,7 @@ def _samples_below(lines: list[str], start: int, file: str) -> NDArray[np.float6
 
 
 def parse_knet(text: str, file: str) -> Series:
-    """Return the samples of a K-NET or KiK-net file, without their mean."""
+    """The samples of a K-NET or KiK-net file, without their mean."""
     lines = text.splitlines()
     header = {line[:_KNET_NAME].strip().rstrip("."): line[_KNET_NAME:].strip() for line in lines[:_KNET_TEXT]}
     names = ("Station Code", "Sampling Freq(Hz)", "Duration Time(s)", "Dir", "Scale Factor")
@@ -655,7 +689,7 @@ def parse_knet(text: str, file: str) -> Series:
 
 
 def parse_esm(text: str, file: str) -> Series:
-    """Return the samples of an ESM or ITACA file."""
+    """The samples of an ESM or ITACA file."""
     lines, header = text.splitlines(), {}
     for line in lines[:_ESM_TEXT]:
         if not _ESM_NAME.match(line):
@@ -680,22 +714,18 @@ def parse_esm(text: str, file: str) -> Series:
 
 # seismology -----------------------------------------------------------------------------------------------------------
 
-_OBSPY = {"miniSEED": "MSEED", "SAC": "SAC", "GSE2": "GSE2"}  # names in `recognise` and in obspy
 _NO_ACCELERATION = {6: "displacement", 7: "velocity"}  # IDEP in a SAC header
 
 
 def parse_obspy(path: str | Path, channel: str | None, inventory: str | Path | None = None) -> Series:
-    """Return the samples of one trace in a miniSEED, SAC or GSE2 file, in m/s2 with the `inventory` of its recorder."""
+    """The samples of one trace in a miniSEED, SAC or GSE2 file, in m/s2 with the `inventory` of its recorder."""
     try:
         import obspy
     except ImportError as error:
         raise ValueError(
             f"reading {path} needs the package obspy: install it with pip install obspy, or write the record as CSV"
         ) from error
-    content = read_bytes(path)
-    form = _OBSPY.get(recognise(content)[0])
-    if form is None:
-        raise ValueError(f"{path}: expected a file in {', '.join(_OBSPY)}")
+    content, form = read_bytes(path), recognise(path)[0]
     try:
         # by name: obspy would also find formats such as pickle, which runs code of the file
         stream = obspy.read(io.BytesIO(content), format=form).merge()
@@ -736,4 +766,4 @@ def parse_obspy(path: str | Path, channel: str | None, inventory: str | Path | N
     rate = round(1.0 / trace.stats.delta)  # SAC has the step in single precision
     dt = 1.0 / rate if rate and abs(rate * trace.stats.delta - 1.0) < 1e-6 else trace.stats.delta
     unit = None if inventory is None else "m/s2"
-    return Series(f"{trace.id}", float(dt), unit, np.asarray(trace.data, dtype=np.float64))
+    return Series(trace.id, float(dt), unit, np.asarray(trace.data, dtype=np.float64), name=trace.id)

@@ -5,11 +5,11 @@ Semicolons, tabs, commas or blanks separate cells, whichever splits most of the 
 are read if commas do not separate cells; separators of thousands go if a number shows them: ``1,234.5``, ``1.234,5``,
 ``1'234``. Text before the header line is left out, as are lines of numbers and words that a header line follows.
 
-`table_step` and `table_start` return seconds. Values of columns stay in the units of the file; `column_values` and
-`column_unit` return them with NaN for missing samples and the unit on which file and caller agree.
+`table_step` and `table_start` return seconds, `table_values` the samples of columns with NaN for missing ones, and the
+unit on which file and caller agree. The first part reads text, numbers and units, for other formats as well.
 """
 
-import contextlib
+import codecs
 import csv
 import datetime
 import itertools
@@ -18,6 +18,7 @@ import re
 import warnings
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from numbers import Real
 from pathlib import Path
 from typing import NamedTuple
@@ -25,70 +26,335 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..units import find_unit, to_si
+from ..units import DIMENSIONS, UNITS, find_unit
 from .sampling import check_step
-from .text_files import (
-    Statements,
-    agree_on_unit,
-    check_count,
-    check_peaks,
-    decimals_of,
-    decode_text,
-    dimension_of,
-    is_number,
-    number_cells,
-    parse_count,
-    parse_number,
-    read_bytes,
-    read_statements,
-)
 
 __all__ = [
-    "Column",
-    "Table",
+    "LINE_END",
+    "NUMBER",
     "WORKBOOKS",
+    "Column",
+    "Statements",
+    "Table",
+    "agree_on_unit",
+    "check_count",
+    "check_peaks",
+    "clock_text",
     "column_unit",
     "column_values",
+    "decimals_of",
+    "decode_text",
+    "dimension_of",
+    "is_clock",
+    "is_number",
+    "number_cells",
+    "parse_count",
+    "parse_number",
+    "read_bytes",
+    "read_statements",
     "read_table",
+    "read_text",
     "row_times",
     "stated_unit",
     "table_start",
     "table_step",
+    "table_values",
     "text_unit",
+    "uniform_times",
     "unit_in_name",
     "value_column",
     "value_columns",
-    "warn_if_absent",
 ]
 
-WORKBOOKS = (".xlsx", ".xlsm")
-"""Endings of the names of Excel workbooks."""
+# text and numbers -----------------------------------------------------------------------------------------------------
 
-_SEPARATORS = (";", "\t", ",", " ")
-_LAST_LINES = 50  # lines that determine the separator
-_MISSING = frozenset({"", "nan", "#n/a", "n/a", "na", "null", "-", "--"})
-_DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?$")
-_THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}$")  # 1,000: a thousand, or one with three decimals
-# Separators of thousands that cannot be decimal marks: another mark or a second group follows
-_GROUPED = re.compile(r"[-+]?[1-9]\d{0,2}(?:(?:,\d{3})+\.\d*|(?:\.\d{3})+,\d*|(?:,\d{3}){2,}|(?:\.\d{3}){2,})$")
-_SPACED = re.compile(r"[-+]?[1-9]\d{0,2}(?:['\u2019\u00a0\u202f ]\d{3})+(?:[.,]\d*)?$")
-_SPACE = re.compile(r"\d['\u2019\u00a0\u202f ]\d{3}")
-_SPACES = str.maketrans("", "", "'\u2019\u00a0\u202f ")
-_HUNDREDS = re.compile(r"[-+]?[1-9]\d{2}$")
-_NUMBERS = re.compile(r"[\s\d.+\-eEdD]*")
-_STEP = re.compile(r"0?\.\d+|\d(?:\.\d+)?[eEdD]-\d+")  # below 1 s
-_TIME = re.compile(r"(elapsed |relative )?(t|(time|zeit|temps|tempo|tiempo)\d*)(\b|_)", re.IGNORECASE)
-_STAMP = re.compile(r"(timestamp|unix|epoch)(\b|_)", re.IGNORECASE)  # times if no other column has them
-_UNIX = re.compile(r"unix|epoch", re.IGNORECASE)
-_UNIX_SECONDS = (1e9, 4.2e9)  # seconds since 1970 of the years 2001 to 2103
-_LONGEST_UNIT = 100
-_SENTINELS = (-9999.0, -999.25, 1e30, 9.97e36)  # numbers that loggers and formats write for missing samples
-# also used for missing samples, but plausible as measured numbers: counts, or accelerations in gal
-_PLAUSIBLE_SENTINELS = (-999.0, 99999.0, -99999.0, 32767.0, -32768.0)
-_POINTS = "Numbers with decimal commas need another separator between columns, such as ';'"
-_SKIP = "If the text is about other samples, give skip= to leave it out"
+NUMBER = r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
+"""Regular expression for a decimal number, without alternatives for the same digits: its time is linear."""
 
-_Line = tuple[int, list[str]]  # its number and cells
+LINE_END = re.compile(r"\r+\n|\r")
+"""Regular expression for the end of a line with a carriage return, or two in a text that was transferred twice."""
+
+_LARGEST_FILE = 256 * 2**20  # bytes of a text file or an archive; long records have some MiB
+_UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+# What editors and transfers add after the last line: blank lines, ^Z (the end of a text in DOS), zero bytes as padding
+_PADDING = " \t\n\f\0\x1a"
+_CLOSING = re.compile(r"[^\d,;\t]{0,80}(?<![A-Za-z])(?:end|eof)[^\d,;\t]{0,80}", re.IGNORECASE)  # *** End data ***
+_LAST_DECIMALS = re.compile(r"\.(\d+)([eEdD][-+]?\d+)?\s*$")
+_FORTRAN_EXPONENT = re.compile(r"(?<=[\d.])[dD](?=[-+]?\d)")  # the letter of double precision
+
+
+def read_bytes(path: str | Path) -> bytes:
+    """The content of a file; ValueError if it cannot be read or is too large."""
+    try:
+        size = Path(path).stat().st_size
+        if size > _LARGEST_FILE:
+            raise ValueError(f"{path}: expected at most {_LARGEST_FILE} bytes, got {size}; cut the file")
+        return Path(path).read_bytes()
+    except OSError as error:
+        raise ValueError(f"cannot read {path}: {error.strerror}; check the path") from error
+
+
+def decode_text(content: bytes) -> str:
+    """The text of a file without padding and closing remarks after its last line.
+
+    It is UTF-8 or UTF-16 with a byte-order mark, UTF-8 where it is valid, else Latin-1. Zero bytes directly after a
+    number are kept, so that this number is refused: a table that a crash has cut may have lost its last digits.
+    """
+    try:
+        text = content.decode("utf-8-sig") if not content.startswith(_UTF_16) else content.decode("utf-16", "replace")
+    except UnicodeDecodeError:
+        text = content.decode("latin-1")
+    text = LINE_END.sub("\n", text)
+    while True:
+        last = len(text.rstrip(_PADDING))  # blanks at the end of this line may be empty cells
+        text = text[:last] + re.split(r"[\n\f\x1a]", text[last:], maxsplit=1)[0]
+        start = text.rfind("\n") + 1
+        if not _CLOSING.fullmatch(text, start):
+            return text
+        text = text[:start]
+
+
+def read_text(path: str | Path) -> str:
+    """The text of a file in a format that states its number of samples; ValueError if it cannot be read."""
+    return decode_text(read_bytes(path)).rstrip("\0\x1a")
+
+
+def number_cells(line: str) -> list[str]:
+    """The fields of a line of numbers, which blanks separate or which touch, as in some Fortran formats.
+
+    Numbers that touch have equally many decimals, and begin with a sign (``-12.34567-0.12345``) or are equally wide
+    (`` 12.34567100.12345``). Other text stays one field, which is no number.
+    """
+    cells, last = line.split(), _LAST_DECIMALS.search(line)
+    if last is None or all(cell.count(".") < 2 for cell in cells):
+        return cells
+    exponent = r"[eEdD][-+]\d{2,3}" if last[2] else ""
+    fields = re.findall(rf"\s*[-+]?\d*\.\d{{{len(last[1])}}}{exponent}", line)
+    split = len({len(field) for field in fields}) == 1 or all(field[0] in " \t+-" for field in fields[1:])
+    return [field.strip() for field in fields] if split and "".join(fields) == line.rstrip() else cells
+
+
+def _as_float(field: str) -> float:
+    """A number, also with an exponent of Fortran (1.0D-03); ValueError for digits grouped by underscores."""
+    if "_" in field:
+        raise ValueError
+    try:
+        return float(field)
+    except ValueError:
+        return float(_FORTRAN_EXPONENT.sub("e", field))
+
+
+def is_number(field: str) -> bool:
+    """Whether a field of a file is a number."""
+    try:
+        _as_float(field)
+    except ValueError:
+        return False
+    return True
+
+
+def parse_number(field: str, where: str) -> float:
+    """The finite number in a field of a file; ValueError for anything else."""
+    try:
+        value = _as_float(field)
+    except ValueError:
+        clock = ", or a clock time such as '03:19:53.010' or '2019-07-06T03:19:53.010'" if ":" in field else ""
+        raise ValueError(f"{where}: expected a number{clock}, got {field[:100]!r}") from None
+    if not math.isfinite(value):
+        raise ValueError(f"{where}: expected a finite number, got {field[:100]!r}")
+    return value
+
+
+def parse_count(digits: str, where: str) -> int:
+    """A number of samples, channels or columns; ValueError for more than 12 digits."""
+    if len(digits) > 12:
+        raise ValueError(f"{where}: expected a count, got a number with {len(digits)} digits")
+    return int(digits)
+
+
+def check_count(found: int, stated: int, where: str, advice: str = "") -> None:
+    """ValueError if a file has another number of samples than it announces."""
+    if found != stated:
+        raise ValueError(
+            f"{where} announces {stated} samples, the file has {found}; it is truncated or damaged{advice}"
+        )
+
+
+def decimals_of(field: str) -> int:
+    """How many digits after the decimal point the number in a field has, less than zero for 1e3."""
+    digits = field.partition(".")[2]
+    if digits.isdecimal():  # most fields
+        return len(digits)
+    mantissa, _, exponent = field.lower().replace("d", "e").partition("e")
+    power = int(exponent or 0) if len(exponent) < 6 else 0  # a larger exponent belongs to zero
+    return min(max(len(mantissa.partition(".")[2]) - power, -300), 300)
+
+
+def dimension_of(unit: str) -> str | None:
+    """The dimension of a unit, or None for other text."""
+    try:
+        return find_unit(unit).dimension
+    except ValueError:
+        return None
+
+
+def agree_on_unit(stated: str | None, given: str | None, dimension: str, file: str | Path) -> str:
+    """The canonical name of the unit that a file states or the caller gives.
+
+    ValueError if both are None, they disagree, or a unit is unknown or of another dimension.
+    """
+    names = [name for name in (stated, given) if name is not None]
+    if not names:
+        example = "g" if dimension == "acceleration" else DIMENSIONS[dimension]
+        raise ValueError(f"{file} does not state the unit of its {dimension}: give units=, for instance {example!r}")
+    try:
+        units = [find_unit(name, dimension) for name in names]
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from None
+    if any(unit.factor != units[0].factor for unit in units):
+        raise ValueError(f"{file} states the unit {stated!r} but units = {given!r} was given; correct one of them")
+    return units[0].name
+
+
+# what the text above samples states -----------------------------------------------------------------------------------
+
+_VALUE = rf"\s*(?:[\[(]\s*(?P<bracket>[^\])]{{1,20}}?)\s*[\])])?\s*[:=,;\t]*\s*(?P<number>{NUMBER})\s*"
+_STEP = re.compile(
+    r"\b(?:dt|delta[ _]?t|(?:sampl(?:ing|e)|time|scan)[ _-]?(?:interval|step|period|increment|spacing)|"
+    r"equal(?:ly)?\s+spac(?:ing\s+of|ed\s+at)|intervals\s+of|abtast(?:intervall|periode|zeit)|zeitschritt|"
+    r"pas de temps|paso de tiempo|passo temporale|interval(?:o de muestreo|lo di campionamento))"
+    rf"(?:_(?P<ending>s|ms)\b)?{_VALUE}(?P<unit>[a-z]*)",
+    re.IGNORECASE,
+)
+_RATE = re.compile(
+    r"(?:\b(?:(?:sampl(?:ing|e)|scan)[ _-]?(?:rate|freq(?:uency|\.)?)|(?:samples|scans) per sec(?:ond)?\b|"
+    r"abtast(?:rate|frequenz)|fr[eé]quence d.[eé]chantillonnage|frecuencia de muestreo|frequenza di campionamento)|"
+    rf"^\W*(?:fs|rate)\b(?=\s*[\[(:=,;\t])){_VALUE}"
+    r"(?P<unit>k?hz|sps|(?:samples|pts|points)\s*(?:per|/)\s*s(?:ec(?:ond)?)?)?",
+    re.IGNORECASE,
+)
+_COUNT = re.compile(
+    r"\b(?:npts|ndata|(?:number|no\.?|num)[ _]of[ _](?:data|samples|scans|rows|values)(?:[ _]points)?|"
+    r"(?:number|no\.?|num)[ _]of[ _]points|(?:scans|samples) in (?:the )?file|"
+    r"anzahl(?: der)? (?:abtastwerte|messwerte|werte|punkte)|nombre d(?:e points|.[eé]chantillons)|"
+    r"n[uú]mero de (?:datos|muestras|puntos))\s*[:=,;\t]*\s*(\d+)(?![\d.])|"
+    r"^\W*(?:samples|points|scans)\s*[:=,;\t]\s*(\d+)\W*$",
+    re.IGNORECASE,
+)
+_UNIT_LINE = re.compile(r"\b(?:units?|einheit)(?:\s+of\s+[a-z]{1,20})?\s*[:=]\s*([^\s;,]+)", re.IGNORECASE)
+_UNITS_ARE = re.compile(r"\bunits?\s+(?:of|are|is)\s+[(\[]?\s*([^\s,;()\[\]]+)", re.IGNORECASE)
+_PEAK = re.compile(
+    r"\b(?:pga|(?:peak|max\w*\.?)(?:\s+ground)?\s+acc\w*\.?|(?P<any>(?:peak|max\w*\.?)\s+value))(?:\s+values?)?\s*"
+    r"(?:[\[(]\s*(?P<unit>[^\])]{1,20}?)\s*[\])])?\s*[:=,;\t]\s*(?P<numbers>.{0,200})",
+    re.IGNORECASE,
+)
+_NAMED = re.compile(rf"\(([^)]{{1,40}})\)\s*({NUMBER})")
+_PLAIN = re.compile(rf"({NUMBER})\s*(\S*)")
+_LONGER = ("min", "minutes", "h", "hours")  # loggers of temperature
+_LONGEST = 10_000  # letters of a line that are searched
+_LARGEST_ROUNDING = 0.005  # relative, of a number with three digits; with fewer ones, such as 0.01, a step is exact
+
+
+class StatedStep(NamedTuple):
+    """A step of the samples, in the words of a file."""
+
+    text: str
+    steps: tuple[float, ...]  # [s]; several if the unit is not stated
+    rounding: float  # largest relative error of the printed number
+
+
+class StatedPeak(NamedTuple):
+    """Peak accelerations, in the words of a file."""
+
+    text: str
+    unit: str | None
+    printed: dict[str, str]  # by the name of the column, "" for a peak without name
+
+    def of(self, names: Sequence[str], index: int) -> str | None:
+        """The number for one of the columns of values: by its name, or where no name is there by its place."""
+        if any(name in self.printed for name in names):
+            return self.printed.get(names[index])
+        return list(self.printed.values())[index] if len(self.printed) == len(names) else None
+
+
+class Statements(NamedTuple):
+    """What lines state: steps, and the words and values of sample counts, units and peaks."""
+
+    steps: tuple[StatedStep, ...] = ()
+    counts: tuple[tuple[str, int], ...] = ()
+    units: tuple[tuple[str, str], ...] = ()
+    peaks: tuple[StatedPeak, ...] = ()
+
+
+def read_statements(lines: Sequence[str], decimal_commas: bool = False) -> Statements:
+    """What lines of text state."""
+    steps, counts, units, peaks = [], [], [], []
+    for line in lines:
+        line = re.sub(r"(?<=\d),(?=\d)", ".", line[:_LONGEST]) if decimal_commas else line[:_LONGEST]
+        steps += [_stated_step(found, form is _RATE) for form in (_STEP, _RATE) for found in form.finditer(line)]
+        counts += [(found[0], parse_count(found[1] or found[2], found[0][:60])) for found in _COUNT.finditer(line)]
+        units += [(found[0], found[1]) for found in _UNIT_LINE.finditer(line)]
+        units += [(each[0], each[1]) for each in _UNITS_ARE.finditer(line) if dimension_of(each[1]) == "acceleration"]
+        peaks += [_stated_peak(found) for found in _PEAK.finditer(line)]
+    return Statements(tuple(filter(None, steps)), tuple(counts), tuple(units), tuple(filter(None, peaks)))
+
+
+def _stated_step(found: re.Match[str], is_rate: bool) -> StatedStep | None:
+    """A step, or the step of a rate; None for zero, and for a number of something else."""
+    number, unit, bracket = float(found["number"]), found["unit"] or "", found["bracket"]
+    if not number > 0.0 or unit.lower() in _LONGER:
+        return None
+    if is_rate:
+        stated = (unit or bracket or "").lower()
+        steps = tuple(1.0 / (number * each) for each in ([1e3 if stated == "khz" else 1.0] if stated else [1.0, 1e3]))
+    else:
+        stated = [each for each in (found["ending"], bracket, unit) if each and dimension_of(each) == "time"]
+        if bracket and not stated:  # brackets around something else
+            return None
+        steps = tuple(number * each for each in [find_unit(each).factor for each in stated[:1]] or [1.0, 1e-3, 1e-6])
+    rounding = 0.5 * 10.0 ** -decimals_of(found["number"]) / number
+    return StatedStep(found[0].strip(), steps, min(rounding, _LARGEST_ROUNDING))
+
+
+def _stated_peak(found: re.Match[str]) -> StatedPeak | None:
+    """Peaks by name, or one without; None for other text, and a value that may be no acceleration."""
+    unit, printed = found["unit"], {name.strip(): number for name, number in _NAMED.findall(found["numbers"])}
+    if not printed and (plain := _PLAIN.match(found["numbers"])):
+        unit, printed = unit or plain[2].rstrip(",;"), {"": plain[1]}
+    unit = unit if unit and dimension_of(unit) == "acceleration" else None
+    return StatedPeak(found[0].strip(), unit, printed) if printed and (unit or not found["any"]) else None
+
+
+def check_peaks(
+    peaks: Sequence[StatedPeak],
+    names: Sequence[str],
+    index: int,
+    values: NDArray[np.float64],
+    decimals: int,
+    unit: str,
+    file: str,
+    advice: str = "",
+) -> None:
+    """ValueError if a stated peak is not the peak of a column, with its mean or without it.
+
+    The column is number `index` of `names`, with printed values (n_rows,) without missing ones; `advice` ends the
+    message.
+    """
+    factor, digit = find_unit(unit).factor, 1.01 * 10.0**-decimals
+    found = [float(np.abs(each).max()) for each in (values, values - values.mean())]
+    for peak in peaks:
+        printed = peak.of(names, index)
+        known = [peak.unit] if peak.unit else [name for name in UNITS if UNITS[name].dimension == "acceleration"]
+        ratios = [find_unit(each).factor / factor for each in known]
+        if printed is not None and not any(
+            abs(each - ratio * abs(float(printed))) <= digit + 0.505 * ratio * 10.0 ** -decimals_of(printed)
+            for each in found
+            for ratio in ratios
+        ):
+            raise ValueError(
+                f"{file}: the file states {peak.text!r}, the samples have a peak of {found[0]:g} {unit}; the unit is "
+                f"wrong, or the file is damaged{advice}"
+            )
 
 
 # clock times ----------------------------------------------------------------------------------------------------------
@@ -117,9 +383,10 @@ def is_clock(cell: str) -> bool:
     return ":" in cell and _CLOCK.fullmatch(cell) is not None
 
 
-def _is_date(cell: str) -> bool:
-    """Whether a cell is a date without a time, in any order of day, month and year."""
-    return _DAY_ONLY.fullmatch(cell) is not None
+def clock_text(clock: ClockTime) -> str:
+    """A clock time as `zero` takes it."""
+    text = str((datetime.datetime.min + datetime.timedelta(seconds=clock.seconds)).time())
+    return text if clock.day is None else f"{datetime.date.fromordinal(clock.day)} {text}"
 
 
 def _parse_clock(cell: str, where: str) -> ClockTime:
@@ -157,38 +424,59 @@ def _day_number(found: re.Match[str], where: str) -> int:
         raise ValueError(f"{where}: expected a date, got {found[0][:100]!r} ({error})") from None
 
 
-def _seconds_since_midnight(times: list[ClockTime | None], where: str) -> list[float]:
+def _seconds_of(times: list[ClockTime | None], file: str) -> list[float]:
     """Seconds since the midnight before the first time, NaN for None.
 
     Without dates, a time that is more than half a day earlier than the previous time belongs to the next day. 1 o'clock
     after 12 o'clock is refused: it is on a 12-hour clock.
     """
     known = [time for time in times if time is not None]
-    first, zones = known[0], {time.zone for time in known}
+    zones = {time.zone for time in known}
     for differ, expected in (
         (len({time.day is None for time in known}) > 1, "a date in all clock times or in none"),
         (len(zones) > 1, f"one time zone in all clock times, got {len(zones)}"),
         (len({time.halves for time in known}) > 1, "AM or PM in all clock times or in none"),
     ):
         if differ:
-            raise ValueError(f"{where}: expected {expected}; write them alike")
+            raise ValueError(f"{file}: expected {expected}; write them alike")
     day, last, found = 0, 0.0, []
     for time in times:
         if time is None:
             found.append(math.nan)
             continue
-        if not first.halves and 12 * _HOUR <= last < 13 * _HOUR and _HOUR <= time.seconds < 2 * _HOUR:
+        if not time.halves and 12 * _HOUR <= last < 13 * _HOUR and _HOUR <= time.seconds < 2 * _HOUR:
             raise ValueError(
-                f"{where}: the clock times go back from 12 to 1 o'clock, as on a clock of 12 hours; write hours from 0 "
+                f"{file}: the clock times go back from 12 to 1 o'clock, as on a clock of 12 hours; write hours from 0 "
                 "to 23"
             )
-        day = time.day - first.day if time.day is not None else day + (time.seconds < last - _DAY / 2)
+        day = time.day - known[0].day if time.day is not None else day + (time.seconds < last - _DAY / 2)
         last = time.seconds
         found.append(day * _DAY + time.seconds)
     return found
 
 
 # the table ------------------------------------------------------------------------------------------------------------
+
+WORKBOOKS = (".xlsx", ".xlsm")
+"""Endings of the names of Excel workbooks."""
+
+_SEPARATORS = (";", "\t", ",", " ")
+_LAST_LINES = 50  # lines that determine the separator
+_MISSING = frozenset({"", "nan", "#n/a", "n/a", "na", "null", "-", "--"})
+_DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?$")
+_THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}$")  # 1,000: a thousand, or one with three decimals
+# Separators of thousands that cannot be decimal marks: another mark or a second group follows
+_GROUPED = re.compile(r"[-+]?[1-9]\d{0,2}(?:(?:,\d{3})+\.\d*|(?:\.\d{3})+,\d*|(?:,\d{3}){2,}|(?:\.\d{3}){2,})$")
+_SPACED = re.compile(r"[-+]?[1-9]\d{0,2}(?:['\u2019\u00a0\u202f ]\d{3})+(?:[.,]\d*)?$")
+_SPACE = re.compile(r"\d['\u2019\u00a0\u202f ]\d{3}")
+_SPACES = str.maketrans("", "", "'\u2019\u00a0\u202f ")
+_HUNDREDS = re.compile(r"[-+]?[1-9]\d{2}$")
+_NUMBERS = re.compile(r"[\s\d.+\-eEdD]*")
+_BELOW_ONE = re.compile(r"0?\.\d+|\d(?:\.\d+)?[eEdD]-\d+")
+_POINTS = "Numbers with decimal commas need another separator between columns, such as ';'"
+_SKIP = "If the text is about other samples, give skip= to leave it out"
+
+_Line = tuple[int, list[str]]  # its number and cells
 
 
 class Column(NamedTuple):
@@ -217,9 +505,6 @@ class Table(NamedTuple):
     chosen: bool = False  # whether the caller has chosen the column of times
 
 
-# rows of cells --------------------------------------------------------------------------------------------------------
-
-
 def read_table(
     path: str | Path,
     skip: int | None = None,
@@ -231,22 +516,19 @@ def read_table(
 
     `skip` lines are above the table, None finds them; lines with ``#`` are comments. `time` is the name or number of
     the column of times, by default found; with `time_unit`, the first column of a file without a header line has them.
-    With `along_rows` the numbers are one column, row after row, and the last row may be shorter. Raises ValueError if
-    the file cannot be read, has no rows or rows of different length, has a cell that is no finite number, or states
-    another number of samples.
+    With `along_rows` the numbers are one column, row after row, and the last row may be shorter. ValueError if the file
+    cannot be read, has no rows or rows of different length, has a cell that is no finite number, or states another
+    number of samples.
     """
     if skip is not None and (isinstance(skip, bool) or not isinstance(skip, int) or skip < 0):
         raise ValueError(f"skip must be a number of lines, zero or more, got {skip!r}")
     if time_unit is not None:
         find_unit(time_unit, "time")
-    file, lines, comments = str(path), [], []
-    is_book = Path(path).suffix.lower() in WORKBOOKS
+    file, is_book = str(path), Path(path).suffix.lower() in WORKBOOKS
     text = _workbook(path) if is_book else decode_text(read_bytes(path)).splitlines()
-    for number, line in enumerate(text, 1):
-        if number > (skip or 0) and line.strip():
-            comment = line.lstrip().startswith("#")
-            comments += [line.lstrip("# \t")] * comment
-            lines += [(number, line)] * (not comment)
+    lines = [(number, line) for number, line in enumerate(text, 1) if number > (skip or 0) and line.strip()]
+    comments = [line.lstrip("# \t") for _, line in lines if line.lstrip().startswith("#")]
+    lines = [(number, line) for number, line in lines if not line.lstrip().startswith("#")]
     separator = "\t" if is_book else _separator([line for _, line in lines[-_LAST_LINES:]])
     rows = [(number, _split(line, separator, f"{file}, line {number}")) for number, line in lines]
     rows, stated = _logger_table(rows, file)
@@ -258,19 +540,15 @@ def read_table(
         rows = _along_rows(rows, file)
     elif announced:
         rows, stated = announced
-    comments += stated
     names, below, rows = _header(rows, file)
     rows, commas = _with_points(rows, separator, file)
     columns, clock = _columns(names, below, rows, file)
     above = [line for number, line in lines if number < rows[0][0]]
-    numbers, stated = tuple(number for number, _ in rows), read_statements([*comments, *above], commas)
-    table = Table(file, bool(names), columns, numbers, "".join(comments[:1]), stated, clock, None, time_unit)
-    for text, count in table.stated.counts:
-        if len(rows) != count:
-            raise ValueError(
-                f"{file}: {text!r} announces {count} samples, the file has {len(rows)}; it is truncated or damaged. "
-                f"{_SKIP}"
-            )
+    found = read_statements([*comments, *stated, *above], commas)
+    title = "".join([*comments, *stated][:1])
+    table = Table(file, bool(names), columns, tuple(n for n, _ in rows), title, found, clock, None, time_unit)
+    for words, count in found.counts:
+        check_count(len(rows), count, f"{file}: {words!r}", f". {_SKIP}")
     if time is None:
         return table._replace(time=_time_column(table))
     places = [k for k, column in enumerate(columns) if column.name == str(time) and column.kind != "text"]
@@ -304,6 +582,9 @@ def _cell_text(value: object) -> str:
     return repr(float(value)) if number else " ".join(str("" if value is None else value).split())
 
 
+# rows of cells --------------------------------------------------------------------------------------------------------
+
+
 def _split(line: str, separator: str, where: str) -> list[str]:
     if separator == " ":
         return number_cells(line) if _NUMBERS.fullmatch(line) else line.split()
@@ -312,9 +593,9 @@ def _split(line: str, separator: str, where: str) -> list[str]:
     except csv.Error as error:
         raise ValueError(f"{where}: expected cells separated by {separator!r} ({error})") from None
     cells = [cell.strip() for cell in cells]
-    return (
-        [cell.translate(_SPACES) if _SPACED.match(cell) else cell for cell in cells] if _SPACE.search(line) else cells
-    )
+    if not _SPACE.search(line):
+        return cells
+    return [cell.translate(_SPACES) if _SPACED.match(cell) else cell for cell in cells]
 
 
 def _separator(lines: Sequence[str]) -> str:
@@ -323,7 +604,7 @@ def _separator(lines: Sequence[str]) -> str:
     for separator in _SEPARATORS:
         widths: Counter[int] = Counter()
         for line in lines:
-            with contextlib.suppress(ValueError):
+            with suppress(ValueError):
                 cells = _split(line, separator, "")
                 widths[len(cells)] += _is_data(cells)
         width, count = max(widths.items(), key=lambda item: item[1], default=(0, 0))
@@ -334,9 +615,47 @@ def _separator(lines: Sequence[str]) -> str:
     return best
 
 
+def _is_missing(cell: str) -> bool:
+    return cell.lower() in _MISSING
+
+
+def _is_date(cell: str) -> bool:
+    """Whether a cell is a date without a time, in any order of day, month and year."""
+    return _DAY_ONLY.fullmatch(cell) is not None
+
+
+def _known(cell: str) -> bool:
+    """Whether a cell is a number in any spelling, a clock time or a date."""
+    if _is_missing(cell):
+        return False
+    return (
+        is_number(cell) or bool(_DECIMAL_COMMA.match(cell) or _GROUPED.match(cell)) or is_clock(cell) or _is_date(cell)
+    )
+
+
+def _is_data(cells: Sequence[str]) -> bool:
+    return any(map(_known, cells)) and all(_known(cell) or _is_missing(cell) for cell in cells)
+
+
+def _is_text(cells: Sequence[str]) -> bool:
+    words = any(any(map(str.isalpha, cell)) and not _is_missing(cell) for cell in cells)
+    return words and not any(map(_known, cells))
+
+
 def _along_rows(lines: list[_Line], file: str) -> list[_Line]:
-    """One row per number, below lines of text. All lines of numbers but the last one have the same number of them."""
-    rows = [*itertools.dropwhile(lambda line: _is_title(line[1]), lines)]
+    """One row per number, below lines of text. All lines of numbers but the last one have the same number of them.
+
+    A line of words with more numbers than other cells is a damaged row and no text.
+    """
+    rows = [
+        *itertools.dropwhile(
+            lambda line: (
+                any(re.search("[A-Za-z]{2}", cell) for cell in line[1])
+                and 2 * sum(map(_known, line[1])) <= len(line[1])
+            ),
+            lines,
+        )
+    ]
     for number, cells in rows:
         width = len(rows[0][1])
         if wrong := [cell for cell in cells if not _known(cell)]:
@@ -344,11 +663,6 @@ def _along_rows(lines: list[_Line], file: str) -> list[_Line]:
         if len(cells) > width or (len(cells) < width and number != rows[-1][0]):
             raise ValueError(f"{file}, line {number}: expected {width} numbers as in the first row, got {len(cells)}")
     return [(number, [cell]) for number, cells in rows for cell in cells]
-
-
-def _is_title(cells: list[str]) -> bool:
-    """Whether a line has words, and no more numbers than other cells: a damaged row of numbers is no title."""
-    return any(re.search("[A-Za-z]{2}", cell) for cell in cells) and 2 * sum(map(_known, cells)) <= len(cells)
 
 
 def _announced(lines: list[_Line], file: str) -> tuple[list[_Line], list[str]] | None:
@@ -361,16 +675,13 @@ def _announced(lines: list[_Line], file: str) -> tuple[list[_Line], list[str]] |
     place = next((k for k, head in enumerate(heads[:-1]) if head and all(map(is_number, head))), None)
     if place is None or not 2 <= len(head := heads[place]) <= 3 or len(heads[place + 1]) == len(head):
         return None
-    if not all(map(str.isdecimal, (head[0], *head[2:]))) or not _STEP.fullmatch(head[1]):
+    if not all(map(str.isdecimal, (head[0], *head[2:]))) or not _BELOW_ONE.fullmatch(head[1]):
         return None
     if not all(_known(cell) for _, cells in lines[place + 1 :] for cell in cells):
         return None
     numbers = _along_rows(lines[place + 1 :], file)
     check_count(len(numbers), parse_count(head[0], file), f"{file}, line {lines[place][0]}")
     return numbers, [*(" ".join(cells) for _, cells in lines[: min(place, 1)]), f"dt = {head[1]} s"]
-
-
-# formats of logger programs -------------------------------------------------------------------------------------------
 
 
 def _logger_table(lines: list[_Line], file: str) -> tuple[list[_Line], list[str]]:
@@ -421,28 +732,6 @@ def _logger_table(lines: list[_Line], file: str) -> tuple[list[_Line], list[str]
 # header line and decimal marks ----------------------------------------------------------------------------------------
 
 
-def _is_missing(cell: str) -> bool:
-    return cell.lower() in _MISSING
-
-
-def _known(cell: str) -> bool:
-    """Whether a cell is a number in any spelling, a clock time or a date."""
-    if _is_missing(cell):
-        return False
-    return (
-        is_number(cell) or bool(_DECIMAL_COMMA.match(cell) or _GROUPED.match(cell)) or is_clock(cell) or _is_date(cell)
-    )
-
-
-def _is_data(cells: Sequence[str]) -> bool:
-    return any(map(_known, cells)) and all(_known(cell) or _is_missing(cell) for cell in cells)
-
-
-def _is_text(cells: Sequence[str]) -> bool:
-    words = any(any(map(str.isalpha, cell)) and not _is_missing(cell) for cell in cells)
-    return words and not any(map(_known, cells))
-
-
 def _first_row(lines: Sequence[_Line]) -> tuple[int, int]:
     """Place and width of the first row that is as wide as most first rows: a number above the table is no row."""
     places = [*itertools.islice((k for k, (_, cells) in enumerate(lines) if _is_data(cells)), _LAST_LINES)]
@@ -471,8 +760,7 @@ def _header(lines: list[_Line], file: str) -> tuple[list[str], list[str], list[_
                 f"{file}, line {number}: expected {width} cells as in the first line, got {len(cells)}{advice}"
             )
     kept = [k for k in range(width) if (names and names[k]) or not all(_is_missing(cells[k]) for _, cells in rows)]
-    if not kept or len(kept) == width:  # else empty after a separator at the end of each line
-        return names, below, rows
+    kept = kept or [*range(width)]  # the others are empty after a separator at the end of each line
     names, below = ([each[k] for k in kept] if each else [] for each in (names, below))
     return names, below, [(number, [cells[k] for k in kept]) for number, cells in rows]
 
@@ -519,7 +807,7 @@ def _are_units(cells: Sequence[str]) -> bool:
 
 
 def _check_names(lines: Sequence[_Line], separator: str, along_rows: bool, file: str) -> None:
-    """Raise ValueError if the line above the rows has half as many names as they have cells, or one name too few.
+    """ValueError if the line above the rows has half as many names as they have cells, or one name too few.
 
     Commas then separate cells and decimals, or the rows have names.
     """
@@ -543,14 +831,12 @@ def _with_points(lines: list[_Line], separator: str, file: str) -> tuple[list[_L
     """
     rows = [(number, ["" if _is_missing(cell) else cell for cell in cells]) for number, cells in lines]
 
-    def cells():
-        return ((number, cell) for number, row in rows for cell in row)
+    def first(fits):
+        return next(((number, cell) for number, row in rows for cell in row if fits(cell)), None)
 
-    shown = next(((n, cell) for n, cell in cells() if "," in cell or cell.count(".") > 1 if _GROUPED.match(cell)), None)
-    if shown is not None:
+    if shown := first(lambda cell: ("," in cell or cell.count(".") > 1) and _GROUPED.match(cell)):
         mark = next(letter for letter in shown[1] if letter in ",.")
-        decimal = "." if mark == "," else ","
-        grouped = re.compile(rf"[-+]?[1-9]\d{{0,2}}(?:\{mark}\d{{3}})+(?:\{decimal}\d*)?$")
+        grouped = re.compile(rf"[-+]?[1-9]\d{{0,2}}(?:\{mark}\d{{3}})+(?:\{'.' if mark == ',' else ','}\d*)?$")
         for number, row in rows:
             for k, cell in enumerate(row):
                 if mark in cell and grouped.match(cell):
@@ -560,20 +846,20 @@ def _with_points(lines: list[_Line], separator: str, file: str) -> tuple[list[_L
                         f"{file}: {mark!r} separates thousands in {shown[1]!r}, line {shown[0]}, but not in {cell!r}, "
                         f"line {number}; write all numbers alike, without separators of thousands"
                     )
-    comma = next(((n, cell) for n, cell in cells() if _DECIMAL_COMMA.match(cell)), None)
+    comma = first(_DECIMAL_COMMA.match)
     if comma is None:
         return rows, False
     columns = [[(number, row[k]) for number, row in rows] for k in range(len(rows[0][1]))]
-    thousands = [next((each for each in column if _THOUSANDS.match(each[1])), None) for column in columns]
     decimals = [any(_DECIMAL_COMMA.match(c) and not _THOUSANDS.match(c) for _, c in column) for column in columns]
-    for column, found, own in zip(columns, thousands, decimals, strict=True):
+    for column, own in zip(columns, decimals, strict=True):
+        found = next((each for each in column if _THOUSANDS.match(each[1])), None)
         hundreds = not own and any(_HUNDREDS.match(cell) for _, cell in column)
         if found and (hundreds or (separator == "," and not any(decimals))):
             raise ValueError(
                 f"{file}, line {found[0]}: expected a number, got {found[1]!r}, which may have a separator of "
                 "thousands or a decimal comma; write it without separators of thousands and with a decimal point"
             )
-    if point := next(((n, cell) for n, cell in cells() if "." in cell and is_number(cell)), None):
+    if point := first(lambda cell: "." in cell and is_number(cell)):
         raise ValueError(
             f"{file}: expected decimal points or decimal commas, got {comma[1]!r} in line {comma[0]} and {point[1]!r} "
             f"in line {point[0]}; write all numbers alike, without separators of thousands"
@@ -581,30 +867,36 @@ def _with_points(lines: list[_Line], separator: str, file: str) -> tuple[list[_L
     return [(n, [cell.replace(",", ".") if _known(cell) else cell for cell in row]) for n, row in rows], True
 
 
-# columns --------------------------------------------------------------------------------------------------------------
+# columns and units ----------------------------------------------------------------------------------------------------
+
+_LONGEST_UNIT = 100
+_SENTINELS = (-9999.0, -999.25, 1e30, 9.97e36)  # numbers that loggers and formats write for missing samples
+# also used for missing samples, but plausible as measured numbers: counts, or accelerations in gal
+_PLAUSIBLE_SENTINELS = (-999.0, 99999.0, -99999.0, 32767.0, -32768.0)
 
 
 def _columns(
     names: list[str], below: list[str], rows: list[_Line], file: str
 ) -> tuple[tuple[Column, ...], ClockTime | None]:
     """Columns of numbers, clock times and text, and the first clock time."""
-    columns, first = [], None
-    for k in range(len(rows[0][1])):
-        cells = [(row[k], f"{file}, line {number}") for number, row in rows]
-        filled = [cell for cell, _ in cells if cell]
+    columns, first, lines = [], None, [f"{file}, line {number}" for number, _ in rows]
+    for k, cells in enumerate(zip(*(row for _, row in rows), strict=True)):
+        filled = [cell for cell in cells if cell]
         kind, decimals = "number", 0
         if any(map(is_clock, filled)):
-            kind, times = "clock", [_parse_clock(cell, where) if cell else None for cell, where in cells]
-            values = _seconds_since_midnight(times, file)
+            kind = "clock"
+            times = [_parse_clock(cell, where) if cell else None for cell, where in zip(cells, lines, strict=True)]
+            values = _seconds_of(times, file)
             known = [time for time in times if time is not None]
             first, decimals = first or known[0], max(time.decimals for time in known)
         elif filled and all(_is_date(cell) or _is_word(cell) for cell in filled):
             kind, values = "text", [math.nan] * len(cells)
         else:
-            values = [parse_number(cell, where) if cell else math.nan for cell, where in cells]
+            pairs = zip(cells, lines, strict=True)
+            values = [parse_number(cell, where) if cell else math.nan for cell, where in pairs]
             decimals = max(map(decimals_of, filled), default=0)
         name, unit = names[k] if names else str(k + 1), below[k] if below else ""
-        columns.append(Column(name, np.array(values), decimals, unit, kind, tuple(cell for cell, _ in cells)))
+        columns.append(Column(name, np.array(values), decimals, unit, kind, cells))
     return tuple(columns), first
 
 
@@ -614,7 +906,7 @@ def _is_word(cell: str) -> bool:
 
 
 def unit_in_name(name: str) -> str | None:
-    """Return the unit at the end of a column name (``acc_cm_s2``, ``force [kip]``, ``acc, g``), or None."""
+    """The unit at the end of a column name (``acc_cm_s2``, ``force [kip]``, ``acc, g``), or None."""
     name = name[-_LONGEST_UNIT:]
     bracket = re.search(r"[\[(]([^\])]+)[\])]\s*$", name)
     parts = name.split("_")
@@ -627,7 +919,7 @@ def unit_in_name(name: str) -> str | None:
 
 
 def stated_unit(table: Table, place: int, dimension: str | None = None) -> str | None:
-    """Return the unit of a column as the file states it, in its name or below the header line, or None.
+    """The unit of a column as the file states it, in its name or below the header line, or None.
 
     With a `dimension` other than force, the N at the end of a name such as ``acc_N`` is the direction north, and an S
     is the direction south unless it is a time.
@@ -638,12 +930,45 @@ def stated_unit(table: Table, place: int, dimension: str | None = None) -> str |
     named = unit_in_name(column.name) if table.named and not direction else None
     if named is None or below is None:
         return named or below
-    dimension = dimension_of(below) or dimension_of(named)
-    return agree_on_unit(named, below, dimension, f"{table.file} (name and line of units)")
+    return agree_on_unit(
+        named, below, dimension_of(below) or dimension_of(named), f"{table.file} (name and line of units)"
+    )
+
+
+def text_unit(table: Table, place: int, dimension: str, others: bool = False) -> str | None:
+    """The unit that comments or the text above a table state for a column of a dimension, or None.
+
+    With other units known (`others`), text that is no unit is ignored, except for counts.
+    """
+    places = value_columns(table)
+    for _, unit in table.stated.units:
+        known = dimension_of(unit)
+        alone = len(places) == 1 and known != "time" and (known or not others or "count" in unit.lower())
+        if alone or known == dimension:
+            return unit
+    if dimension != "acceleration" or others or place not in places:
+        return None
+    names = [table.columns[k].name for k in places]
+    return next((peak.unit for peak in table.stated.peaks if peak.unit and peak.of(names, places.index(place))), None)
+
+
+def column_unit(
+    table: Table, place: int, values: NDArray[np.float64], given: str | None, dimension: str, where: str
+) -> str:
+    """The unit of a column, on which file and caller agree; a stated peak is compared with its `values`."""
+    named = stated_unit(table, place, dimension)
+    text = text_unit(table, place, dimension, others=named is not None or given is not None)
+    stated = agree_on_unit(named, text, dimension, f"{where} (column and text)") if named or text else None
+    unit = agree_on_unit(stated, given, dimension, where)
+    if dimension == "acceleration" and not np.isnan(values).any():
+        places, decimals = value_columns(table), table.columns[place].decimals
+        names = [table.columns[k].name for k in places]
+        check_peaks(table.stated.peaks, names, places.index(place), values, decimals, unit, table.file, f". {_SKIP}")
+    return unit
 
 
 def value_columns(table: Table) -> list[int]:
-    """Return the places of the columns with values."""
+    """The places of the columns with values."""
     return [k for k, column in enumerate(table.columns) if column.kind == "number" and k != table.time]
 
 
@@ -654,7 +979,7 @@ def _listed_columns(table: Table) -> str:
 
 
 def value_column(table: Table, column: int | str | None = None) -> int:
-    """Return the place of the named column, or of the only column that is not the time."""
+    """The place of the named column, or of the only column that is not the time."""
     places = value_columns(table)
     if column is not None:
         places = [place for place in places if table.columns[place].name == str(column)]
@@ -671,11 +996,11 @@ def value_column(table: Table, column: int | str | None = None) -> int:
 
 
 def column_values(table: Table, place: int, missing: Sequence[float] | None = None) -> NDArray[np.float64]:
-    """Return the numbers of a column, with NaN for numbers that are in `missing`.
+    """The numbers of a column, with NaN for numbers that are in `missing`.
 
-    ValueError is raised for a number that usually stands for missing samples and is not in `missing`, unless `missing`
-    is empty or the number may have been measured: the column has other numbers within 1 % of it, or, for -999 and the
-    limits of integers, other numbers of half its size, like the samples next to a measured peak.
+    ValueError for a number that usually stands for missing samples and is not in `missing`, unless `missing` is empty
+    or the number may have been measured: the column has other numbers within 1 % of it, or, for -999 and the limits of
+    integers, other numbers of half its size, like the samples next to a measured peak.
     """
     values, listed = table.columns[place].values, _listed(missing)
     if missing is not None:
@@ -694,8 +1019,29 @@ def column_values(table: Table, place: int, missing: Sequence[float] | None = No
     return values
 
 
-def warn_if_absent(table: Table, places: Sequence[int], missing: Sequence[float] | None, stacklevel: int) -> None:
-    """Warn if a number in `missing` is in none of the columns: the file may write it in another way."""
+def _listed(missing: Sequence[float] | None) -> NDArray[np.float64]:
+    """Numbers that stand for missing samples; ValueError if they are not finite numbers."""
+    given = [] if missing is None else [missing] if np.ndim(missing) == 0 else list(missing)
+    if not all(isinstance(number, Real) and math.isfinite(number) for number in given):
+        raise ValueError(f"missing must be finite numbers, such as (-9999,), or () for none; got {missing!r}")
+    return np.array(given, dtype=float)
+
+
+def table_values(
+    table: Table,
+    columns: Sequence[tuple[str | int | None, str, str | None, str]],
+    missing: Sequence[float] | None,
+    stacklevel: int,
+) -> list[tuple[NDArray[np.float64], str]]:
+    """Samples of columns (n_rows,) with their units; a column is its name, dimension and unit, and words for messages.
+
+    Warns if a number in `missing` is in none of the columns: the file may write it in another way.
+    """
+    found, places = [], []
+    for name, dimension, unit, where in columns:
+        places.append(value_column(table, name))
+        values = column_values(table, places[-1], missing)
+        found.append((values, column_unit(table, places[-1], values, unit, dimension, where)))
     listed = _listed(missing)
     absent = listed[~np.isin(listed, [table.columns[place].values for place in places])]
     if absent.size:
@@ -705,50 +1051,14 @@ def warn_if_absent(table: Table, places: Sequence[int], missing: Sequence[float]
             UserWarning,
             stacklevel=stacklevel + 1,
         )
-
-
-def _listed(missing: Sequence[float] | None) -> NDArray[np.float64]:
-    """Numbers that stand for missing samples; ValueError if they are not finite numbers."""
-    given = [] if missing is None else [missing] if np.ndim(missing) == 0 else list(missing)
-    if not all(isinstance(number, Real) and math.isfinite(number) for number in given):
-        raise ValueError(f"missing must be finite numbers, such as (-9999,), or () for none; got {missing!r}")
-    return np.array(given, dtype=float)
-
-
-def text_unit(table: Table, place: int, dimension: str, others: bool = False) -> str | None:
-    """Return the unit that comments or the text above a table state for a column of a dimension, or None.
-
-    With other units known (`others`), text that is no unit is ignored, except for counts.
-    """
-    places = value_columns(table)
-    for _, unit in table.stated.units:
-        known = dimension_of(unit)
-        alone = len(places) == 1 and known != "time" and (known or not others or "count" in unit.lower())
-        if alone or known == dimension:
-            return unit
-    if dimension != "acceleration" or others or place not in places:
-        return None
-    names = [table.columns[k].name for k in places]
-    peaks = (peak for peak in table.stated.peaks if peak.unit and peak.printed_of(names, places.index(place)))
-    return next((peak.unit for peak in peaks), None)
-
-
-def column_unit(
-    table: Table, place: int, values: NDArray[np.float64], given: str | None, dimension: str, where: str
-) -> str:
-    """Return the unit of a column, on which file and caller agree; a stated peak is compared with its `values`."""
-    named = stated_unit(table, place, dimension)
-    text = text_unit(table, place, dimension, others=named is not None or given is not None)
-    stated = agree_on_unit(named, text, dimension, f"{where} (column and text)") if named or text else None
-    unit = agree_on_unit(stated, given, dimension, where)
-    if dimension == "acceleration" and not np.isnan(values).any():
-        names, decimals = [table.columns[k].name for k in value_columns(table)], table.columns[place].decimals
-        index = value_columns(table).index(place)
-        check_peaks(table.stated.peaks, names, index, values, decimals, unit, table.file, f". {_SKIP}")
-    return unit
+    return found
 
 
 # times ----------------------------------------------------------------------------------------------------------------
+
+_TIME = re.compile(r"(elapsed |relative )?(t|(time|zeit|temps|tempo|tiempo)\d*)(\b|_)", re.IGNORECASE)
+_STAMP = re.compile(r"(timestamp|unix|epoch)(\b|_)", re.IGNORECASE)  # times if no other column has them
+_UNIX = re.compile(r"unix|epoch", re.IGNORECASE)
 
 
 def _time_column(table: Table) -> int | None:
@@ -762,31 +1072,32 @@ def _time_column(table: Table) -> int | None:
 
 
 def _is_unix(seconds: float) -> bool:
-    return _UNIX_SECONDS[0] <= seconds < _UNIX_SECONDS[1]
+    return 1e9 <= seconds < 4.2e9  # since 1970, of the years 2001 to 2103
 
 
-def _time_unit(table: Table) -> str:
+def _time_unit(table: Table) -> float:
+    """Unit of the times [s]."""
     column = table.columns[table.time]
     if column.kind == "clock":
-        return "s"
+        return 1.0
     stated = stated_unit(table, table.time)
     if stated is None and table.time_unit is None:
         # the unit in which the times are Unix times of this century
-        units = (("s", 1), ("ms", 1e3), ("us", 1e6))
-        unix = next((unit for unit, n in units if _is_unix(column.values[0] / n)), None)
+        units = {"s": 1.0, "ms": 1e3, "us": 1e6}
+        unix = next((unit for unit, n in units.items() if _is_unix(column.values[0] / n)), None)
         if unix is not None and _UNIX.search(column.name):
-            return unix
+            return find_unit(unix).factor
         hint = "" if unix is None else f" (for Unix times {unix!r} would fit the numbers)"
         raise ValueError(
             f"{table.file}: the column {column.name!r} has no unit; call it time_s or time_ms, or give time_unit={hint}"
         )
-    return agree_on_unit(stated, table.time_unit, "time", f"{table.file} (times)")
+    return find_unit(agree_on_unit(stated, table.time_unit, "time", f"{table.file} (times)")).factor
 
 
 def _times(table: Table) -> NDArray[np.float64]:
     """Times of the rows [s]; ValueError if some are missing, or another column has different times."""
     unit = _time_unit(table)
-    times = to_si(table.columns[table.time].values, unit, "time")
+    times = table.columns[table.time].values * unit
     if np.isnan(times).any():
         line = table.lines[int(np.argmax(np.isnan(times)))]
         raise ValueError(f"{table.file}, line {line}: expected a time, got an empty cell or NaN; write all times")
@@ -799,10 +1110,10 @@ def _times(table: Table) -> NDArray[np.float64]:
         plain = stated is None and _TIME.match(other.name) and not re.match(r"t(\b|_)", other.name, re.IGNORECASE)
         if not plain and (stated is None or dimension_of(stated) != "time"):
             continue
-        digits = (to_si(10.0**-column.decimals, each) for column, each in ((own, unit), (other, stated or unit)))
-        ahead = to_si(other.values, stated or unit, "time") - times
+        others_unit = unit if stated is None else find_unit(stated, "time").factor
+        ahead = other.values * others_unit - times
         ahead = ahead - ahead[0] if _is_unix(abs(ahead[0])) else ahead  # a Unix time beside an elapsed one
-        if not np.all(np.abs(ahead) <= max(map(float, digits))):
+        if not np.all(np.abs(ahead) <= max(unit * 10.0**-own.decimals, others_unit * 10.0**-other.decimals)):
             raise ValueError(
                 f"{table.file}: expected one column of times, the columns {own.name!r} and {other.name!r} have "
                 "different times; write one file for each of them with its columns of values, or name one, time="
@@ -811,7 +1122,7 @@ def _times(table: Table) -> NDArray[np.float64]:
 
 
 def row_times(table: Table, dt: float | None = None) -> NDArray[np.float64]:
-    """Return the times of the rows [s]; raise ValueError if the table has none, some are missing, or `dt` is given."""
+    """The times of the rows [s]; ValueError if the table has none, some are missing, or `dt` is given."""
     if table.time is None or dt is not None:
         raise ValueError(
             f"{table.file}: resample is for uneven times in the file and dt for a file without times; give one of them"
@@ -820,7 +1131,7 @@ def row_times(table: Table, dt: float | None = None) -> NDArray[np.float64]:
 
 
 def _uniform_step(table: Table) -> tuple[float, float]:
-    """Return the mean step of the times [s], and the largest error in it that rounding can cause."""
+    """The mean step of the times [s], and the largest error in it that rounding can cause."""
     times, column = _times(table), table.columns[table.time]
     if times.size < 2 or not times[-1] > times[0]:
         raise ValueError(
@@ -830,7 +1141,7 @@ def _uniform_step(table: Table) -> tuple[float, float]:
     increments = np.diff(times)
     step, largest = float(times[-1] - times[0]) / increments.size, float(np.abs(times).max())
     digit = 10.0**-column.decimals
-    rounding = float(to_si(digit, _time_unit(table))) * (1 + 1e-6)
+    rounding = digit * _time_unit(table) * (1 + 1e-6)
     with np.errstate(over="ignore"):  # whether each printed time is a float32, rounded to the printed digits
         apart = np.abs(column.values.astype(np.float32).astype(np.float64) - column.values)
     single = 2e-7 * largest if 2e-7 * largest <= 0.25 * step and np.all(apart <= 0.501 * digit) else 0.0
@@ -843,7 +1154,7 @@ def _uniform_step(table: Table) -> tuple[float, float]:
     if bad.any() or off_grid.any():
         index = int(np.argmax(bad) if bad.any() else np.argmax(off_grid))
         advice = "insert rows with empty cells where the logger has missed samples, print the times with more digits"
-        with contextlib.suppress(ValueError):
+        with suppress(ValueError):
             even = uniform_times(times, None, table.file)
             advice += f", or give resample={even.step:.6g} to interpolate to a uniform step"
         raise ValueError(
@@ -856,8 +1167,7 @@ def _uniform_step(table: Table) -> tuple[float, float]:
 
 
 def table_step(table: Table, dt: float | None = None) -> float:
-    """Return the time step [s] of a table: from its times, the comment ``dt = ... s`` and the argument, which must
-    agree.
+    """The time step [s] of a table: from its times, the comment ``dt = ... s`` and the argument, which must agree.
 
     Printed times are rounded, so each may differ from a uniform grid by one unit of its last digit: half a unit because
     it is rounded, half a unit because the two ends that define the grid are rounded. If this unit is more than half a
@@ -884,7 +1194,8 @@ def table_step(table: Table, dt: float | None = None) -> float:
             f"{table.file}: the step is {chosen} s by {first} but {step} s by the time column; correct one"
         )
     for each in table.stated.steps:
-        if not each.fits(chosen, tolerance):
+        allowed = tolerance + (each.rounding + 1e-6) * chosen
+        if not any(abs(other - chosen) <= allowed for other in each.steps):
             raise ValueError(
                 f"{table.file}: the step is {chosen} s by {first} but {each.steps[0]} s by {each.text!r}; correct one, "
                 "or give skip= to leave out text that is about other samples"
@@ -893,7 +1204,7 @@ def table_step(table: Table, dt: float | None = None) -> float:
 
 
 def table_start(table: Table, step: float, zero: float | str = 0.0) -> float:
-    """Return the time of the first row after `zero` [s or clock time]; a file without times begins at time zero.
+    """The time of the first row after `zero` [s or clock time]; a file without times begins at time zero.
 
     With ``zero=0``, a start within the rounding of its printed digits from a whole number of steps is set to this
     number; for another `zero`, within round-off.
@@ -903,7 +1214,7 @@ def table_start(table: Table, step: float, zero: float | str = 0.0) -> float:
     if table.time is None:
         return 0.0 - zero
     unit, column = _time_unit(table), table.columns[table.time]
-    first, digit = (float(to_si(each, unit)) for each in (column.values[0], 10.0**-column.decimals))
+    first, digit = float(column.values[0]) * unit, unit * 10.0**-column.decimals
     start = first - zero
     rounding = 0.5 * digit * (1 + 1e-6) if zero == 0.0 else 4 * float(np.spacing(max(abs(first), abs(zero))))
     nearest = round(start / step)
@@ -911,11 +1222,11 @@ def table_start(table: Table, step: float, zero: float | str = 0.0) -> float:
 
 
 def _clock_zero(table: Table, text: str) -> float:
-    """Return the clock time `zero` in the times of the table [s]; what it does not state is as in the first row."""
+    """The clock time `zero` in the times of the table [s]; what it does not state is as in the first row."""
     zero, first = _parse_clock(text, "zero"), table.clock
     column = None if table.time is None else table.columns[table.time]
     if column is None or column.kind != "clock":
-        if column is None or not _is_unix(to_si(column.values[0], _time_unit(table))):
+        if column is None or not _is_unix(column.values[0] * _time_unit(table)):
             raise ValueError(f"{table.file}: zero={text!r} needs a column of clock times; give zero in seconds")
         if zero.day is None or zero.zone is None:
             raise ValueError(
@@ -928,7 +1239,7 @@ def _clock_zero(table: Table, text: str) -> float:
     if zero.zone is not None and first.zone is None:
         raise ValueError(f"{table.file}: the times have no time zone; give zero={text!r} without one, as in the file")
     days = 0 if zero.day is None else zero.day - first.day
-    return 86400 * days + zero.seconds - (0 if zero.zone is None else 60 * (zero.zone - first.zone))
+    return _DAY * days + zero.seconds - (0 if zero.zone is None else 60 * (zero.zone - first.zone))
 
 
 # uneven times, from a clock with jitter or a logger that loses packets ------------------------------------------------

@@ -9,7 +9,7 @@ import numpy as np
 from fe_likelihoods import from_si, to_si
 from fe_likelihoods.problems import bridge_column_data, isolated_bridge_data
 from fe_likelihoods.signals.read import read_record
-from fe_likelihoods.signals.strong_motion import find_v2_channels, parse_v2
+from fe_likelihoods.signals.strong_motion import find_channels
 
 __all__ = ["RealChannel", "real_channels"]
 
@@ -26,8 +26,8 @@ class RealChannel(NamedTuple):
 def real_channels(shared: Path) -> Iterator[RealChannel]:
     """Right channels, about 370 with the reference material."""
     for archive in sorted((shared / "measured").rglob("*.zip")):
-        for each in find_v2_channels(archive):
-            series = parse_v2(each)
+        for each in find_channels(archive, "v2"):
+            series = each.parse()
             values = to_si(series.values, series.unit, "acceleration")
             yield RealChannel(f"{archive.stem} {each.channel}", "acceleration", series.dt, values)
     for table in sorted(path for path in (shared / "measured").rglob("*.csv") if path.stem != "channels"):

@@ -146,7 +146,7 @@ def test_channels_of_a_real_structure_in_a_zip_archive(shared):
             {"columns": [8]},
             "expected one channel with channel = 8, .*found 0; choose with channel= and member=, or in a TOML file",
         ),
-        ({"columns": [3, 7]}, "expected one channel of .* for each of 1 channels"),
+        ({"columns": [3, 7]}, "expected one column and one unit for each of 1 channels"),
         ({"resample": 0.01}, "a uniform step; leave resample out"),
     ],
 )
