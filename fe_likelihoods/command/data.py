@@ -1,6 +1,6 @@
 """The record and the measurements that a TOML file names."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -162,50 +162,39 @@ def _read_columns(path: Path, given: Measured, channels: Sequence[Channel]) -> M
     )
 
 
-def _known(measured: Measurements, names: Iterable[str]) -> tuple[str, ...]:
-    """Names of the channels; ValueError if a given name is none of them."""
-    known = tuple(channel.name for channel in measured.channels)
-    for name in names:
-        if name not in known:
-            raise ValueError(f"unknown channel {name!r}; {did_you_mean(name, known)}")
-    return known
-
-
 def _left_out(measured: Measurements, missing: Sequence[Any]) -> Measurements:
     """Measurements without the samples at the times that `missing` lists, for one channel or all."""
-    times = [each for each in missing if isinstance(each, list)]
-    if not times:
+    spans = [each for each in missing if isinstance(each, list)]
+    if not spans:
         return measured
-    known = _known(measured, [each[0] for each in times if len(each) == 3])
-    values, left_out = measured.values.copy(), dict.fromkeys(known, 0)
-    for *name, first, last in times:
-        for row, (channel, step) in enumerate(zip(known, measured.steps, strict=True)):
-            at = measured.times(channel)
-            inside = (at >= first - 0.1 * step) & (at <= last + 0.1 * step) & (channel in (name or known))
-            left_out[channel] += int(np.isfinite(values[row, inside]).sum())
-            values[row, inside] = np.nan
-    text = ", ".join(f"{count} of {name}" for name, count in left_out.items() if count)
-    text = f"{measured.description}, samples left out: {text or 'none'}"
-    return replace(measured, values=values, description=text)
+    values, names = measured.values.copy(), [channel.name for channel in measured.channels]
+    for *name, first, last in spans:
+        for channel in measured.select(name or names).channels:
+            row, times = names.index(channel.name), measured.times(channel.name)
+            margin = 0.1 * measured.steps[row]
+            values[row, (times >= first - margin) & (times <= last + margin)] = np.nan
+    counts = (np.isfinite(measured.values) & np.isnan(values)).sum(axis=1)
+    text = ", ".join(f"{count} of {name}" for name, count in zip(names, counts, strict=True) if count)
+    return replace(measured, values=values, description=f"{measured.description}, samples left out: {text or 'none'}")
 
 
 def _straightened(measured: Measurements, points: Mapping[str, Any]) -> Measurements:
     """Measurements less the polynomial through points of time and level, for each channel that has some."""
-    known, values = _known(measured, points), measured.values.copy()
-    for name, each in points.items():
-        row = known.index(name)
-        levels = [read_quantity(value, measured.channels[row].dimension) for _, value in each]
-        line = np.polynomial.Polynomial.fit([time for time, _ in each], levels, len(each) - 1)
-        values[row] -= line(measured.times(name))
+    values, names = measured.values.copy(), [channel.name for channel in measured.channels]
+    for channel in measured.select([*points]).channels:
+        times, levels = zip(*points[channel.name], strict=True)
+        levels = [read_quantity(level, channel.dimension) for level in levels]
+        line = np.polynomial.Polynomial.fit(times, levels, len(levels) - 1)
+        values[names.index(channel.name)] -= line(measured.times(channel.name))
     return replace(measured, values=values, description=f"{measured.description}, less a baseline: {', '.join(points)}")
 
 
 def _turned(measured: Measurements, names: Sequence[str]) -> Measurements:
-    """Measurements with the channels `names` multiplied by -1; ValueError for an unknown channel."""
-    known = _known(measured, names)
-    signs = np.where(np.isin(known, names), -1.0, 1.0)[:, None]
+    """Measurements with the channels `names` multiplied by -1."""
+    turned = measured.select(names).channels
+    signs = np.array([[-1.0 if channel in turned else 1.0] for channel in measured.channels])
     text = f"{measured.description}, reversed: {', '.join(names)}"
-    return Measurements(measured.channels, measured.dt, signs * measured.values, text, measured.start)
+    return replace(measured, values=signs * measured.values, description=text)
 
 
 FEWEST_SAMPLES = 10  # of a channel, where others lie outside the record

@@ -22,8 +22,6 @@ __all__ = ["Event", "predict_events", "predict_quietly", "read_events"]
 
 logger = logging.getLogger(__name__)
 
-_ENDS = (0.05, 0.5, 0.95)  # quantiles that tables and scores need
-
 
 class Event(NamedTuple):
     """An event to predict."""
@@ -77,7 +75,6 @@ def predict_quietly(job: Job, problem: Problem, samples: np.ndarray, **options: 
     likelihood, part = _histories_of(problem)
     usual = {
         "noise": bool(job.prediction.noise),
-        "quantiles": tuple(job.prediction.quantiles),
         "seed": job.sampler.seed,
     }
     with warnings.catch_warnings():
@@ -114,7 +111,6 @@ def _predict_event(
     from ..prediction.quantities import peak
 
     likelihood, _ = _histories_of(problem)
-    options = event.options | {"quantiles": tuple(sorted({*job.prediction.quantiles, *_ENDS}))}
     quantities = {"histories": None, "peaks": [peak(channel.name) for channel in likelihood.model.channels]}
     wanted = job.prediction.noise
     wanted = event.measured is not None if wanted is None else wanted  # measurements contain noise
@@ -125,6 +121,6 @@ def _predict_event(
     # The second kind finds all responses in the cache; with `[budget] cache = false` it simulates them again.
     for noise in dict.fromkeys(noises.values()):
         some = {name: quantities[name] for name in quantities if noises[name] == noise}
-        more = options | {"record": event.record, "quantity": some, "noise": noise, "progress": progress}
+        more = event.options | {"record": event.record, "quantity": some, "noise": noise, "progress": progress}
         found |= predict_quietly(job, problem, samples, **more)
     return found

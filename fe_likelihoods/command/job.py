@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from . import sections
-from .keys import Key, did_you_mean, keys_of, parse_prior, read_keys
+from .keys import Key, did_you_mean, keys_of, read_keys
 from .sections import FREE_SECTIONS, MODEL_KINDS, SECTIONS, USER_MODELS, model_keys, part_keys
 
 __all__ = ["Job", "parse_job", "read_job"]
@@ -150,11 +150,6 @@ def parse_job(text: str, file: Path, folder: Path) -> Job:
         raise ValueError(
             f"{file.name}: [events]: an event is predicted with the model of [measurements], which is missing"
         )
-    for name, prior in content.get("priors", {}).items():
-        try:
-            parse_prior(prior)
-        except ValueError as error:
-            raise ValueError(f"{file.name}: [priors] {name}: {error}") from None
     values |= {"kind": kind, "model": model, "own_models": own, "shared": shared}
     events = _read_events(content.get("events", {}), file.name)
     return Job(file=file, text=text, folder=folder, priors=content.get("priors", {}), events=events, **values)

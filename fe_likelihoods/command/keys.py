@@ -67,7 +67,7 @@ def keys_of(section: type) -> tuple[Key, ...]:
 def _as_toml(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return f'"{value}"' if isinstance(value, str) else str(list(value) if isinstance(value, tuple) else value)
+    return f'"{value}"' if isinstance(value, str) else str(value)
 
 
 def _is_number(value: Any) -> bool:
@@ -94,10 +94,6 @@ def _either(*checks: Callable[[Any], bool]) -> Callable[[Any], bool]:
     return lambda value: any(fits(value) for fits in checks)
 
 
-def _are_probabilities(value: Any) -> bool:
-    return _list(_is_number)(value) and all(0.0 < number < 1.0 for number in value) and len(set(value)) == len(value)
-
-
 def _is_time(value: Any) -> bool:
     """Whether a value is a pair of times in order, or a name and such a pair."""
     times = value[1:] if isinstance(value, list) and value and _is_text(value[0]) else value
@@ -120,7 +116,6 @@ KINDS: dict[str, tuple[Callable[[Any], bool], str]] = {
     "whole number": (_is_whole, "a whole number"),
     "whole number >= 0": (lambda value: _is_whole(value, 0), "a whole number of 0 or more"),
     "whole number >= 1": (lambda value: _is_whole(value, 1), "a whole number of 1 or more"),
-    "probabilities": (_are_probabilities, "a list of different numbers between 0 and 1, such as [0.05, 0.5, 0.95]"),
     "yes or no": (lambda value: isinstance(value, bool), "true or false"),
     "texts": (_list(_is_text), 'a list of texts, such as ["a", "b"]'),
     "numbers": (_list(_is_number), "a list of numbers, such as [1.0, 2.0]"),

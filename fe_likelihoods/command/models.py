@@ -226,8 +226,6 @@ def _read_load_cases(job: Job, channels: tuple[Channel, ...]) -> LoadTest:
     errors = read_by_channel(job.load_test.errors or {}, channels, "errors")
     path = job.path("load_test", "file", job.load_test.file)
     test = read_load_test(path, channels, errors=errors, **job.load_test.given("columns", "units", "cases"))
-    if not np.isfinite(test.values).any():
-        raise ValueError(f"file: {path} has no value")
     for key, value in (("dt", 1.0), ("n_steps", n := len(test.cases))):
         if job.model.get(key, value) != value:
             raise ValueError(f"{job.where('model')} {key}: a load test has {n} load cases and no time: leave it out")

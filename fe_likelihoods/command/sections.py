@@ -280,7 +280,6 @@ class Predictions(Section):
 
     draws: Any = key("whole number >= 0", "Draws of the posterior whose response is predicted; 0 for none", 100)
     noise: Any = key("yes or no", "Predict measurements, with their noise; by default only in events with measurements")
-    quantiles: Any = key("probabilities", "Probabilities of the quantiles", (0.05, 0.5, 0.95))
 
 
 SECTIONS: dict[str, type[Section]] = {

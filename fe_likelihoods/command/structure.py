@@ -24,7 +24,7 @@ def built_in(job: Job, record: Record, names: tuple[str, ...] | None, measured: 
     """A structure of the library with channels (None: its usual ones)."""
     values = dict(job.model)
     if job.kind == "column":
-        from ..models.rc_column import PARAMETERS, RCColumn
+        from ..models.rc_column import RCColumn
         from ..models.rc_column_parts import LowCycleFatigue
 
         usual = RCColumn.lhpost(record)
@@ -32,7 +32,6 @@ def built_in(job: Job, record: Record, names: tuple[str, ...] | None, measured: 
             values[part] = _changed(job, part, getattr(usual, part) or LowCycleFatigue(), values[part])
         if "units" in values:
             values["units"] = tuple((dict(usual.units) | values["units"]).items())
-        _check_parameters(job, tuple(PARAMETERS))
         return RCColumn.lhpost(record, **values, outputs=names)
     if job.kind == "bridge":
         from ..models.isolated_bridge import IsolatedBridge
@@ -44,7 +43,6 @@ def built_in(job: Job, record: Record, names: tuple[str, ...] | None, measured: 
             values[f"{part}s"] = tuple(_changed(job, place, one, values.pop(place, {})) for place, one in pair)
         if measured is not None:
             values["every"] = max(1, round(measured.dt / record.dt))
-        _check_parameters(job, usual.parameter_names)
         return IsolatedBridge(record, **values, outputs=names)
     if job.kind == "oscillator":
         from ..models.linear_oscillator import LinearOscillator
@@ -74,12 +72,6 @@ def _changed(job: Job, part: str, usual: Any, changes: Mapping[str, Any]) -> Any
         return replace(usual, **changes)
     except ValueError as error:
         raise ValueError(f"{job.file.name}: [model.{part}] {error}") from error
-
-
-def _check_parameters(job: Job, known: tuple[str, ...]) -> None:
-    for name in job.model.get("parameters", ()):
-        if name not in known:
-            raise ValueError(f"{job.where('model')} parameters: unknown {name!r}; {did_you_mean(name, known)}")
 
 
 def user_channels(job: Job) -> tuple[Channel, ...]:

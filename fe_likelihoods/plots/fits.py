@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..signals.channels import Measurements
+from ..signals.error_measures import relative_errors
 from ..units import from_si
 from .style import BLUE, ORANGE, add_figure_legend, channel_label, marker_of, new_figure
 
@@ -63,7 +64,6 @@ def plot_fit(
     if not given:
         raise ValueError("no response to draw: pass a mapping of titles to responses")
     shown = {str(text): _as_measurements(measurements, response, text) for text, response in given.items()}
-    errors = {text: measurements.rrmse_of(response) for text, response in shown.items()}
     times_of = {channel.name: measurements.times(channel.name) for channel in measurements.channels}
     windows = {
         name: strongest_window(times, measurements.channel(name), _STRONGEST)
@@ -89,8 +89,10 @@ def plot_fit(
             shade = _SHADES[k % len(_SHADES)] if len(shown) > 1 else BLUE
             for axes in (row[k], *row[len(shown) :]):
                 axes.plot(*drawn, color=shade, linewidth=0.9, label=text)
-            error = errors[text].get(name)
-            row[k].set_title(text + ("" if error is None else f", RRMSE {_percent(error)} %"), fontsize="small")
+            error, own = np.nan, measurements.channel(name)
+            if np.array_equal(drawn[0], times_of[name]):
+                error = relative_errors(response.channel(name) - own, own)
+            row[k].set_title(text + (f", RRMSE {_percent(error)} %" if np.isfinite(error) else ""), fontsize="small")
         row[0].set_ylabel(channel_label(channel))
         for axes in row[1 : len(shown)]:
             axes.sharey(row[0])

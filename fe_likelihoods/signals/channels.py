@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..units import DIMENSIONS, find_unit
-from .error_measures import rrmse
-from .sampling import as_number, check_step, same_sampling, sample_window
+from .sampling import as_number, check_step, sample_window
 
 __all__ = ["Channel", "Measurements"]
 
@@ -327,28 +326,6 @@ class Measurements:
             raise ValueError(f"factor must be a whole number from 1 to {self.n_steps}, got {factor!r}")
         dt = self.dt * factor if self.simultaneous else tuple(dt * factor for dt in self.steps)
         return replace(self, dt=dt, values=self.values[:, ::factor], points=self.points[::factor])
-
-    def rrmse_of(self, response: "Measurements") -> dict[str, float]:
-        """Return the RRMSE of each common channel [-], except channels that are zero or whose times differ.
-
-        Examples
-        --------
-        >>> response = Measurements(model.channels, model.dt, model.simulate([1.1, 0.9]))
-        >>> {name: round(error, 2) for name, error in measurements.rrmse_of(response).items()}
-        {'acceleration': 0.27, 'displacement': 0.44}
-        """
-        simulated = {channel.name for channel in response.channels}
-        common = [channel.name for channel in self.channels if channel.name in simulated]
-        return {
-            name: float(rrmse(response.channel(name), self.channel(name)))
-            for name in common
-            if self._same_times(response, name) and np.nan_to_num(self.channel(name)).any()
-        }
-
-    def _same_times(self, other: "Measurements", name: str) -> bool:
-        row, place = self._row(name), other._row(name)
-        same = same_sampling(self.steps[row], self.n_steps, other.steps[place], other.n_steps)
-        return same and self.starts[row] == other.starts[place]
 
     def _with_rows(
         self, rows: Sequence[int], values: Sequence[Any], starts: Sequence[float], steps: Sequence[float]

@@ -122,14 +122,6 @@ class Events(Record):
         """Names of the events."""
         return tuple(window.name for window in self.windows)
 
-    @property
-    def in_events(self) -> NDArray[np.bool_]:
-        """Whether each sample of the joined record is in an event, not in a pause, shape (n_steps,)."""
-        inside = np.zeros(self.n_steps, dtype=bool)
-        for window in self.windows:
-            inside[window.samples] = True
-        return inside
-
     def window(self, name: str) -> EventWindow:
         """Return the window of one event; raise ValueError if there is no event of this name.
 

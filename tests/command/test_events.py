@@ -4,7 +4,6 @@ import contextlib
 import csv
 import re
 import shutil
-import warnings
 from collections import Counter
 
 import numpy as np
@@ -122,25 +121,6 @@ def test_an_event_is_added_to_a_finished_run_without_new_samples(events):
     assert (events / "r" / "events.csv").is_file()
 
 
-def test_warnings_of_the_model_are_given_and_findings_are_not(events, monkeypatch):
-    (events / "oscillator.toml").write_text(SETTINGS + EVENTS.replace("scale = 0.5", "scale = 0.1"))
-    job, one = read_job("oscillator.toml"), LinearOscillator.simulate
-    problem = make_problem(job)
-
-    def simulate(self, theta):
-        warnings.warn("the oscillator is very soft", UserWarning, stacklevel=1)
-        return one(self, theta)
-
-    monkeypatch.setattr(LinearOscillator, "simulate", simulate)
-    monkeypatch.setattr(LinearOscillator, "simulate_batch", None, raising=False)
-    monkeypatch.delattr(LinearOscillator, "simulate_batch")
-    found = read_events(job, problem)
-    with pytest.warns(UserWarning) as caught:
-        predicted = predict_events(job, found, problem, np.array([[1.0, 1.0, 0.1, 0.005]]), False)
-    assert {str(each.message) for each in caught} == {"the oscillator is very soft"}
-    assert "predicted peaks are outside" in predicted["weaker"]["peaks"].findings[0].text
-
-
 @pytest.mark.slow
 def test_an_event_whose_simulations_all_fail_is_named_in_the_report(events, monkeypatch):
     weak, one = 0.7 * np.abs(read_record("base.csv").acceleration).max(), LinearOscillator.simulate
@@ -161,20 +141,6 @@ def test_an_event_whose_simulations_all_fail_is_named_in_the_report(events, monk
     assert "weaker: It could not be predicted." in report.text
     numbers = next(table for table in report.tables if table[0][1:3] == ["Quantity", "Median"])[1:]
     assert {row[0] for row in numbers} == {"after"}
-
-
-def test_the_prediction_is_that_of_propagate(events):
-    job = read_job("oscillator.toml")
-    problem = make_problem(job)
-    samples = problem.posterior.sample_prior(12, 1)
-    found = read_events(job, problem)
-    assert [event.name for event in found] == ["weaker", "after"]
-    predicted = predict_events(job, found, problem, samples, False)
-    for event in found:
-        noise = event.measured is not None
-        options = {"record": event.record, "seed": 1, "noise": noise, "progress": False} | event.options
-        expected = propagate(problem.posterior, samples, quantity=peak("displacement"), **options)
-        assert predicted[event.name]["peaks"].quantile(0.5)[1] == pytest.approx(expected.quantile(0.5), rel=1e-12)
 
 
 def test_peaks_with_a_noise_in_shares_have_the_error_of_the_model(events, monkeypatch):

@@ -189,7 +189,7 @@ def test_the_lines_for_faults_of_sensors_work(tmp_path):
     np.testing.assert_allclose(measured.values[1], 1e-3 * right[1], atol=4e-5)
     assert check_data(measured) == ()
     for old, new, message in (
-        ('[["acceleration"', '[["top"', "missing: unknown channel 'top'"),
+        ('[["acceleration"', '[["top"', "missing: no channel 'top'"),
         ("[0.000, ", "[", "baseline: expected points of time and value by name"),
     ):
         job.write_text(head + named.replace(old, new))

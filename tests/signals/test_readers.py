@@ -112,23 +112,18 @@ TABS = tuple(row.replace(",", "\t") for row in POINTS)
 PREAMBLE = ("Logger 7, firmware 2.1", "Sampling rate,100", "Date: 2019-07-06", "")
 # files as loggers and spreadsheets write them, with the arguments that they need
 LOGGERS = {
-    "plain": (lines("time_s,acc_m_s2", *POINTS), {}),
     "UTF-8 header": (lines("Time [s],Acceleration [m/s²]", *POINTS), {}),
     "UTF-8 with mark": (lines("Time [s],Acceleration [m/s²]", *POINTS, encoding="utf-8-sig"), {}),
     "Latin-1 header": (lines("Time (s),Acceleration (m/s²)", *POINTS, encoding="latin-1"), {}),
     "UTF-16": (lines("Time (s)\tAcceleration (m/s²)", *TABS, encoding="utf-16"), {}),
     "units by arguments": (lines("Time,Acceleration", *POINTS), {"time_unit": "s", "units": "m/s2"}),
-    "tabs": (lines("time_s\tacc_m/s2", *TABS, end="\n"), {}),
     "tabs, decimal commas": (lines("time_s\tacc_m/s2", *(row.replace(".", ",") for row in TABS)), {}),
     "semicolons": (lines("Zeit [s];a [m/s²]", *(row.replace(",", ";") for row in POINTS)), {}),
-    "semicolons, decimal commas": (lines("Zeit [s];a [m/s²]", *SEMICOLONS), {}),
     "quoted decimal commas": (lines("t_s,a_gal", '"0,00","10"', '"0,01","-25"', '"0,02","1250"', '"0,03","0"'), {}),
-    "blanks": (lines("time_s   acc_m/s2", *("   ".join(row.split(",")) for row in POINTS)), {}),
     "blanks, decimal commas": (lines("t_s a_m/s2", *(row.replace(";", " ") for row in SEMICOLONS)), {}),
     "preamble": (lines(*PREAMBLE, "Time [s],Acceleration [m/s²]", *POINTS), {}),
     "preamble, skipped": (lines(*PREAMBLE, "time_s,acc_m/s2", *POINTS), {"skip": 4}),
     "preamble, semicolons": (lines(*PREAMBLE, "Zeit [s];a [m/s²]", *SEMICOLONS), {}),
-    "line of units": (lines("Time,Acceleration", "s,m/s²", *POINTS), {}),
     "line of units in brackets": (
         lines(*PREAMBLE, "Time\tAcc", "[ms]\t[gal]", "0\t10", "10\t-25", "20\t1250", "30\t0"),
         {},
@@ -152,9 +147,6 @@ class TestCSV:
         assert (record.n_steps, record.dt) == (n_steps, dt)
         # The table rounds to three places the peak that each file states with four.
         assert np.abs(record.acceleration).max() / G0 == pytest.approx(peak, abs=5.6e-4)
-
-    def test_every_real_record_is_tested(self, shared):
-        assert {path.stem for path in (shared / "records").glob("*.csv")} == set(REAL_RECORDS)
 
     @pytest.mark.parametrize(
         ("text", "given"),
@@ -297,17 +289,16 @@ def real_columns(path):
 
 
 class TestV2OnRealZips:
-    @pytest.mark.parametrize(("channel", "direction"), [(12, 270), (14, 360)])
-    def test_petrolia_free_field_is_the_same_as_its_csv(self, shared, channel, direction):
-        record = read_record(shared / PAINTER, channel=channel, member=f"Structure.zip/CHAN{channel}.V2")
-        same = read_record(shared / f"records/petrolia_1992_rio_dell_freefield_{direction}.csv")
-        assert record.dt == same.dt
-        np.testing.assert_allclose(record.acceleration, same.acceleration, atol=0.5001e-7 * G0)
-
-    @pytest.mark.parametrize(("channel", "direction"), [(24, 270), (15, 360)])
-    def test_imperial_valley_free_field_is_the_same_as_its_csv(self, shared, channel, direction):
-        record = read_record(shared / MELOLAND, channel=channel)
-        same = read_record(shared / f"records/imperial_valley_1979_meloland_freefield_{direction}.csv")
+    @pytest.mark.parametrize(
+        ("archive", "channel", "member", "name"),
+        [
+            (PAINTER, 12, "Structure.zip/CHAN12.V2", "petrolia_1992_rio_dell_freefield_270"),
+            (MELOLAND, 15, None, "imperial_valley_1979_meloland_freefield_360"),
+        ],
+    )
+    def test_the_free_field_is_the_same_as_its_csv(self, shared, archive, channel, member, name):
+        record = read_record(shared / archive, channel=channel, member=member)
+        same = read_record(shared / f"records/{name}.csv")
         assert record.dt == same.dt
         np.testing.assert_allclose(record.acceleration, same.acceleration, atol=0.5001e-7 * G0)
 
@@ -591,16 +582,6 @@ class TestColumns:
         (tmp_path / "a.xlsx").write_bytes(b"PK")
         with pytest.raises(ValueError, match="install it with pip install openpyxl, or save the sheet as CSV"):
             read_record(tmp_path / "a.xlsx")
-
-    def test_bridge_response_is_that_of_its_v2_files(self, shared):
-        folder = shared / "measured/meloland_bridge"
-        channels = [Channel(f"ch{number}", "acceleration", "g") for number in (5, 7, 9)]
-        path = folder / "imperial_valley_1979/acc_cm_s2_dt0.02.csv"
-        deck = read_columns(path, channels, [channel.name for channel in channels], "cm/s2")
-        assert (deck.dt, deck.values.shape) == (0.02, (3, 1138))
-        for number in (5, 7, 9):
-            original = read_record(folder / "imperialvalley79_ce01336p.zip", channel=number)
-            np.testing.assert_allclose(deck.channel(f"ch{number}"), original.acceleration, rtol=5e-6)
 
     def test_shake_table_at_120_hertz(self, shared):
         channels = [Channel(name, "acceleration", "g") for name in ("ground", "roof")]
