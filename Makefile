@@ -63,6 +63,7 @@ lint: $(READY)   ## check format and rules with ruff, and how docstrings read
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/python -m tests.prose
+	! grep -rnE '^(<<<<<<<|>>>>>>>) ' docs tutorials README.md CHANGELOG.md CONTRIBUTING.md
 
 format: $(READY) ## format and fix with ruff
 	$(BIN)/ruff format .
