@@ -32,13 +32,10 @@ import numpy as np
 
 from ..resampling import systematic
 from .genealogy import student_factor
-from .importance import KnownDensity, Round
+from .importance import KnownDensity, Round, mixture_at_draws, pool_rounds
 
 __all__ = ["Expectation", "SignedSample", "signed_sample", "unreached_share"]
 
-# A round counts with the inverse of the mean square of its differences, plus this share of the mean over all rounds:
-# few draws may have small differences by chance.
-SMOOTHING = 0.1
 # Smallest step of probability over which the slope of a quantile is taken, as a share of the tail probability.
 SMALLEST_STEP = 0.1
 # Variances from n draws are multiplied by 1 + FEW / n. Without it, two errors contain the standard deviations and outer
@@ -138,16 +135,20 @@ class SignedSample(NamedTuple):
 def signed_sample(rounds: Sequence[Round]) -> SignedSample | None:
     """The signed sample of all rounds with a known density; None if there is none.
 
-    Rounds are independent estimates. Each counts with the inverse of the mean square of its differences. Rounds without
-    a possible draw, or without a draw where the known density is positive, are left out.
+    Rounds, as `add_round` returns them, are independent estimates. Each counts with the inverse of the mean square of
+    its differences, an expectation that the draws of all rounds give: few draws may have small differences by chance,
+    as where none of them failed. Rounds without a possible draw, or without a draw where the known density is positive,
+    are left out.
     """
-    found = [(r, *_differences(r)) for r in rounds if r.known is not None and _meets_known(r)]
-    if not found:
+    used = [k for k, r in enumerate(rounds) if r.known is not None and _meets_known(r)]
+    if not used:
         return None
-    sizes = np.array([len(differences) for _, differences, _ in found])
-    squares = np.array([np.mean(np.square(differences)) for _, differences, _ in found])
-    squares = squares + SMOOTHING * np.average(squares, weights=sizes) + np.finfo(float).eps ** 2
-    shares = sizes / squares / np.sum(sizes / squares)
+    found = [(rounds[k], *_differences(rounds[k])) for k in used]
+    log_evidence = pool_rounds(rounds).log_evidence
+    for _ in range(2):  # the evidence that the differences are taken with becomes more accurate
+        log_shares = np.log([len(r.coords) for r, *_ in found]) - _log_mean_squares(rounds, used, log_evidence)
+        shares = np.exp(log_shares - np.logaddexp.reduce(log_shares))
+        log_evidence, error = _evidence(found, shares)
     coords, weights, numbers, known = [], [], [], {}
     for number, ((r, differences, _), share) in enumerate(zip(found, shares, strict=True), start=1):
         coords.append(r.coords)
@@ -158,8 +159,21 @@ def signed_sample(rounds: Sequence[Round]) -> SignedSample | None:
         coords.append(density.coords)
         weights.append(share * density.weights)
         numbers.append(np.zeros(len(density.weights), dtype=int))
-    log_evidence, error = _evidence(found, shares)
     return SignedSample(np.concatenate(coords), np.concatenate(weights), np.concatenate(numbers), log_evidence, error)
+
+
+def _log_mean_squares(rounds: Sequence[Round], used: Sequence[int], log_evidence: float) -> np.ndarray:
+    """Logarithms (k,) of the mean squares of the differences that draws of some of the rounds have."""
+    coords, densities = (np.concatenate([getattr(r, name) for r in rounds]) for name in ("coords", "log_densities"))
+    log_prob, mixture = mixture_at_draws(rounds)
+    posterior, found = log_prob - log_evidence, []
+    for k in used:
+        known = rounds[k].known.log_density(coords)
+        larger, smaller = np.maximum(posterior, known), np.minimum(posterior, known)
+        some = larger > -np.inf
+        log_square = 2.0 * (larger + np.log1p(-np.exp(smaller - larger) * (1.0 - np.finfo(float).eps)))[some]
+        found.append(np.logaddexp.reduce(log_square - densities[some, k] - mixture[some]))
+    return np.array(found)
 
 
 def unreached_share(log_density: Callable[[np.ndarray], np.ndarray], latest: KnownDensity) -> float:

@@ -28,6 +28,7 @@ __all__ = [
     "evidence_from_weights",
     "fewest_points",
     "log_mixture",
+    "mixture_at_draws",
     "pool_rounds",
     "recent_share",
     "round_shares",
@@ -149,6 +150,7 @@ SMALLEST_EXCESS = 0.05
 LARGE_GROWTH = {0.5: 0.1, 0.25: 0.3, 0.125: 0.3}
 SIGNIFICANT = 4.0  # in errors
 FEWEST_FOR_GROWTH = 8
+SMALLEST_LOG_DENSITY = -1e5  # instead of -inf: rounds of which each misses a draw of another still have shares
 
 
 class KnownDensity(NamedTuple):
@@ -169,10 +171,8 @@ class Round(NamedTuple):
     log_weights: np.ndarray  # (n,), log_prob minus log-density of the proposal; -inf for impossible points
     known: KnownDensity | None = None  # close to the posterior, fixed before the draws were made
     log_known: np.ndarray | None = None  # (n,), log-density of `known` minus log-density of the proposal
-    # log-density (m,) of the proposal at points (m, ndim), and the logarithm (n,) of the sum over all rounds of numbers
-    # of draws times densities at these draws
-    log_density: Callable[[np.ndarray], np.ndarray] | None = None
-    log_mixture: np.ndarray | None = None
+    log_density: Callable[[np.ndarray], np.ndarray] | None = None  # (m,) of the proposal at points (m, ndim)
+    log_densities: np.ndarray | None = None  # (n, n_rounds), of the proposals of all rounds at these draws
 
     @property
     def effective_sample_size(self) -> float:
@@ -286,16 +286,13 @@ def recent_share(rounds: Sequence[Round]) -> float:
 
 
 def add_round(rounds: Sequence[Round], latest: Round) -> list[Round]:
-    """Rounds and a further one, each with the mixture of the densities of all of them at its draws."""
-    count, alive = np.log(len(latest.coords)), latest.log_weights > -np.inf
-    log_prob = np.where(alive, latest.records["log_prob"], 0.0)
-    mixture = count + log_prob - np.where(alive, latest.log_weights, 0.0)
-    earlier = []
-    for each in rounds:
-        mixture = np.logaddexp(mixture, np.log(len(each.coords)) + each.log_density(latest.coords))
-        other = np.logaddexp(each.log_mixture, count + latest.log_density(each.coords))
-        earlier.append(each._replace(log_mixture=other))
-    return [*earlier, latest._replace(log_mixture=mixture)]
+    """Rounds and a further one, each with the densities of all of them at its draws."""
+    earlier = [
+        each._replace(log_densities=np.column_stack([each.log_densities, latest.log_density(each.coords)]))
+        for each in rounds
+    ]
+    densities = [each.log_density(latest.coords) for each in (*rounds, latest)]
+    return [*earlier, latest._replace(log_densities=np.column_stack(densities))]
 
 
 def log_mixture(rounds: Sequence[Round], coords: np.ndarray) -> np.ndarray:
@@ -305,29 +302,51 @@ def log_mixture(rounds: Sequence[Round], coords: np.ndarray) -> np.ndarray:
     return np.logaddexp.reduce(parts)
 
 
-def pool_rounds(rounds: Sequence[Round]) -> PooledRounds:
-    r"""Combine one or more rounds: each draw is weighted by the mixture of all their densities (`add_round`).
+def mixture_at_draws(rounds: Sequence[Round]) -> tuple[np.ndarray, np.ndarray]:
+    """Log-probabilities (n,) of all draws, and the logarithms (n,) of the sums of numbers of draws times densities."""
+    log_prob = np.concatenate([r.records["log_prob"] for r in rounds])
+    sizes = np.log([len(r.coords) for r in rounds])
+    return log_prob, np.logaddexp.reduce(np.concatenate([r.log_densities for r in rounds]) + sizes, axis=1)
 
-    The variance of the log-evidence is the sum of three parts: of the mean weights, :math:`\sum_r n_r s_r^2 / \hat Z^2`
-    with the sample variances :math:`s_r^2` of the weights in each round, or, if it is larger, that of n draws like the
-    latest ones (`recent_share`), since proposals that were fitted to earlier draws make their weights too even;
-    `tail_variance`; and the square of the standard error of the known density's log normalising constant.
+
+def pool_rounds(rounds: Sequence[Round]) -> PooledRounds:
+    r"""Combine one or more rounds, as `add_round` returns them.
+
+    Each draw is weighted by the mixture of all densities, so that expectations do not suffer from a part that one round
+    missed. But a density that was fitted to earlier draws is large there, so the sum of these weights is too small, in
+    the logarithm by .03 to .17 for mixtures fitted to 100 to 300 draws. The evidence is therefore
+    :math:`\hat Z = \sum_r \alpha_r \hat Z_r` with the mean weight :math:`\hat Z_r` of each round under its own density.
+    The share is proportional to the number of draws and to the effective share of the density,
+    :math:`Z^2 / E_{q_r}[(\pi / q_r)^2] = Z / E_\pi[\pi / q_r]`, an expectation over the draws of all rounds: a round
+    that missed a part of the posterior cannot know it, and a share from its own weights would be too large.
+
+    The variance of the log-evidence is the sum of three parts: the largest of the variance of these means, their
+    deviations, :math:`\sum_r \alpha_r^2 (\hat Z_r / \hat Z - 1)^2`, and the square of the logarithm by which the sum of
+    the mixture's weights is larger, as where each round missed a part; `tail_variance`; and the square of the standard
+    error of the known density's log normalising constant.
     """
-    parts = [
-        np.where(alive, np.where(alive, r.records["log_prob"], 0.0) - r.log_mixture, -np.inf)
-        for r in rounds
-        for alive in (r.log_weights > -np.inf,)
-    ]
-    log_weights = np.concatenate(parts)
-    log_evidence = float(log_mean_weight(log_weights) + np.log(len(log_weights)))
-    shape = tail_shape(log_weights)
     coords, records = np.concatenate([r.coords for r in rounds]), np.concatenate([r.records for r in rounds])
-    if log_evidence == -np.inf:
-        return PooledRounds(coords, records, log_weights, log_evidence, float("inf"), 0.0, shape)
-    weights = [np.exp(part - log_evidence) for part in parts]
-    variance = sum(len(each) * float(np.var(each, ddof=1)) if len(each) > 1 else np.inf for each in weights)
-    fresh = (1.0 / recent_share(rounds) - 1.0) / len(log_weights)
+    log_prob, mixture = mixture_at_draws(rounds)
+    log_weights = log_prob - mixture
+    shape, effective = tail_shape(log_weights), effective_sample_size(log_weights)
+    total = np.logaddexp.reduce(log_weights)
+    if total == -np.inf:
+        return PooledRounds(coords, records, log_weights, -np.inf, float("inf"), 0.0, shape)
+    sizes, alive = np.array([len(r.coords) for r in rounds]), log_prob > -np.inf
+    densities = np.concatenate([r.log_densities for r in rounds])[alive]
+    under = log_prob[alive, None] - np.maximum(densities, SMALLEST_LOG_DENSITY)
+    log_shares = np.log(sizes) - np.logaddexp.reduce(log_weights[alive, None] + under, axis=0)
+    log_shares = log_shares - np.logaddexp.reduce(log_shares)
+    parts = [r.log_weights + log_share - np.log(n) for r, log_share, n in zip(rounds, log_shares, sizes, strict=True)]
+    own = np.concatenate(parts)
+    log_evidence = np.logaddexp.reduce(own)
+    within, between = 0.0, 0.0
+    for part, n, share in zip(parts, sizes, np.exp(log_shares), strict=True):
+        weights = np.exp(part - log_evidence)
+        within += n * float(np.var(weights, ddof=1)) if n > 1 else np.inf
+        between += float(weights.sum() - share) ** 2
     known = max((r.known.log_density_error for r in rounds if r.known is not None), default=0.0)
-    variance = max(variance, fresh) + tail_variance(log_weights) + known**2
-    effective = effective_sample_size(log_weights)
-    return PooledRounds(coords, records, log_weights, log_evidence, float(np.sqrt(variance)), effective, shape)
+    missed = max(float(total - log_evidence), 0.0)
+    error = float(np.sqrt(max(within, between, missed**2) + tail_variance(own) + known**2))
+    log_weights = log_weights + (log_evidence - total)
+    return PooledRounds(coords, records, log_weights, float(log_evidence), error, effective, shape)

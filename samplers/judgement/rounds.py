@@ -41,8 +41,7 @@ LARGEST_DIFFERENCE = 0.25
 RELIABLE_SHARE, LARGEST_RELIABLE_SHAPE = 0.25, 0.5
 SHORT_TAIL_SHARE, FEW_DRAWS = 0.75, 100
 # Rounds go on while more than this share of the guide's latest known density is hardly reached by the draws of all of
-# them, and the result is not usable if that is so at the end. A round whose known density reaches less is left out of
-# the signed sample.
+# them, and the result is not usable if that is so at the end.
 LARGEST_UNREACHED = 0.03
 # The guide is given up when the mean effective share of the last 4 rounds is below this: 1.5 of 30 draws.
 HOPELESS_ROUNDS, HOPELESS_SHARE = 4, 0.05
@@ -52,7 +51,7 @@ UNREACHED = (
 )
 UNSETTLED = (
     "the density that the guide emulates has changed from round to round, in a part of it by more than a factor of "
-    "1000: the posterior is larger than its draws, as along a ridge of parameters that the data do not tell apart, or "
+    "10: the posterior is larger than its draws, as along a ridge of parameters that the data do not tell apart, or "
     "the response is rough. Evidence and standard deviations may be wrong by far more than their errors. Fix one of "
     "such parameters, or make their product the parameter"
 )

@@ -264,7 +264,7 @@ def draw_rounds(
                 reached = not rounds or reaches(partial(log_mixture, rounds), guide.known_density)
                 outcome = RoundsOfGuide("", "" if reached else UNREACHED, pooled, rounds, True)
             if not batches or (outcome is None and _too_few(rounds, batches, size, guide)):
-                return outcome and _with_signed(outcome, guide)
+                return outcome and _with_signed(outcome)
             most = 0  # submitted draws are part of the result
 
     yield tick("search", False)
@@ -288,7 +288,7 @@ def draw_rounds(
         if len(points) > 0:
             yield from asked(guide.refine(points, log_prob, session), f"after round {len(rounds)}")
         if outcome is not None:
-            outcome = _with_signed(outcome, guide)
+            outcome = _with_signed(outcome)
             if reaches(partial(log_mixture, rounds), guide.known_density):
                 return outcome
             if len(rounds) == MOST_ROUNDS:
@@ -297,11 +297,9 @@ def draw_rounds(
             return (yield from judge(0))
 
 
-def _with_signed(outcome: RoundsOfGuide, guide: AdaptedGuide) -> RoundsOfGuide:
-    """The signed sample of the rounds whose known density reaches all that the guide knows, if it is more accurate."""
-    latest = guide.known_density
-    known = [r for r in outcome.rounds if r.known is not None and reaches(r.known.log_density, latest)]
-    found = signed_sample(known)
+def _with_signed(outcome: RoundsOfGuide) -> RoundsOfGuide:
+    """With the signed sample of all rounds, if its evidence is more accurate."""
+    found = signed_sample(outcome.rounds)
     better = found is not None and found.log_evidence_error < outcome.pooled.log_evidence_error
     return outcome._replace(signed=found if better else None)
 

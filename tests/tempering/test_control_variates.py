@@ -19,14 +19,20 @@ WIDE = stats.multivariate_t(np.zeros(NDIM), 1.5 * np.eye(NDIM), df=5)
 def rounds_of(rng, n, number, shift=0.1, scale=1.1, posterior=POSTERIOR):
     """Rounds of draws from .85 known + .15 wide, for a standard normal posterior with the evidence exp(4)."""
     normal, made = stats.multivariate_normal(np.full(NDIM, shift), scale**2 * np.eye(NDIM)), []
+
+    def density(coords):
+        return np.logaddexp(np.log(0.85) + normal.logpdf(coords), np.log(0.15) + WIDE.logpdf(coords))
+
     for _ in range(number):
         of_known = (rng.random(n) < 0.85)[:, None]
         coords = np.where(of_known, normal.rvs(n, random_state=rng), WIDE.rvs(n, random_state=rng))
-        log_q = np.logaddexp(np.log(0.85) + normal.logpdf(coords), np.log(0.15) + WIDE.logpdf(coords))
+        log_q = density(coords)
         log_p = posterior.logpdf(coords) + LOG_EVIDENCE
         known = KnownDensity(normal.logpdf, normal.rvs(POOL, random_state=rng), np.full(POOL, 1.0 / POOL), 0.0)
         records = np.zeros(n, dtype=[("log_prob", float)])
-        made.append(Round(coords, records, log_p - log_q, known, known.log_density(coords) - log_q))
+        records["log_prob"] = log_p
+        latest = Round(coords, records, log_p - log_q, known, known.log_density(coords) - log_q, density)
+        made = add_round(made, latest)
     return made
 
 
@@ -54,12 +60,31 @@ def test_errors_cover(n, number, shift, scale, rng):
         assert np.sqrt(np.nanmean(np.square(score))) > 0.3, name
 
 
+def test_a_round_without_failures_does_not_count_more(rng):
+    """A sixth of the known density fails: rounds that did not see it agree with that density, and are wrong by log 6/5.
+
+    Weighted by the differences of their own draws, they would make the evidence too large by .07 on average.
+    """
+
+    class Fails:
+        def logpdf(self, x):
+            return np.where(x[:, 0] > stats.norm.isf(1.0 / 6.0), -np.inf, POSTERIOR.logpdf(x))
+
+    scores, values = [], []
+    for _ in range(200):
+        sample = signed_sample(rounds_of(rng, 12, 4, 0.0, 1.0, Fails()))
+        values.append(np.exp(sample.log_evidence - LOG_EVIDENCE) - 5.0 / 6.0)
+        scores.append((sample.log_evidence - LOG_EVIDENCE - np.log(5.0 / 6.0)) / sample.log_evidence_error)
+    assert abs(np.mean(values)) < 4.0 * np.std(values) / np.sqrt(len(values))
+    assert np.mean(np.abs(scores) < 2.0) > 0.9
+
+
 def test_few_draws_are_worth_many(rng):
     """30 draws with a known density that is off by 5 %: means as accurate as from several hundred independent draws."""
     errors = [signed_sample(rounds_of(rng, 30, 1, 0.05, 1.0)).expectation().value for _ in range(100)]
     assert np.sqrt(np.mean(np.square(errors))) < 1.0 / np.sqrt(300.0)
     # the chain of the same draws
-    plain = [pool_rounds(add_round([], *rounds_of(rng, 30, 1, 0.05, 1.0))) for _ in range(100)]
+    plain = [pool_rounds(rounds_of(rng, 30, 1, 0.05, 1.0)) for _ in range(100)]
     means = [np.exp(found.log_weights - found.log_evidence) @ found.coords for found in plain]
     assert np.sqrt(np.mean(np.square(means))) > 3.0 * np.sqrt(np.mean(np.square(errors)))
 
@@ -85,7 +110,7 @@ def test_rounds_without_knowledge_are_left_out(rng):
     assert signed_sample(without) is None
     elsewhere = made[0]._replace(log_known=np.full(30, -np.inf))
     impossible = made[0]._replace(log_weights=np.full(30, -np.inf))
-    alone = signed_sample([made[1]])
+    alone = signed_sample(add_round([], made[1]))
     for other in (without[0], elsewhere, impossible):
         assert np.array_equal(signed_sample([other, made[1]]).weights, alone.weights)
 
@@ -195,7 +220,7 @@ def test_rounds_that_missed_a_part_of_the_posterior_do_no_harm():
     sampler = SMCSampler(100, 2, box, vectorize=True, seed=4, guide=GrowingGuide(box))
     sampler.run_mcmc(None, 1)
     error = sampler.log_evidence + np.log(64.0)
-    assert abs(error) < 4.0 * sampler.log_evidence_error < 0.4
+    assert abs(error) < 4.0 * sampler.log_evidence_error + 1e-9 < 0.4
     assert sampler.verdict.status == "converged"
 
 

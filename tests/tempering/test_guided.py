@@ -214,6 +214,21 @@ def _rounds(rng, spreads, ndim=3):
     return rounds
 
 
+def test_rounds_that_each_miss_a_part_have_a_large_error(rng):
+    """Three of four intervals each, with constant weights: the spread of the weights alone would be zero."""
+    rounds, parts = [], 4
+    for missed in range(2):
+
+        def log_density(x, missed=missed):
+            return np.where((x[:, 0] >= missed) & (x[:, 0] < missed + parts - 1), -np.log(parts - 1.0), -np.inf)
+
+        coords = rng.uniform(missed, missed + parts - 1, (50, 1))
+        records = np.zeros(50, dtype=[("log_prob", float)])
+        rounds = add_round(rounds, Round(coords, records, -log_density(coords), log_density=log_density))
+    pooled = pool_rounds(rounds)
+    assert abs(pooled.log_evidence - np.log(parts)) < 2.0 * pooled.log_evidence_error < 1.0
+
+
 @pytest.mark.parametrize("spreads", [(1.3, 1.2, 1.1), (3.0, 1.5, 1.2), (0.2, 2.0, 1.2)])
 def test_the_evidence_of_rounds_is_unbiased_and_its_error_covers(spreads, rng):
     """Also where the first draws are far too narrow, and would have made the evidence too small alone."""
