@@ -85,9 +85,13 @@ def test_two_standard_errors_cover(case, limit):
 
 @pytest.mark.slow
 def test_control_a_guide_that_misses_a_mode_is_wrong():
-    """Negative control: the criterion of the test above fails. The guide claims that it misses nothing."""
+    """Negative control: the criterion of the test above fails. The guide claims that it misses nothing.
+
+    A draw in the tail of the guide may hit the other mode; its weight then makes the run "not usable".
+    """
     deviations, statuses = outcomes(*two_modes(1, FixedGuide), 500, runs=5)
-    assert np.all(np.abs(deviations[:, 0]) > 5.0) and np.mean(statuses == "converged") > 0.5
+    believed = statuses != "not usable"
+    assert np.all(np.abs(deviations[believed, 0]) > 5.0) and np.mean(statuses == "converged") > 0.5
 
 
 def test_a_guide_that_does_not_say_how_it_searched_is_at_best_usable():
