@@ -58,7 +58,7 @@ class _Request:
 
     For n `keys` (see `distinct_keys`): `thetas` (n, n_structural), `statistics` (n, n_numbers), NaN where not known,
     `reasons` of failures, `responses` (n, n_channels, n_steps) if requested, and whether the statistics are `known`,
-    and nothing is to be simulated (`done`). `ended` is set when no simulation runs for it any more.
+    and nothing is to be simulated (`done`).
     """
 
     def __init__(self, keys: list[bytes], full: bool, run: VerifyingRun, statistics: np.ndarray, known: Any) -> None:
@@ -71,15 +71,14 @@ class _Request:
         self.responses = None
         if full:
             self.responses = np.full((len(keys), len(run.model.channels), run.model.n_steps), np.nan)
-        self.ended = threading.Event()
 
 
 class _Running:
-    """What runs in a pool for one simulator, in one process: requests by the keys of their simulations."""
+    """What runs in a pool for one simulator, in one process: the keys of the simulations."""
 
     def __init__(self) -> None:
-        self.owner, self.lock = os.getpid(), threading.RLock()
-        self.requests: dict[bytes, _Request] = {}
+        self.owner, self.lock = os.getpid(), threading.Condition()
+        self.keys: set[bytes] = set()
         self.counted_until = 0.0  # time of the last arrival [s]
 
 
@@ -352,7 +351,7 @@ class Simulator:
         return self._in_pool
 
     def _check_failures(self) -> None:
-        self.failures.check(max(len(self._running.requests), 0 if self.pending is None else self.pending()))
+        self.failures.check(max(len(self._running.keys), 0 if self.pending is None else self.pending()))
 
     def _chunk(self, n: int, full: bool) -> int:
         """Number of simulations, of n, between two writes to the cache on disk, or two reports of progress."""
@@ -366,13 +365,12 @@ class Simulator:
 
     @interrupts_end_the_run()
     def _run_in_pool(self, keys: list[bytes], which: Sequence[int], full: bool) -> _Request:
-        """Run what is not known in the pool, and record each as it arrives; wait for what runs for another request."""
+        """Run what is not known in the pool, and record each as it arrives, after what runs for another request."""
         running, arrived = self._running, SimpleQueue()
         with running.lock:  # so that nothing arrives between the two
+            running.lock.wait_for(lambda: running.keys.isdisjoint(keys))
             request = self._look_up(keys, which, full)
-            rows = (~request.done).nonzero()[0].tolist()
-            others = {row: running.requests[keys[row]] for row in rows if keys[row] in running.requests}
-            left = self._send(request, [row for row in rows if row not in others], arrived)
+            left = self._send(request, (~request.done).nonzero()[0].tolist(), arrived)
         try:
             while left:
                 self._receive(request, left, take_all(arrived))
@@ -385,19 +383,8 @@ class Simulator:
             raise
         finally:
             with running.lock:
-                running.requests = {key: each for key, each in running.requests.items() if each is not request}
-            request.ended.set()
-        for other in others.values():
-            other.ended.wait()
-        if others:
-            places = list(others)
-            found = self.run(request.thetas[places], full=full)
-            request.statistics[places], batch = found if full else (found, None)
-            request.done[places] = True
-            if full:
-                request.responses[places] = batch.response
-                for row, reason in zip(places, batch.reasons, strict=True):
-                    request.reasons[row] = reason
+                running.keys -= {keys[row] for row in left.values()}
+                running.lock.notify_all()
         return request
 
     def _send(self, request: _Request, rows: Sequence[int], arrived: SimpleQueue) -> dict[Future, int]:
@@ -406,12 +393,12 @@ class Simulator:
             return {}
         self._check_before(request.run)
         running = self._running
-        if not running.requests:
+        if not running.keys:
             running.counted_until = time.perf_counter()
         measured = () if self._returns_responses(request.responses is not None) else (self.measured, self.statistic)
         function = Observed(sent_simulation(self.model, *measured))
         futures = self.pool.submit_all(function, list(request.thetas[rows]))
-        running.requests |= {request.keys[row]: request for row in rows}
+        running.keys |= {request.keys[row] for row in rows}
         for future in futures:
             future.add_done_callback(arrived.put)
         return dict(zip(futures, rows, strict=True))
@@ -425,7 +412,7 @@ class Simulator:
         with self._running.lock:
             for future in ended:
                 row = left.pop(future)
-                del self._running.requests[request.keys[row]]
+                self._running.keys.discard(request.keys[row])
                 try:
                     (result, reason), opened = unpack(future.result(), self.pool)
                     self._checked.label.add(opened)
@@ -441,6 +428,7 @@ class Simulator:
                 shape = (len(self.model.channels), self.model.n_steps) if responses else (self.n_numbers,)
                 values = np.array([np.full(shape, np.nan) if each is None else each for each in results])
                 self._record(request, rows, values, reasons, seconds)
+            self._running.lock.notify_all()
         if error is not None:
             raise error
 
