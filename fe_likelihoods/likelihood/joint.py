@@ -135,32 +135,10 @@ class JointLikelihood(SumOfParts):
         return result
 
     def samples_of(self, name: str, samples: Any, noise: bool = False) -> dict[str, np.ndarray]:
-        """Parameter samples for one likelihood, under its own names.
+        """Samples (n,) of the parameters of one likelihood under its own names, with `noise` also of its noise.
 
-        Parameters
-        ----------
-        name : str
-            Name of the likelihood.
-        samples : (n, ndim) array_like, or named values of shape (n,)
-            Samples of all parameters, or without `noise` of the structural ones. `draw_noise` returns named values.
-        noise : bool
-            Whether the noise parameters are needed.
-
-        Returns
-        -------
-        dict of str to (n,) ndarray
-            Structural parameters, and with `noise` also noise parameters.
-
-        Raises
-        ------
-        ValueError
-            If the name is unknown, a parameter is missing, or an array has another shape.
-
-        Examples
-        --------
-        >>> joint = JointLikelihood({"first": likelihood, "second": likelihood}, separate=["damping"])
-        >>> sorted(joint.samples_of("second", np.ones((3, 5))))
-        ['damping', 'stiffness']
+        `samples` are (n, ndim) or named values (n,) of all parameters, or without `noise` of the structural ones.
+        ValueError if the name is unknown, a parameter is missing, or an array has another shape.
         """
         likelihood = self[name]
         if not isinstance(samples, Mapping):

@@ -254,18 +254,7 @@ class FELikelihood(SumOfParts):
         return self.residuals_of(response[0])
 
     def residuals_of(self, response: np.ndarray) -> np.ndarray:
-        """Measured minus simulated response, as `residuals`, from a response that is known: nothing is simulated.
-
-        Parameters
-        ----------
-        response : (n_channels, n_steps) float
-            Response of the model [SI], such as one of ``simulate(thetas).response``.
-
-        Returns
-        -------
-        (n_channels, n_steps) float
-            [SI]; NaN where a sample is missing.
-        """
+        """Measured minus simulated response, as `residuals`, for a known response (n_channels, n_steps) [SI]."""
         response = np.asarray(response, dtype=float)
         if isinstance(self.measured, Comparison):
             return -self.measured.residuals(response)

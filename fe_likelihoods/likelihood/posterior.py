@@ -521,15 +521,10 @@ class Posterior:
         return evaluation_queue(self, responses)
 
     def when_simulated(self, callback: Callable[[float], None] | None) -> None:
-        """Announce simulations as they end, also within a batch: samplers show their progress with it.
+        """Call a function with the number of points whose simulations have ended, for the progress of samplers.
 
-        A batch without a pool and without a cache on disk is then run in parts of about 5 s.
-
-        Parameters
-        ----------
-        callback : callable, or None
-            Called with a number of points: ended simulations of this process, divided by the number of likelihoods in a
-            `JointLikelihood`. It must not raise. None ends the announcements.
+        The number is divided by that of the data sets; the function must not raise, and None ends the announcements. A
+        batch without a pool and without a cache on disk is then run in parts of about 5 s.
         """
         parts = self.likelihood.parts()
         share = 1.0 / max(len(parts), 1)
@@ -537,17 +532,10 @@ class Posterior:
             likelihood.simulator.when_simulated = None if callback is None else lambda n: callback(n * share)
 
     def fault(self, x: Any) -> str:
-        """As `FELikelihood.fault`: samplers record the reason where they evaluate points in other processes.
+        """Reason of a failed simulation at a point (ndim,) evaluated in this process, if the cause is not the model.
 
-        Parameters
-        ----------
-        x : array_like (ndim,), or mapping
-            A point whose log-probability was computed in this process.
-
-        Returns
-        -------
-        str
-            Empty where there was no fault of the infrastructure.
+        Such as a worker that was killed; empty where there was none. Samplers record it where they evaluate points in
+        other processes.
         """
         return self.likelihood.fault(x)
 

@@ -118,18 +118,7 @@ class SumOfParts:
         return np.all([part.possible(rows[:, columns]) for part, columns in self.parts()], axis=0)
 
     def fault(self, x: Any) -> str:
-        """Reason of a failed simulation whose cause is not the model, such as a worker that was killed.
-
-        Parameters
-        ----------
-        x : array_like (ndim,), or mapping
-            A point whose log-likelihood was computed in this process.
-
-        Returns
-        -------
-        str
-            Empty where the simulations succeeded, or a failure is an answer of the model.
-        """
+        """Reason of a failed simulation whose cause is not the model, see `Posterior.fault`."""
         _, reason = self._failure_at(as_points(x, self.parameter_names))
         return split_seconds(reason)[0] if isinstance(reason, TransientReason) else ""
 
@@ -210,20 +199,8 @@ class SumOfParts:
     def marginal(self, priors: Mapping[str, Distribution]) -> Self:
         """The same likelihood with the standard deviations of white noise integrated out, see `Posterior.marginal`.
 
-        Parameters
-        ----------
-        priors : mapping of str to Distribution
-            Priors of the noise parameters; others may be among them.
-
-        Returns
-        -------
-        FELikelihood or JointLikelihood
-
-        Raises
-        ------
-        ValueError
-            If the noise is not white, has sensor noise, or is integrated out already; if a noise parameter has a joint
-            prior distribution with others, or belongs to several data sets: its integral is not a product.
+        `priors` are those of the noise parameters; others may be among them. ValueError also if a noise parameter has a
+        joint prior distribution with others, or belongs to several data sets: its integral is not a product.
         """
         noise = [self.parameter_names[place] for place in self.fast_parameters]
         if correlated := [name for name in noise if name not in priors]:

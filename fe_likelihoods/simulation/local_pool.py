@@ -34,19 +34,11 @@ class Submitting:
     _of_map: dict[str, Any] = {}
 
     def map(self, function: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
-        """Results of a function for every item, in order.
+        """Results of a function for every item, in order; ``(None, reason)`` for one that kills all its processes.
 
-        An item that killed every process that ran it gets the `Outcome` ``(None, reason)``.
-
-        Raises
-        ------
-        ValueError
-            If the function or an item cannot be sent to the processes, or the function cannot be loaded there.
-        RuntimeError
-            If three processes of a `LocalPool` in succession die before they are given an item.
-        Exception
-            The first exception that `function` raises; no further items are started. At Ctrl-C, too, the other items
-            are given up.
+        ValueError if the function or an item cannot be sent or loaded, RuntimeError if three processes of a `LocalPool`
+        in succession die before they are given an item, or the first exception of the function: no further items are
+        started then.
         """
         futures = self.submit_all(function, list(items), **self._of_map)
         try:
