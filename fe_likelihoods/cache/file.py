@@ -47,7 +47,6 @@ OUTSIDE = {
 }
 
 _files: "weakref.WeakSet[CacheFile]" = weakref.WeakSet()
-_made: Counter[Path] = Counter()  # times that this process has made the tables of a file
 _lock = threading.RLock()  # held while a file is used, and while this process forks
 
 
@@ -232,11 +231,6 @@ class CacheFile:
             logger.warning("%s is damaged (%s): set aside as %s, and a new cache created", self.path, why, aside.name)
 
     @property
-    def version(self) -> tuple:
-        """Identity of the file, and how often it was made: a new file may get the inode of a removed one."""
-        return self.identity, _made[self.path]
-
-    @property
     def identity(self) -> tuple[int, int] | None:
         """Device and inode of the file, None if it does not exist."""
         try:
@@ -284,7 +278,6 @@ class CacheFile:
                         LAYOUT if self._is_empty(connection) else ()
                     ):  # another process may have been first
                         connection.execute(statement)
-                    _made[self.path] += 1
                     connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
                     connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
             self._identify(connection)

@@ -30,7 +30,7 @@ import numpy as np
 from ..simulation.faults import TransientReason
 from ..simulation.files import Opened
 from ..simulation.label import ModelLabel
-from ..simulation.model import Model, SimulationBatch, misfit_of_responses
+from ..simulation.model import SimulationBatch, misfit_of_responses
 from .comparison import Simulated, VerifyingRun, difference_in_words, simulate_again
 from .rows import (
     LABEL_COLUMNS,
@@ -83,7 +83,7 @@ class StaleCache(ValueError):
 
 
 class Trust:
-    """The label of a model, and which rows of a file this process trusts; all likelihoods with the same `key` share it.
+    """The label of a model, and which rows of a file this process trusts; a likelihood and its copies share one `key`.
 
     `generations` and `written` labels are by the source number of the model; `left` has the rows that may be used until
     the next verification, by fingerprint and whether any row is a success; `used` counts rows. Rows with the number of
@@ -147,16 +147,13 @@ class _Comparison(NamedTuple):
 class VerifiedCache:
     """A `SimulationCache` whose rows are verified before they are used.
 
-    `model` and `label` are those in whose state the likelihood was made. Counted are rows that were `compared`,
-    `unverified` ones whose new simulation was stopped (not by the model), and the wall time, `seconds`. Likelihoods of
-    a process with equal built-in models and one file verify rows once, and so do derived likelihoods and copies;
-    another process verifies them again.
+    The `label` is that of the model when the likelihood was made. Counted are rows that were `compared`, `unverified`
+    ones whose new simulation was stopped (not by the model), and the wall time, `seconds`. Derived likelihoods and
+    copies verify rows once in a process; another process verifies them again.
     """
 
-    def __init__(self, cache: SimulationCache, label: ModelLabel, model: Model) -> None:
-        # user code may depend on what no label contains: there, each model object is verified
-        same = cache.path, cache.file.version, cache.verify, label.code, model.fingerprint
-        self._set_up(cache, Trust.of(label, secrets.token_hex(16) if label.observes else repr(same)))
+    def __init__(self, cache: SimulationCache, label: ModelLabel) -> None:
+        self._set_up(cache, Trust.of(label, secrets.token_hex(16)))
 
     def _set_up(self, cache: SimulationCache, trust: Trust) -> None:
         self.cache, self._trust = cache, trust

@@ -43,7 +43,7 @@ class CheckedModel:
 
     def _set_up(self, model: Model, statistic: Statistic | None, cache: SimulationCache | None) -> None:
         self._label = ModelLabel(model, statistic)
-        self.rows = None if cache is None else VerifiedCache(cache, self._label, model)
+        self.rows = None if cache is None else VerifiedCache(cache, self._label)
         self._known: dict[str, str | None] = self.label.items | {_FINGERPRINT: model.fingerprint}
         self._repeated = 0
         self._begin()

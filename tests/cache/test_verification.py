@@ -10,7 +10,7 @@ from collections import OrderedDict
 import numpy as np
 import pytest
 
-from fe_likelihoods import AutoregressiveNoise, FELikelihood, LinearOscillator, Measurements, Record, SimulationCache
+from fe_likelihoods import AutoregressiveNoise, FELikelihood, Measurements, SimulationCache
 from fe_likelihoods.cache import verification
 from fe_likelihoods.cache.comparison import largest_difference
 from fe_likelihoods.cache.verification import StaleCache
@@ -44,11 +44,6 @@ class Scaled(Treacherous):
 def likelihood_of(model, cache, **options):
     values = np.sin(np.arange(1.0 * N_STEPS))[None]
     return FELikelihood(model, Measurements(CHANNELS, DT, values), cache=cache, **options)
-
-
-def oscillator(path):
-    model = LinearOscillator(Record("sine", 0.02, np.sin(np.arange(50.0))))
-    return FELikelihood(model, Measurements(model.channels, 0.02, np.ones((2, 50))), cache=path)
 
 
 @pytest.fixture
@@ -347,31 +342,6 @@ def test_rows_that_the_same_likelihood_has_stored_are_not_verified(path, thetas)
     assert (other.simulator.verifications, other.simulations) == (2, 0)
 
 
-def test_a_file_that_replaces_another_one_is_verified(path):
-    def misfit():
-        likelihood = oscillator(path)
-        likelihood.misfit([[1.0, 0.9], [1.1, 0.9], [1.2, 0.9]])
-        return likelihood.simulations, likelihood.simulator.verifications
-
-    assert [misfit(), misfit()] == [(3, 0), (0, 0)]  # a built-in model is trusted by its arguments
-    other = path.with_name("other.sqlite")
-    oscillator(other).misfit([[1.0, 0.9], [1.1, 0.9], [1.2, 0.9]])
-    SimulationCache(other).close()
-    SimulationCache(path).close()
-    other.replace(path)
-    assert misfit() == (0, 2)
-
-
-def test_a_file_that_is_made_again_gets_the_label_too(path):
-    """It may have the inode of the removed one."""
-    for _ in range(3):
-        path.unlink(missing_ok=True)
-        likelihood = oscillator(path)
-        likelihood.misfit([[1.0, 0.9]])
-        assert likelihood.simulator.cache.file.select("SELECT count(*) FROM labels") == [(1,)]
-        likelihood.simulator.cache.close()
-
-
 # copies ---------------------------------------------------------------------------------------------------------------
 
 
@@ -399,6 +369,3 @@ def test_a_fork_while_another_thread_verifies_does_not_block(filled, thetas):
                 break
             time.sleep(0.05)
     assert os.waitstatus_to_exitcode(status) == 2
-
-
-# many likelihoods -----------------------------------------------------------------------------------------------------
