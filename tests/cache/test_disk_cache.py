@@ -15,13 +15,10 @@ from fe_likelihoods.cache.simulation_cache import SimulationCache
 from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.likelihood.posterior import Posterior
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
-from fe_likelihoods.models.rc_column import RCColumn
 from fe_likelihoods.priors.distributions import HalfNormal, TruncatedNormal, Uniform
-from fe_likelihoods.problems import bridge_column
 from fe_likelihoods.signals.channels import Measurements
 from fe_likelihoods.signals.records import Record
 from fe_likelihoods.simulation import label
-from fe_likelihoods.simulation.model import simulate_batch
 from tests.cache.stored import stored_outcomes
 from tests.lines import Batched, Line
 
@@ -327,30 +324,6 @@ def test_pickles_by_path(tmp_path, monkeypatch, thetas):
 # responses ------------------------------------------------------------------------------------------------------------
 
 
-def models():
-    record = Record("pulse", 0.01, np.sin(np.arange(30) / 3))
-    return [Line(), Batched(np.inf), LinearOscillator(record), RCColumn.lhpost(record, mesh=10)]
-
-
-@pytest.mark.parametrize("model", models(), ids=lambda model: type(model).__name__)
-def test_responses_are_stored_in_addition_to_the_sums(path, rng, model):
-    thetas = rng.uniform(0.5, 1.4, size=(12, len(model.parameter_names)))
-    likelihood = likelihood_of(model, SimulationCache(path, responses=True), data=0.1)
-    np.testing.assert_array_equal(likelihood.misfit(thetas), likelihood_of(model, data=0.1).misfit(thetas))
-    again = SimulationCache(path)
-    kept = 0
-    failures = np.isnan(likelihood.misfit(thetas)).any(axis=1)
-    for theta, failed, response in zip(thetas, failures, stored_outcomes(again, model, thetas), strict=True):
-        if failed:
-            assert response is None or isinstance(response, str)
-        else:
-            kept += 1
-            np.testing.assert_array_equal(response, simulate_batch(model, theta[None]).response[0])
-    assert again.info().responses == kept > 0
-    assert stored_outcomes(again, model, thetas[:1] + 1e-9) == [None]
-    assert stored_outcomes(again, Line(fingerprint="another"), thetas[:1, :2]) == [None]
-
-
 def test_responses_are_bounded(path, rng):
     bytes_each = 2 * 8 * 8
     cache = SimulationCache(path, responses=True, max_response_bytes=10 * bytes_each)
@@ -364,20 +337,4 @@ def test_responses_are_bounded(path, rng):
     assert cache.info().simulations == 25
 
 
-def test_a_response_whose_misfit_overflows_is_a_failure(path):
-    likelihood = likelihood_of(Line(), SimulationCache(path, responses=True))
-    assert np.isnan(likelihood.misfit([[1e200, 0.0]])).all()
-    assert likelihood.simulator.failures.records[0]["reason"] == "the misfit of channel 'a' is not finite"
-
-
 # the ready-made posterior ---------------------------------------------------------------------------------------------
-
-
-def test_bridge_column_takes_a_cache(path):
-    x = np.append(np.ones(5), [0.5, 0.002])
-    first = bridge_column(duration=1.0, every=4, cache=path)
-    value = first.log_prob(x)
-    second = bridge_column(duration=1.0, every=4, cache=SimulationCache(path))
-    assert second.log_prob(x) == value
-    assert (second.report()["simulations"], second.report()["disk_hits"]) == (0, 1)
-    assert second.fingerprint == first.fingerprint == bridge_column(duration=1.0, every=4).fingerprint

@@ -46,17 +46,6 @@ def test_a_change_of_the_noise_needs_no_simulation(rng):
     assert (likelihood.simulations, likelihood.simulator.cache_hits) == (21, 39)
 
 
-def test_failures_are_cached_and_recorded_once():
-    model = Line()
-    likelihood = likelihood_of(model)
-    for _ in range(3):
-        assert np.isnan(likelihood.misfit([[0.0, 2.0], [0.0, 2.0]])).all()
-    assert model.runs == 1
-    assert likelihood.simulator.failures.count == len(likelihood.simulator.failures.records) == 1
-    assert likelihood.simulator.failures.reasons == {"θ too steep": 1}
-    assert likelihood.simulator.cache_hits == 4
-
-
 def test_the_cache_is_bounded(rng):
     model = Line()
     likelihood = likelihood_of(model, memory_rows=10)

@@ -18,7 +18,6 @@ from fe_likelihoods import (
     TruncatedNormal,
     check_result,
 )
-from fe_likelihoods.models.rc_column_analysis import expect_fracture
 from samplers import SMCSampler
 
 THETAS = np.array([[1.0], [1.1]])
@@ -59,14 +58,6 @@ def test_warning_of_another_process_is_repeated_once(drift, expected, path, capl
         assert "exceeds the ultimate strain of the steel" in caplog.text and "{'fy': " in caplog.text
 
 
-def test_a_model_that_has_warned_does_not_repeat_itself(path, caplog):
-    first = likelihood(path)
-    first.misfit(THETAS)
-    first.simulator.memory_cache.clear()
-    first.misfit(THETAS)
-    assert first.simulator.disk_hits == 2 and len(caplog.records) == 1
-
-
 @pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
 @pytest.mark.parametrize("drift", [0.2, 0.05])
 def test_a_stored_remark_is_a_finding_of_the_result(drift, path):
@@ -80,19 +71,3 @@ def test_a_stored_remark_is_a_finding_of_the_result(drift, path):
         titles = [finding.kind for finding in check_result(sampler).findings]
         assert ("Beyond the range of a law of the model" in titles) == (drift > 0.1)
     assert run.simulations == 0
-
-
-def test_a_model_that_expects_fracture_has_no_remark(path, caplog):
-    pushed = likelihood(path)
-    expect_fracture(pushed.model)
-    pushed.misfit(THETAS)
-    again = likelihood(path)
-    again.misfit(THETAS)
-    assert again.simulator.disk_hits == 2 and not caplog.records
-
-
-def test_forgotten_with_the_rows_of_the_model(path):
-    first, other = likelihood(path), likelihood(path, 0.19)
-    first.misfit(THETAS)
-    other.misfit(THETAS)
-    assert first.simulator.cache.forget(*first.simulator.cache_keys) == 3  # two rows and the remark

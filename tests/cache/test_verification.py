@@ -278,26 +278,6 @@ def test_one_of_every_hundred_rows_is_verified(path, rng):
             likelihood.misfit(thetas[start : start + 10])
 
 
-def test_a_change_in_a_tenth_of_the_space_is_noticed_within_several_processes(path, rng):
-    """A hidden change under a known label: 300 rows are used and five of them compared each time."""
-
-    class Partly(Scaled):
-        fingerprint = "partly scaled"
-
-        def simulate(self, theta):
-            self.runs += 1
-            return (self.factor if theta[0] > 0.9 else 1.0) * line(theta)
-
-    thetas = rng.uniform(size=(300, 2))
-    likelihood_of(Partly(), path).misfit(thetas)
-    for _ in range(40):  # missed by all with a probability of 0.9 ** 160
-        try:
-            likelihood_of(Partly(2.0), path).misfit(thetas)
-        except StaleCache:
-            return
-    pytest.fail("the change was not noticed")
-
-
 def test_a_simulation_that_is_stopped_is_not_a_difference(filled, thetas, caplog):
     """Another row is verified in its place; the first of them is the one that was stored last."""
     likelihood = likelihood_of(Scaled(fault=thetas[-1:, 0]), filled)

@@ -3,8 +3,6 @@
 import multiprocessing
 import os
 import signal
-import subprocess
-import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -304,41 +302,6 @@ def test_an_interrupt_loses_no_run_that_has_ended(asynchronous, tmp_path):
                     values.update(queue.collect())
                 np.testing.assert_array_equal([values[ticket] for ticket in tickets], posterior(x))
         assert posterior.likelihood.simulations == len(x) - (not asynchronous)
-
-
-KILLED = """
-import sys
-from pathlib import Path
-import numpy as np
-from tests.faults.treacherous import Gated, posterior_of
-from tests.likelihood.test_evaluation_queue import LONG, SHORT
-
-folder = Path(sys.argv[1])
-if __name__ == "__main__":
-    posterior = posterior_of(Gated(folder), pool=2, cache=folder / "cache.sqlite")
-    x = np.concatenate([LONG[:1], SHORT])
-    queue = posterior.evaluation_queue()
-    queue.submit(x)
-    for _ in x:
-        queue.collect()
-"""
-
-
-def test_a_killed_process_loses_what_runs_and_the_last_second(tmp_path):
-    """SIGKILL after the short runs are stored: the next process simulates the long one only."""
-    script = tmp_path / "script.py"
-    script.write_text(KILLED)
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    posterior = posterior_of(Gated(tmp_path), cache=tmp_path / "cache.sqlite")
-    stored, key = SimulationCache(tmp_path / "cache.sqlite"), posterior.likelihood.simulator.simulation_key
-    with subprocess.Popen([sys.executable, script, str(tmp_path)], env=environment) as process:
-        try:
-            wait_until(lambda: process.poll() is not None or stored.look_up(key, SHORT[:, :2], 1).known.all())
-        finally:
-            process.kill()
-    (tmp_path / "go").touch()
-    posterior(np.concatenate([LONG[:1], SHORT]))
-    assert (posterior.likelihood.simulations, posterior.likelihood.simulator.disk_hits) == (1, len(SHORT))
 
 
 def test_wrong_shapes_are_refused():

@@ -2,8 +2,6 @@
 
 import logging
 import math
-import multiprocessing
-import pickle
 import time
 import warnings
 from multiprocessing.pool import ThreadPool
@@ -316,20 +314,6 @@ def test_a_failed_simulation_is_minus_infinity_with_its_reason(threads, caplog):
     assert len(caplog.records) == 1
 
 
-def test_records_of_failures_are_bounded():
-    class AlwaysFails(Polynomial):
-        def simulate(self, theta):
-            raise SimulationFailed(f"no convergence at offset {theta[0]}")
-
-    posterior = polynomial_posterior(AlwaysFails())
-    posterior(np.column_stack([np.linspace(-9.0, 9.0, 1500), np.ones((1500, 3))]))
-    report = posterior.report()
-    assert report["failure_count"] == sum(report["failure_reasons"].values()) == 1500
-    assert len(report["failures"]) == 1000
-    assert len(report["failure_reasons"]) == 101
-    assert report["failure_reasons"]["no convergence at offset #"] == 1400
-
-
 @pytest.mark.parametrize(
     ("reason", "text"),
     [
@@ -397,32 +381,6 @@ def test_nothing_is_simulated_outside_the_support():
     assert posterior.report()["failure_count"] == 0
 
 
-def test_the_likelihood_does_not_simulate_impossible_points():
-    model = Polynomial()
-    likelihood = polynomial_posterior(model).likelihood
-    x = np.array([[0.5, 0.1, 0.0, 1.0], [0.5, 0.1, 0.5, -1.0], [np.nan, 0.1, 0.5, 1.0], [0.5, np.inf, 0.5, 1.0]])
-    assert np.isneginf(likelihood.log_likelihood(x)).all()
-    assert np.isnan(likelihood.misfit(x[2:, :2])).all()
-    assert model.runs == []
-    assert likelihood.simulator.failures.count == 0
-
-
-def test_equal_structural_parameters_are_simulated_once():
-    model = Polynomial()
-    posterior = polynomial_posterior(model)
-    x = np.array(
-        [[0.5, 0.1, 0.5, 1.0], [0.0, 0.2, 0.5, 1.0], [0.5, 0.1, 0.9, 2.0], [-0.0, 0.2, 0.3, 1.0], [1.0, 0.2, 0.3, 1.0]]
-        + [[1.0, 0.2, 0.4, 1.0]]
-    )
-    kept = x.copy()
-    values = posterior(x)
-    np.testing.assert_array_equal(x, kept)
-    assert model.runs == [(0.5, 0.1), (0.0, 0.2), (1.0, 0.2)]
-    assert posterior.report()["simulations"] == 3
-    assert posterior.report()["failure_count"] == 1
-    assert values.tolist() == [posterior(row) for row in x]
-
-
 # batch methods --------------------------------------------------------------------------------------------------------
 
 
@@ -465,24 +423,3 @@ def test_an_empty_batch():
 
 
 # pools, pickles, clients ----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_spawned_processes_give_the_same_bits(posterior, oscillator, measurements, prior):
-    x = posterior.sample_prior(12, 3)
-    x[5, 1] = 25.0  # overdamped: fails in the worker
-    expected = posterior(x)
-    with multiprocessing.get_context("spawn").Pool(2) as pool:
-        pooled = Posterior(FELikelihood(oscillator, measurements, pool=pool), prior)
-        np.testing.assert_array_equal(pooled(x), expected)
-        assert pooled.report()["failures"] == posterior.report()["failures"]
-        assert pooled.report()["failure_count"] == 1
-        np.testing.assert_array_equal(pool.map(pooled, list(x)), expected)  # the pool is not pickled
-
-
-def test_pickle(posterior):
-    x = posterior.sample_prior(5, 1)
-    copy = pickle.loads(pickle.dumps(posterior))
-    np.testing.assert_array_equal(copy(x), posterior(x))
-    assert copy.parameter_names == posterior.parameter_names
-    assert copy.likelihood.fingerprint == posterior.likelihood.fingerprint

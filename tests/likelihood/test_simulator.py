@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from fe_likelihoods.cache.simulation_cache import SimulationCache
-from fe_likelihoods.likelihood.failure_log import TooManyFailures
 from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
@@ -210,34 +209,6 @@ def test_statistics_from_stored_responses(path, thetas):
     assert_same_log_likelihood(third, thetas, 0)  # the statistics have been stored
 
 
-def test_a_response_that_is_no_longer_stored_is_simulated_again(path, thetas):
-    good = thetas[thetas[:, 1] < 1.0]
-    cache = SimulationCache(path, responses=True, max_response_bytes=10 * 2 * 8 * 8)
-    expected = likelihood_of(Line(), cache=cache).simulate(good).response
-    likelihood = likelihood_of(Line(), cache=SimulationCache(path, responses=True))
-    np.testing.assert_array_equal(likelihood.simulate(good).response, expected)
-    assert likelihood.simulations == len(good) - 10
-    assert_same_log_likelihood(likelihood, good, len(good) - 10)
-
-
-def test_chunks_do_not_change_a_bit(path, thetas, monkeypatch):
-    expected = likelihood_of(Line()).simulate(thetas)
-    monkeypatch.setattr("fe_likelihoods.likelihood.simulator._SECONDS_PER_CHUNK", 0.0)
-    batch = likelihood_of(Line(), cache=path).simulate(thetas)
-    np.testing.assert_array_equal(batch.response, expected.response)
-    assert batch.reasons == expected.reasons
-
-
-def test_too_many_failures(thetas):
-    likelihood = likelihood_of(Line(), max_failure_share=0.1)
-    thetas[:, 1] += 0.5
-    likelihood.simulate(thetas)
-    with pytest.raises(TooManyFailures, match="simulations failed"):
-        likelihood.simulate(thetas + 10.0)
-    likelihood.log_likelihood(points(likelihood, thetas))  # finished simulations are kept
-    assert likelihood.simulations == 40
-
-
 @pytest.mark.parametrize("source", ["disk", "disk, responses", "recalled"])
 def test_known_failures_are_compared_with_all_known_simulations(source, path, thetas, monkeypatch):
     """Failures of an earlier run must not stop a run that has simulated little itself."""
@@ -255,17 +226,6 @@ def test_known_failures_are_compared_with_all_known_simulations(source, path, th
     request(new)
     assert second.simulator.failures.count == first.simulator.failures.count
     assert second.simulator.statistics(new).shape == (40, 2)
-
-
-def test_a_pool_changes_nothing(thetas, shared_pool):
-    expected = likelihood_of(Line()).simulate(thetas)
-    with shared_pool(2) as pool:
-        likelihood = likelihood_of(Line(), pool=pool)
-        batch = likelihood.simulate(thetas)
-        np.testing.assert_array_equal(batch.response, expected.response)
-        assert batch.reasons == expected.reasons
-        assert likelihood.model.runs == 0  # all in the workers
-        assert_same_log_likelihood(likelihood, thetas, 40)
 
 
 def test_known_statistics_are_recalled_without_a_simulation(thetas):

@@ -13,8 +13,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fe_likelihoods import problems
-from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.signals.records import Record
 from fe_likelihoods.simulation import pool_executor
@@ -178,17 +176,6 @@ def test_models_defined_in_a_script(tmp_path):
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
     run = subprocess.run([sys.executable, script, "8"], env=environment, capture_output=True, text=True, timeout=120)
     assert " ".join(run.stdout.split()) == "run True True", run.stderr
-
-
-def test_compiled_models_go_through_a_pool_to_the_same_bits(shared_pool):
-    """Without a pool a batch runs on threads of this process; with a pool, sets run one by one in the workers."""
-    posterior = problems.bridge_column(duration=2.0)
-    thetas = posterior.sample_prior(6, 1)[:, :5]
-    likelihood = posterior.likelihood
-    with shared_pool(2) as pool:
-        pooled = FELikelihood(likelihood.model, likelihood.measurements, likelihood.noise, pool=pool)
-        np.testing.assert_array_equal(pooled.misfit(thetas), likelihood.misfit(thetas))
-        assert pooled.simulations == 6
 
 
 # items that are submitted: each ends by itself -----------------------------------------------------------------------

@@ -224,17 +224,6 @@ def test_files_of_the_user_survive_a_simulation_that_empties_their_folder(isolat
     assert all(not path.is_symlink() and path.read_text() == "precious" for path in (start / "results").iterdir())
 
 
-def test_many_folders_are_shown_up_to_a_number_of_links(start, monkeypatch, tmp_path_factory):
-    monkeypatch.setattr(folder, "_MOST_LINKS", 10)
-    monkeypatch.setattr(folder, "_mirror", None)
-    for k in range(12):
-        old(start / f"data {k // 3}" / f"{k}.txt", "1")
-        old(start / "data 0" / "sub" / f"{k}.txt", "1")
-    sender = Sender(b"another", str(start), str(tmp_path_factory.mktemp("place")), "")
-    found = run_in_folder(lambda item: sorted(str(path) for path in Path().rglob("*.txt")), 1, sender)[0]
-    assert len(found) == 9 and os.path.isfile(start / "data 3" / "9.txt")
-
-
 @pytest.mark.parametrize("kind", ["link", "large", "deep"])
 def test_names_below_folders_are_private(kind, start, pool, tmp_path_factory):
     folder = start / {"link": "out", "large": "out", "deep": "a/b/c/d/e"}[kind]
