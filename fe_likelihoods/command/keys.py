@@ -19,8 +19,8 @@ from ..units import DIMENSIONS, to_si
 
 __all__ = [
     "FORMS",
-    "KINDS",
     "Key",
+    "check_of",
     "did_you_mean",
     "key",
     "keys_of",
@@ -37,7 +37,7 @@ CLOCK = "time or clock time"
 class Key(NamedTuple):
     """One key of a section.
 
-    Its kind is a name in `KINDS`; a dimension of `fe_likelihoods.units.DIMENSIONS`, for a text with number and unit
+    Its kind is one of `check_of`; a dimension of `fe_likelihoods.units.DIMENSIONS`, for a text with number and unit
     (``"1.22 m"``) or a number in SI units; "one of " and choices; or "time or clock time".
     """
 
@@ -82,80 +82,57 @@ def _is_text(value: Any) -> bool:
     return isinstance(value, str) and bool(value.strip())
 
 
-def _list(fits: Callable[[Any], bool]) -> Callable[[Any], bool]:
-    return lambda value: isinstance(value, list) and all(map(fits, value))
-
-
-def _table(fits: Callable[[Any], bool]) -> Callable[[Any], bool]:
-    return lambda value: isinstance(value, dict) and bool(value) and all(map(fits, value.values()))
-
-
-def _either(*checks: Callable[[Any], bool]) -> Callable[[Any], bool]:
-    return lambda value: any(fits(value) for fits in checks)
-
-
 def _is_time(value: Any) -> bool:
     """Whether a value is a pair of times in order, or a name and such a pair."""
     times = value[1:] if isinstance(value, list) and value and _is_text(value[0]) else value
-    return _list(_is_number)(times) and len(times) == 2 and times[0] <= times[1]
+    return isinstance(times, list) and len(times) == 2 and all(map(_is_number, times)) and times[0] <= times[1]
 
 
 def _are_points(value: Any) -> bool:
     """Whether a value is a list of points [time, value] at different times."""
-    pairs = _list(lambda point: isinstance(point, list) and len(point) == 2)(value) and value
-    return (
-        bool(pairs)
-        and all(map(_is_number, times := [point[0] for point in pairs]))
-        and (all(_is_number(point[1]) or _is_text(point[1]) for point in pairs) and len({*times}) == len(times))
-    )
+    if not isinstance(value, list) or not all(isinstance(point, list) and len(point) == 2 for point in value):
+        return False
+    right = all(_is_number(time) and (_is_number(level) or _is_text(level)) for time, level in value)
+    return bool(value) and right and len({time for time, _ in value}) == len(value)
 
 
-KINDS: dict[str, tuple[Callable[[Any], bool], str]] = {
-    "text": (_is_text, 'a text in quotes, such as "abc"'),
-    "number": (_is_number, "a number"),
-    "whole number": (_is_whole, "a whole number"),
-    "whole number >= 0": (lambda value: _is_whole(value, 0), "a whole number of 0 or more"),
-    "whole number >= 1": (lambda value: _is_whole(value, 1), "a whole number of 1 or more"),
-    "yes or no": (lambda value: isinstance(value, bool), "true or false"),
-    "texts": (_list(_is_text), 'a list of texts, such as ["a", "b"]'),
-    "numbers": (_list(_is_number), "a list of numbers, such as [1.0, 2.0]"),
-    "whole numbers": (_list(_is_whole), "a list of whole numbers, such as [1, 2]"),
-    "number or numbers": (
-        _either(_is_number, _list(_is_number)),
-        "a number, or a list of numbers, such as [0.005, 0.01]",
-    ),
-    "matrix": (
-        _list(_list(_is_number)),
-        "a list of rows of numbers, such as [[1e-4, 0.0], [0.0, 2e-4]]",
-    ),
-    "text or numbers": (
-        _either(_is_text, _list(_is_number)),
-        "a text in quotes, or a list of numbers, such as [1.0, 5.0]",
-    ),
-    "numbers and times": (
-        _list(_either(_is_number, _is_time)),
-        'a list of numbers, and of times [first, last] in seconds, such as [-9999, [12.3, 12.8], ["top", 3.0, 3.2]]',
-    ),
-    "points by name": (
-        _table(_are_points),
-        'points of time and value by name, such as {top = [[0.0, "0.01 g"], [40.0, "0.03 g"]]}',
-    ),
-    "table of texts": (_table(_is_text), 'texts by name, such as {top = "abc"}'),
-    "table of texts or numbers": (
-        _table(_either(_is_text, _is_whole)),
-        'texts or whole numbers by name, such as {top = "abc"} or {top = 7}',
-    ),
-    "table of quantities": (
-        _table(_either(_is_number, _is_text)),
-        'numbers with units by name, such as {top = "0.01 g"}',
-    ),
-    "table of whole numbers": (_table(_is_whole), "whole numbers by name, such as {top = 2}"),
-    "table of whole numbers or texts": (
-        _either(_table(_is_whole), _list(_is_text)),
-        'whole numbers by name, such as {top = 2}, or a list of names, such as ["top"]',
-    ),
+_Check = tuple[Callable[[Any], bool], str, str]
+_ONE: dict[str, _Check] = {
+    "text": (_is_text, "text in quotes", '"abc"'),
+    "number": (_is_number, "number", "1.0"),
+    "whole number": (_is_whole, "whole number", "1"),
+    "whole number >= 0": (lambda value: _is_whole(value, 0), "whole number of 0 or more", "1"),
+    "whole number >= 1": (lambda value: _is_whole(value, 1), "whole number of 1 or more", "1"),
+    "yes or no": (lambda value: isinstance(value, bool), "value true or false", "true"),
+    "quantity": (lambda value: _is_number(value) or _is_text(value), "number with unit", '"0.01 g"'),
+    "points": (_are_points, "list of points of time and value", '[[0.0, "0.01 g"], [40.0, "0.03 g"]]'),
+    "time span": (_is_time, "time span in seconds", '["top", 12.3, 12.8]'),
 }
-"""Check of a value, and what a message says was expected, by kind."""
+"""Check of a value, what a message says was expected, and an example, of the kinds that others are made of."""
+
+
+def check_of(kind: str) -> _Check:
+    """The same for kinds such as "list of number", "table of text or number" (by name), and "text, or list of text"."""
+    if kind in _ONE:
+        return _ONE[kind]
+    first, _, second = kind.partition(", or ")
+    if not second and kind.startswith("list of "):
+        fits, expected, example = check_of(kind.removeprefix("list of "))
+        return (
+            lambda value: isinstance(value, list) and all(map(fits, value)),
+            f"list, each a {expected}",
+            f"[{example}]",
+        )
+    if not second and kind.startswith("table of "):
+        fits, expected, example = check_of(kind.removeprefix("table of "))
+        return (
+            lambda value: isinstance(value, dict) and bool(value) and all(map(fits, value.values())),
+            f"table by name, each a {expected}",
+            f"{{top = {example}}}",
+        )
+    first, second = (first, second) if second else kind.split(" or ", 1)
+    (fits, expected, _), (other, further, example) = check_of(first), check_of(second)
+    return lambda value: fits(value) or other(value), f"{expected}, or a {further}", example
 
 
 def did_you_mean(given: str, known: Sequence[str]) -> str:
@@ -172,19 +149,19 @@ def _split_number(text: str) -> tuple[str, str]:
     return number, unit.strip()
 
 
-_EXAMPLES = {
-    "acceleration": "0.1 g",
-    "velocity": "0.5 m/s",
-    "displacement": "1.22 m",
-    "force": "522 kip",
-    "stress": "42 MPa",
-    "moment": "100 kN m",
-    "curvature": "0.01 1/m",
-    "energy": "1 kJ",
-    "strain": "100 microstrain",
-    "rotation": "5 deg",
-    "time": "20 s",
-}
+def _parse(text: str, dimension: str | None, expected: str) -> float:
+    """The number in SI units in a text with a number and perhaps a unit; ValueError says what was `expected`."""
+    number, unit = _split_number(text)
+    try:
+        value = float(number)
+    except ValueError:
+        value = math.nan
+    if math.isnan(value):
+        raise ValueError(f"expected {expected}; got {text!r}")
+    try:
+        return to_si(value, unit, dimension).item() if unit else value
+    except ValueError as error:
+        raise ValueError(f"expected {expected}; got {text!r}: {error}") from None
 
 
 def read_quantity(value: Any, dimension: str) -> float:
@@ -200,20 +177,12 @@ def read_quantity(value: Any, dimension: str) -> float:
                 f'as "{value!r} MPa" or "{value!r} ksi"'
             )
         return float(value)
-    example = f"a number in {DIMENSIONS[dimension]}, or a text with a unit such as {_EXAMPLES.get(dimension, '1')!r}"
-    number, unit = _split_number(value) if isinstance(value, str) else ("", "")
-    try:
-        found = float(number)
-    except ValueError:
-        found = math.nan
-    if not math.isfinite(found):
-        raise ValueError(f"expected {example}; got {value!r}")
-    if not unit:
-        raise ValueError(f"expected {example}; {value!r} has no unit")
-    try:
-        return to_si(found, unit, dimension).item()
-    except ValueError as error:
-        raise ValueError(f"expected {example}; got {value!r}: {error}") from None
+    expected = f"a number in {DIMENSIONS[dimension]}, or a text with a unit such as '1 {DIMENSIONS[dimension]}'"
+    if not isinstance(value, str) or not math.isfinite(found := _parse(value, dimension, expected)):
+        raise ValueError(f"expected {expected}; got {value!r}")
+    if not _split_number(value)[1]:
+        raise ValueError(f"expected {expected}; {value!r} has no unit")
+    return found
 
 
 def read_by_channel(given: Mapping[str, Any], channels: Sequence[Any], key: str) -> dict[str, float]:
@@ -263,9 +232,9 @@ def _read_value(value: Any, kind: str, where: str) -> Any:
             return value
         near = difflib.get_close_matches(value, choices, n=1, cutoff=0.55) if isinstance(value, str) else []
         raise ValueError(f"{where}: expected {kind}; got {value!r}{f'; did you mean {near[0]}?' if near else ''}")
-    fits, expected = KINDS[kind]
+    fits, expected, example = check_of(kind)
     if not fits(value):
-        raise ValueError(f"{where}: expected {expected}; got {value!r}")
+        raise ValueError(f"{where}: expected a {expected}, such as {example}; got {value!r}")
     return value
 
 
@@ -297,17 +266,5 @@ def parse_prior(text: str, dimension: str | None = None) -> Distribution:
         raise ValueError(f"expected {form}; got {text!r}")
     if name == "log-normal" and _split_number(arguments[1])[1]:
         raise ValueError(f"expected {form}, which has no unit; got {text!r}")
-    return _MAKE[name](*(_number(argument, text, dimension) for argument in arguments))
-
-
-def _number(argument: str, text: str, dimension: str | None) -> float:
-    number, unit = _split_number(argument)
-    try:
-        value = float(number)
-    except ValueError:
-        raise ValueError(
-            f"expected a number, or a number with a unit such as '0.1 g'; got {argument!r} in {text!r}"
-        ) from None
-    if math.isnan(value):
-        raise ValueError(f"expected a number; got {argument!r} in {text!r}")
-    return to_si(value, unit, dimension).item() if unit else value
+    expected = "a number, or a number with a unit such as '0.1 g'"
+    return _MAKE[name](*(_parse(argument.strip(), dimension, expected) for argument in arguments))

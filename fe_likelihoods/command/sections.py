@@ -65,10 +65,10 @@ _KINDS_OF_TYPES = {
     "int": "whole number",
     "bool": "yes or no",
     "str": "text",
-    "tuple of str": "texts",
-    "sequence of str": "texts",
-    "sequence of int": "whole numbers",
-    "sequence of float": "numbers",
+    "tuple of str": "list of text",
+    "sequence of str": "list of text",
+    "sequence of int": "list of whole number",
+    "sequence of float": "list of number",
 }
 
 
@@ -142,7 +142,7 @@ class Calibration(Motion):
     """``[record]``."""
 
     supports: Any = key(
-        "texts",
+        "list of text",
         'Motions of several supports instead of file, as "file.csv" or "file.csv:column"; of a bridge deck the base of '
         "the column, the first end and the second end",
     )
@@ -164,17 +164,19 @@ class Measured(Table):
     """``[measurements]``."""
 
     file: Any = key("text", "Measured response: CSV, Excel, V2 and other files as in [record], or a data set (.h5)")
-    columns: Any = key("table of texts or numbers", "Channel = name of its column in the file, or number in a V2 file")
-    units: Any = key("table of texts", "Channel = unit, if the file does not state it")
-    reversed: Any = key("texts", "Channels whose sensor counts the other way round: they are multiplied by -1")
-    channels: Any = key("texts", "Channels to use; by default all")
+    columns: Any = key(
+        "table of text or whole number", "Channel = name of its column in the file, or number in a V2 file"
+    )
+    units: Any = key("table of text", "Channel = unit, if the file does not state it")
+    reversed: Any = key("list of text", "Channels whose sensor counts the other way round: they are multiplied by -1")
+    channels: Any = key("list of text", "Channels to use; by default all")
     zero: Any = key(CLOCK, "Time in the file at which the base motion begins")
     missing: Any = key(
-        "numbers and times",
+        "list of number or time span",
         "Numbers that stand for missing samples, and times [first, last] that are left out, with the name of a channel "
         "before them for this one alone [s after zero]",
     )
-    baseline: Any = key("points by name", "Channel = points [time, value] of an offset or a drift that is subtracted")
+    baseline: Any = key("table of points", "Channel = points [time, value] of an offset or a drift that is subtracted")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -185,24 +187,27 @@ class Modes(Section):
         "text", "Identified modes, alone or beside other data: CSV, Excel or MATLAB (`read_modal_data`)", ...
     )
     unit: Any = key("text", 'Unit of the frequencies, if the file does not state it: "Hz" or "rad/s"')
-    columns: Any = key("table of texts", "Sensor of the model = name of its column; by default the column of this name")
-    variables: Any = key("table of texts", "Of a MATLAB file: frequencies, shapes and damping = names of the variables")
-    modes: Any = key("whole numbers", "Numbers of the modes to compare; by default all but those held out")
+    columns: Any = key("table of text", "Sensor of the model = name of its column; by default the column of this name")
+    variables: Any = key("table of text", "Of a MATLAB file: frequencies, shapes and damping = names of the variables")
+    modes: Any = key("list of whole number", "Numbers of the modes to compare; by default all but those held out")
     held_out: Any = key(
-        "whole numbers", "Numbers of modes that are not compared, but predicted and shown beside the measured ones"
+        "list of whole number",
+        "Numbers of modes that are not compared, but predicted and shown beside the measured ones",
     )
     mean: Any = key("yes or no", "Take the mean of several identifications, and their scatter as the errors", False)
     frequency_cv: Any = key(
-        "number or numbers",
+        "number, or list of number",
         "Known coefficient of variation of the frequencies, such as 0.005, or one per mode of the file",
     )
-    covariance: Any = key("matrix", "Known covariance of the compared frequencies [Hz²], instead of frequency_cv")
+    covariance: Any = key(
+        "list of list of number", "Known covariance of the compared frequencies [Hz²], instead of frequency_cv"
+    )
     temperatures: Any = key(
-        "number or numbers",
+        "number, or list of number",
         "Temperature of each identification [°C], if the file does not state it; adds the parameter temperature_slope",
     )
     shape_error: Any = key(
-        "number or numbers", "Known standard deviation of a component of a shape with a norm of 1, such as 0.02"
+        "number, or list of number", "Known standard deviation of a component of a shape with a norm of 1, such as 0.02"
     )
     unknown_errors: Any = key(
         "one of common, mode",
@@ -221,10 +226,10 @@ class LoadTest(Section):
     """``[load_test]``."""
 
     file: Any = key("text", "Load test, alone or beside other data: CSV or Excel with a line for each load case", ...)
-    columns: Any = key("table of texts", "Channel = name of its column; by default the column of this name")
-    units: Any = key("table of texts", "Channel = unit, if the file does not state it")
+    columns: Any = key("table of text", "Channel = name of its column; by default the column of this name")
+    units: Any = key("table of text", "Channel = unit, if the file does not state it")
     cases: Any = key("text", "Column with the names of the load cases, or with positions; by default the first one")
-    errors: Any = key("table of quantities", 'Channel = known standard deviation of its sensor, such as "0.1 mm"')
+    errors: Any = key("table of quantity", 'Channel = known standard deviation of its sensor, such as "0.1 mm"')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -236,9 +241,9 @@ class Noise(Section):
         "Autoregressive: each error depends on the one before, with a correlation per channel; takes sensor only",
         "gaussian",
     )
-    groups: Any = _argument(GaussianNoise, "groups", "text or numbers")
+    groups: Any = _argument(GaussianNoise, "groups", "text, or list of number")
     level: Any = _argument(GaussianNoise, "level", "text")
-    sensor: Any = _argument(GaussianNoise, "sensor", "table of quantities")
+    sensor: Any = _argument(GaussianNoise, "sensor", "table of quantity")
     window: Any = _argument(GaussianNoise, "window", "time")
     local: Any = _argument(GaussianNoise, "local", "number")
     marginal: Any = key("yes or no", "Integrate the levels out; for levels in SI units without bands and sensor", False)
@@ -302,16 +307,16 @@ FREE_SECTIONS = {
 
 
 USER = (
-    Key("parameters", "texts", "Names of the structural parameters, in the order of theta", True),
-    Key("channels", "table of texts", 'Channels of the response: name = "quantity [unit]", in order'),
+    Key("parameters", "list of text", "Names of the structural parameters, in the order of theta", True),
+    Key("channels", "table of text", 'Channels of the response: name = "quantity [unit]", in order'),
     Key(
         "sensors",
-        "table of whole numbers or texts",
+        "table of whole number, or list of text",
         "With [modes], instead of channels: sensor = row of the matrices, from 0, that a function returns; a list of "
         "names for other models",
     ),
     *_arguments(FunctionModel, "dt n_steps time_limit", n_steps="whole number >= 1"),
-    Key("depends_on", "texts", "Files that the response depends on besides the code"),
+    Key("depends_on", "list of text", "Files that the response depends on besides the code"),
     Key("version", "text", "Text that stands for the code in the cache; change it when the results change"),
 )
 """Keys of ``[model]`` that all models of the user have; a program needs a `time_limit`."""
@@ -322,22 +327,22 @@ _OWN = {
     "opensees": (_FUNCTION, *USER),
     "executable": (
         *_arguments(ExecutableModel, "command", required="command"),
-        Key("templates", "table of texts", "Input files: name in the folder of the run = template"),
+        Key("templates", "table of text", "Input files: name in the folder of the run = template"),
         Key("output", "text", "Name of the file with the response", True),
-        *_arguments(ExecutableModel, "columns output_units record_file", output_units="table of texts"),
-        Key("files", "table of texts", "Further files: name in the folder of the run = file"),
+        *_arguments(ExecutableModel, "columns output_units record_file", output_units="table of text"),
+        Key("files", "table of text", "Further files: name in the folder of the run = file"),
         *(each._replace(required=each.required or each.name == "time_limit") for each in USER),
     ),
 }
 _COLUMN_PARTS = dict(concrete="Concrete", steel="Steel", bars="Bars", hoops="Hoops", fatigue="LowCycleFatigue")
 _BRIDGE_PARTS = {f"{name.lower()}_{i}": name for name in ("Pier", "Bearing", "Damper") for i in (1, 2)}
 _STOREYS: dict[str, Any] = dict(
-    names="floors masses stiffnesses groups", required="floors masses stiffnesses", floors="table of whole numbers"
+    names="floors masses stiffnesses groups", required="floors masses stiffnesses", floors="table of whole number"
 )
 _BUILT_IN: dict[str, tuple[str, dict[str, Any]]] = {
     "column": (
         "rc_column.RCColumn",
-        dict(without=f"loading outputs max_increment {' '.join(_COLUMN_PARTS)}", units="table of texts"),
+        dict(without=f"loading outputs max_increment {' '.join(_COLUMN_PARTS)}", units="table of text"),
     ),
     "bridge": (
         "isolated_bridge.IsolatedBridge",

@@ -190,7 +190,7 @@ def test_the_lines_for_faults_of_sensors_work(tmp_path):
     assert check_data(measured) == ()
     for old, new, message in (
         ('[["acceleration"', '[["top"', "missing: no channel 'top'"),
-        ("[0.000, ", "[", "baseline: expected points of time and value by name"),
+        ("[0.000, ", "[", "baseline: expected a table by name, each a list of points"),
     ):
         job.write_text(head + named.replace(old, new))
         with pytest.raises(ValueError, match=message):

@@ -58,12 +58,15 @@ def test_noises_are_those_of_python(folder, keys, parameters, options):  # noqa:
         ('kind = "autoregresive"', "got 'autoregresive'; did you mean autoregressive?"),
         ('kind = "autoregressive"\ngroups = "all"', '[noise] groups: the kind "autoregressive" has no such key'),
         ('level = "response"\nwindow = "1 g"\n' + SENSOR, "[noise] window: expected a number in s"),
-        ("groups = true\n" + SENSOR, "[noise] groups: expected a text in quotes, or a list of numbers"),
+        ("groups = true\n" + SENSOR, "[noise] groups: expected a text in quotes, or a list, each a number"),
         ('marginal = true\nlevel = "measured"', "[noise] marginal() integrates out the standard deviations"),
         ('sensor = {acceleration = "1 mm"}', "[noise] sensor: acceleration: expected a number in m/s"),
         ('sensor = {accelaration = "1 g"}', "sensor: unknown channel 'accelaration'; did you mean acceleration?"),
         ('sensor = {acceleration = "-1 g"}', "[noise] sensor: acceleration: expected a standard deviation"),
-        ('sensor = "1 g"', '[noise] sensor: expected numbers with units by name, such as {top = "0.01 g"}'),
+        (
+            'sensor = "1 g"',
+            '[noise] sensor: expected a table by name, each a number with unit, such as {top = "0.01 g"}',
+        ),
     ],
 )
 def test_wrong_keys_of_the_noise_are_named(folder, keys, message):  # noqa: F811

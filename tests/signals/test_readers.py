@@ -583,13 +583,6 @@ class TestColumns:
         with pytest.raises(ValueError, match="install it with pip install openpyxl, or save the sheet as CSV"):
             read_record(tmp_path / "a.xlsx")
 
-    def test_shake_table_at_120_hertz(self, shared):
-        channels = [Channel(name, "acceleration", "g") for name in ("ground", "roof")]
-        path = shared / "measured/mini_shake_table/Flexible_3_story__Northridge.csv"
-        response = read_columns(path, channels, ("ground_x", "3rd_x"), "m/s2")
-        assert response.dt == 1 / 120
-        np.testing.assert_allclose(response.values[:, 0], [0.0853, -0.10002], rtol=1e-14)
-
     def test_cyclic_column(self, shared):
         path = shared / "measured/rc_column_cyclic/2017_Lehman_415.csv"
         history, forces = read_imposed_test(path, "disp_in", (Channel("base", "shear force", "kip"),), ("force_kip",))
