@@ -10,6 +10,7 @@ import numpy as np
 from ..checks.finding import NOTE
 from ..checks.screening import Screened, check_data, check_sensors, repair_lines, screen, screen_motion
 from ..checks.sensor_faults import find_sensor_faults
+from ..modal.modal_readers import read_modal_data
 from ..signals.datasets import read_dataset
 from ..signals.read import read_record, recognise_format
 from ..signals.records import Record
@@ -38,11 +39,10 @@ _HEAD = ("samples", "step [s]", "duration [s]", "peak [g]")
 
 
 class _Lines(NamedTuple):
-    """Text about a file, and the lines of the sections ``[record]`` and ``[measurements]``."""
+    """Text about a file, and lines of sections such as ``[record]`` and ``[measurements]``."""
 
     text: list[str]
-    record: list[str] | None = None
-    measured: list[str] | None = None
+    sections: dict[str, list[str]] = {}
 
 
 def describe_data(path: Path) -> str:
@@ -57,9 +57,8 @@ def describe_data(path: Path) -> str:
         single = _table if form is None else _single
         found = _several(path, form) if form in ("v2", "geonet") else single(path)
     lines = [f"{path}: {found.text[0]}", *found.text[1:], "", "# lines for the TOML file"]
-    for section, given in (("record", found.record), ("measurements", found.measured)):
-        if given is not None:
-            lines += [f"[{section}]", f"file = {_quoted(str(path))}", *given]
+    for section, given in found.sections.items():
+        lines += [f"[{section}]", f"file = {_quoted(str(path))}", *given]
     return "\n".join(lines)
 
 
@@ -132,7 +131,7 @@ def _several(path: Path, form: str) -> _Lines:
     first = columns[0][1]
     line = f"channel = {first}" if isinstance(first, int) else f"column = {_quoted(first)}"
     measured = [f"columns = {_inline(columns)}    # channel of the model = channel of the file"]
-    return _Lines(text, [f"{line}    # the base motion"], measured + repair_lines(screened))
+    return _Lines(text, {"record": [f"{line}    # the base motion"], "measurements": measured + repair_lines(screened)})
 
 
 def _record_text(record: Record) -> list[str]:
@@ -154,7 +153,7 @@ def _single(path: Path) -> _Lines:
         record = read_record(path, **given)
     note = ["The unit is not stated: the peak is that of samples in g."] if "units" in given else []
     note += _texts(screen_motion(record))
-    return _Lines(["a ground motion", *_record_text(record), *note], lines)
+    return _Lines(["a ground motion", *_record_text(record), *note], {"record": lines})
 
 
 def _dataset(path: Path) -> _Lines:
@@ -165,11 +164,17 @@ def _dataset(path: Path) -> _Lines:
         rows.append((channel.name, channel.quantity, str(values.size), f"{step:g}", str(int(np.isnan(values).sum()))))
     text = ["a data set", *_record_text(found.record), text_table(rows), measured.description]
     text += [f"CAUTION: {each}" for each in check_data(measured, found.record) if each.severity != NOTE]
-    return _Lines(text, [], repair_lines(screen(measured)))
+    return _Lines(text, {"record": [], "measurements": repair_lines(screen(measured))})
 
 
 def _table(path: Path) -> _Lines:
+    """A table of samples, of modes or of load cases."""
     table = read_table(path)
+    try:
+        return _Lines(["a table of modes", str(read_modal_data(path))], {"modes": []})
+    except ValueError as error:
+        if "unit of the frequencies is not stated" in str(error):
+            return _Lines(["a table of modes"], {"modes": ['unit = "?"    # write it: the file does not state it']})
     options, remarks, step = _sampling(table)
     rows: list[tuple[str, ...]] = [("column", "unit", "numbers", "missing", "smallest", "largest")]
     columns, unstated, marks, screened = [], [], set(), list[Screened]()
@@ -211,10 +216,14 @@ def _table(path: Path) -> _Lines:
         )
     if not columns:
         return _Lines(text)
+    if table.time is None and table.columns[0].kind == "text":
+        return _Lines(
+            [*text, "a line for each load case"], {"load_test": [*measured[:1], *measured[1 + len(options) :]]}
+        )
     base = [f"column = {_quoted(columns[0][1])}    # the base motion, if it is in this file"]
     if unstated and columns[0][0] == unstated[0][0]:
         base.append('units = "?"    # write it: the file does not state it')
-    return _Lines(text, [*base, *options], measured + repairs)
+    return _Lines(text, {"record": [*base, *options], "measurements": measured + repairs})
 
 
 def _sampling(table: Table) -> tuple[list[str], list[str], float | None]:

@@ -60,6 +60,10 @@ class Record:
         object.__setattr__(self, "dt", check_step(self.dt, self.name))
         object.__setattr__(self, "acceleration", check_samples(self.acceleration, "acceleration", self.name))
 
+    def __str__(self) -> str:
+        peak = np.abs(self.acceleration).max()
+        return f"{self.name}: {self.n_steps} samples at {self.dt:g} s, peak {peak:.3g} m/s²"
+
     @property
     def n_steps(self) -> int:
         """Number of samples."""

@@ -120,6 +120,24 @@ def test_a_data_set_and_a_file_that_cannot_be_read(tmp_path):
     assert "a data set" in result.output
 
 
+@pytest.mark.parametrize(
+    ("text", "section", "given"),
+    [
+        ("frequency_Hz,top\n1.5,1.0\n4.6,-0.7\n", "modes", {}),
+        ("frequency,top\n1.5,1.0\n4.6,-0.7\n", "modes", {"unit": "?"}),
+        (
+            "case,mid [mm],end\none,1,2\ntwo,2,3\n",
+            "load_test",
+            {"columns": {"mid": "mid [mm]", "end": "end"}, "units": {"end": "?"}},
+        ),
+    ],
+)
+def test_data_without_time_have_sections_of_their_own(tmp_path, text, section, given):
+    path = tmp_path / "a.csv"
+    path.write_text(text)
+    assert listed(path)[1] == {section: {"file": str(path)} | given}
+
+
 def test_channels_of_a_real_structure_in_a_zip_archive(shared):
     folder = shared / "measured/painter_street_bridge"
     output, lines = listed(folder / "petrolia_25apr1992_ce89324p.zip")
