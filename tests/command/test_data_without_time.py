@@ -76,20 +76,6 @@ def test_from_a_load_test_to_a_report(tmp_path, monkeypatch):
     assert "Predicted values" in (outcome.folder / "report.html").read_text()
 
 
-def test_units_and_signs_are_named_before_a_run(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    write_templates("modal", tmp_path)
-    modes = (tmp_path / "synthetic_modes.csv").read_text()
-    (tmp_path / "synthetic_modes.csv").write_text(modes.replace("2.088", "13.12").replace("6.195", "38.92"))
-    path = changed(tmp_path, "modal", ("modes = [1, 2, 3]", "modes = [1, 2]"))
-    assert "as with rad/s instead of Hz" in call("check", str(path), "--quiet")
-    reverse = ["-" + row.rpartition(",")[2] for row in modes.splitlines()]
-    rows = [row.rpartition(",")[0] + "," + last for row, last in zip(modes.splitlines(), reverse, strict=True)]
-    text = "\n".join(rows).replace("-floor", "floor").replace("--", "")
-    (tmp_path / "synthetic_modes.csv").write_text(text)
-    assert "the sensor floor_4 counts the other way round" in call("check", str(path), "--quiet")
-
-
 def test_other_models_have_modes(tmp_path):
     write_templates("modal", tmp_path)
     (tmp_path / "my_storeys.py").write_text(MATRICES)

@@ -80,20 +80,9 @@ def test_events_are_predicted_and_scored(finished, run_once):
     assert rows[2]["measured"] == rows[2]["pit"] == ""
 
     report = read_page(events / "r" / "report.html")
-    numbers = next(table for table in report.tables if table[0][1:3] == ["Quantity", "Median"])[1:]
-    assert [row[:2] for row in numbers] == [[row["event"], f"{row['quantity']} [{row['unit']}]"] for row in rows]
-    for cells, row in zip(numbers, rows[:2], strict=False):
-        shown = [float(row[key]) for key in ("median", "measured")]
-        assert [float(cells[2]), float(cells[5])] == pytest.approx(shown, rel=6e-3)
-        assert cells[6].startswith("within") == (0.05 <= float(row["pit"]) <= 0.95)
-    assert all(row[5:7] == ["–", "not known"] for row in numbers[2:])
-    histories = next(table for table in report.tables if table[0][-1] == "In the 90 % band")[1:]
-    assert [row[0] for row in histories] == ["weaker", "weaker"]
     assert sum(alt.startswith("Predicted histories") for _, alt in report.images) == 3  # with the calibrated event
     told = [title.removeprefix("weaker: ") for title in report.notes if title.startswith("weaker: ")]
     assert told and all(f"CAUTION: event weaker: {title}" in said for title in told)
-    for text in ("with the noise", "without the noise", "The motion meets the structure before any other event"):
-        assert text in report.text
 
 
 @pytest.mark.slow
