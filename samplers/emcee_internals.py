@@ -17,10 +17,8 @@ __all__ = [
     "get_moves",
     "get_previous_state",
     "get_random",
-    "restore_counts",
     "set_moves",
     "set_previous_state",
-    "trim_chain",
     "type_of_blobs",
 ]
 
@@ -50,42 +48,23 @@ def set_previous_state(sampler: EnsembleSampler, state: State | None) -> None:
     sampler._previous_state = state
 
 
-def cut_chain(backend: Backend, steps: int) -> None:
-    """Keep the first `steps` steps of a chain; with 0, the counts of accepted proposals begin anew."""
+def cut_chain(backend: Backend, steps: int, accepted: np.ndarray) -> None:
+    """Set a chain's number of steps and its counts of accepted proposals (nwalkers,).
+
+    What an interrupted step or allocation has left, from which emcee's backends cannot grow, is removed.
+    """
     if isinstance(backend, HDFBackend):
         with backend.open("a") as file:
             group = file[backend.name]
             group.attrs["iteration"] = steps
-            if steps == 0:
-                group["accepted"][...] = 0.0
-                group.attrs["has_blobs"] = False
-            _remove_half_made_blobs(group)
+            group["accepted"][...] = accepted
+            group.attrs["has_blobs"] &= steps > 0
+            if not group.attrs["has_blobs"]:  # emcee sets it after it has made the dataset
+                group.pop("blobs", None)
         return
-    backend.iteration = steps
-    if steps == 0:
-        backend.accepted, backend.blobs = np.zeros_like(backend.accepted), None
-    trim_chain(backend)
-
-
-def trim_chain(backend: Backend) -> None:
-    """Remove what an interrupted step or allocation has left, from which emcee's backends cannot grow."""
-    if isinstance(backend, HDFBackend):
-        with backend.open() as file:
-            whole = file[backend.name].attrs["has_blobs"] or "blobs" not in file[backend.name]
-        if not whole:
-            with backend.open("a") as file:
-                _remove_half_made_blobs(file[backend.name])
-        return
-    for name in ("chain", "log_prob", "blobs"):
-        values = vars(backend)[name]
-        if values is not None:
-            setattr(backend, name, values[: backend.iteration])
-
-
-def _remove_half_made_blobs(group: Any) -> None:
-    """Remove a dataset of blobs that emcee does not know: it sets `has_blobs` after it has made the dataset."""
-    if not group.attrs["has_blobs"]:
-        group.pop("blobs", None)
+    backend.iteration, backend.accepted = steps, np.array(accepted)
+    backend.chain, backend.log_prob = backend.chain[:steps], backend.log_prob[:steps]
+    backend.blobs = None if backend.blobs is None or steps == 0 else backend.blobs[:steps]
 
 
 def type_of_blobs(backend: Backend) -> np.dtype | None:
@@ -95,15 +74,3 @@ def type_of_blobs(backend: Backend) -> np.dtype | None:
     with backend.open() as file:
         group = file[backend.name]
         return group["blobs"].dtype.base if group.attrs["has_blobs"] else None
-
-
-def restore_counts(backend: Backend, steps: int, accepted: np.ndarray) -> None:
-    """Set a chain's number of steps and its counts of accepted proposals (nwalkers,), if they differ."""
-    if backend.iteration == steps and np.array_equal(backend.accepted, accepted):
-        return
-    if isinstance(backend, HDFBackend):
-        with backend.open("a") as file:
-            file[backend.name].attrs["iteration"] = steps
-            file[backend.name]["accepted"][...] = accepted
-    else:
-        backend.iteration, backend.accepted = steps, accepted.copy()

@@ -2,42 +2,32 @@
 
 emcee's backend writes the chain. In an HDF5 file, the group of the chain has the attribute ``run``, the dataset
 ``tempering`` (JSON), and the group ``restart``: the population at beta = 1, or the state from which a reset chain
-continues. The attribute ``checksum`` of all of this tells a chain that something else has changed. In memory, results
-are attributes of the backend.
+continues.
 """
 
 import json
 import logging
-import os
-import tempfile
-import zlib
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
-import h5py
 import numpy as np
 from emcee import State
 from emcee.backends import Backend, HDFBackend
 
-from .emcee_internals import cut_chain, restore_counts, trim_chain, type_of_blobs
+from .emcee_internals import cut_chain, type_of_blobs
 from .estimates.importance import EvidenceCheck
 from .finding import Finding
 from .judgement.verdict import Verdict
-from .output_file import FileHeld, open_file, replace_group, whole_file
+from .output_file import whole_file
 from .reports import AnnealingResult, Stage
 
-__all__ = ["DAMAGED", "Output", "make_group", "run_of_file"]
+__all__ = ["Output"]
 
 logger = logging.getLogger(__name__)
 
-DAMAGED = "damaged"
-CHECKSUM = "checksum"
-# attributes and datasets of every chain of emcee
-OF_EVERY_CHAIN = {"version", "nwalkers", "ndim", "has_blobs", "iteration", "chain", "log_prob", "accepted"}
-
 
 class Output:
-    """Data stored with the chain of an initialised backend: `result` and `verdict` (empty, None: nothing).
+    """Data stored with the chain of an initialised backend: `result` and `verdict` (empty, None: nothing) of a `run`.
 
     `first_step` steps were stored before the last annealing. `provisional`: the last step is the estimate of a run that
     the limit of simulations ended, and is replaced when the run continues.
@@ -47,6 +37,7 @@ class Output:
         self._backend, self._file = backend, whole_file(backend)
         self._counts = int(backend.iteration), np.array(backend.accepted)
         stored = _read(backend)
+        self.run = stored.get("run", "")  # empty: a chain of emcee
         self.result, self.verdict = _parsed(stored)
         self.first_step = stored.get("first_step", 0)
         # the process may have been killed after the provisional step was removed, and before its note was
@@ -54,15 +45,13 @@ class Output:
 
     def whole(self) -> AbstractContextManager:
         """Context in which a file is changed as a whole (`samplers.output_file`)."""
-        if self._file is None:
-            return nullcontext()
-        self._file.seal = _seal
-        return self._file
+        return nullcontext() if self._file is None else self._file
 
     def begin(self, run: str) -> None:
         """A new annealing begins, without results. OSError or ValueError if a file cannot be written."""
-        self.result, self.verdict, self.first_step = AnnealingResult(), None, int(self._backend.iteration)
-        self._write(run, keep=False)
+        self.run, self.result, self.verdict = run, AnnealingResult(), None
+        self.first_step = int(self._backend.iteration)
+        self.write(None)
         if self._file is not None:
             self._file.save()
 
@@ -71,6 +60,18 @@ class Output:
         self._counts = int(self._backend.iteration), np.array(self._backend.accepted)
         if self._file is not None:
             self._file.save_now_and_then()
+
+    def undo_half_a_step(self) -> None:
+        """Remove a step that an error or Ctrl-C has left incomplete."""
+        try:
+            if self._backend.iteration != self._counts[0] or np.any(self._backend.accepted != self._counts[1]):
+                cut_chain(self._backend, *self._counts)
+        except Exception as error:  # the error that has ended the step is raised
+            logger.warning("the chain may end with half of a step (%s)", error)
+
+    def trim(self) -> None:
+        """Remove allocated steps."""
+        cut_chain(self._backend, int(self._backend.iteration), self._backend.accepted)
 
     def check_blobs(self, blobs: np.ndarray | None) -> None:
         """Raise ValueError if blobs (n, ...) that are stored next have another type than those of the chain."""
@@ -81,26 +82,12 @@ class Output:
                 "delete the file of the chain, but not its record, from which the chain is made again"
             )
 
-    def undo_half_a_step(self) -> None:
-        """Remove a step that an error or Ctrl-C has left incomplete."""
-        try:
-            restore_counts(self._backend, *self._counts)
-        except Exception as error:  # the error that has ended the step is raised
-            logger.warning("the chain may end with half of a step (%s)", error)
-
-    def write(self, result: AnnealingResult, verdict: Verdict | None) -> None:
-        """Store a result."""
-        self.result, self.verdict = result, verdict
-        self._write()
-
-    def keep_state(self, state: State | None) -> None:
-        """Store the state from which a chain without steps continues, also in another process."""
-        self._write(keep=False, state=state)
-
-    def _write(self, run: str | None = None, keep: bool = True, state: State | None = None) -> None:
-        """Write the results, the name of a `run`, and a state in place of the stored one, unless that is to `keep`."""
+    def write(self, *state: State | None) -> None:
+        """Store the results, and a `state` that a chain without steps goes on from, if it is another one."""
         result, backend = self.result, self._backend
         self._counts = int(backend.iteration), np.array(backend.accepted)
+        if self._file is None:
+            return
         contents = {
             "ladder": result.ladder,
             "check": result.check,
@@ -109,23 +96,20 @@ class Output:
             "first_step": self.first_step,
             "provisional": self.provisional,
         }
-        if not isinstance(backend, HDFBackend):
-            backend.tempering = contents
-            return
         data = np.frombuffer(json.dumps(contents).encode(), dtype=np.uint8)
         with self.whole(), backend.open("a") as file:
             group = file[backend.name]
-            if run is not None:
-                group.attrs["run"] = run
-            if not keep:
+            group.attrs["run"] = self.run
+            if state:
                 group.pop("restart", None)
-            if state is not None and state.log_prob is not None:
-                kept = group.create_group("restart")
-                for name in ("coords", "log_prob", "blobs"):
-                    if (values := getattr(state, name)) is not None:
-                        kept.create_dataset(name, data=values)
-                for i, value in enumerate(state.random_state or ()):
-                    kept.attrs[f"random_state_{i}"] = value
+            for each in state:
+                if each is not None and each.log_prob is not None:
+                    kept = group.create_group("restart")
+                    for name in ("coords", "log_prob", "blobs"):
+                        if (values := getattr(each, name)) is not None:
+                            kept.create_dataset(name, data=values)
+                    for i, value in enumerate(each.random_state or ()):
+                        kept.attrs[f"random_state_{i}"] = value
             group.pop("tempering", None)
             group.create_dataset("tempering", data=data)
 
@@ -146,45 +130,42 @@ class Output:
             random_state = tuple(value for _, value in sorted(group.attrs.items())) or backend.random_state
         return State(values.pop("coords"), **values, random_state=random_state)
 
-    def mark_again(self, run: str) -> bool:
-        """Mark a file whose chain emcee has reset as the file of a run; returns whether this was needed."""
-        if self._file is None:
-            return False
-        with self._backend.open() as file:
-            if "run" in file[self._backend.name].attrs:
-                return False
-        self._write(run)
-        return True
+    @property
+    def was_reset(self) -> bool:
+        """Whether the user has called the method ``reset`` of the backend."""
+        gone = self._backend.iteration < self._counts[0]
+        return gone or (self._file is not None and "run" not in _read(self._backend))
 
     def clear_chain(self, state: State | None) -> None:
         """Remove all steps; the chain continues from `state`."""
         with self.whole():
-            cut_chain(self._backend, 0)
+            cut_chain(self._backend, 0, np.zeros_like(self._counts[1]))
             self.first_step, self.provisional = 0, False
-            self.keep_state(state)
+            self.write(state)
 
     def store_provisional_step(self, state: State) -> None:
         """Store the estimate of a run that the limit of simulations ended, as a step that is replaced later."""
-        trim_chain(self._backend)
+        self.trim()
         self._backend.grow(1, state.blobs)
         self._backend.save_step(state, np.zeros(len(state.coords), dtype=bool))
         self.provisional = True
-        self._write()
+        self.write()
 
     def drop_provisional_step(self) -> None:
         """Remove the last step if it is provisional."""
         if self.provisional:
-            cut_chain(self._backend, int(self._backend.iteration) - 1)
+            cut_chain(self._backend, self._counts[0] - 1, self._counts[1])
             self.provisional = False
-            self._write()
+            self.write()
 
 
 def _read(backend: Backend) -> dict[str, Any]:
     if not isinstance(backend, HDFBackend):
-        return getattr(backend, "tempering", {})
+        return {}
     with backend.open() as file:
         group = file[backend.name]
-        return json.loads(group["tempering"][...].tobytes()) if "tempering" in group else {}
+        stored = json.loads(group["tempering"][...].tobytes()) if "tempering" in group else {}
+        return stored | ({"run": group.attrs["run"]} if "run" in group.attrs else {})
 
 
 def _parsed(stored: dict[str, Any]) -> tuple[AnnealingResult, Verdict | None]:
@@ -198,65 +179,3 @@ def _parsed(stored: dict[str, Any]) -> tuple[AnnealingResult, Verdict | None]:
         return result, None
     status, reasons, *others, findings = verdict
     return result, Verdict(status, tuple(reasons), *others, tuple(Finding(*each) for each in findings))
-
-
-def _seal(group: h5py.Group) -> None:
-    """Write the checksum of a chain that is complete."""
-    group.attrs[CHECKSUM] = _checksum(group)
-
-
-def _checksum(group: h5py.Group) -> int:
-    """CRC-32 of all datasets and attributes of a chain, apart from this number."""
-    found = 0
-
-    def add(name: str, node: h5py.Group | h5py.Dataset) -> None:
-        nonlocal found
-        for key in sorted(node.attrs):
-            if key != CHECKSUM:
-                found = zlib.crc32(f"{name} {key}".encode() + np.asarray(node.attrs[key]).tobytes(), found)
-        if isinstance(node, h5py.Dataset):
-            found = zlib.crc32(name.encode() + node[...].tobytes(), found)
-
-    add("", group)
-    group.visititems(add)
-    return found
-
-
-def run_of_file(backend: HDFBackend) -> str | None:
-    """The run that the file of a backend belongs to; the empty string for a chain without a run.
-
-    It is "damaged" for a chain that cannot be read completely, or is not as it was stored. It is None if there is no
-    file, the file is empty, or it has no chain with this name, or an incomplete one that never had a step.
-    """
-    if not os.path.exists(backend.filename) or os.path.getsize(backend.filename) == 0:
-        return None
-    try:
-        with open_file(backend) as file:
-            if backend.name not in file:
-                return None
-            group = file[backend.name]
-            if not group.attrs.get("iteration", 0) and "run" not in group.attrs and "log_prob" not in group:
-                return None  # emcee was killed while it made the group
-            whole = OF_EVERY_CHAIN <= {*group.attrs, *group}
-            if "run" in group.attrs or "tempering" in group:  # else a chain of emcee
-                whole &= group.attrs.get(CHECKSUM) == _checksum(group)
-            return group.attrs.get("run", "") if whole else DAMAGED
-    except FileHeld:
-        raise
-    except Exception:  # HDF5 raises nearly anything
-        return DAMAGED
-
-
-def make_group(backend: HDFBackend, nwalkers: int, ndim: int, run: str, damaged: bool = False) -> None:
-    """Make the file of a backend, with an empty chain, in one step; other groups of a readable file are kept."""
-    with tempfile.TemporaryDirectory() as folder:
-        options = {"compression": backend.compression, "compression_opts": backend.compression_opts}
-        made = HDFBackend(
-            f"{folder}/new.h5", backend.name, dtype=backend.dtype if backend.dtype_set else None, **options
-        )
-        made.reset(nwalkers, ndim)
-        with made.open("a") as file:
-            group = file[made.name]
-            group.attrs["run"] = run
-            _seal(group)
-            replace_group(backend, file, damaged)

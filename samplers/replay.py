@@ -21,8 +21,7 @@ from emcee.moves import Move
 
 from .blobs import leaves
 from .moves.population_moves import describe
-from .output import DAMAGED, make_group, run_of_file
-from .output_file import whole_file
+from .output_file import DAMAGED, run_of_file, whole_file
 from .record import EvaluatedBatch, Record, free_name
 from .settings import Settings
 from .tempering.guide import Guide, guide_fingerprint
@@ -44,7 +43,6 @@ def open_record(backend: Backend | None, nwalkers: int, ndim: int, slow: Sequenc
     """
     if not isinstance(backend, HDFBackend) or backend.read_only:
         return Record(slow=slow)
-    whole_file(backend).save_what_is_left()  # of a sampler whose last steps are in memory only
     path = Path(backend.filename).resolve()
     record = Record(path.with_name(f"{path.name}.{quote(backend.name, safe='')}.record"), slow)
     stored = run_of_file(backend)
@@ -52,7 +50,7 @@ def open_record(backend: Backend | None, nwalkers: int, ndim: int, slow: Sequenc
         if stored == DAMAGED:
             raise ValueError(f"{backend.filename} is damaged, and has no record {record.path}: move it away")
         if stored is None:
-            make_group(backend, nwalkers, ndim, "")  # in one step, unlike emcee
+            whole_file(backend).make(nwalkers, ndim, "")  # in one step, unlike emcee
         return record
     run, shape = record.start.header["run"], record.start.coords.shape
     if stored in (run, None, DAMAGED) and shape != (nwalkers, ndim):
@@ -77,7 +75,7 @@ def open_record(backend: Backend | None, nwalkers: int, ndim: int, slow: Sequenc
                 aside,
             )
         logger.warning("the chain of %s is made again from %s", backend.filename, record.path)
-        make_group(backend, *record.start.coords.shape, run, damaged=stored == DAMAGED)
+        whole_file(backend).make(*record.start.coords.shape, run, anew=stored == DAMAGED)
         return record
     aside = record.renew()
     logger.warning(

@@ -25,7 +25,7 @@ import numpy as np
 from emcee import EnsembleSampler, State
 
 from .budget import Budget, BudgetExhausted, as_limit
-from .emcee_internals import get_moves, get_previous_state, get_random, set_moves, set_previous_state, trim_chain
+from .emcee_internals import get_moves, get_previous_state, get_random, set_moves, set_previous_state
 from .evaluation.asynchronous import AsynchronousEvaluator, check_asynchronous
 from .evaluation.evaluator import Evaluator, unpack
 from .evaluation.user_target import Target, advise_on_pool
@@ -365,7 +365,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
                     self._must_repeat = self._must_repeat and self._result.early_stop is not None
                 self.seconds += time.perf_counter() - start
                 self._evaluator.evaluates_parts = False
-                trim_chain(self.backend)
+                self._output.trim()
                 moves, probabilities = get_moves(self)
                 set_moves(self, without_unfitted(moves), probabilities)
                 state.blobs = self._evaluator.typed(state.blobs)
@@ -457,7 +457,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
             self._verdict = judge(self._result, *numbers, missing, failed, searched, self._near)
         elif self._record.start is not None:  # an annealing that could not be made again
             self._verdict = self._verdict._replace(simulations=self.simulations)
-        self._output.write(self._result, self._verdict)
+        self._output.result, self._output.verdict = self._result, self._verdict
+        self._output.write()
 
     def compute_log_prob(self, coords):
         """Log-probability and blobs of points (n, ndim), as in emcee; -inf for NaN and outside the prior's support."""
@@ -468,8 +469,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
 
     def _first_state(self, given: State | None, skip_check: bool) -> State | RunStart:
         """The state at beta = 1 from which a call continues, or the start of the annealing that comes first."""
-        if self._record.start is not None and self._output.mark_again(self._record.start.header["run"]):
-            self.reset()  # the user has called the method reset of the backend
+        if self._record.start is not None and self._output.was_reset:
+            self.reset()
         self._open_record()
         if self._record.start is not None:
             self._output.drop_provisional_step()
@@ -623,16 +624,11 @@ class TemperedSampler(RunResults, EnsembleSampler):
         log_prob, blobs = unpack(population.records)
         state = State(population.coords, log_prob=log_prob, blobs=blobs, random_state=self.random_state)
         if not ended:
-            self._output.keep_state(state)
+            self._output.write(state)
         return state
 
     def _finished(self, result: AnnealingResult, population: Population, guidance: Guidance | None) -> AnnealingResult:
         """The result of an annealing, with what is known of it as a whole."""
-        stored, made = (
-            [stage._replace(seconds=0.0) for stage in each.ladder] for each in (self._output.result, result)
-        )
-        if stored == made:
-            result = result._replace(ladder=self._output.result.ladder)  # with the wall times of the evaluations
         coords, log_prob = self._record.first(self.nwalkers)  # draws of the prior, or of a guide
         log_prior = self._target.log_prior(coords)
         said = check_end(result, population.coords) + check_likelihood(log_prob, log_prior)

@@ -18,7 +18,7 @@ import h5py
 import numpy as np
 import pytest
 
-from samplers import SamplingWarning, SMCSampler, output_file
+from samplers import SMCSampler
 from samplers.evaluation import evaluator
 from samplers.record import BLOCK, MAGIC
 from tests.contract.targets import Gaussian
@@ -288,13 +288,16 @@ def test_a_program_that_reads_the_file_is_no_obstacle(begins, whole_smc, tmp_pat
     assert outcome(sampler) == whole_smc
 
 
-def test_a_program_that_writes_to_the_file_at_the_end(whole_smc, tmp_path, monkeypatch):
-    """Steps stay in the sampler until the file is free, what the program wrote is kept, and a new process goes on."""
-    monkeypatch.setattr(output_file, "SECONDS", 0.1)
+def test_a_program_that_writes_to_the_file(whole_smc, tmp_path):
+    """At the beginning nothing is evaluated; at the end, steps stay in the sampler; the next call writes them."""
     path, log = tmp_path / "run.h5", tmp_path / "log"
     sampler = make(path, "smc", log=log)
+    match = "held open by another program .*: close the file there"
+    with held(path, "a"), pytest.raises(ValueError, match=match):
+        sampler.run_mcmc(None, 1)
+    assert not points_of(log)
     sampler.run_mcmc(None, 1)
-    with contextlib.ExitStack() as stack, pytest.warns(SamplingWarning, match="held open .* run_mcmc.None, 0. later"):
+    with contextlib.ExitStack() as stack, pytest.raises(ValueError, match=match):
         for _ in sampler.sample(None, iterations=STEPS - 1):
             if sampler.iteration == 2:
                 stack.enter_context(held(path, "a"))
@@ -310,20 +313,6 @@ def test_a_program_that_writes_to_the_file_at_the_end(whole_smc, tmp_path, monke
         assert again.iteration == (STEPS if place == path else 1)
         assert outcome(go_on(again)) == whole_smc
     assert evaluated_again(log, "smc") == 0 and not list(tmp_path.rglob("*.damaged"))
-
-
-def test_a_run_does_not_begin_with_a_file_that_another_process_writes(whole_smc, tmp_path, monkeypatch):
-    """Nothing is evaluated, and the same call goes on when the file is free."""
-    monkeypatch.setattr(output_file, "SECONDS", 0.1)
-    path, log = tmp_path / "run.h5", tmp_path / "log"
-    sampler = make(path, "smc", log=log)
-    with held(path, "a"), pytest.raises(ValueError, match="held open by another program .*: close the file there"):
-        sampler.run_mcmc(None, STEPS)
-    assert not points_of(log)
-    sampler.run_mcmc(None, STEPS)
-    assert outcome(sampler) == whole_smc
-    with held(path, "a"), pytest.raises(ValueError, match="held open by another program .*: close the file there"):
-        make(path, "smc")
 
 
 def test_a_sampler_that_does_not_know_the_chain_of_another_one_leaves_it_alone(tmp_path):
