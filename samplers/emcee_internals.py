@@ -5,7 +5,6 @@ later version of emcee (``emcee>=3.1.4,<4``) differs.
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from emcee import EnsembleSampler, State
