@@ -12,7 +12,7 @@ from .evaluation.evaluator import Evaluator
 from .evaluation.user_target import Target
 from .judgement.clusters import error_between_modes, find_members
 from .judgement.failures import NearFailures
-from .judgement.verdict import RunParts, Verdict
+from .judgement.verdict import Verdict
 from .record import Record
 from .reports import AnnealingResult, GuidedRound, Stage
 from .tempering.guide import AdaptedGuide, Guide
@@ -228,8 +228,4 @@ class RunResults:
         """
         if self._verdict is None:
             raise ValueError("there is no verdict before a run: call run_mcmc first")
-        near = None if self._result.independent_points is None else self._near
-        get_chain = self.get_chain if self.iteration > 0 else lambda: np.empty((0, self.nwalkers, 0))
-        failed = self._target.failure_count
-        run = self._result, get_chain, self.nwalkers, self.evaluations, self.failure_count, near, failed
-        return self._verdict.of(RunParts(*run))
+        return self._verdict.of(self)

@@ -648,7 +648,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
             "SciPy, computes other bits, or its record has lost points. The chain goes on from its last stored state, "
             "with its stored results, by differential evolution instead of moves that were fitted to the annealing"
         )
-        self._result, self._verdict = self._output.result, self._output.verdict
+        self._result, self._verdict, self._near = self._output.result, self._output.verdict, None
         self._budget.take_from_record()
         self._reopened = False
         self.random_state = stored.random_state

@@ -10,19 +10,13 @@
 No run can see a part of the posterior in which it has no points. The reasons state the basis of the verdict.
 """
 
-from collections.abc import Callable
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..estimates.genealogy import standard_error_of_mean
-from ..estimates.importance import (
-    FIRST_ROUND_SHARE,
-    USABLE_SHARE,
-    fewest_points,
-    usable,
-)
+from ..estimates.importance import FIRST_ROUND_SHARE, USABLE_SHARE, fewest_points, usable
 from ..estimates.pareto import LARGEST_SHAPE
 from ..finding import CARE, NOTE, WRONG, Finding
 from ..reports import AnnealingResult, EarlyStop, GuidedRound
@@ -36,7 +30,6 @@ __all__ = [
     "CONVERGED",
     "NOT_USABLE",
     "USABLE",
-    "RunParts",
     "Verdict",
     "describe_early_stop",
     "independent_points",
@@ -49,18 +42,6 @@ NOT_USABLE = "not usable"
 STATUSES = (CONVERGED, USABLE, NOT_USABLE)
 SEVERITIES = (NOTE, CARE, WRONG)
 LIMIT = "The limit of simulations ended the run"
-
-
-class RunParts(NamedTuple):
-    """What `Verdict` computes its attributes from; `get_chain` returns the chain at beta = 1."""
-
-    result: AnnealingResult
-    get_chain: Callable[[], np.ndarray]
-    nwalkers: int
-    evaluations: int
-    failures: int
-    near: NearFailures | None
-    failed_simulations: int | None = None
 
 
 class _Stored(NamedTuple):
@@ -112,41 +93,27 @@ class Verdict(_Stored):
     ()
     """
 
-    _run: RunParts | None = None
+    _sampler: Any = None
 
-    def of(self, run: RunParts) -> "Verdict":
-        """This verdict with the run from which its other attributes are computed."""
+    def of(self, sampler: Any) -> "Verdict":
+        """This verdict with the sampler from which its other attributes are computed."""
         verdict = Verdict(*self)
-        verdict._run = run
+        verdict._sampler = sampler
         return verdict
 
     def __reduce__(self):
         return Verdict, tuple(self)
 
     @property
-    def _parts(self) -> RunParts:
-        if self._run is None:
+    def _run(self) -> Any:
+        if self._sampler is None:
             raise ValueError("this verdict has no run: read it from a sampler, as sampler.verdict")
-        return self._run
-
-    @cached_property
-    def _chain(self) -> np.ndarray:
-        self._parts.result.require_finished()
-        chain = self._parts.get_chain()
-        if len(chain) == 0:
-            raise ValueError("modes are found in a chain, which is empty: call run_mcmc with one step or more")
-        return chain
+        return self._sampler
 
     @property
-    def _founders(self) -> np.ndarray:
-        """Founder of each walker; a different founder for each walker if the record of the resampling is lost."""
-        founders = self._parts.result.founders
-        return np.arange(self._parts.nwalkers) if founders is None else founders
-
-    @cached_property
     def unknown(self) -> tuple[str, ...]:
         """Questions that the run cannot answer."""
-        return tuple(_unknown(self._parts))
+        return tuple(_unknown(self._run))
 
     @property
     def pareto_shape(self) -> float | None:
@@ -154,7 +121,7 @@ class Verdict(_Stored):
 
         Weights with a shape above 0.7 have no useful mean.
         """
-        result = self._parts.result
+        result = self._run._result
         shapes = [] if result.check is None else [result.check.pareto_shape]
         if result.start is not None and result.start.used:
             shapes.append(result.start.pareto_shape)
@@ -167,12 +134,16 @@ class Verdict(_Stored):
         Values of -inf inside the support of the prior are failures if ``log_prob_fn.report()`` has a "failure_count",
         except if ``log_prob_fn.possible(points)`` is False: parameters that need no simulation are impossible there.
         """
-        return self._parts.near
+        return self._run._near
 
     @cached_property
     def modes(self) -> tuple[Cluster, ...]:
         """Modes in which the run has points, with shares and their standard errors, the largest first."""
-        return find_clusters(self._chain, self._founders, self._parts.result.ladder[-1].log_evidence_error)
+        run = self._run
+        stages = run._result.require_finished()
+        if run.iteration == 0:
+            raise ValueError("modes are found in a chain, which is empty: call run_mcmc with one step or more")
+        return find_clusters(run.get_chain(), run.founders, stages[-1].log_evidence_error)
 
     @property
     def summary(self) -> str:
@@ -185,8 +156,7 @@ class Verdict(_Stored):
         else:
             shares = ", ".join(f"{mode.share:.2f} +- {mode.share_error:.2g}" for mode in self.modes)
             found = f"{len(self.modes)} modes with shares {shares}"
-        run = self._parts
-        result, check = run.result, run.result.check
+        run, result, check = self._run, self._run._result, self._run._result.check
         stated = "{:.2f} +- {:.2g}".format(*result.evidence)
         others = []
         if check is not None:
@@ -197,9 +167,11 @@ class Verdict(_Stored):
             others.append(("guide", last.log_evidence, last.log_evidence_error, ", uneven weights"))
         if others:
             stated += f" ({'; '.join(f'{name} {x:.2f} +- {error:.2g}{note}' for name, x, error, note in others)})"
-        failed = f"{run.failures} of {run.evaluations} evaluations failed" if run.failures else "no failed evaluations"
-        if run.failed_simulations:
-            failed = f"{run.failed_simulations} simulations failed"
+        failed = f"{run.failure_count} of {run.evaluations} evaluations failed"
+        if simulations := run._target.failure_count:
+            failed = f"{simulations} simulations failed"
+        elif not run.failure_count:
+            failed = "no failed evaluations"
         return (
             f"{self.status.capitalize()}: {found}; log-evidence {stated}; effective sample size "
             f"{self.effective_sample_size:.0f}; {failed}."
@@ -367,27 +339,26 @@ def _missing_draws(rounds: tuple[GuidedRound, ...], nwalkers: int) -> float | No
     return float(np.ceil(missing / last.effective_share))
 
 
-def _unknown(run: RunParts) -> list[str]:
-    """Questions that a run cannot answer."""
-    result = run.result
+def _unknown(run: Any) -> list[str]:
+    """Questions that the run of a sampler cannot answer."""
     missing = [
         f"modes that none of the points came near, above all modes much narrower than those found and modes in a part "
         f"of the prior that holds less than about {3.0 / run.nwalkers:.2g} of its probability (3 / walkers); a run "
         "with another seed and more walkers is the test"
     ]
-    if result.check is None:
+    if run._result.check is None:
         missing.append("whether the evidence is right, since there was no check by independent draws")
-    if result.founders is None:
+    if run._result.founders is None:
         missing.append(
             "which walkers are copies, since the chain was read from a file: errors and effective sample size treat "
             "them as independent"
         )
-    if run.failures:
+    if run.failure_count:
         missing.append("the posterior where evaluations failed, which counts as impossible")
-    if run.near is not None and not run.near.known:
+    if run._near is not None and not run._near.known:
         # of 153 runs with such points, 9 were wrong, and the evidences told of these
         missing.append(
-            f"whether the log-probability of -inf of {run.near.failed} of {run.near.evaluated} evaluated points in the "
-            "region of the final points means impossible parameters or failed simulations, which should return NaN"
+            f"whether the log-probability of -inf of {run._near.failed} of {run._near.evaluated} evaluated points in "
+            "the region of the final points means impossible parameters or failed simulations, which should return NaN"
         )
     return missing

@@ -51,13 +51,12 @@ def test_sentence_and_what_it_is_made_of(sampler):
 
 
 @pytest.mark.parametrize("higher", [-3.0, 0.0, 3.0])
-def test_the_summary_begins_with_the_evidence_that_counts(higher, sampler):
+def test_the_summary_begins_with_the_evidence_that_counts(higher, sampler, monkeypatch):
     """The estimates that it was chosen from come later, by their names; a reliable check that is higher counts."""
     check = sampler.log_evidence_check._replace(error=0.02, pareto_shape=0.1)
     check = check._replace(log_evidence=sampler.log_evidence_ladder + higher)
-    result = sampler._result._replace(check=check)
-    text = sampler.verdict.of(sampler.verdict._parts._replace(result=result)).summary
-    value, error = result.evidence
+    monkeypatch.setattr(sampler, "_result", sampler._result._replace(check=check))
+    text, value, error = sampler.verdict.summary, sampler.log_evidence, sampler.log_evidence_error
     assert f"; log-evidence {value:.2f} +- {error:.2g} (stages {sampler.log_evidence_ladder:.2f} +- " in text
     assert f"; check {check.log_evidence:.2f} +- 0.02)" in text
     assert higher < 0.0 or (value, error) == (check.log_evidence, 0.02)
