@@ -33,22 +33,19 @@ class CostEstimate(NamedTuple):
         Number of simultaneous evaluations.
     seconds : (runs,) float
         Durations of the timed evaluations [s].
-    evaluated, failures, cached : int
-        Evaluations made for the estimate, evaluations that returned -inf, and evaluations that needed no simulation (0
-        for a posterior whose ``report()`` has no number of simulations).
     fewest, most : float
         Range of the evaluations of the posterior, without sweeps over fast parameters, which need no simulation. Each
         step at beta = 1 needs one more per walker.
+    note : str
+        Which of the evaluations failed, or needed no simulation; may be empty.
     """
 
     title: str
     workers: int
     seconds: np.ndarray
-    evaluated: int
-    failures: int
-    cached: int
     fewest: float
     most: float
+    note: str = ""
 
     def time_of(self, *evaluations: float) -> str:
         """Wall time of one or two numbers of evaluations with all workers busy, as text.
@@ -57,22 +54,19 @@ class CostEstimate(NamedTuple):
         """
         return as_duration(*(n * float(self.seconds.mean()) / self.workers for n in evaluations))
 
-    def __repr__(self) -> str:
-        return str(self)
-
     def __str__(self) -> str:
         low, high = (int(float(f"{n:.2g}")) for n in (self.fewest, self.most))
         seconds = f"mean {self.seconds.mean():.3g} s, {self.seconds.min():.3g} to {self.seconds.max():.3g} s"
         rows = {
-            self.title: "",
-            f"one evaluation ({self.evaluated} made, {len(self.seconds)} timed)": seconds,
+            f"one evaluation ({len(self.seconds)} timed)": seconds,
             "evaluations": f"about {low} to {high}",
             f"wall time, {self.workers} worker{'s' if self.workers > 1 else ''}": self.time_of(self.fewest, self.most),
         }
-        rows |= {"failed evaluations": str(self.failures)} if self.failures else {}
-        rows |= {"note": f"{self.cached} points were cached; the times include them"} if self.cached else {}
         width = max(map(len, rows))
-        return "\n".join(f"{name:{width}}  {value}".rstrip() for name, value in rows.items())
+        table = [f"{name:{width}}  {value}" for name, value in rows.items()]
+        return "\n".join([self.title, *table, *([self.note] if self.note else [])])
+
+    __repr__ = __str__
 
 
 def as_duration(*seconds: float) -> str:
@@ -94,8 +88,7 @@ def estimate_cost(
 ) -> CostEstimate:
     """Time a few evaluations, and estimate the cost of a run.
 
-    One point is evaluated without timing, because the first evaluation may include a job queue, the start of processes,
-    or a compilation. Then `runs` points are timed, one after another. All are draws of the prior. A sampler with the
+    After a first evaluation, which may include a compilation, `runs` draws of the prior are timed. A sampler with the
     same `seed` starts from them, so a posterior with a cache does not repeat them. The range of evaluations held in
     90 % of the runs on 41 posteriors; the time is too low for models that take longer near the posterior.
 
@@ -144,31 +137,21 @@ def estimate_cost(
     for i, point in enumerate(draws[: runs + 1]):
         start = time.perf_counter()
         values[i], seconds[i] = float(np.ravel(posterior(point))[0]), time.perf_counter() - start
-    finite = np.isfinite(values)
-    if finite.sum() < 2:
+    failed, cached = int(np.sum(~np.isfinite(values))), 0
+    if failed > runs - 1:
         raise ValueError(
-            f"{len(finite) - finite.sum()} of {len(finite)} draws of the prior have a log-probability of -inf, and the "
-            "estimate needs two finite ones: check the model at these points, or time more with runs="
+            f"{failed} of {runs + 1} draws of the prior have a log-probability of -inf, and the estimate needs two "
+            "finite ones: check the model at these points, or time more with runs="
         )
+    if before is not None:
+        cached = max(runs + 1 - (report()["simulations"] - before), 0)
+    notes = {"failed": failed, "were cached, and the times include them": cached}
     share = max(ndim / MANY_PARAMETERS, 1.0) ** 2 * nwalkers
     fewest, most = (share * each for each in (RECYCLING if chosen.recycle else MOVES))
-    return CostEstimate(
-        f"{sampler.__name__}, {nwalkers} walkers, {ndim} parameters",
-        int(workers or _workers_of(posterior)),
-        seconds[1:],
-        len(values),
-        int((~finite).sum()),
-        0 if before is None else max(len(values) - (report()["simulations"] - before), 0),
-        fewest,
-        most,
-    )
-
-
-def _workers_of(posterior: Any) -> int:
-    """Number of points that the pool of a posterior evaluates at once."""
-    if not callable(getattr(posterior, "evaluation_queue", None)):
-        return 1
-    queue = posterior.evaluation_queue()
-    workers = queue.workers or 1
-    queue.close()
-    return workers
+    if workers is None and callable(getattr(posterior, "evaluation_queue", None)):
+        queue = posterior.evaluation_queue()
+        workers = queue.workers
+        queue.close()
+    title = f"{sampler.__name__}, {nwalkers} walkers, {ndim} parameters"
+    note = "; ".join(f"{number} of {runs + 1} evaluations {what}" for what, number in notes.items() if number)
+    return CostEstimate(title, int(workers or 1), seconds[1:], fewest, most, note)
