@@ -35,7 +35,7 @@ from .judgement.checks import check_likelihood, check_prior
 from .judgement.failures import judged_failures
 from .judgement.verdict import CONVERGED, describe_early_stop, independent_points, judge
 from .moves.fast_parameters import with_fast_sweeps
-from .moves.population_moves import GuideMove, RandomWalkMove, calibrate_move, without_unfitted
+from .moves.population_moves import GuideMove, RandomWalkMove, without_unfitted
 from .output import Output
 from .record import EvaluatedBatch, Incomplete, RunStart
 from .replay import changes, describe_run, differences, open_record
@@ -613,8 +613,9 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._result = self._finished(self._result, population, guidance)
         if self._result.start is not None and self._result.start.used:
             moves = with_fast_sweeps([GuideMove(self._guide)], self._fast, self.ndim, self.settings.fast_sweeps)
-            calibrate_move(moves[0], population.coords, np.full(self.nwalkers, 1.0 / self.nwalkers))
-            set_moves(self, moves, np.ones(1))
+            schedule = MoveSchedule(moves, np.ones(1))
+            schedule.calibrate(population.coords, np.full(self.nwalkers, 1.0 / self.nwalkers))
+            set_moves(self, *schedule)
         self._judge(0, population.coords)
         self._reopened = False
         ended = self._result.early_stop is not None

@@ -14,33 +14,33 @@ doi:10.1103/PhysRevD.87.103529
 
 from collections.abc import Sequence
 from numbers import Integral
+from typing import Any
 
 import numpy as np
 from emcee import State
 from emcee.model import Model
 from emcee.moves import Move
 
-from ..proposals.mixture import Mixture
-from .population_moves import Inside, RandomWalkMove, calibrate_move
+from .population_moves import RandomWalkMove
 
 __all__ = ["FastWalk", "WithFastSweeps", "with_fast_sweeps"]
-
-# Optimal acceptance of a random walk in two dimensions; it is 0.44 in one dimension and 0.23 in many. Gelman, Roberts &
-# Gilks (1996), Efficient Metropolis jumping rules, Bayesian Statistics 5, 599-608.
-TARGET_ACCEPTANCE = 0.35
 
 
 class FastWalk(RandomWalkMove):
     """Random walk in the parameters with some indices, whose covariance is conditional on the others."""
 
+    # optimal in two dimensions; it is 0.44 in one dimension and 0.23 in many: Gelman, Roberts & Gilks (1996), Efficient
+    # Metropolis jumping rules, Bayesian Statistics 5, 599-608
+    target = 0.35
+
     def __init__(self, indices: Sequence[int]):
-        super().__init__(adapt=True, target=TARGET_ACCEPTANCE)
+        super().__init__(adapt=True)
         self.indices = tuple(indices)
 
-    def calibrate(self, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None) -> None:
+    def calibrate(self, coords: np.ndarray, weights: np.ndarray, *others: Any) -> None:
         """Fit the walk to points (n, ndim) with normalised weights (n,)."""
         slow = np.setdiff1d(np.arange(coords.shape[1]), self.indices)
-        super().calibrate(coords[:, np.concatenate([slow, self.indices])], weights, inside)
+        super().calibrate(coords[:, np.concatenate([slow, self.indices])], weights)
         # The last diagonal block of a lower-triangular root of the covariance is a root of the covariance of the last
         # coordinates, conditional on the others.
         self._root = self._root[len(slow) :, len(slow) :]
@@ -66,12 +66,11 @@ class WithFastSweeps(Move):
         """Whether walk and move were calibrated."""
         return self._walk.is_fitted and getattr(self.move, "is_fitted", True)
 
-    def calibrate(
-        self, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None, mixture: Mixture | None = None
-    ) -> None:
-        """Fit the walk, and the move if it can be fitted, as `samplers.moves.population_moves.calibrate_move` does."""
-        calibrate_move(self.move, coords, weights, inside, mixture)
-        self._walk.calibrate(coords, weights, inside)
+    def calibrate(self, *arguments: Any) -> None:
+        """Fit the walk, and the move if it can be fitted (`samplers.moves.population_moves`)."""
+        if hasattr(self.move, "calibrate"):
+            self.move.calibrate(*arguments)
+        self._walk.calibrate(*arguments)
 
     def propose(self, model: Model, state: State) -> tuple[State, np.ndarray]:
         """Make the move, then the fast sweeps; the accepted proposals (nwalkers,) are those of the move."""

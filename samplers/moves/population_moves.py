@@ -1,7 +1,8 @@
 """Mutation kernels in the form of emcee moves, which also adapt to the population.
 
-Their method ``calibrate(coords, weights, inside)`` is called once per stage with the points of the previous stage,
-their weights at the new beta, and a function that returns which points lie in the support of the prior. Proposals are
+Their method ``calibrate(coords, weights, inside, mixture)`` is called once per stage with the points of the previous
+stage, their weights at the new beta, a function that returns which points lie in the support of the prior, and a
+mixture if one is known. Proposals are
 for all walkers at once, and fitted in units of the weighted standard deviations, so that very different magnitudes of
 parameters (2e-4 s and 3e10 Pa) cause no numerical problem. Acceptances are derived in ``docs/theory/tempering``.
 """
@@ -33,7 +34,6 @@ __all__ = [
     "GuideMove",
     "MixtureMove",
     "RandomWalkMove",
-    "calibrate_move",
     "describe",
     "without_unfitted",
 ]
@@ -77,19 +77,6 @@ def describe(move: Move) -> dict:
     return {"class": type(move).__name__, **settings}
 
 
-def calibrate_move(
-    move: Move, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None, mixture: Mixture | None = None
-) -> None:
-    """Fit a move to points (n, ndim) with normalised weights (n,), if it can be fitted; emcee's own moves cannot.
-
-    A `MixtureMove`, with fast sweeps or without, takes a given `mixture` instead.
-    """
-    if mixture is not None and isinstance(getattr(move, "move", move), MixtureMove):
-        move.calibrate(coords, weights, inside, mixture)
-    elif hasattr(move, "calibrate"):
-        move.calibrate(coords, weights, inside)
-
-
 class _FittedMove(MHMove):
     """A Metropolis-Hastings move of the whole ensemble, whose proposal is fitted to weighted points before."""
 
@@ -131,10 +118,8 @@ class RandomWalkMove(_FittedMove):
     scale : float, optional
         Factor on the covariance root; 2.38 / sqrt(ndim) by default.
     adapt : bool
-        Whether ``tune`` adapts the scale to reach the acceptance `target`. The adapted scale is kept for later stages.
-    target : float, optional
-        Desired acceptance; 0.234 is optimal in many dimensions. None: 0.23 + 0.21 / ndim, for any number of dimensions
-        (values: Gelman, Roberts & Gilks 1996; formula: Betz, Papaioannou & Straub 2016).
+        Whether ``tune`` adapts the scale to reach an acceptance of 0.234, which is optimal in many dimensions. The
+        adapted scale is kept for later stages.
 
     References
     ----------
@@ -147,13 +132,14 @@ class RandomWalkMove(_FittedMove):
     >>> walking = SMCSampler(100, posterior.ndim, posterior, moves=walk, recycle=False, vectorize=True)
     """
 
-    def __init__(self, scale: float | None = None, adapt: bool = False, target: float | None = 0.234):
+    target = 0.234
+
+    def __init__(self, scale: float | None = None, adapt: bool = False):
         if scale is not None and not scale > 0.0:
             raise ValueError(f"scale multiplies the root of the covariance and must be positive; got {scale}")
         super().__init__()
         self.scale = scale
         self.adapt = adapt
-        self.target = target
         self._root: np.ndarray | None = None
         self._log_factor = 0.0
 
@@ -162,7 +148,9 @@ class RandomWalkMove(_FittedMove):
         """Whether the move was calibrated."""
         return self._root is not None
 
-    def calibrate(self, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None) -> None:
+    def calibrate(
+        self, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None, mixture: Mixture | None = None
+    ) -> None:
         """Fit the covariance to points (n, ndim) with normalised weights (n,)."""
         self._root = location_and_root(coords, weights)[1]
 
@@ -174,8 +162,7 @@ class RandomWalkMove(_FittedMove):
     def tune(self, state: State, accepted: np.ndarray) -> None:
         """If `adapt`, increase the scale when the acceptance exceeds the target, and decrease it otherwise."""
         if self.adapt:
-            target = 0.23 + 0.21 / state.coords.shape[1] if self.target is None else self.target
-            self._log_factor += float(np.mean(accepted)) - target
+            self._log_factor += float(np.mean(accepted)) - self.target
 
 
 class MixtureMove(_FittedMove):

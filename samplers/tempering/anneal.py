@@ -171,7 +171,8 @@ def _by_recycling(
     for each in compare(found):
         yield population, each
     if found.independent:  # sweeps would cost evaluations and improve nothing
-        schedule.expect_independence()
+        for move in schedule.mixtures:
+            move.expect_independence()
         moved = Mutated(population, effective / len(found.coords), 0, 0.0)
     else:
         moved = yield from move_together(population, density, random, schedule, settings)

@@ -5,7 +5,7 @@ with its resampled start (`StartCorrelation`). The chains of transitional Markov
 `samplers.tempering.leaders`.
 """
 
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Generator, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -17,8 +17,7 @@ from emcee.moves import DESnookerMove, Move, RedBlueMove
 from ..budget import BudgetExhausted
 from ..estimates.weights import LOWEST
 from ..judgement.checks import ROUNDING
-from ..moves.population_moves import MixtureMove, calibrate_move
-from ..proposals.mixture import Mixture
+from ..moves.population_moves import MixtureMove
 from ..reports import Sweep
 from ..settings import Settings
 from .population import Density, Population
@@ -75,37 +74,19 @@ class MoveSchedule(NamedTuple):
         """The move of the next sweep."""
         return random.choice(self.moves, p=self.probabilities)
 
-    def calibrate(
-        self,
-        coords: np.ndarray,
-        weights: np.ndarray,
-        inside: Callable[[np.ndarray], np.ndarray] | None,
-        mixture: Mixture | None = None,
-    ) -> None:
-        """Fit the moves that can be fitted to points (n, ndim) with normalised weights (n,); or use a `mixture`."""
+    def calibrate(self, *arguments: Any) -> None:
+        """Fit the moves that can be fitted (`samplers.moves.population_moves`); emcee's own moves cannot."""
         for move in self.moves:
-            calibrate_move(move, coords, weights, inside, mixture)
-
-    def cover_basins(self, coords: np.ndarray, log_target: np.ndarray) -> None:
-        """Let mixture moves propose points in parts of the target that their fits do not cover.
-
-        `coords` (n, ndim) are points, also from earlier stages; `log_target` (n,) is scaled so that its integral is
-        about 1.
-        """
-        for move in self._mixture_moves():
-            move.cover_basins(coords, log_target)
+            if hasattr(move, "calibrate"):
+                move.calibrate(*arguments)
 
     def follow(self, ancestors: np.ndarray) -> None:
-        """Tell mixture moves from which of the points of the last calibration (by indices) each walker descends."""
-        for move in self._mixture_moves():
+        """Say from which of the points of the last calibration (by indices) each walker descends."""
+        for move in self.mixtures:
             move.follow(ancestors)
 
-    def expect_independence(self) -> None:
-        """Tell mixture moves that the points are already independent draws of the target."""
-        for move in self._mixture_moves():
-            move.expect_independence()
-
-    def _mixture_moves(self) -> list[MixtureMove]:
+    @property
+    def mixtures(self) -> list[MixtureMove]:
         """The mixture moves, with fast sweeps or without."""
         return [each for move in self.moves if isinstance(each := getattr(move, "move", move), MixtureMove)]
 

@@ -80,7 +80,8 @@ def anneal_by_moves(
         # fit the moves to the weighted points, and to parts of the target that this fit does not cover
         schedule.calibrate(population.coords, coarse_weights(log_weights), density.inside)
         coords, log_target = visited.at(beta)
-        schedule.cover_basins(coords, log_target - log_evidence)
+        for move in schedule.mixtures:
+            move.cover_basins(coords, log_target - log_evidence)
 
         # 4. resample
         ancestors = settings.resample(weights, random)

@@ -5,9 +5,8 @@ import pytest
 from scipy import integrate, stats
 
 from samplers import SMCSampler
-from samplers.moves.population_moves import calibrate_move
+from samplers.moves.population_moves import MixtureMove
 from samplers.proposals import mixture
-from samplers.tempering import mutation
 from tests.contract.targets import Gaussian
 
 SCALE = 0.5
@@ -67,7 +66,8 @@ def test_recycling_keeps_the_variance_of_heavy_tails(seed):
 def test_light_proposals_that_are_fitted_to_their_points_cut_heavy_tails(seed, monkeypatch):
     """Negative control: six degrees of freedom, and sweeps by a fit to the points that they move."""
     monkeypatch.setattr(mixture, "HEAVIER", ())
-    monkeypatch.setattr(mutation, "calibrate_move", lambda *fit: calibrate_move(*fit[:4]))  # without the proposal
+    calibrate = MixtureMove.calibrate
+    monkeypatch.setattr(MixtureMove, "calibrate", lambda *fit: calibrate(*fit[:4]))  # without the proposal
     squares, _ = mean_squares(1000 * seed + np.arange(200))
     error = squares.std(ddof=1) / np.sqrt(len(squares))
     print(squares.mean(), error)
