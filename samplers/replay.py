@@ -20,6 +20,7 @@ from emcee.backends import Backend, HDFBackend
 from emcee.moves import Move
 
 from .blobs import leaves
+from .evaluation.user_target import Target
 from .moves.population_moves import describe
 from .output_file import DAMAGED, run_of_file, whole_file
 from .record import EvaluatedBatch, Record, free_name
@@ -31,8 +32,6 @@ __all__ = ["changes", "describe_run", "differences", "open_record"]
 logger = logging.getLogger(__name__)
 
 CLOSE = {"rtol": 1e-9, "atol": 1e-9}
-# entries of a header in which runs may differ
-NOT_COMPARED = ("run", "seed", "of_earlier_guides", "log_prior")
 
 
 def open_record(backend: Backend | None, nwalkers: int, ndim: int, slow: Sequence[int]) -> Record:
@@ -68,12 +67,8 @@ def open_record(backend: Backend | None, nwalkers: int, ndim: int, slow: Sequenc
         if stored is not None:
             aside = free_name(path, "damaged")
             shutil.copyfile(path, aside)
-            logger.warning(
-                "%s does not end with a step that this run has stored: it is damaged, or another program has added "
-                "steps. A copy of it is kept as %s",
-                backend.filename,
-                aside,
-            )
+            said = "%s does not end with a step that this run has stored: it is damaged, or another program has added"
+            logger.warning(f"{said} steps. A copy of it is kept as %s", backend.filename, aside)
         logger.warning("the chain of %s is made again from %s", backend.filename, record.path)
         whole_file(backend).make(*record.start.coords.shape, run, anew=stored == DAMAGED)
         return record
@@ -87,21 +82,22 @@ def open_record(backend: Backend | None, nwalkers: int, ndim: int, slow: Sequenc
 
 
 def describe_run(
-    function: Callable,
-    described: dict,
+    sampler: str,
+    target: Target,
     settings: Settings,
     moves: Sequence[Move],
     probabilities: Sequence[float],
     guide: Guide | None,
 ) -> dict:
-    """The start of a run as plain data, with the entries `described`, in the form that JSON returns.
+    """The start of a run as plain data, in the form that JSON returns.
 
     The function and the guide are identified by their attributes ``fingerprint``; a guide without one by its class, a
     function without one not at all.
     """
     header = {
-        "log_prob_fn": getattr(function, "fingerprint", None),
-        **described,
+        "log_prob_fn": getattr(target.function, "fingerprint", None),
+        "sampler": sampler,
+        "log_likelihood_fn": "used" if target.is_likelihood else None,
         **asdict(settings),
         "moves": [describe(move) for move in moves],
         "probabilities": [float(probability) for probability in probabilities],
@@ -111,16 +107,13 @@ def describe_run(
 
 
 def differences(stored: dict, ours: dict) -> list[str]:
-    """Differences between the headers of two runs, as text."""
+    """Differences between the headers of two runs, as text; entries that only the stored one has do not count."""
     if stored["sampler"] != ours["sampler"]:  # most settings then differ as well
         return [f"it was written by {stored['sampler']}, and this is a {ours['sampler']}"]
-    names = [name for name in ours if name not in NOT_COMPARED and stored.get(name) != ours[name]]
-    return [f"{name} was {stored.get(name)}, is {ours[name]}" for name in names]
+    return [f"{name} was {stored.get(name)}, is {ours[name]}" for name in ours if stored.get(name) != ours[name]]
 
 
-def changes(
-    record: Record, last: State | None, compute: Callable[[np.ndarray], EvaluatedBatch], name: str = "log_prob_fn"
-) -> list[str]:
+def changes(record: Record, last: State | None, compute: Callable[[np.ndarray], EvaluatedBatch]) -> list[str]:
     """How a log-density differs from its stored value at the best known point, as text; empty if it does not.
 
     The known points are those of the `record`, or of the `last` step of a chain without a record.
@@ -133,20 +126,20 @@ def changes(
     known = known.rows([int(np.argmax(np.where(np.isfinite(known.log_prob), known.log_prob, -np.inf)))])
     found, (coords,) = compute(known.coords), known.coords
     if (known.blobs is None) != (found.blobs is None):
-        return [f"{name} returned blobs, and returns none" if found.blobs is None else f"{name} returns blobs now"]
+        return ["log_prob_fn returned blobs, and returns none" if found.blobs is None else "it returns blobs now"]
     if not np.isclose(known.log_prob, found.log_prob, **CLOSE).all():
-        return [f"{name} was {known.log_prob[0]:.10g} at {coords}, is {found.log_prob[0]:.10g}"]
+        return [f"log_prob_fn was {known.log_prob[0]:.10g} at {coords}, is {found.log_prob[0]:.10g}"]
     if known.blobs is not None and not _same_blobs(known.blobs[0], found.blobs[0]):
-        return [f"blobs of {name} were {known.blobs[0]} at {coords}, are {found.blobs[0]}"]
+        return [f"blobs of log_prob_fn were {known.blobs[0]} at {coords}, are {found.blobs[0]}"]
     return []
 
 
 def _same_blobs(before: Any, after: Any) -> bool:
     """Whether the blobs of a point agree: numbers up to rounding, and everything else exactly."""
-    ours, theirs = list(leaves([before])), list(leaves([after]))
 
     def same(one: Any, other: Any) -> bool:
         numbers = isinstance(one, float | complex) and isinstance(other, float | complex)
         return bool(np.isclose(one, other, **CLOSE, equal_nan=True)) if numbers else one == other
 
+    ours, theirs = list(leaves([before])), list(leaves([after]))
     return len(ours) == len(theirs) and all(map(same, ours, theirs))

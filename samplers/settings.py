@@ -1,8 +1,6 @@
 """Settings of the annealing from the prior to the posterior, checked when they are made.
 
-Every default is defined only here. Each sampler has the settings that can affect its annealing: `MOVES` are the
-settings of annealing by moves, which both samplers have. Constants that no user changes are beside their use, with the
-reason for their value (`samplers.tempering.recycling`, `samplers.tempering.guided`).
+Every default is defined only here. Constants that no user changes are beside their use.
 """
 
 from collections.abc import Callable, Collection

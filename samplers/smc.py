@@ -9,11 +9,10 @@ others has little mass at small beta, and is lost unless draws of the prior happ
 Huber 2009, doi:10.1214/EJP.v14-638). If such modes are possible, use more walkers.
 """
 
-from collections.abc import Collection
 from typing import Any
 
 from .moves.population_moves import MixtureMove
-from .settings import MOVES, Settings
+from .settings import MOVES
 from .tempered import TemperedSampler
 
 __all__ = ["SMCSampler"]
@@ -64,9 +63,8 @@ class SMCSampler(TemperedSampler):
     setting_names = (*MOVES, *_OF_WEIGHTS, "recycle", "asynchronous")
 
     @classmethod
-    def _choose(cls, settings: Settings, given: Collection[str], moves: Any, nwalkers: int) -> tuple[bool, Any]:
-        recycle = settings.recycle
-        if recycle is None:
-            of_moves = set(given) & {*_OF_WEIGHTS, *MOVES[:4]}
-            recycle = moves is None and not of_moves and nwalkers >= FEWEST_TO_RECYCLE
-        return recycle, MixtureMove() if moves is None else moves
+    def _chosen(cls, settings: dict[str, Any], moves: Any, nwalkers: int) -> tuple[dict[str, Any], Any]:
+        if settings.get("recycle") is None:
+            of_moves = set(settings) & {*_OF_WEIGHTS, *MOVES[:4]}
+            settings = settings | {"recycle": moves is None and not of_moves and nwalkers >= FEWEST_TO_RECYCLE}
+        return settings, MixtureMove() if moves is None else moves

@@ -16,9 +16,9 @@ import copy
 import logging
 import time
 import uuid
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
-from dataclasses import fields, replace
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -147,11 +147,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._target = target = Target(*functions, ndim, args, kwargs, vectorize, blobs_dtype)
         self.log_prior_fn = target.log_prior_fn
         check_size(nwalkers, ndim)
-        settings = self._with_defaults(settings, moves)
-        given = Settings(**settings)
-        recycle, moves = self._choose(given, settings, moves, nwalkers)
-        sweeps = given.max_moves if "max_moves" in settings else most_moves(ndim)
-        self.settings = replace(given, recycle=recycle, max_moves=sweeps)
+        settings, moves = self._chosen(settings, moves, nwalkers)
+        self.settings = given = Settings(**{"max_moves": most_moves(ndim)} | settings)
         self._given_guide, self._guide = guide, None
         if guide is not None:
             check_guide(guide, target.function, vectorize)
@@ -162,34 +159,29 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._must_repeat = self._reopened = self._record.start is not None
         self.seconds = 0.0
         set_previous_state(self, None)
-        super().__init__(
-            nwalkers,
-            ndim,
-            target.function,
-            pool=pool,
-            moves=copy.deepcopy(moves),
-            args=args,
-            kwargs=kwargs,
-            backend=backend,
-            vectorize=vectorize,
-            blobs_dtype=blobs_dtype,
-            parameter_names=parameter_names,
-        )
+        same = pool, copy.deepcopy(moves), args, kwargs, backend, vectorize, blobs_dtype, parameter_names
+        super().__init__(nwalkers, ndim, target.function, *same)
         self._output = Output(self.backend)
         self._result, self._verdict = self._output.result, self._output.verdict
         self._is_compared = not self._reopened and self.backend.iteration == 0
         check_moves(get_moves(self)[0], given.chains)
         self._fast = target.fast_parameters if pool is None or vectorize else ()
-        followed = with_fast_sweeps(get_moves(self)[0], self._fast, ndim, self.settings.fast_sweeps)
+        followed = with_fast_sweeps(get_moves(self)[0], self._fast, ndim, given.fast_sweeps)
         # each annealing begins with copies of these
         self._first_moves = copy.deepcopy(followed), get_moves(self)[1]
         set_moves(self, followed, get_moves(self)[1])
-        refuse_unused(self.settings, guide is not None)
+        refuse_unused(given, guide is not None)
         advise_on_pool(pool)
         if given.ess_floor >= nwalkers:
             raise ValueError(f"ess_floor={given.ess_floor} must be below nwalkers={nwalkers}")
         target.parameter_names = self.parameter_names if self.params_are_named else None
-        self._evaluator = self._make_evaluator()
+        common = target, self._record, self._budget, nwalkers, given.max_failure_share
+        if given.asynchronous:
+            check_asynchronous(target, pool)
+            queue = getattr(guide, "evaluation_queue", None)
+            self._evaluator: Evaluator = AsynchronousEvaluator(*common, queue=queue)
+        else:
+            self._evaluator = Evaluator(*common)
         if self._reopened and self._record.start.header["log_prob_fn"] == getattr(target.function, "fingerprint", None):
             target.recall(self._record.latest(self._record.count))
         self._drawn: np.ndarray | None = None  # a start that need not be tested
@@ -203,23 +195,10 @@ class TemperedSampler(RunResults, EnsembleSampler):
         elif self.backend.random_state is None:
             get_random(self).seed(stream)
 
-    def _make_evaluator(self) -> Evaluator:
-        """The evaluator of the target."""
-        common = self._target, self._record, self._budget, self.nwalkers, self.settings.max_failure_share
-        if not self.settings.asynchronous:
-            return Evaluator(*common)
-        check_asynchronous(self._target, self.pool)
-        return AsynchronousEvaluator(*common, queue=getattr(self._given_guide, "evaluation_queue", None))
-
     @classmethod
-    def _with_defaults(cls, settings: dict[str, Any], moves: Any) -> dict[str, Any]:
-        """The given settings, with the settings that this sampler chooses."""
-        return settings
-
-    @classmethod
-    def _choose(cls, settings: Settings, given: Collection[str], moves: Any, nwalkers: int) -> tuple[bool, Any]:
-        """Whether to recycle, and the moves."""
-        return bool(settings.recycle), RandomWalkMove() if moves is None else moves
+    def _chosen(cls, settings: dict[str, Any], moves: Any, nwalkers: int) -> tuple[dict[str, Any], Any]:
+        """The given settings, with the settings that this sampler chooses, and the moves."""
+        return {"recycle": False} | settings, RandomWalkMove() if moves is None else moves
 
     def __deepcopy__(self, memo):
         memo[id(self)] = copied = type(self).__new__(type(self))
@@ -508,49 +487,40 @@ class TemperedSampler(RunResults, EnsembleSampler):
         return self._new_start(given, skip_check)
 
     def _open_record(self) -> None:
-        """Lock the record of a file, and find out once whether this sampler made the stored run."""
-        if self._record.start is not None:
+        """Lock the record of a file; once, a ValueError if another posterior or other settings made the stored run."""
+        stored, found = self._record.start, []
+        if stored is not None:
             self._record.open()
         if self._is_compared:
             return
-        if self._record.start is None and self._record.path is not None and self._result.finished:
+        if stored is not None:
+            found = differences(stored.header, self._header())
+            log_prior = 0.0 if found else float(np.sum(self._target.log_prior(stored.coords)))
+            if not found and not np.isclose(log_prior, stored.header["log_prior"], rtol=1e-9, atol=1e-9):
+                found = ["the log-prior of the draws that it started from differs"]
+        elif self._record.path is not None and self._result.finished:
             logger.warning(
                 "%s has no record: the chain goes on from its last step, and other settings cannot be noticed",
                 self.backend.filename,
             )
-        if found := self._differences():
+        if not found and getattr(self._target.function, "fingerprint", None) is None:
+            found = changes(self._record, get_previous_state(self), self._evaluator.compute)
+        if found:
             raise ValueError(
                 f"{self._place} contains another run: {'; '.join(found)}. Use another file or backend, or "
                 "backend.reset(nwalkers, ndim)"
             )
+        self._is_compared = True
 
     @property
     def _place(self) -> str:
         """Where the chain is, for messages."""
         return getattr(self.backend, "filename", "the backend in memory")
 
-    def _differences(self) -> list[str]:
-        """Differences of a stored run in its posterior or settings, as text; none after they were found to agree."""
-        if self._is_compared:
-            return []
-        stored = self._record.start
-        found = [] if stored is None else differences(stored.header, self._header())
-        if stored is not None and not found:
-            log_prior = float(np.sum(self._target.log_prior(stored.coords)))
-            if not np.isclose(log_prior, stored.header["log_prior"], rtol=1e-9, atol=1e-9):
-                found = ["the log-prior of the draws that it started from differs"]
-        if not found and getattr(self._target.function, "fingerprint", None) is None:
-            found = changes(self._record, get_previous_state(self), self._evaluator.compute)
-        self._is_compared = not found
-        return found
-
     def _header(self) -> dict:
         """The start of this run, in the form that JSON returns."""
-        described = {
-            "sampler": type(self).__name__,
-            "log_likelihood_fn": "used" if self._target.is_likelihood else None,
-        }
-        return describe_run(self._target.function, described, self.settings, *self._first_moves, self._given_guide)
+        made_of = self._target, self.settings, *self._first_moves, self._given_guide
+        return describe_run(type(self).__name__, *made_of)
 
     def _new_start(self, state: State, skip_check: bool) -> RunStart:
         """Draws of the prior, checked and entered in the record."""

@@ -11,11 +11,10 @@ processors of a pool are busy, as in BASIS (Angelikopoulos, Papadimitriou & Koum
 Wu, Angelikopoulos, Papadimitriou & Koumoutsakos 2018, doi:10.1115/1.4037450).
 """
 
-from collections.abc import Collection
 from typing import Any
 
 from .moves.population_moves import MixtureMove
-from .settings import MOVES, Settings
+from .settings import MOVES
 from .tempered import TemperedSampler
 from .tempering.mutation import needs_many_walkers
 
@@ -73,18 +72,13 @@ class TMCMCSampler(TemperedSampler):
     setting_names = (*MOVES, "coefficient_of_variation", "chains", "burn_in")
 
     @classmethod
-    def _with_defaults(cls, settings: dict[str, Any], moves: Any) -> dict[str, Any]:
-        chains = settings.get("chains", "equal" if needs_many_walkers(moves) else "leaders")
-        if chains != "leaders":
-            return {"chains": chains} | settings
-        settings = {"chains": chains, "burn_in": BURN_IN} | settings
-        if settings["burn_in"] == 0 and (idle := [name for name in OF_SWEEPS if name in settings]):
-            raise ValueError(
-                f"{idle[0]} cannot act with burn_in=0, which makes no sweeps after the chains, as published: pass "
-                'burn_in of 1 or more, or chains="equal"'
-            )
-        return settings
-
-    @classmethod
-    def _choose(cls, settings: Settings, given: Collection[str], moves: Any, nwalkers: int) -> tuple[bool, Any]:
-        return False, MixtureMove() if moves is None else moves
+    def _chosen(cls, settings: dict[str, Any], moves: Any, nwalkers: int) -> tuple[dict[str, Any], Any]:
+        settings = {"chains": "equal" if needs_many_walkers(moves) else "leaders", "recycle": False} | settings
+        if settings["chains"] == "leaders":
+            settings.setdefault("burn_in", BURN_IN)
+            if settings["burn_in"] == 0 and (idle := [name for name in OF_SWEEPS if name in settings]):
+                raise ValueError(
+                    f"{idle[0]} cannot act with burn_in=0, which makes no sweeps after the chains, as published: pass "
+                    'burn_in of 1 or more, or chains="equal"'
+                )
+        return settings, MixtureMove() if moves is None else moves
