@@ -100,8 +100,7 @@ class AsynchronousEvaluator(Evaluator):
         self._submitted += len(asked)
         self._running.update((number, (pending, int(row))) for number, row in zip(numbers, asked, strict=True))
         if not known.all():
-            if self.observer is not None:
-                self.observer.submitted(int(sum(~known)))
+            self.count(int(sum(~known)))
             tickets = self._opened().submit(coords[asked[~known]])
             self._tickets.update(zip(tickets, np.array(numbers)[~known].tolist(), strict=True))
         return pending
@@ -139,8 +138,7 @@ class AsynchronousEvaluator(Evaluator):
             self.enter(batch)
             for ticket, _ in new.values():
                 del self._tickets[ticket]
-        if self.observer is not None:
-            self.observer.finished(len(new))
+        self.count(0, len(new))
 
     def _arrive(self, numbers: list[int]) -> None:
         """Let points that were submitted together arrive, and check how many have failed."""

@@ -28,8 +28,8 @@ class Evaluator:
 
     Evaluated points are structured arrays with the fields log_prob, log_prior and, if there are any, blobs.
     `evaluations` counts the points that were asked for. With `evaluates_parts`, the first points of a batch that does
-    not fit into the limit of simulations are evaluated. An `observer` is told of points, as
-    `samplers.reporting.progress.Progress` is.
+    not fit into the limit of simulations are evaluated. A function `observer` is called when the number of points that
+    are `done` or `running` changes.
     """
 
     asynchronous = False
@@ -42,13 +42,21 @@ class Evaluator:
         self._has_blobs: bool | None = None  # whether the function returns blobs; None while this is not known
         self.evaluates_parts = True
         self.pool = self.observer = None
-        self.evaluations = 0
+        self.evaluations = self.done = self.running = 0
 
     def __getstate__(self):
         return {**self.__dict__, "pool": None, "observer": None}
 
     def __deepcopy__(self, memo):
         return self  # moves that are copied go on with the same density
+
+    def count(self, begun: int, ended: int = 0) -> None:
+        """Count points that begin to be evaluated, and points that have been evaluated."""
+        self.running += begun
+        ended = min(ended, self.running)
+        self.running, self.done = self.running - ended, self.done + ended
+        if self.observer is not None:
+            self.observer()
 
     @property
     def map(self) -> Callable:
@@ -96,6 +104,7 @@ class Evaluator:
                     observe(part)
         if len(new) > 0:
             arriving = _Arriving(self, coords[new])
+            self.count(len(new))
             try:
                 with interrupts_end_the_run():
                     for answer in self.target.answers(coords[new], self.pool):
@@ -103,6 +112,7 @@ class Evaluator:
             except BaseException:  # Ctrl-C, or a pool that cannot go on
                 arriving.store()
                 raise
+            self.count(0, self.running)
             batches.append(arriving.settle(whole=len(new) == sum(inside)))
         self.evaluations += len(asked)
         records = self._pack(log_prior, np.concatenate([old, new]), batches)
@@ -129,8 +139,7 @@ class Evaluator:
             raise Incomplete
         for batch in batches:
             self._check_blobs(batch)
-        if self.observer is not None and known.any():
-            self.observer.repeated(int(sum(known)))
+        self.count(int(sum(known)), int(sum(known)))
         return asked, known, batches
 
     def check_failures(
@@ -212,21 +221,18 @@ class _Arriving:
     """
 
     def __init__(self, evaluator: Evaluator, coords: np.ndarray):
-        self._evaluator, self._coords = evaluator, coords
-        self._results: Any = []
+        self._evaluator, self._coords, self._results = evaluator, coords, []
         self._failed: list[int] = []
         self._stored, self._noted = 0, time.perf_counter()
-        if evaluator.observer is not None:
-            evaluator.observer.submitted(len(coords))
 
     def take(self, answer: Any) -> None:
         """Take the value of the next point; or of all points, if the function takes a batch."""
-        if self._evaluator.target.vectorize:
+        evaluator = self._evaluator
+        if evaluator.target.vectorize:
             self._results = answer
             return
         self._results.append(answer)
-        if self._evaluator.observer is not None:
-            self._evaluator.observer.finished(1)
+        evaluator.count(0, 1)
         if time.perf_counter() - self._noted > SECONDS_BETWEEN_NOTES:
             self.store()
 
@@ -241,14 +247,11 @@ class _Arriving:
 
     def settle(self, whole: bool) -> EvaluatedBatch:
         """Enter what is left of a `whole` batch, or of a part of it, and return it; RuntimeError for many failures."""
-        evaluator = self._evaluator
-        if evaluator.observer is not None:
-            evaluator.observer.settled()
+        evaluator, record = self._evaluator, self._evaluator.record
         batch = evaluator.as_batch(self._coords, self._results)
         new = batch.rows([*self._failed, *range(self._stored, len(self._coords))])
-        counts = evaluator.record.count, len(evaluator.record.failed)
         try:
-            evaluator.check_failures(new, *counts, whole=whole and self._stored == 0)
+            evaluator.check_failures(new, record.count, len(record.failed), whole=whole and self._stored == 0)
         except RuntimeError:
             evaluator.enter(_successes(new))
             raise

@@ -80,14 +80,14 @@ class Progress:
         self._figures: dict[str, Any] = {}
         self._phase = ""  # of a guide
         self._of_guide = 0.0  # simulations that the posterior does not count
-        self._done = self._running = self._shown = 0
         self._part = 0.0  # of a point: simulations of a point that has several
         self._drawn = time.perf_counter()
         self._before = self._counts()
 
     def __enter__(self) -> "Progress":
+        self._evaluator.running, self._shown = 0, self._evaluator.done
         if not self._silent:
-            self._evaluator.observer = self
+            self._evaluator.observer = self._draw_now_and_then
             if self._announce is not None and not self._evaluator.asynchronous:
                 self._announce(self._simulated)
         return self
@@ -99,37 +99,12 @@ class Progress:
                 self._announce(None)
             self._draw()
 
-    # called by the evaluator
-
-    def repeated(self, points: int) -> None:
-        """Points were evaluated before, in an earlier process."""
-        self._done += points
-        self._draw_now_and_then()
-
-    def submitted(self, points: int) -> None:
-        """Points begin to be evaluated, or wait for a worker."""
-        self._running += points
-        self._draw_now_and_then()
-
-    def finished(self, points: int) -> None:
-        """Points have been evaluated."""
-        points = min(points, self._running)
-        self._running -= points
-        self._done += points
-        self._draw_now_and_then()
-
-    def settled(self) -> None:
-        """All points that were submitted have been evaluated."""
-        self.finished(self._running)
-
     def _simulated(self, points: float) -> None:
-        """Simulations of submitted points have ended."""
-        self._part += points if self._running > 0 else 0.0
+        """Simulations of points that are evaluated have ended."""
+        self._part += points if self._evaluator.running > 0 else 0.0
         whole = int(self._part + 1e-9)
         self._part -= whole
-        self.finished(whole)
-
-    # called by the sampler
+        self._evaluator.count(0, whole)
 
     def show(self, result: AnnealingResult, population: Population, report: Report) -> None:
         """Show a report of the annealing."""
@@ -171,13 +146,13 @@ class Progress:
         """Show the figures, and advance the bar by steps, or by the points since the last time."""
         self._drawn = time.perf_counter()
         if self._counts_points:
-            steps, self._shown = self._done - self._shown, self._done
+            steps, self._shown = self._evaluator.done - self._shown, self._evaluator.done
         counts = self._made()
         if self._phase:
             made = round(self._of_guide + counts.get("simulations", 0))
             self._bar.set_description_str(f"{self._phase}: simulation {made}", refresh=False)
         figures = {name: number for name, number in counts.items() if number or name == "simulations"}
-        figures |= self._figures | ({"running": self._running} if self._running else {})
+        figures |= self._figures | ({"running": self._evaluator.running} if self._evaluator.running else {})
         self._bar.set_postfix({name: str(figures[name]) for name in ORDER if name in figures}, refresh=False)
         self._bar.update(steps)
 
