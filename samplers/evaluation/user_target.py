@@ -127,13 +127,18 @@ class Target:
 
         It knows this without a simulation; True if unknown.
         """
-        possible, shape = getattr(self.function, "possible", None), (len(coords),)
+        possible, before = getattr(self.function, "possible", None), sys.exception()
         if callable(possible) and len(coords) > 0:
-            found = _answer(possible, coords.copy())
-            if found is not None and found.shape == shape and found.dtype == bool:
-                return found
-            logger.warning("the verdict takes all points as possible: possible must return bool of shape %s", shape)
-        return np.ones(shape, dtype=bool)
+            try:
+                found = np.asarray(possible(coords.copy()))
+                if found.shape == (len(coords),) and found.dtype == bool:
+                    return found
+                error: Any = f"it must return bool of shape {(len(coords),)}"
+            except Exception as raised:
+                raise_if_it_ends_the_run(raised, before)
+                error = repr(raised)
+            logger.warning("the method possible failed, so the verdict takes all points as possible: %s", error)
+        return np.ones(len(coords), dtype=bool)
 
     def recall(self, batch: EvaluatedBatch) -> None:
         """Tell a function that counts failures itself what an earlier process has evaluated, by `recall_failures`."""
@@ -234,14 +239,3 @@ def _unless_ended(map_of_pool: Callable, caught: Callable, points: Any) -> Itera
         if isinstance(answer, Ended):
             raise answer.error
         yield answer
-
-
-def _answer(method: Callable, *args: Any) -> np.ndarray | None:
-    """What an optional method of the user returns; None if it fails."""
-    before = sys.exception()
-    try:
-        return np.asarray(method(*args))
-    except Exception as error:
-        raise_if_it_ends_the_run(error, before)
-        logger.warning("the method %s failed: %r", getattr(method, "__name__", method), error)
-        return None
