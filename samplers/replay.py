@@ -20,7 +20,6 @@ from emcee.backends import Backend, HDFBackend
 from emcee.moves import Move
 
 from .blobs import leaves
-from .evaluation.user_target import Target
 from .moves.population_moves import describe
 from .output_file import DAMAGED, run_of_file, whole_file
 from .record import EvaluatedBatch, Record, free_name
@@ -83,13 +82,13 @@ def open_record(backend: Backend | None, nwalkers: int, ndim: int, slow: Sequenc
 
 def describe_run(
     sampler: str,
-    target: Target,
+    target: Any,
     settings: Settings,
     moves: Sequence[Move],
     probabilities: Sequence[float],
     guide: Guide | None,
 ) -> dict:
-    """The start of a run as plain data, in the form that JSON returns.
+    """The start of a run as plain data, in the form that JSON returns, with a `samplers.evaluation.user_target.Target`.
 
     The function and the guide are identified by their attributes ``fingerprint``; a guide without one by its class, a
     function without one not at all.

@@ -3,7 +3,6 @@
 matplotlib is imported inside the functions.
 """
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -37,37 +36,37 @@ def plot_run(sampler: Any) -> "Figure":
     import matplotlib.pyplot as plt
 
     stages, rounds = finished_ladder(sampler), sampler.rounds
-    stage = {name: np.array([getattr(each, name) for each in stages]) for name in stages[0]._fields}
-    ends = np.cumsum(stage["evaluations"])
     several = len(stages) > 1  # a guide that is enough has a single stage, the result of its rounds
     size = {"figsize": (7.5, 8.8 + 2.0 * several), "layout": "constrained"}
     heights = (0.45, 1, 1, 1, 1)[: 4 + several]
     figure, (top, *ladder, points, evidence, chain) = plt.subplots(4 + several, 1, height_ratios=heights, **size)
     _draw_phases(top, sampler)
-    top.set_title(_headline(sampler), fontsize="medium")
+    made, ess, distinct = (
+        np.array([getattr(stage, name) for stage in stages])
+        for name in ("evaluations", "effective_sample_size", "distinct_ancestors")
+    )
+    ends = np.cumsum(made)
     for axes in ladder:
-        _draw_ladder(axes, sampler, stage, ends)
-    style = {"markersize": 4}
+        _draw_ladder(axes, sampler, ends)
+    lines = []
     if several or not rounds:
-        points.plot(ends, stage["effective_sample_size"], "o-", color=BLUE, label="effective sample size", **style)
-        points.plot(ends, stage["distinct_ancestors"], "s--", color=BLUE, alpha=0.5, label="distinct points", **style)
-        log_evidence = np.cumsum(stage["log_evidence_increment"])
-        _draw_evidence(evidence, ends, log_evidence, stage["log_evidence_error"], BLUE, "stages")
+        values = np.cumsum([stage.log_evidence_increment for stage in stages])
+        lines.append((ends, ess, values, [stage.log_evidence_error for stage in stages], BLUE, "", "stages"))
     if rounds:
-        draws, effective, value, error = (
-            np.array([getattr(each, name) for each in rounds])
-            for name in ("draws", "effective_sample_size", "log_evidence", "log_evidence_error")
-        )
-        points.plot(np.cumsum(draws), effective, "o-", color=ORANGE, label="effective sample size, guide", **style)
-        _draw_evidence(evidence, np.cumsum(draws), value, error, ORANGE, "rounds of the guide")
+        draws, ess, values, errors = np.array([(r.draws, r.effective_sample_size, *r[3:5]) for r in rounds]).T
+        lines.append((np.cumsum(draws), ess, values, errors, ORANGE, ", guide", "rounds of the guide"))
+    for at, ess, values, errors, colour, whose, name in lines:
+        points.plot(at, ess, "o-", color=colour, label=f"effective sample size{whose}", markersize=4, zorder=3)
+        style = {"fmt": "o-", "color": colour, "markersize": 4, "capsize": 3}
+        evidence.errorbar(at, values, 2.0 * np.array(errors), label=f"{name}, ± 2 standard errors", **style)
+    if several or not rounds:
+        points.plot(ends, distinct, "s--", color=BLUE, alpha=0.5, label="distinct points", markersize=4)
     points.axhline(sampler.nwalkers, color=GREY, linewidth=1, linestyle=":", label="walkers")
-    points.set_ylim(0.0, 1.3 * points.get_ylim()[1])
-    points.set_ylabel("number of points")
+    points.set(ylim=(0.0, 1.3 * points.get_ylim()[1]), ylabel="number of points")
     points.legend(frameon=False, fontsize="small", ncols=4, loc="upper center")
     if stages[-1].beta == 1.0:
         evidence.axhline(sampler.log_evidence, color=GREY, linewidth=1, linestyle=":", label="result of the run")
-    evidence.set_xlabel("evaluations of the log-probability")
-    evidence.set_ylabel("log-evidence so far")
+    evidence.set(xlabel="evaluations of the log-probability", ylabel="log-evidence so far")
     evidence.ticklabel_format(axis="y", useOffset=False)
     evidence.legend(frameon=False, fontsize="small", loc="best")
     _draw_chain(chain, sampler)
@@ -79,23 +78,20 @@ def plot_run(sampler: Any) -> "Figure":
     return figure
 
 
-def _headline(sampler: Any) -> str:
-    """Stages, cost and evidence of a run in one line, or how far an unfinished run has come."""
-    stages = sampler.ladder
-    number = f"{len(stages)} stage{'s' if len(stages) > 1 else ''}"
-    cost = f"{sampler.evaluations} evaluations"
-    if sampler.ended_at is not None:
-        return f"{number}, {cost}, ended by the limit of simulations at beta = {sampler.ended_at:.3g}"
-    if stages[-1].beta < 1.0:
-        return f"{number}, {cost}, not finished: beta = {stages[-1].beta:.3g}"
-    return f"{number}, {cost}, " + rf"$\log Z$ = {sampler.log_evidence:.2f} $\pm$ {sampler.log_evidence_error:.2g}"
-
-
 def _draw_phases(axes: "Axes", sampler: Any) -> None:
-    """One bar with one part per phase, whose length is the number of evaluations."""
-    annealing = sum(stage.evaluations for stage in sampler.ladder)
+    """One bar with one part per phase, whose length is the number of evaluations; the title has cost and evidence."""
+    stages = sampler.ladder
+    title = f"{len(stages)} stage{'s' if len(stages) > 1 else ''}, {sampler.evaluations} evaluations, "
+    if sampler.ended_at is not None:
+        title += f"ended by the limit of simulations at beta = {sampler.ended_at:.3g}"
+    elif stages[-1].beta < 1.0:
+        title += f"not finished: beta = {stages[-1].beta:.3g}"
+    else:
+        title += rf"$\log Z$ = {sampler.log_evidence:.2f} $\pm$ {sampler.log_evidence_error:.2g}"
+    axes.set_title(title, fontsize="medium")
+    annealing = sum(stage.evaluations for stage in stages)
     of_guide = min(sum(each.draws for each in sampler.rounds), annealing)
-    check = sampler.log_evidence_check if sampler.ladder[-1].beta == 1.0 else None
+    check = sampler.log_evidence_check if stages[-1].beta == 1.0 else None
     of_check = 0 if check is None else check.evaluations
     phases = (
         ("draws of the guide", of_guide, ORANGE),
@@ -114,46 +110,32 @@ def _draw_phases(axes: "Axes", sampler: Any) -> None:
     axes.set_xlabel("evaluations of the log-probability, by phase")
 
 
-def _draw_ladder(axes: "Axes", sampler: Any, stage: Mapping[str, np.ndarray], ends: np.ndarray) -> None:
+def _draw_ladder(axes: "Axes", sampler: Any, ends: np.ndarray) -> None:
     """Exponent beta and acceptance of the stages."""
+    beta, share = (np.array([getattr(stage, name) for stage in sampler.ladder]) for name in ("beta", "acceptance"))
     ended = sampler.ended_at is not None  # then the last stage has all known points, weighted for beta = 1
     reached = slice(None, -1 if ended else None)
-    axes.semilogy(ends[reached], stage["beta"][reached], "o-", color=BLUE, markersize=4)
+    axes.semilogy(ends[reached], beta[reached], "o-", color=BLUE, markersize=4)
     if ended:
         axes.semilogy(ends[-1], 1.0, "o", color=BLUE, markerfacecolor="white", markersize=5, label="not reached")
         axes.legend(frameon=False, fontsize="small", loc="lower right")
     axes.set_ylabel(r"exponent $\beta$ [-]", color=BLUE)
-    axes.set_ylim(min(0.05, 0.5 * stage["beta"].min()), 2.0)  # at least a decade, so that decades are labelled
+    axes.set_ylim(min(0.05, 0.5 * beta.min()), 2.0)  # at least a decade, so that decades are labelled
     acceptance = axes.twinx()
-    acceptance.plot(ends, stage["acceptance"], "s--", color=ORANGE, markersize=4)
+    acceptance.plot(ends, share, "s--", color=ORANGE, markersize=4)
     acceptance.set_ylim(0, 1)
     acceptance.set_ylabel("acceptance [-]", color=ORANGE)
 
 
-def _draw_evidence(
-    axes: "Axes", ends: np.ndarray, values: np.ndarray, errors: np.ndarray, colour: str, name: str
-) -> None:
-    """Log-evidence after each stage or round."""
-    label = f"{name}, ± 2 standard errors"
-    axes.errorbar(ends, values, 2.0 * errors, fmt="o-", color=colour, markersize=4, capsize=3, label=label)
-
-
 def _draw_chain(axes: "Axes", sampler: Any) -> None:
     """Log-probability of the walkers at beta = 1."""
-    axes.set_xlabel("step at beta = 1")
-    axes.set_ylabel("log-probability")
+    axes.set(xlabel="step at beta = 1", ylabel="log-probability")
     if sampler.iteration == 0:
         axes.text(0.5, 0.5, "no steps at beta = 1 were made", transform=axes.transAxes, ha="center", va="center")
         return
-    values = np.asarray(sampler.get_log_prob(), dtype=float)
-    steps = np.arange(1, len(values) + 1)
-    low, middle, high = np.quantile(values, [0.05, 0.5, 0.95], axis=1)
-    if len(values) == 1:
-        label = "median and 90 % of the walkers"
-        axes.errorbar(steps, middle, [middle - low, high - middle], fmt="o", color=BLUE, capsize=4, label=label)
-        axes.set(xticks=[1], xlim=(0.5, 1.5))
-    else:
-        axes.fill_between(steps, low, high, color=BLUE, alpha=0.2, linewidth=0.0, label="90 % of the walkers")
-        axes.plot(steps, middle, "o-" if len(values) < 40 else "-", color=BLUE, markersize=3, label="median")
-        axes.xaxis.get_major_locator().set_params(integer=True)
-    axes.legend(frameon=False, fontsize="small", ncols=2, loc="lower right")
+    low, middle, high = np.quantile(np.asarray(sampler.get_log_prob(), dtype=float), [0.05, 0.5, 0.95], axis=1)
+    steps = np.arange(1, len(middle) + 1)
+    style = {"fmt": "o-" if len(steps) < 40 else "-", "color": BLUE, "markersize": 3, "ecolor": BLUE + "60"}
+    axes.errorbar(steps, middle, [middle - low, high - middle], label="median and 90 % of the walkers", **style)
+    axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.legend(frameon=False, fontsize="small", loc="lower right")
