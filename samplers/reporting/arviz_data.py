@@ -1,9 +1,6 @@
-"""Results of runs as arviz data, for its statistics, figures and files.
+"""Results of runs as arviz data: each run is one chain, whose draws are ordered by founder, walker and step.
 
-Each run is one chain, because the walkers of a run share proposals and ancestors (`arviz.from_emcee` makes each walker
-a chain). arviz estimates effective sample sizes from the correlation between neighbours, so the draws are ordered by
-founder, walker and step: dependent draws are neighbours, and ``ess`` and ``mcse`` of the mean agree with
-``sampler.mean_error()``.
+arviz estimates effective sample sizes from the correlation between neighbours, which dependent draws are then.
 """
 
 import json

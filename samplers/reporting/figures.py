@@ -6,11 +6,10 @@ or x0, x1, ... matplotlib and corner are imported inside the functions.
 
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-
-from .summary import described_parameters_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -251,7 +250,7 @@ def _choose(
     if len(set(widths.values())) > 1:
         raise ValueError(f"all samples must have the same parameters; the numbers of columns are {widths}")
     ndim = next(iter(widths.values()))
-    parameters = described_parameters_of(posterior, ndim)
+    parameters = _parameters_of(posterior, ndim)
     if labels is not None and len(labels) != ndim:
         raise ValueError(f"expected one label for each of {ndim} parameters; got {len(labels)}: {list(labels)}")
     known = list(labels) if labels is not None and posterior is None else [each.name for each in parameters]
@@ -278,6 +277,20 @@ def _choose(
         _limits(arrays, truths),
         note,
     )
+
+
+def _parameters_of(posterior: Any, ndim: int) -> Sequence[Any]:
+    """Name, label, unit (``factor``) and nominal value for each of `ndim` parameters; ValueError for another number."""
+    described = getattr(posterior, "parameters", None)
+    if described is None:
+        names = getattr(posterior, "parameter_names", None) or [f"x{i}" for i in range(ndim)]
+        described = [SimpleNamespace(name=str(name), label=str(name), factor=1.0, nominal=np.nan) for name in names]
+    if len(described) != ndim:
+        raise ValueError(
+            f"the posterior has {len(described)} parameters ({', '.join(each.name for each in described)}), but the "
+            f"samples have {ndim} columns"
+        )
+    return described
 
 
 def _checked(samples: Any, label: str) -> np.ndarray:

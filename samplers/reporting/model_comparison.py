@@ -63,19 +63,18 @@ class ModelComparison(NamedTuple):
         """Table with one line per model, the most probable first, and the verdict of each run."""
         table = [("model", "log evidence", "log Bayes factor", "prior", "probability", "95 % interval")]
         for k in np.argsort(-self.probability, kind="stable"):
-            table.append(
-                (
-                    self.names[k],
-                    f"{self.log_evidence[k]:.3f} +- {self.log_evidence_error[k]:.3f}",
-                    f"{self.log_bayes_factor[k]:.3f} +- {self.log_bayes_factor_error[k]:.3f}",
-                    f"{self.prior[k]:.3g}",
-                    f"{self.probability[k]:.4g}",
-                    f"{self.lower[k]:.4g} ... {self.upper[k]:.4g}",
-                )
+            evidence, factor = (
+                f"{value[k]:.3f} +- {error[k]:.3f}"
+                for value, error in (self[1:3], (self.log_bayes_factor, self.log_bayes_factor_error))
             )
-        rows = aligned(table)
-        rows += [f"{name}: {text}" for name, text in zip(self.names, self.summaries, strict=True) if text]
-        return "\n".join(rows)
+            shares = (
+                f"{self.prior[k]:.3g}",
+                f"{self.probability[k]:.4g}",
+                f"{self.lower[k]:.4g} ... {self.upper[k]:.4g}",
+            )
+            table.append((self.names[k], evidence, factor, *shares))
+        said = [f"{name}: {text}" for name, text in zip(self.names, self.summaries, strict=True) if text]
+        return "\n".join([*aligned(table), *said])
 
     __str__ = __repr__ = table
 
@@ -131,17 +130,10 @@ def compare_models(models: Mapping[str, Any], prior: Mapping[str, float] | None 
     reach = norm.ppf(0.975) * odds_error
     best = int(np.argmax(log_evidence))
     factor_error = np.where(np.arange(len(names)) == best, 0.0, np.hypot(error, error[best]))
+    shares = before, probability, expit(odds - reach), expit(odds + reach)
+    factors = log_evidence - log_evidence[best], factor_error
     return ModelComparison(
-        names=names,
-        log_evidence=log_evidence,
-        log_evidence_error=error,
-        prior=before,
-        probability=probability,
-        lower=expit(odds - reach),
-        upper=expit(odds + reach),
-        log_bayes_factor=log_evidence - log_evidence[best],
-        log_bayes_factor_error=factor_error,
-        summaries=tuple(map(verdict_summary_of, models.values())),
+        names, log_evidence, error, *shares, *factors, tuple(map(verdict_summary_of, models.values()))
     )
 
 

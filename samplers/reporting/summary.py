@@ -13,7 +13,6 @@ if TYPE_CHECKING:
 __all__ = [
     "Summary",
     "aligned",
-    "described_parameters_of",
     "finished_ladder",
     "is_tempered",
     "ladder_table",
@@ -22,29 +21,6 @@ __all__ = [
     "summary",
     "verdict_summary_of",
 ]
-
-
-class _NamedParameter(NamedTuple):
-    """A parameter with a name only, with the members of ``posterior.parameters``."""
-
-    name: str
-    label: str
-    factor: float = 1.0
-    nominal: float = np.nan
-
-
-def described_parameters_of(posterior: Any, ndim: int) -> Sequence[Any]:
-    """Name, label, unit (``factor``) and nominal value for each of `ndim` parameters; ValueError for another number."""
-    described = getattr(posterior, "parameters", None)
-    if described is None:
-        names = getattr(posterior, "parameter_names", None) or [f"x{i}" for i in range(ndim)]
-        described = [_NamedParameter(str(name), str(name)) for name in names]
-    if len(described) != ndim:
-        raise ValueError(
-            f"the posterior has {len(described)} parameters ({', '.join(each.name for each in described)}), but the "
-            f"samples have {ndim} columns"
-        )
-    return described
 
 
 def is_tempered(sampler: Any) -> bool:
@@ -183,18 +159,6 @@ def finished_ladder(sampler: Any) -> tuple[Stage, ...]:
     return sampler.ladder
 
 
-# columns of `ladder_table`: heading, field of a stage, format
-_STAGE = (
-    ("ESS", "effective_sample_size", ".0f"),
-    ("acceptance", "acceptance", ".3f"),
-    ("sweeps", "moves", ""),
-    ("distinct", "distinct_ancestors", ""),
-    ("d log Z", "log_evidence_increment", ".3f"),
-    ("evaluations", "evaluations", ""),
-    ("time [s]", "seconds", ".3g"),
-)
-
-
 def ladder_table(sampler: Any) -> str:
     """Table of the tempering stages (`samplers.Stage`), estimates of the evidence, and summary of the verdict.
 
@@ -208,19 +172,18 @@ def ladder_table(sampler: Any) -> str:
     log evidence 376...
     Converged: one mode; ...
     """
-    stages = finished_ladder(sampler)
-    table = [("stage", "beta ", *(heading for heading, _, _ in _STAGE))]
-    for number, stage in enumerate(stages, start=1):
-        ended = sampler.ended_at is not None and number == len(stages)
-        beta = f"{sampler.ended_at:.3e}*" if ended else f"{stage.beta:.3e} "
-        table.append((str(number), beta, *(format(getattr(stage, name), form) for _, name, form in _STAGE)))
+    stages, ended = finished_ladder(sampler), sampler.ended_at
+    table = [("stage", "beta ", "ESS", "acceptance", "sweeps", "distinct", "d log Z", "evaluations", "time [s]")]
+    for number, (beta, ess, share, moves, distinct, increment, _, made, seconds) in enumerate(stages, start=1):
+        reached = f"{beta:.3e} " if ended is None or number < len(stages) else f"{ended:.3e}*"
+        cells = f"{ess:.0f}", f"{share:.3f}", f"{moves}", f"{distinct}", f"{increment:.3f}", f"{made}", f"{seconds:.3g}"
+        table.append((f"{number}", reached, *cells))
     rows = aligned(table)
-    if sampler.ended_at is not None:
+    if ended is not None:
         rows.append("* the limit of simulations ended the run here: all points known then, weighted for beta = 1")
-    evaluations, seconds = sum(s.evaluations for s in stages), sum(s.seconds for s in stages)
     rows.append(
         f"log evidence {sampler.log_evidence:.3f} +- {sampler.log_evidence_error:.3f}; "
-        f"{evaluations} evaluations in {seconds:.3g} s"
+        f"{sum(s.evaluations for s in stages)} evaluations in {sum(s.seconds for s in stages):.3g} s"
     )
     if (check := sampler.log_evidence_check) is not None:
         rows.append(
