@@ -424,13 +424,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
         """Store the verdict on an annealing by this object, or keep the verdict of the backend."""
         if self._result.independent_points is not None or self._verdict is None:
             failed = f"{self.failure_count} of {self.evaluations} evaluations" if self.failure_count else ""
-            target, latest, self._near = self._target, self._record.latest(), None
-            if latest is not None:
-                has_failed = np.isin(np.arange(len(latest.coords)), list(latest.reasons))
-                points = latest.coords, latest.log_prob, has_failed
-                slow = np.array(target.slow_parameters)
-                options = slow, target.failure_count is not None, target.may_be_positive
-                self._near = judged_failures(*points, coords, *options)
+            latest = self._record.latest()
+            self._near = None if latest is None else judged_failures(latest, coords, self._target)
             numbers = self.nwalkers, self.ndim, self.simulations
             searched = self._budget.of_guides
             self._verdict = judge(self._result, *numbers, missing, failed, searched, self._near)

@@ -9,8 +9,7 @@ The share of failures among the 20 evaluated points nearest to each final point 
 0.017 to 0.021 in runs cut off at 1 standard deviation, against 0.024 to 0.033 where 4 % of all points fail at random.
 """
 
-from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -124,34 +123,25 @@ def failures_near(samples: np.ndarray, failed: np.ndarray, succeeded: np.ndarray
     )
 
 
-def judged_failures(
-    coords: np.ndarray,
-    log_prob: np.ndarray,
-    failed: np.ndarray,
-    final_coords: np.ndarray,
-    columns: np.ndarray,
-    counts_failures: bool,
-    possible: Callable[[np.ndarray], np.ndarray] | None = None,
-) -> NearFailures:
+def judged_failures(evaluated: Any, final_coords: np.ndarray, target: Any) -> NearFailures:
     """Failures in the region of a run's final points (n, ndim), on which the verdict depends.
 
-    The latest 20 000 evaluated points are compared in the `columns` that a simulation depends on. If the log-density
-    `counts_failures` by itself, all values of -inf are failures. Points that are not `possible` lie outside the
-    support.
+    The latest 20 000 of the `evaluated` points (`samplers.record.EvaluatedBatch`) are compared in the parameters that
+    a simulation depends on. If the `target` counts failures by itself, all values of -inf are failures, except outside
+    its support.
     """
-    latest = slice(-KEPT_POINTS, None)
-    coords, log_prob, failed = coords[latest], log_prob[latest], failed[latest]
+    failed = np.isin(np.arange(len(evaluated.coords)), list(evaluated.reasons))[-KEPT_POINTS:]
+    coords, log_prob = evaluated.coords[-KEPT_POINTS:], evaluated.log_prob[-KEPT_POINTS:]
     impossible = ~failed & ~(log_prob > -np.inf)
     if not np.any(failed | impossible):
         return NearFailures(0, 0)
-    if possible is not None:
-        rows = np.flatnonzero(impossible)
-        ruled_out = rows[~possible(coords[rows])]
-        coords, failed, impossible = (np.delete(each, ruled_out, axis=0) for each in (coords, failed, impossible))
-    coords, samples = coords[:, columns], final_coords[:, columns]
-    either = failed | impossible
-    found = failures_near(samples, coords[either if counts_failures else failed], coords[~either])
-    if found.borders or counts_failures:
+    rows = np.flatnonzero(impossible)
+    ruled_out = rows[~target.may_be_positive(coords[rows])]
+    coords, failed, impossible = (np.delete(each, ruled_out, axis=0) for each in (coords, failed, impossible))
+    slow, either, counts = target.slow_parameters, failed | impossible, target.failure_count is not None
+    coords, samples = coords[:, slow], final_coords[:, slow]
+    found = failures_near(samples, coords[either if counts else failed], coords[~either])
+    if found.borders or counts:
         return found
     unknown = failures_near(samples, coords[either], coords[~either])
     return unknown._replace(known=False) if unknown.borders else found

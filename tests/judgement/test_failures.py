@@ -115,13 +115,14 @@ def test_an_answer_that_cannot_be_used_rules_nothing_out(answer, caplog):
             raise RuntimeError("no answer")
         return answer
 
-    posterior = RulesOut(5.0, "inf")
+    posterior = CountingRulesOut(5.0, "inf")
     sampler = run(posterior)
     posterior.possible = possible
     known = sampler._record.latest()
-    points = known.coords, known.log_prob, np.zeros(len(known.coords), bool), sampler.get_chain(flat=True)
-    expected = judged_failures(*points, np.arange(2), True)
-    found = judged_failures(*points, np.arange(2), True, Target(posterior, None, None, posterior.ndim).may_be_positive)
+    target, final = Target(posterior, None, None, posterior.ndim), sampler.get_chain(flat=True)
+    found = judged_failures(known, final, target)
+    posterior.possible = lambda x: np.ones(len(x), dtype=bool)
+    expected = judged_failures(known, final, target)
     assert found == expected and found.failed > 50 and "takes all points as possible" in caplog.text
 
 
