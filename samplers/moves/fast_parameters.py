@@ -3,8 +3,9 @@
 In many posteriors some parameters change the density without a new simulation: the noise standard deviations, for
 example, when the sums of squared residuals are cached. A posterior declares their indices by an attribute
 ``fast_parameters``. After each expensive move the ensemble makes a few random-walk steps in them alone. This is
-Metropolis within Gibbs, so the target distribution is unchanged. With 24 to 80 walkers by moves, five checks of the
-tutorials fail without these sweeps; with 100 walkers, the errors of means are three times as large.
+Metropolis within Gibbs, so the target distribution is unchanged. Without these sweeps, 16 runs of 50 walkers by moves
+with five structural parameters and four noise levels had means that were off by 0.75 standard deviations (with them by
+0.13), and took 14 % more simulations.
 
 References
 ----------
