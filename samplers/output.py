@@ -29,8 +29,8 @@ logger = logging.getLogger(__name__)
 class Output:
     """Data stored with the chain of an initialised backend: `result` and `verdict` (empty, None: nothing) of a `run`.
 
-    `first_step` steps were stored before the last annealing. `provisional`: the last step is the estimate of a run that
-    the limit of simulations ended, and is replaced when the run continues.
+    `provisional`: the only step is the estimate of a run that the limit of simulations ended, and is replaced when the
+    run continues.
     """
 
     def __init__(self, backend: Backend):
@@ -39,9 +39,8 @@ class Output:
         stored = _read(backend)
         self.run = stored.get("run", "")  # empty: a chain of emcee
         self.result, self.verdict = _parsed(stored)
-        self.first_step = stored.get("first_step", 0)
         # the process may have been killed after the provisional step was removed, and before its note was
-        self.provisional = stored.get("provisional", False) and int(backend.iteration) > self.first_step
+        self.provisional = stored.get("provisional", False) and backend.iteration > 0
 
     def whole(self) -> AbstractContextManager:
         """Context in which a file is changed as a whole (`samplers.output_file`)."""
@@ -50,7 +49,6 @@ class Output:
     def begin(self, run: str) -> None:
         """A new annealing begins, without results. OSError or ValueError if a file cannot be written."""
         self.run, self.result, self.verdict = run, AnnealingResult(), None
-        self.first_step = int(self._backend.iteration)
         self.write(None)
         if self._file is not None:
             self._file.save()
@@ -93,7 +91,6 @@ class Output:
             "check": result.check,
             "founders": None if result.founders is None else np.asarray(result.founders).tolist(),
             "verdict": self.verdict,
-            "first_step": self.first_step,
             "provisional": self.provisional,
         }
         data = np.frombuffer(json.dumps(contents).encode(), dtype=np.uint8)
@@ -118,7 +115,7 @@ class Output:
     def last_state(self) -> State | None:
         """The last stored state at beta = 1 of the last annealing; None without any."""
         backend = self._backend
-        if backend.iteration > self.first_step:
+        if backend.iteration > 0:
             return backend.get_last_sample()
         if not isinstance(backend, HDFBackend):
             return None
@@ -140,7 +137,7 @@ class Output:
         """Remove all steps; the chain continues from `state`."""
         with self.whole():
             cut_chain(self._backend, 0, np.zeros_like(self._counts[1]))
-            self.first_step, self.provisional = 0, False
+            self.provisional = False
             self.write(state)
 
     def store_provisional_step(self, state: State) -> None:
@@ -154,7 +151,7 @@ class Output:
     def drop_provisional_step(self) -> None:
         """Remove the last step if it is provisional."""
         if self.provisional:
-            cut_chain(self._backend, self._counts[0] - 1, self._counts[1])
+            cut_chain(self._backend, 0, self._counts[1])
             self.provisional = False
             self.write()
 

@@ -240,10 +240,9 @@ class TemperedSampler(RunResults, EnsembleSampler):
         initial_state : (nwalkers, ndim) float, State or None
             Draws of the prior. None: continue from the last state if there is one, else draw
             ``log_prob_fn.sample_prior(nwalkers, random)``. After annealing, a State of this sampler (or the coordinates
-            of its last State) is continued, and so is a run that began with the same draws. Other coordinates start a
-            new annealing, whose steps are added to the chain: call `reset` before, or use a new sampler. Points that
-            cannot be such draws, such as a ball near the posterior, are refused with a ValueError
-            (`samplers.evaluation.starts`).
+            of its last State) is continued, and so is a run that began with the same draws. Other draws start a new
+            annealing: call `reset` before, or use a new sampler. Points that cannot be draws of the prior, such as a
+            ball near the posterior, are refused with a ValueError (`samplers.evaluation.starts`).
         nsteps : int
             Number of steps stored in the chain; 0 for the annealing only.
         **kwargs
@@ -412,7 +411,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
             for name in State.__slots__:
                 setattr(advanced, name, getattr(stored, name))
         self.random_state = stored.random_state
-        if store and missing > 0 and self.backend.iteration == self._output.first_step:
+        if store and missing > 0 and self.backend.iteration == 0:
             self._output.store_provisional_step(stored)
         text = describe_early_stop(self.verdict, self._budget.limit, self._result, new, missing)
         # only steps at beta = 1 are missing in a converged run: nothing to be warned of
@@ -474,10 +473,10 @@ class TemperedSampler(RunResults, EnsembleSampler):
                 given = previous  # started again with the same draws goes on
         if given.log_prob is not None and self._result.finished:
             return given
-        if self.backend.iteration > 0 and not self._result.finished and start is None:
+        if self.backend.iteration > 0:
             raise ValueError(
-                "the backend contains a chain that was not annealed, as one of emcee's own sampler: use another file, "
-                "or backend.reset(nwalkers, ndim)"
+                f"the chain has {self.iteration} steps that were not annealed from these points: pass None to add to "
+                "them, call reset before other draws of the prior, or use another file for a chain of emcee's sampler"
             )
         return self._new_start(given, skip_check)
 

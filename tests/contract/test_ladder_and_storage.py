@@ -117,6 +117,7 @@ def test_annealing_is_done_once():
     ladder = sampler.ladder
     state = sampler.run_mcmc(None, 2)
     sampler.run_mcmc(state, 2)
+    sampler.reset()
     other = posterior.sample_prior(N, np.random.default_rng(5))
     sampler.run_mcmc(other, 0)  # coordinates other than the last: draws of the prior, annealed again
     assert sampler.ladder != ladder

@@ -248,6 +248,7 @@ def test_a_second_annealing_counts_the_search_of_the_first(tmp_path):
     sampler = make("searching guide", None, file)
     sampler.run_mcmc(None, 1)
     first, searched = sampler.simulations, sampler.guide.simulations
+    sampler.reset()
     sampler.run_mcmc(sampler.log_prob_fn.f.sample_prior(N, np.random.default_rng(3)), 1)
     made = sampler.simulations
     assert made == sampler.log_prob_fn.f.calls and made > first + searched
