@@ -47,7 +47,7 @@ from .tempering.anneal import anneal
 from .tempering.guide import AdaptedGuide, Guide, check_guide
 from .tempering.guided import Guidance, lend
 from .tempering.mutation import MoveSchedule, check_moves
-from .tempering.population import Population, check_size, check_start
+from .tempering.population import Population, check_size
 from .tempering.recording import Recording, check_end
 
 __all__ = ["TemperedSampler"]
@@ -518,12 +518,10 @@ class TemperedSampler(RunResults, EnsembleSampler):
 
     def _new_start(self, state: State, skip_check: bool) -> RunStart:
         """Draws of the prior, checked and entered in the record."""
-        check_start(state.coords, self.nwalkers, self.ndim, skip_check)
-        self.random_state = state.random_state
         coords = np.asarray(state.coords, dtype=float)
-        log_prior = self._target.log_prior_of_start(coords)
-        if not np.array_equal(coords, self._drawn):
-            self._target.check_start(coords)
+        is_drawn = np.array_equal(coords, self._drawn)
+        log_prior = self._target.check_start(coords, self.nwalkers, skip_check, is_drawn)
+        self.random_state = state.random_state
         run = {"run": uuid.uuid4().hex, "seed": self._seed, "of_earlier_guides": self._budget.of_guides}
         run["log_prior"] = float(np.sum(log_prior))
         start = RunStart(self._header() | run, coords, self.random_state)

@@ -7,7 +7,7 @@ from numbers import Integral
 from typing import Any
 
 import numpy as np
-from emcee.ensemble import ndarray_to_list_of_dicts
+from emcee.ensemble import ndarray_to_list_of_dicts, walkers_independent
 
 from ..interrupts import Ended, SentFunction, interrupts_end_the_run, raise_if_it_ends_the_run
 from ..record import EvaluatedBatch
@@ -197,10 +197,21 @@ class Target:
             )
         return np.array(draw(n, random), dtype=float)
 
-    # ------------------------------------------------------------------ the start of a run
+    def check_start(self, coords: np.ndarray, nwalkers: int, skip_check: bool, is_drawn: bool) -> np.ndarray:
+        """Log-prior (n,) of the points (n, ndim) that a run starts from; ValueError if they are no draws of the prior.
 
-    def log_prior_of_start(self, coords: np.ndarray) -> np.ndarray:
-        """Log-prior (n,) of the points (n, ndim) that a run starts from; ValueError if one is outside the support."""
+        Points that the sampler has drawn (`is_drawn`) are not tested (`samplers.evaluation.starts`).
+        """
+        if coords.shape != (nwalkers, self.ndim):
+            raise ValueError(
+                f"incompatible input dimensions: initial_state must be ({nwalkers}, {self.ndim}) draws of the prior; "
+                f"got {coords.shape}"
+            )
+        if not skip_check and not walkers_independent(coords):
+            raise ValueError(
+                "Initial state has a large condition number: the walkers must be finite and linearly independent, as "
+                "draws of the prior are"
+            )
         try:
             log_prior = self.log_prior(coords)
         except Exception as error:
@@ -217,12 +228,8 @@ class Target:
                 f"{len(outside)} of {len(coords)} initial points lie outside the prior's support (log_prior -inf or "
                 f"NaN), the first of them {coords[outside[0]]}: pass draws of the prior"
             )
-        return log_prior
-
-    def check_start(self, coords: np.ndarray) -> None:
-        """Raise ValueError for points (n, ndim) that cannot be draws of the prior (`samplers.evaluation.starts`)."""
-        if not (reason := not_of_the_prior(coords, self.log_prior)):
-            return
+        if is_drawn or not (reason := not_of_the_prior(coords, self.log_prior)):
+            return log_prior
         draws = getattr(self.function, "sample_prior", None) is not None
         known = "None, so that the sampler draws the prior" if draws else "draws of the prior"
         raise ValueError(

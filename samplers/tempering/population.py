@@ -4,11 +4,10 @@ from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from emcee.ensemble import walkers_independent
 
 from .pending_points import PendingPoints
 
-__all__ = ["Density", "Population", "check_size", "check_start"]
+__all__ = ["Density", "Population", "check_size"]
 
 
 class Density(Protocol):
@@ -62,18 +61,4 @@ def check_size(nwalkers: int, ndim: int) -> None:
         raise ValueError(
             "a population must span the parameters: at least 2 ndim walkers and one parameter are needed, some "
             f"hundreds of walkers are usual; got nwalkers={nwalkers} for ndim={ndim}"
-        )
-
-
-def check_start(coords: np.ndarray, nwalkers: int, ndim: int, skip_independence: bool) -> None:
-    """Raise ValueError unless points have the shape (nwalkers, ndim) and, if that is wanted, span the parameters."""
-    if coords.shape != (nwalkers, ndim):
-        raise ValueError(
-            f"incompatible input dimensions: initial_state must be ({nwalkers}, {ndim}) draws of the prior; got "
-            f"{coords.shape}"
-        )
-    if not skip_independence and not walkers_independent(coords):
-        raise ValueError(
-            "Initial state has a large condition number: the walkers must be finite and linearly independent, as draws "
-            "of the prior are"
         )

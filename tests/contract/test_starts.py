@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from samplers import SMCSampler, TemperedSampler, TMCMCSampler
-from samplers.evaluation.user_target import Target
+from samplers.evaluation import user_target
 from tests.contract.targets import Gaussian
 
 N = 60
@@ -43,7 +43,7 @@ def test_a_ball_is_refused_without_draws_of_the_prior(Sampler):
 
 def test_control_a_start_that_is_not_of_the_prior_would_be_wrong(monkeypatch):
     """Negative control: why starts are tested."""
-    monkeypatch.setattr(Target, "check_start", lambda *args: None)
+    monkeypatch.setattr(user_target, "not_of_the_prior", lambda *args: "")
     posterior = Gaussian(3, sd=0.1)
     sampler = SMCSampler(100, 3, posterior, vectorize=True, seed=1, check_draws=0)
     sampler.run_mcmc(ball(posterior, 100, 0.02), 1)
