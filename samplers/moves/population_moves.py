@@ -67,7 +67,7 @@ def describe(move: Move) -> dict:
     """
     settings = {}
     for name, value in sorted(vars(move).items()):
-        if not name.startswith("_"):
+        if not name.startswith("_") and name != "is_fitted":
             if isinstance(value, Move):
                 settings[name] = describe(value)
             elif value is None or isinstance(value, bool | int | float | str):
@@ -80,13 +80,10 @@ def describe(move: Move) -> dict:
 class _FittedMove(MHMove):
     """A Metropolis-Hastings move of the whole ensemble, whose proposal is fitted to weighted points before."""
 
+    is_fitted = False  # whether the move was calibrated; otherwise it cannot propose
+
     def __init__(self):
         super().__init__(self._draw_if_fitted)
-
-    @property
-    def is_fitted(self) -> bool:
-        """Whether the move was calibrated; otherwise it cannot propose."""
-        raise NotImplementedError
 
     def _draw(self, coords: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
         """Proposed points and log-ratios of proposal densities for points (n, ndim)."""
@@ -143,15 +140,11 @@ class RandomWalkMove(_FittedMove):
         self._root: np.ndarray | None = None
         self._log_factor = 0.0
 
-    @property
-    def is_fitted(self) -> bool:
-        """Whether the move was calibrated."""
-        return self._root is not None
-
     def calibrate(
         self, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None, mixture: Mixture | None = None
     ) -> None:
         """Fit the covariance to points (n, ndim) with normalised weights (n,)."""
+        self.is_fitted = True
         self._root = location_and_root(coords, weights)[1]
 
     def _draw(self, coords, random):
@@ -207,16 +200,6 @@ class MixtureMove(_FittedMove):
         self._current: int | None = None  # kernel index in the latest sweep; None right after a calibration
         self._independence_accepted = False
 
-    @property
-    def is_fitted(self) -> bool:
-        """Whether the move was calibrated."""
-        return self._mixture is not None
-
-    @property
-    def mixture(self) -> Mixture | None:
-        """The fitted mixture; None before the first fit."""
-        return self._mixture
-
     def calibrate(
         self, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None, mixture: Mixture | None = None
     ) -> None:
@@ -228,6 +211,7 @@ class MixtureMove(_FittedMove):
         has widened the mixture is replaced too easily. So in 15 dimensions or more, each tenth of the points is moved
         by a fit to the others, if `follow` says which walker descends from which point.
         """
+        self.is_fitted = True
         if inside is not None and self._bounds is None:
             self._bounds = find_support_bounds(inside, coords)
         self._mixture = fit_mixture(coords, weights, bounds=self._bounds) if mixture is None else mixture

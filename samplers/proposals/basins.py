@@ -27,7 +27,7 @@ import numpy as np
 from .mixture import Mixture, invert_roots, log_components, to_component_space
 from .transforms import log_abs_det_jacobian
 
-__all__ = ["cover_basins", "find_basins", "with_components"]
+__all__ = ["find_basins", "with_components"]
 
 # Points whose log-density is this far below the highest, per dimension, are left out. The only points of a narrow mode
 # may be low on its flank.
@@ -78,13 +78,6 @@ class _Quadratic(NamedTuple):
     def at(self, points: np.ndarray) -> np.ndarray:
         """Values (n,) at points (n, d)."""
         return self.constant + points @ self.slope - 0.5 * np.einsum("ij,ij->i", points @ self.curvature, points)
-
-
-def cover_basins(
-    mixture: Mixture, coords: np.ndarray, log_target: np.ndarray, most: int = 3, share: float = 0.1
-) -> Mixture:
-    """Add the components of `find_basins`, with the same arguments, to a mixture."""
-    return with_components(mixture, find_basins(mixture, coords, log_target, most, share))
 
 
 def with_components(mixture: Mixture, found: Mixture | None) -> Mixture:

@@ -36,7 +36,7 @@ from ..judgement.checks import (
     describe_unused_guide,
     find_unreached_part,
 )
-from ..proposals.basins import cover_basins
+from ..proposals.basins import find_basins, with_components
 from ..proposals.mixture import fit_mixture, log_density
 from ..proposals.transforms import find_support_bounds
 from ..reports import EarlyStop, GuidedStart, Report, Restart, Stage, warn
@@ -135,7 +135,7 @@ def check_population(
     coords, n = population.coords, len(population.coords)
     mixture = fit_mixture(coords, np.full(n, 1.0 / n), bounds=find_support_bounds(density.inside, coords))
     points, log_target = visited.at(1.0)
-    mixture = cover_basins(mixture, points, log_target - log_evidence)
+    mixture = with_components(mixture, find_basins(mixture, points, log_target - log_evidence))
     drawn, made = draw_inside(mixture, n if draws is None else draws, random, density.inside)
     log_weights = density.evaluate(drawn)["log_prob"] - log_density(mixture, drawn)
     findings = check_shares(mixture, coords, population.founders[0], drawn, log_weights)

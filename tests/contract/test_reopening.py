@@ -301,15 +301,6 @@ def test_a_file_that_is_only_read(kind, tmp_path):
 # ---------------------------------------------------------------- idioms of emcee's users
 
 
-@pytest.mark.parametrize("kind", ONE)
-def test_a_negative_number_of_steps_is_refused(kind, tmp_path):
-    sampler = begin(make(kind, tmp_path / "run.h5", Counted()), 3)
-    for each in (sampler, make(kind, tmp_path / "run.h5", Counted())):
-        with pytest.raises(ValueError, match="nsteps must be 0 or more; got -2 "):
-            each.run_mcmc(None, -2)
-        assert each.iteration == 3
-
-
 @pytest.mark.parametrize(("kind", "steps"), covering(OURS, [0, 2], strength=1))
 def test_a_run_with_other_bits_goes_on_from_its_population(kind, steps, tmp_path):
     """Another processor computes other bits; here, a proposal is changed in its last one. Nothing is evaluated anew."""

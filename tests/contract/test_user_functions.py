@@ -33,17 +33,28 @@ def run(Sampler, log_prob_fn, posterior=None, nsteps=1, n=N, **kwargs):
 # ---------------------------------------------------------------- shapes
 
 
+GAUSSIAN = Gaussian()
+PRIOR, LIKELIHOOD = GAUSSIAN.log_prior, GAUSSIAN.log_likelihood
+
+
 @every
-@pytest.mark.parametrize("vectorize", [False, True])
-def test_a_log_prior_that_is_not_summed_is_refused(Sampler, vectorize):
-    with pytest.raises(ValueError, match=r"log_prior_fn must return one number per point; got ndarray of shape \(3,\)"):
-        run(Sampler, lambda x: Gaussian()(x), log_prior_fn=terms, vectorize=vectorize)
-
-
-@pytest.mark.parametrize("wrong", [lambda x: (0.0, "blob"), lambda x: [0.0, 1.0], lambda x: None, lambda x: "0"])
-def test_a_log_prior_is_one_number(wrong):
-    with pytest.raises(ValueError, match="log_prior_fn must return (one|a) number"):
-        run(SMCSampler, lambda x: Gaussian()(x), log_prior_fn=wrong)
+@pytest.mark.parametrize(
+    ("function", "arguments", "match"),
+    [
+        (lambda x: GAUSSIAN(x), {"log_prior_fn": terms}, r"log_prior_fn must return one number .* of shape \(3,\)"),
+        (lambda x: GAUSSIAN(x), {"log_prior_fn": terms, "vectorize": True}, r"one number .* of shape \(3,\)"),
+        (lambda x: GAUSSIAN(x), {"log_prior_fn": lambda x: (0.0, "blob")}, "log_prior_fn must return one number"),
+        (lambda x: GAUSSIAN(x), {"log_prior_fn": lambda x: None}, "log_prior_fn must return a number"),
+        (None, {"log_prior_fn": PRIOR}, "exactly one of log_prob_fn .* got neither"),
+        (GAUSSIAN, {"log_likelihood_fn": LIKELIHOOD}, "exactly one of log_prob_fn .* got both"),
+        (None, {"log_likelihood_fn": LIKELIHOOD}, "pass log_prior_fn, or a log_likelihood_fn with a method log_prior"),
+        (None, {"log_likelihood_fn": 3.0, "log_prior_fn": PRIOR}, "log_likelihood_fn must be callable"),
+        (LIKELIHOOD, {"log_prior_fn": PRIOR}, "is the method log_likelihood, .* as log_likelihood_fn="),
+    ],
+)
+def test_functions_that_cannot_be_sampled_are_refused(Sampler, function, arguments, match):
+    with pytest.raises(ValueError, match=match):
+        run(Sampler, function, **arguments)
 
 
 @pytest.mark.parametrize("vectorize", [False, True])
@@ -127,30 +138,6 @@ def test_attributes_of_a_log_likelihood_count():
         SMCSampler(N, 2, None, log_likelihood_fn=Likelihood())
 
 
-@every
-def test_exactly_one_function_is_given(Sampler):
-    posterior = Gaussian()
-    with pytest.raises(ValueError, match="exactly one of log_prob_fn .* got neither"):
-        Sampler(N, 3, None, log_prior_fn=posterior.log_prior)
-    with pytest.raises(ValueError, match="exactly one of log_prob_fn .* got both"):
-        Sampler(N, 3, posterior, log_likelihood_fn=posterior.log_likelihood)
-    with pytest.raises(ValueError, match="pass log_prior_fn, or a log_likelihood_fn with a method log_prior"):
-        Sampler(N, 3, None, log_likelihood_fn=posterior.log_likelihood)
-    with pytest.raises(ValueError, match="log_likelihood_fn must be callable"):
-        Sampler(N, 3, None, log_likelihood_fn=3.0, log_prior_fn=posterior.log_prior)
-
-
-# ---------------------------------------------------------------- one taken for the other
-
-
-@every
-def test_a_log_likelihood_as_log_prob_is_refused(Sampler):
-    posterior = Gaussian()
-    with pytest.raises(ValueError, match=r"is the method log_likelihood, .* as log_likelihood_fn="):
-        Sampler(N, 3, posterior.log_likelihood, log_prior_fn=posterior.log_prior)
-    run(Sampler, posterior.__call__, log_prior_fn=posterior.log_prior, vectorize=True)
-
-
 # ---------------------------------------------------------------- functions that change their argument
 
 
@@ -203,10 +190,3 @@ def test_a_function_that_changes_its_argument_changes_no_point(Sampler, how, tmp
     assert np.array_equal(sampler.get_chain(), expected.get_chain())
     assert np.array_equal(sampler.get_log_prob(), expected.get_log_prob())
     assert sampler.simulations == expected.simulations
-
-
-@pytest.mark.parametrize("shape", [(), (1,), (1, 1)])
-def test_a_log_prior_may_be_an_array_of_one_number(shape):
-    posterior = Gaussian()
-    sampler = run(SMCSampler, lambda x: posterior(x), log_prior_fn=lambda x: np.full(shape, posterior.log_prior(x)))
-    assert np.array_equal(sampler.get_chain(), run(SMCSampler, posterior).get_chain())

@@ -9,7 +9,7 @@ from scipy import stats
 from samplers import RandomWalkMove, SMCSampler, TMCMCSampler
 from samplers.emcee_internals import get_moves
 from samplers.moves.fast_parameters import WithFastSweeps
-from tests.contract.targets import Gaussian, WithBlobs
+from tests.contract.targets import Gaussian
 from tests.statistics.test_posteriors import deviations, evidence_deviation, runs, within
 
 
@@ -57,10 +57,6 @@ class NormalInverseGamma:
 
 class Noisy(Gaussian):
     fast_parameters = (0, 2)
-
-
-class NoisyWithBlobs(WithBlobs):
-    fast_parameters = (2,)
 
 
 MODES = {
@@ -151,44 +147,9 @@ def test_fast_sweeps_follow_the_covariance_given_the_other_coordinates(rng):
     assert np.max(np.abs(left)) < 0.3
 
 
-@pytest.mark.filterwarnings("ignore:stuck")
-def test_fast_parameters_move_when_the_expensive_move_does_not(seed):
-    """If the expensive move is almost never accepted, the fast parameters still change."""
-    moved = []
-    for fast_sweeps in (0, 2):
-        sampler = SMCSampler(
-            200, 3, Noisy(), vectorize=True, seed=seed, moves=RandomWalkMove(scale=8.0), fast_sweeps=fast_sweeps
-        )
-        sampler.run_mcmc(None, 20)
-        chain = sampler.get_chain()
-        moved.append(np.mean(chain[1:] != chain[:-1], axis=(0, 1)))
-        assert moved[-1][1] == pytest.approx(sampler.acceptance_fraction.mean(), abs=0.02)
-    assert np.all(moved[0] < 0.1)
-    assert np.all(moved[1][[0, 2]] > 0.4)
-    assert moved[1][1] < 0.1
-
-
-# ---------------------------------------------------------------- when it is off
-
-
 @pytest.mark.parametrize("fast", [(3,), (-1,), (0, 7), (0.5,), ("sigma",)])
 def test_invalid_indices(fast):
     posterior = Noisy()
     posterior.fast_parameters = fast
     with pytest.raises(ValueError, match="fast_parameters must be indices of parameters"):
         SMCSampler(50, 3, posterior)
-
-
-# ---------------------------------------------------------------- blobs, pickles, files
-
-
-@pytest.mark.parametrize("vectorize", [False, True])
-def test_blobs_stay_with_their_points(vectorize):
-    posterior = NoisyWithBlobs()
-    sampler = SMCSampler(40, 3, posterior, vectorize=vectorize, seed=1)
-    sampler.run_mcmc(None, 4)
-    chain, blobs = sampler.get_chain(), sampler.get_blobs()
-    assert np.allclose(blobs[..., 0], np.sum(chain**2, axis=-1), rtol=1e-13)
-    assert np.array_equal(blobs[..., 1], chain[..., 0])
-    assert np.allclose(sampler.get_log_prob(flat=True), Gaussian()(sampler.get_chain(flat=True)), rtol=1e-13)
-    assert sampler.simulations < 0.6 * sampler.evaluations  # a point of which only the fast parameters change is known

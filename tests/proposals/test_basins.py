@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from samplers.proposals.basins import cover_basins
+from samplers.proposals.basins import find_basins, with_components
 from samplers.proposals.mixture import fit_mixture
 
 WIDE, NARROW = 1.0, 0.6
@@ -41,7 +41,7 @@ def test_a_mode_is_found_from_points_on_its_flank(rng, n, nearest):
     """With enough points the component is exact, with fewer it is near, with very few it is at the points."""
     coords = np.concatenate([cloud(rng), flank(rng, n)])
     mixture = fit_mixture(coords[:400], uniform(coords[:400]))
-    covered = cover_basins(mixture, coords, log_target(coords))
+    covered = with_components(mixture, find_basins(mixture, coords, log_target(coords)))
     assert len(mixture.weights) == 1 and (len(covered.weights) == 2 or n == 8)
     assert covered.weights.sum() == pytest.approx(1.0) and 0.1 <= covered.weights[1] <= 0.25
     error = covered.means[1] - np.array([DISTANCE, 0.0, 0.0, 0.0, 0.0])
@@ -55,7 +55,7 @@ def test_a_mode_is_found_from_points_on_its_flank(rng, n, nearest):
 def test_a_covered_target_is_left_alone(rng):
     coords = cloud(rng)
     mixture = fit_mixture(coords, uniform(coords))
-    assert cover_basins(mixture, coords, log_target(coords, shift=False)) is mixture
+    assert find_basins(mixture, coords, log_target(coords, shift=False)) is None
 
 
 def test_roughness_is_no_basin(rng):
@@ -63,4 +63,4 @@ def test_roughness_is_no_basin(rng):
     coords = cloud(rng)
     mixture = fit_mixture(coords, uniform(coords))
     rough = log_target(coords, shift=False) + rng.uniform(-1.5, 1.5, len(coords))
-    assert cover_basins(mixture, coords, rough) is mixture
+    assert find_basins(mixture, coords, rough) is None

@@ -2,6 +2,7 @@
 
 from functools import cache
 
+import emcee
 import numpy as np
 import pytest
 from scipy import stats
@@ -153,11 +154,11 @@ def test_the_error_of_the_standard_deviation_of_independent_draws():
     assert sampler.sd_error()[2] == 0.0
 
 
-def test_a_chain_continued_by_another_sampler_keeps_its_founders():
-    posterior = Gaussian()
-    sampler = SMCSampler(60, 3, posterior, vectorize=True, seed=1, recycle=False)
+def test_a_chain_that_another_sampler_reads_keeps_its_founders(tmp_path):
+    posterior, backend = Gaussian(), emcee.backends.HDFBackend(str(tmp_path / "run.h5"))
+    sampler = SMCSampler(60, 3, posterior, vectorize=True, seed=1, recycle=False, backend=backend)
     sampler.run_mcmc(None, 3)
-    again = SMCSampler(60, 3, posterior, vectorize=True, backend=sampler.backend)
+    again = SMCSampler(60, 3, posterior, vectorize=True, backend=backend)
     assert np.array_equal(again.mean_error(), sampler.mean_error())
     assert not np.array_equal(again.mean_error(), standard_error_of_mean(sampler.get_chain(), np.arange(60)))
     assert sampler.mean_error(discard=1).shape == (3,)

@@ -1,8 +1,7 @@
 """Every setting that a sampler has changes its run; a setting that it does not have, or that cannot act, is refused."""
 
 import functools
-import re
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import emcee
 import numpy as np
@@ -50,17 +49,6 @@ ACTS = {
 }
 
 
-@pytest.mark.parametrize("Sampler", [SMCSampler, TMCMCSampler])
-def test_docstring_names_every_setting(Sampler):
-    entries = re.findall(r"^ {4}(\w[\w, ]*)(?: : (.*))?$", Sampler.__doc__.partition("Raises")[0], re.MULTILINE)
-    stated = [name for names, _ in entries for name in names.split(", ") if name in CHANGES]
-    assert sorted(stated) == sorted(Sampler.setting_names)
-    for names, kind in entries:
-        if kind and ", default " in kind:
-            own = {"burn_in": BURN_IN} if Sampler is TMCMCSampler else {}
-            assert eval(kind.split(", default ")[1]) == (vars(Settings()) | own)[names]
-
-
 class Target(Gaussian):
     """A sharp Gaussian with a fast parameter; optionally, some of its points fail."""
 
@@ -92,10 +80,6 @@ def usual(path, needed):
     """The outcome of a run without another setting."""
     Sampler, given = PATHS[path]
     return outcome(Sampler, **given | dict(needed))
-
-
-def test_the_changes_cover_all_settings():
-    assert set(CHANGES) == {field.name for field in fields(Settings)}
 
 
 @pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")

@@ -27,18 +27,6 @@ class Prior:
         return x
 
 
-class Correlated(Prior):
-    def __init__(self, ndim):
-        super().__init__(ndim)
-        self.root = np.linalg.cholesky(0.9 * np.ones((ndim, ndim)) + 0.1 * np.eye(ndim))
-
-    def draw(self, n, random):
-        return super().draw(n, random) @ self.root.T
-
-    def log_density(self, x):
-        return super().log_density(np.linalg.solve(self.root, x.T).T)
-
-
 class Uniform(Prior):
     centre, scale = 0.5, 12**-0.5
 
@@ -66,14 +54,6 @@ class LogNormal(Prior):
 
     def fold(self, x):
         return np.abs(x)
-
-
-class Cauchy(Prior):
-    def draw(self, n, random):
-        return random.standard_cauchy((n, self.ndim))
-
-    def log_density(self, x):
-        return -np.sum(np.log1p(x**2), axis=1)
 
 
 class Counts(Prior):
@@ -110,7 +90,7 @@ def test_honest_starts_pass(seed):
     random = np.random.RandomState(seed)
     found = [
         refused(prior.draw(n, random), prior)
-        for prior in (make(ndim) for make in (Correlated, Uniform, LogNormal, Cauchy, Counts) for ndim in (1, 2, 5))
+        for prior in (make(ndim) for make in (Prior, Uniform, LogNormal, Counts) for ndim in (1, 2, 5))
         for n in (12, 40, 300)
     ]
     assert sum(map(bool, found)) <= 1, found
