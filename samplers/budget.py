@@ -1,20 +1,17 @@
 """Simulations of a run: how many there were, and whether more fit into a limit.
 
-An evaluation needs a simulation unless only fast parameters differ from an evaluated point. The points are in the
-record of the run (`samplers.record`); simulations that a guide makes by itself are counted in addition.
-
-A limit only ends a run, and changes nothing before its end. So a run that is continued with a larger limit repeats the
-same steps from the record, which costs no simulation, and continues.
+An evaluation needs a simulation unless only fast parameters differ from an evaluated point in the record. A limit only
+ends a run: one that is continued with a larger limit repeats the same steps from the record, and continues.
 """
 
 from numbers import Real
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from .record import Record
 
-__all__ = ["Budget", "BudgetExhausted", "CountsSimulations", "as_limit"]
+__all__ = ["Budget", "BudgetExhausted", "as_limit"]
 
 # Guides count parts of a simulation as fractions: their sums, in another order, differ by less.
 ROUNDING = 1e-6
@@ -38,16 +35,11 @@ def as_limit(value: Any) -> float | None:
     return float(value)
 
 
-class CountsSimulations(Protocol):
-    """An object that makes simulations by itself, such as a guide."""
-
-    simulations: float  # made so far
-
-
 class Budget:
     """Counts simulations, from the evaluated points of a `record`, and compares them with a `limit` (None: no limit).
 
-    `refused` says whether `fits` has returned False for the guide in use.
+    Simulations that a guide makes by itself, its attribute ``simulations``, are counted in addition. `refused` says
+    whether `fits` has returned False for the guide in use.
     """
 
     def __init__(self, record: Record, limit: float | None = None):
@@ -59,7 +51,7 @@ class Budget:
     def restart(self, of_earlier_guides: float) -> None:
         """An annealing begins, after guides have made this number of simulations by themselves."""
         self._of_earlier_guides = of_earlier_guides
-        self._guide: CountsSimulations | None = None
+        self._guide: Any = None
         self.refused = False
         noted = self._record.noted(OF_GUIDES)
         self._of_record = 0.0 if noted is None else float(noted[0])
@@ -73,7 +65,7 @@ class Budget:
         """Note in the record how many simulations guides have made, including the last allowed batch."""
         self._record.note(OF_GUIDES, np.array([max(self.of_guides, self._allowed)]))
 
-    def begin(self, guide: CountsSimulations) -> None:
+    def begin(self, guide: Any) -> None:
         """Count the simulations of a new guide from now on, in addition to the simulations of earlier guides."""
         self._of_earlier_guides = self.of_guides
         self._guide, self.refused = guide, False

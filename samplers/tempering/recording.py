@@ -14,6 +14,10 @@ from .population import Density, Population
 
 __all__ = ["Recording", "check_end"]
 
+# fields of a result that take a report of a kind, or collect them
+TAKEN = {EvidenceCheck: "check", GuidedStart: "start", SignedSample: "signed", EarlyStop: "early_stop"}
+COLLECTED = {Stage: "ladder", GuidedRound: "rounds", Finding: "findings"}
+
 
 class Recording:
     """The result of an annealing so far; the density counts the evaluations."""
@@ -24,28 +28,21 @@ class Recording:
 
     def add(self, population: Population, report: Report) -> AnnealingResult:
         """The result with a report of `samplers.tempering.anneal.anneal`; a finding is a warning as well."""
-        result = self.result
-        if isinstance(report, Stage):
+        result, kind = self.result, type(report)
+        if kind is Stage:
             now = time.perf_counter(), self._density.evaluations
-            stage = report._replace(seconds=now[0] - self._seconds, evaluations=now[1] - self._evaluations)
+            report = report._replace(seconds=now[0] - self._seconds, evaluations=now[1] - self._evaluations)
             self._seconds, self._evaluations = now
-            result = result._replace(ladder=(*result.ladder, stage))
-        elif isinstance(report, EvidenceCheck):
+        elif kind is EvidenceCheck:
             self._evaluations += report.evaluations  # these belong to no stage
-            result = result._replace(check=report)
-        elif isinstance(report, Restart):
+        elif kind is Restart:
             result = AnnealingResult(rounds=result.rounds)
-        elif isinstance(report, GuidedRound):
-            result = result._replace(rounds=(*result.rounds, report))
-        elif isinstance(report, GuidedStart):
-            result = result._replace(start=report)
-        elif isinstance(report, SignedSample):
-            result = result._replace(signed=report)
-        elif isinstance(report, Finding):
+        elif kind is Finding:
             warn(report.message)
-            result = result._replace(findings=(*result.findings, report))
-        elif isinstance(report, EarlyStop):
-            result = result._replace(early_stop=report)
+        if kind in TAKEN:
+            result = result._replace(**{TAKEN[kind]: report})
+        elif kind in COLLECTED:
+            result = result._replace(**{COLLECTED[kind]: (*getattr(result, COLLECTED[kind]), report)})
         if result.finished and population.founders:
             result = result._replace(founders=population.founders[0])
         self.result = result
