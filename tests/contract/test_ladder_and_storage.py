@@ -61,14 +61,6 @@ def test_recycling_accounts_for_everything():
     assert sampler.evaluations < annealed(Gaussian(sd=0.02), nsteps=0, recycle=False).evaluations
 
 
-@pytest.mark.parametrize("recycle", [False, True])
-def test_without_a_check(recycle):
-    sampler = annealed(check_draws=0, recycle=recycle)
-    assert sampler.log_evidence_check is None
-    assert sampler.log_evidence == sampler.log_evidence_ladder
-    assert sampler.log_evidence_error == sampler.ladder[-1].log_evidence_error
-
-
 def test_two_estimates_that_disagree_widen_the_error_unless_the_higher_one_is_trusted():
     sampler = annealed()
     check = sampler.log_evidence_check

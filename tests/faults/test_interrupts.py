@@ -313,11 +313,3 @@ def test_an_exception_says_that_the_run_is_kept_and_goes_on(stored, tmp_path):
     broken.run_mcmc(None, 3)
     np.testing.assert_array_equal(broken.get_chain(), whole.get_chain())
     assert broken.evaluations == whole.evaluations
-
-
-def test_a_refused_argument_says_nothing_of_what_is_kept():
-    sampler = SMCSampler(30, 2, Gaussian(2), vectorize=True, seed=1)
-    sampler.run_mcmc(None, 1)
-    with pytest.raises(ValueError) as caught:
-        sampler.run_mcmc(None, -1)
-    assert not hasattr(caught.value, "__notes__")

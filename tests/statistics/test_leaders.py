@@ -7,17 +7,7 @@ from scipy import stats
 from samplers import TMCMCSampler
 from samplers.moves.population_moves import RandomWalkMove
 from tests.contract.targets import Box, Gaussian
-from tests.statistics.test_mean_error import TwoModes
 from tests.statistics.test_posteriors import deviations, evidence_deviation, runs, within
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("nwalkers", [pytest.param(100, marks=pytest.mark.slow), 400])
-def test_two_modes(nwalkers, seed):
-    posterior = TwoModes()
-    samplers = runs(posterior, seed, count=12, nwalkers=nwalkers, nsteps=2, Sampler=TMCMCSampler)
-    assert within(deviations(samplers, posterior.mean), samplers)
-    assert within(evidence_deviation(samplers, -3.0 * np.log(3.0)), samplers)
 
 
 def test_truncated_prior_edges(seed):

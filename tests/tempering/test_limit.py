@@ -8,7 +8,7 @@ import emcee
 import numpy as np
 import pytest
 
-from samplers import SamplingWarning, SMCSampler, TMCMCSampler, Verdict
+from samplers import SMCSampler, TMCMCSampler, Verdict
 from tests.contract.targets import Gaussian
 from tests.covering import covering
 from tests.tempering.guides import LearningGuide, SearchingGuide
@@ -115,37 +115,6 @@ def test_steps_that_fit_are_kept():
     assert sampler.iteration == 1 and sampler.simulations == annealing
     assert sampler.verdict.status == "converged"
     assert "5 of the steps at beta = 1 were not made" in str(sampler.verdict)
-
-
-def test_a_converged_run_is_not_warned_of(caplog, recwarn):
-    plain = make("guide", None)
-    until(plain, 0)
-    annealing = plain.simulations
-    sampler = make("guide", annealing)
-    caplog.set_level("INFO", logger="samplers")
-    until(sampler, 5)
-    assert not recwarn.list
-    assert caplog.messages[-1] == (
-        f"max_simulations={annealing:g} allowed 0 of 5 steps at beta = 1. The chain holds draws of the posterior: no "
-        "further simulation is necessary"
-    )
-    sampler = make("guide", 0.5 * annealing)  # control
-    with pytest.warns(SamplingWarning, match="ended the run. .*sable: .*To go on from here"):
-        until(sampler, 5)
-
-
-@pytest.mark.parametrize("limit", [20, 30, None])
-def test_the_verdict_says_what_the_search_took(limit):
-    """Cut after two of its three batches, before the first draws, or never."""
-    sampler = make("searching guide", limit)
-    if limit is None:
-        sampler.run_mcmc(None, 1)
-    else:
-        halted(sampler, 1)
-    made = sampler.guide.simulations
-    assert made == {20: 16, 30: 24}.get(limit, made) and made >= 16
-    words = f"The guide used {made:.0f} of the {sampler.simulations:.0f} simulations for its search."
-    assert words in str(sampler.verdict)
 
 
 class Recorded(Gaussian):
