@@ -78,8 +78,8 @@ class Budget:
     @property
     def simulations(self) -> float:
         """Distinct points in the slow parameters, and the simulations of guides."""
-        running = sum(not self._record.is_simulated(key) for key in self._running)
-        return self._record.simulations + running + self.of_guides
+        simulated = self._record.simulated
+        return len(simulated) + len(self._running - simulated) + self.of_guides
 
     @property
     def remaining(self) -> float:
@@ -99,8 +99,7 @@ class Budget:
 
     def submitted(self, coords: np.ndarray) -> None:
         """Points (n, ndim) begin to be evaluated, and count from now on."""
-        self._running = {key for key in self._running if not self._record.is_simulated(key)}
-        self._running.update(self._record.keys(coords))
+        self._running = (self._running - self._record.simulated) | set(self._record.keys(coords))
 
     def closed(self) -> None:
         """Points that were running and are not in the record have been given up."""
@@ -110,9 +109,9 @@ class Budget:
         """Number of leading points among (n, ndim) that fit."""
         if self.limit is None:
             return len(coords)
-        remaining, new = self.remaining, set()
+        remaining, new, known = self.remaining, set(), self._record.simulated
         for number, key in enumerate(self._record.keys(coords)):
-            if not self._record.is_simulated(key) and key not in self._running:
+            if key not in known and key not in self._running:
                 new.add(key)
                 if len(new) > remaining:
                     return number

@@ -120,7 +120,7 @@ class Record:
         self.failed: list[tuple[np.ndarray, str]] = []
         self._batches: list[EvaluatedBatch] = []
         self._known: dict[bytes, tuple[EvaluatedBatch, int]] = {}  # batch and row of each point
-        self._simulated: set[bytes] = set()  # slow parameters
+        self.simulated: set[bytes] = set()  # keys of the points
         self._arrays: dict[str, list[list[np.ndarray] | tuple[int, int]]] = {}  # or where large ones are in the file
         self._large: Any = None  # temporary file of the large arrays of a record in memory
         self._whole = 0  # bytes of the file that were read
@@ -152,15 +152,25 @@ class Record:
 
     def check_blobs(self, dtype: np.dtype) -> None:
         """Raise ValueError for blobs that the file of the record, if there is one, cannot hold."""
-        if self.path is not None:
-            _check_blobs(dtype)
+        if self.path is None:
+            return
+        try:
+            h5py.h5t.py_create(dtype, logical=True)
+            reason = "Python objects" if dtype.hasobject else ""
+        except TypeError as error:
+            reason = str(error)
+        if reason:
+            raise ValueError(
+                f"blobs of dtype {dtype} cannot be stored in a file ({reason}): return numbers, as many for each point "
+                "(numpy.nan for None), or pass blobs_dtype, as for text blobs_dtype='S20'"
+            )
 
     def _enter(self, batch: EvaluatedBatch) -> None:
         self._batches.append(batch)
         coords = np.ascontiguousarray(batch.coords)
         for row, point in enumerate(coords):
             self._known.setdefault(point.tobytes(), (batch, row))
-        self._simulated.update(self.keys(coords))
+        self.simulated.update(self.keys(coords))
         self.count += len(coords)
         self.failed += [(coords[row].copy(), reason) for row, reason in batch.reasons.items()]
 
@@ -168,15 +178,6 @@ class Record:
         """The slow parameters of points (n, ndim) as bytes: points with the same key share a simulation."""
         slow = np.ascontiguousarray(coords if self._slow is None else coords[:, self._slow])
         return [row.tobytes() for row in slow]
-
-    def is_simulated(self, key: bytes) -> bool:
-        """Whether a point with this key has been evaluated."""
-        return key in self._simulated
-
-    @property
-    def simulations(self) -> int:
-        """Number of evaluated points that differ in their slow parameters."""
-        return len(self._simulated)
 
     def latest(self, most: int = KEPT_IN_MEMORY) -> EvaluatedBatch | None:
         """At least the latest `most` evaluated points, in the order of their evaluation; None without any."""
@@ -311,12 +312,8 @@ class Record:
     @property
     def is_stale(self) -> bool:
         """Whether another sampler has written to the file since it was read or closed."""
-        return (
-            self.path is not None
-            and self._file is None
-            and self.path.exists()
-            and self.path.stat().st_size != self._seen
-        )
+        is_closed = self.path is not None and self._file is None
+        return is_closed and self.path.exists() and self.path.stat().st_size != self._seen
 
     def renew(self) -> Path | None:
         """Begin with an empty record; returns the new name of its file, if it has one."""
@@ -403,20 +400,6 @@ def free_name(path: Path, ending: str) -> Path:
     while name.exists():
         name, number = path.with_name(f"{path.name}.{ending}.{number}"), number + 1
     return name
-
-
-def _check_blobs(dtype: np.dtype) -> None:
-    """Raise ValueError for blobs that a file cannot hold."""
-    try:
-        h5py.h5t.py_create(dtype, logical=True)
-        reason = "Python objects" if dtype.hasobject else ""
-    except TypeError as error:
-        reason = str(error)
-    if reason:
-        raise ValueError(
-            f"blobs of dtype {dtype} cannot be stored in a file ({reason}): return numbers, as many for each point "
-            "(numpy.nan for None), or pass blobs_dtype, as for text blobs_dtype='S20'"
-        )
 
 
 def _close_in_child() -> None:

@@ -54,10 +54,6 @@ DIFFERENT = "The two estimates of the evidence differ"
 FAR = 3.0
 
 
-def _collapsed(stage: Stage, nwalkers: int, ndim: int) -> bool:
-    return stage.distinct_ancestors < max(ndim + 2, nwalkers // 50)
-
-
 def check_likelihood(log_prob: np.ndarray, log_prior: np.ndarray) -> list[Finding]:
     """A finding if the log-likelihood has one value at all points (n,) that a run begins with: it tells nothing.
 
@@ -109,17 +105,16 @@ def check_stages(stages: Sequence[Stage], nwalkers: int, ndim: int) -> list[Find
     Collapsed: the distinct points that survived the resampling are fewer than 2 % of the walkers, or too few to span
     the parameters. Stuck: less than 1 % of the proposals were accepted.
     """
-    stage, number, found = stages[-1], len(stages), []
-    collapsed = [_collapsed(s, nwalkers, ndim) for s in stages]
-    stuck = [s.acceptance < LOW_ACCEPTANCE for s in stages]
-    if collapsed[-1] and not any(collapsed[:-1]):
+    (*earlier, stage), number, found = stages, len(stages), []
+    fewest = max(ndim + 2, nwalkers // 50)
+    if stage.distinct_ancestors < fewest and all(each.distinct_ancestors >= fewest for each in earlier):
         text = (
             f"Collapse at stage {number} (beta = {stage.beta:.3g}): only {stage.distinct_ancestors} distinct points of "
             f"{nwalkers} survived the resampling."
         )
         action = "Use more walkers, more moves or a larger ess_ratio."
         found.append(Finding("The walkers have collapsed", WRONG, text, action))
-    if stuck[-1] and not any(stuck[:-1]):
+    if stage.acceptance < LOW_ACCEPTANCE and all(each.acceptance >= LOW_ACCEPTANCE for each in earlier):
         text = (
             f"Stuck at stage {number} (beta = {stage.beta:.3g}): {100 * stage.acceptance:.2g} % of the proposals were "
             "accepted, so the points did not move."

@@ -9,7 +9,7 @@ parameters (2e-4 s and 3e10 Pa) cause no numerical problem. Acceptances are deri
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 from emcee import State
@@ -30,7 +30,6 @@ from ..proposals.mixture import (
 from ..proposals.transforms import SupportBounds, find_support_bounds, log_abs_det_jacobian
 
 __all__ = [
-    "DrawsWithDensity",
     "GuideMove",
     "MixtureMove",
     "RandomWalkMove",
@@ -317,16 +316,6 @@ class MixtureMove(_FittedMove):
         return self._step(coords, steps)
 
 
-class DrawsWithDensity(Protocol):
-    """A distribution with independent draws and a normalised log-density (`samplers.tempering.guide.Guide`)."""
-
-    def draw(self, n: int, random: np.random.RandomState) -> np.ndarray:
-        """Independent draws (n, ndim)."""
-
-    def log_density(self, coords: np.ndarray) -> np.ndarray:
-        """Log-density (n,) at points (n, ndim); -inf is allowed."""
-
-
 class GuideMove(MHMove):
     """Propose one independent draw of a guide for each walker: independence Metropolis-Hastings.
 
@@ -341,7 +330,7 @@ class GuideMove(MHMove):
         The proposal distribution, which must not change.
     """
 
-    def __init__(self, guide: DrawsWithDensity):
+    def __init__(self, guide: Any):
         super().__init__(self._draw)
         self._guide = guide
 
