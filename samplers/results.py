@@ -37,7 +37,6 @@ class RunResults:
     _target: Target
     _seed: list[int] | None
     _near: NearFailures | None = None
-    _prior_draws: np.ndarray | None = None
 
     @property
     def evaluations(self) -> int:
@@ -111,11 +110,8 @@ class RunResults:
 
     @property
     def prior_draws(self) -> np.ndarray | None:
-        """Draws of the prior (nwalkers, ndim) from which this object annealed; None if they are not known.
-
-        They are not known for a run that was read from a file.
-        """
-        return self._prior_draws
+        """Draws of the prior (nwalkers, ndim) from which the run was annealed; None without a record of it."""
+        return None if self._record.start is None else self._record.start.coords
 
     def mean_error(self, discard: int = 0, thin: int = 1) -> np.ndarray:
         """Monte Carlo standard errors (ndim,) of the mean over ``get_chain(discard, thin)``, from this run alone.

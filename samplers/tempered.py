@@ -184,7 +184,6 @@ class TemperedSampler(RunResults, EnsembleSampler):
             self._evaluator = Evaluator(*common)
         if self._reopened and self._record.start.header["log_prob_fn"] == getattr(target.function, "fingerprint", None):
             target.recall(self._record.latest(self._record.count))
-        self._drawn: np.ndarray | None = None  # a start that need not be tested
         self._seed = None if seed is None else np.ravel(seed).tolist()
         # also drawn where it is not used, so that a script draws the same numbers after a restart
         stream = np.random.randint(2**32, size=8, dtype=np.uint32) if seed is None else seed  # noqa: NPY002
@@ -454,7 +453,6 @@ class TemperedSampler(RunResults, EnsembleSampler):
                 if self._record.path is not None:  # a user who waits sees that the time spent is not lost
                     said = "Going on with %s: %d evaluations and %d steps are stored"
                     logger.warning(said, self.backend.filename, self.evaluations, self.iteration)
-                self._drawn = start.coords  # tested when the run began
                 return start
             if self._reopened:
                 raise ValueError(
@@ -464,8 +462,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
         if given is None and previous is not None:
             given = previous
         elif given is None:
-            self._drawn = self._target.sample_prior(self.nwalkers, get_random(self))
-            given = State(self._drawn)
+            draws = self._target.sample_prior(self.nwalkers, get_random(self))
+            return self._new_start(State(draws), skip_check, True)
         elif previous is not None and given.log_prob is None:
             if np.array_equal(given.coords, previous.coords):
                 given.log_prob, given.blobs = copy.deepcopy((previous.log_prob, previous.blobs))
@@ -516,10 +514,9 @@ class TemperedSampler(RunResults, EnsembleSampler):
         made_of = self._target, self.settings, *self._first_moves, self._given_guide
         return describe_run(type(self).__name__, *made_of)
 
-    def _new_start(self, state: State, skip_check: bool) -> RunStart:
+    def _new_start(self, state: State, skip_check: bool, is_drawn: bool = False) -> RunStart:
         """Draws of the prior, checked and entered in the record."""
         coords = np.asarray(state.coords, dtype=float)
-        is_drawn = np.array_equal(coords, self._drawn)
         log_prior = self._target.check_start(coords, self.nwalkers, skip_check, is_drawn)
         self.random_state = state.random_state
         run = {"run": uuid.uuid4().hex, "seed": self._seed, "of_earlier_guides": self._budget.of_guides}
@@ -543,7 +540,6 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._evaluator.evaluates_parts = True
         self.random_state = start.random_state
         self._budget.restart(start.header["of_earlier_guides"])
-        self._prior_draws = start.coords
         schedule, guidance = MoveSchedule(*copy.deepcopy(self._first_moves)), None
         set_moves(self, *schedule)
         remember = self._evaluator.begin()
