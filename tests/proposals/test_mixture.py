@@ -129,7 +129,7 @@ def test_each_kernel_keeps_a_target_at_a_bound(kernel, rng):
     inside = box(np.zeros(3), np.full(3, np.inf))
     move = MixtureMove()
     move.calibrate(x[:300] * np.array([1.1, 0.9, 1.0]), uniform(300), inside)
-    assert move.mixture.bounds is not None
+    assert move._mixture.bounds is not None
     random = np.random.RandomState(rng.integers(2**31))
     start = x.copy()
     for _ in range(5):
