@@ -32,6 +32,7 @@ __all__ = ["DAMAGED", "WholeFile", "run_of_file", "whole_file"]
 
 logger = logging.getLogger(__name__)
 
+SECONDS, PAUSE = 5.0, 0.05  # longest wait for a file, and between two trials
 SECONDS_BETWEEN, SHARE = 1.0, 0.1  # shortest time between two replacements, and their largest share of the time
 DAMAGED = "damaged"
 CHECKSUM = "checksum"
@@ -121,16 +122,18 @@ def whole_file(backend: Backend) -> WholeFile | None:
 
 
 def _opened(backend: HDFBackend) -> h5py.File:
-    """The file of a backend itself, to be read; `FileHeld` if another program writes to it."""
-    try:
-        return h5py.File(backend.filename, "r")
-    except OSError as error:
-        if not (isinstance(error, BlockingIOError) or "already open" in str(error)):
-            raise
-        raise FileHeld(
-            f"{backend.filename} is held open by another program ({error}): close the file there, and call run_mcmc "
-            "again"
-        ) from error
+    """The file of a backend itself, to be read; `FileHeld` if another program writes to it, also after a wait."""
+    end = time.monotonic() + SECONDS
+    while True:
+        try:
+            return h5py.File(backend.filename, "r")
+        except OSError as error:
+            if not (isinstance(error, BlockingIOError) or "already open" in str(error)):
+                raise
+            if time.monotonic() >= end:
+                held = f"{backend.filename} is held open by another program ({error})"
+                raise FileHeld(f"{held}: close the file there, and call run_mcmc again") from error
+        time.sleep(PAUSE)
 
 
 def _checksum(group: h5py.Group) -> int:

@@ -255,9 +255,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
         Raises
         ------
         KeyboardInterrupt
-            At Ctrl-C, even if a library has set a handler of SIGINT that raises something else, such as dask_jobqueue,
-            which calls ``sys.exit``. The handler is called, and is put back after the run; a handler that returns has
-            dealt with Ctrl-C, and the run goes on.
+            At Ctrl-C, even if a library has set a handler that raises something else, as dask_jobqueue does. The
+            handler is called; one that returns has dealt with Ctrl-C.
         SystemExit
             If the function calls ``sys.exit`` in this process. In a worker process this is a failed evaluation.
 

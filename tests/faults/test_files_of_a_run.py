@@ -18,7 +18,7 @@ import h5py
 import numpy as np
 import pytest
 
-from samplers import SMCSampler
+from samplers import SMCSampler, output_file
 from samplers.evaluation import evaluator
 from samplers.record import BLOCK, MAGIC
 from tests.contract.targets import Gaussian
@@ -288,8 +288,9 @@ def test_a_program_that_reads_the_file_is_no_obstacle(begins, whole_smc, tmp_pat
     assert outcome(sampler) == whole_smc
 
 
-def test_a_program_that_writes_to_the_file(whole_smc, tmp_path):
+def test_a_program_that_writes_to_the_file(whole_smc, tmp_path, monkeypatch):
     """At the beginning nothing is evaluated; at the end, steps stay in the sampler; the next call writes them."""
+    monkeypatch.setattr(output_file, "SECONDS", 0.1)
     path, log = tmp_path / "run.h5", tmp_path / "log"
     sampler = make(path, "smc", log=log)
     match = "held open by another program .*: close the file there"
