@@ -35,16 +35,14 @@ def student_factor(freedom: float | np.ndarray) -> float | np.ndarray:
     return stdtrit(freedom, 0.975) / ndtri(0.975)
 
 
-def trace_founders(
-    founders: Sequence[np.ndarray], ancestors: np.ndarray, min_share: float = MIN_FOUNDER_SHARE
-) -> tuple[np.ndarray, ...]:
+def trace_founders(founders: Sequence[np.ndarray], ancestors: np.ndarray) -> tuple[np.ndarray, ...]:
     """Founders (n,) of each point after one more resampling by `ancestors` (n,), per generation, the oldest first.
 
-    A generation is dropped once it has fewer founders than n times `min_share`, or fewer than ten; the last one is
+    A generation is dropped once it has fewer founders than a tenth of the points, or fewer than ten; the last one is
     kept.
     """
     traced = [generation[ancestors] for generation in founders] + [ancestors]
-    fewest = max(min_share * len(ancestors), MIN_FOUNDERS)
+    fewest = max(MIN_FOUNDER_SHARE * len(ancestors), MIN_FOUNDERS)
     while len(traced) > 1 and len(np.unique(traced[0])) < fewest:
         traced.pop(0)
     return tuple(traced)
@@ -55,18 +53,12 @@ def standard_error_of_mean(chain: np.ndarray, founders: np.ndarray) -> np.ndarra
 
     Infinite if all walkers have one founder.
     """
-    sums = _sums_of_groups(chain, founders)
-    count = len(sums)
+    _, group = np.unique(founders, return_inverse=True)
+    count = group.max() + 1
     if count == 1:
         return np.full(chain.shape[2], np.inf)
-    return np.sqrt(count / (count - 1) * np.sum(sums**2, axis=0)) / chain.shape[1]
-
-
-def _sums_of_groups(chain: np.ndarray, founders: np.ndarray) -> np.ndarray:
-    """Sum (groups, ndim) over each group with one founder: deviations of the walkers' means from the mean."""
-    _, group = np.unique(founders, return_inverse=True)
     deviations = chain.mean(axis=0)
     deviations -= deviations.mean(axis=0)
-    sums = np.zeros((group.max() + 1, chain.shape[2]))
+    sums = np.zeros((count, chain.shape[2]))  # over each group with one founder
     np.add.at(sums, group, deviations)
-    return sums
+    return np.sqrt(count / (count - 1) * np.sum(sums**2, axis=0)) / chain.shape[1]

@@ -64,11 +64,11 @@ def test_founders_are_followed_while_there_are_enough(rng):
     n, generations, lineage = 200, [], np.arange(200)
     for _ in range(4):
         ancestors = multinomial(np.full(n, 1 / n), rng)
-        generations = trace_founders(generations, ancestors, min_share=0.1)
+        generations = trace_founders(generations, ancestors)
         lineage = lineage[ancestors]
     assert len(generations) == 4
     assert np.array_equal(generations[0], lineage) and np.array_equal(generations[-1], ancestors)
-    few = trace_founders(generations, np.repeat([3, 7], n // 2), min_share=0.1)
+    few = trace_founders(generations, np.repeat([3, 7], n // 2))
     assert len(few) == 1 and set(few[0]) == {3, 7}
 
 
