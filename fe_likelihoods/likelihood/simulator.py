@@ -32,6 +32,7 @@ from ..signals.comparison import Comparison, compare_with
 from ..simulation.executors import as_executor
 from ..simulation.faults import ChangedModel
 from ..simulation.folder import Observed, unpack
+from ..simulation.local_pool import value_of
 from ..simulation.model import (
     Model,
     SimulationBatch,
@@ -414,7 +415,7 @@ class Simulator:
                 row = left.pop(future)
                 self._running.keys.discard(request.keys[row])
                 try:
-                    (result, reason), opened = unpack(future.result(), self.pool)
+                    (result, reason), opened = unpack(value_of(future.result()), self.pool)
                     self._checked.label.add(opened)
                     rows, results, reasons = [*rows, row], [*results, result], [*reasons, reason]
                 except CancelledError:

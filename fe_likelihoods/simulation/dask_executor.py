@@ -13,7 +13,7 @@ from typing import Any
 
 from .faults import TransientReason
 from .local_pool import Outcome
-from .pool_executor import PoolExecutor, resolve
+from .pool_executor import PoolExecutor
 
 __all__ = ["DaskExecutor", "wait_for_nanny"]
 
@@ -201,6 +201,16 @@ class DaskExecutor(PoolExecutor):
         if ended := {name for name, checks in self._absent.items() if checks == CHECKS_UNTIL_LOST}:
             cluster.sync(cluster.scale_down, ended)
         cluster.scale(sum(len(spec.get("group", " ")) for spec in wanted.values()))
+
+
+def resolve(future: Future, result: Any = None, error: BaseException | None = None) -> None:
+    """Set the result or the exception of a future, unless it is cancelled."""
+    if future.cancelled() or not future.set_running_or_notify_cancel():
+        return
+    if error is None:
+        future.set_result(result)
+    else:
+        future.set_exception(error)
 
 
 def _run(function: Callable, item: Any) -> Any:

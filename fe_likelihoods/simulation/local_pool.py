@@ -14,11 +14,13 @@ from concurrent.futures import wait as wait_for
 from numbers import Integral
 from typing import Any
 
+from samplers.interrupts import Ended
+
 from .by_value import Pickled
 from .faults import RunFailed
 from .worker import LoadingFailed, Worker, Workers
 
-__all__ = ["LocalPool", "Outcome", "Submitting", "Threads"]
+__all__ = ["LocalPool", "Outcome", "Submitting", "Threads", "value_of"]
 
 MAX_ATTEMPTS = 3
 _LINGER = 0.1  # [s] that a thread waits for another item before it ends; a new thread costs as much as a short item
@@ -43,8 +45,8 @@ class Submitting:
         futures = self.submit_all(function, list(items), **self._of_map)
         try:
             for future in wait_for(futures, return_when=FIRST_EXCEPTION).done:
-                future.result()
-            return [future.result() for future in futures]
+                value_of(future.result())
+            return [value_of(future.result()) for future in futures]
         except BaseException:
             self.give_up(futures)
             raise
@@ -55,6 +57,13 @@ class Submitting:
         ``cancel()`` has an effect until the item is sent to a process, if the pool can cancel.
         """
         return self.submit_all(function, [item])[0]
+
+
+def value_of(result: Any) -> Any:
+    """The result of an item; raises KeyboardInterrupt or SystemExit if the function has raised it in a pool."""
+    if isinstance(result, Ended):
+        raise result.error
+    return result
 
 
 class Threads:

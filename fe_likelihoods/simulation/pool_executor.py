@@ -8,36 +8,12 @@ from multiprocessing.pool import Pool, ThreadPool
 from typing import Any
 
 from samplers.evaluation.point_queue import workers_of
-from samplers.interrupts import Ended, SentFunction
+from samplers.interrupts import SentFunction
 
 from .by_value import Pickled, Recent
-from .local_pool import Outcome, Submitting
+from .local_pool import Outcome, Submitting, value_of
 
-__all__ = ["PoolExecutor", "resolve"]
-
-
-class _Task(Future):
-    """Future of an item, in place of the pool's future."""
-
-    inner: Any = None
-
-    def cancel(self) -> bool:
-        """Cancel the item unless the pool has started it, or cannot cancel anything."""
-        if self.inner is not None and not self.inner.cancel():
-            return False
-        return super().cancel()
-
-
-def resolve(future: Future, result: Any = None, error: BaseException | None = None) -> None:
-    """Set the result or the exception of a future, unless it is cancelled."""
-    if future.cancelled() or not future.set_running_or_notify_cancel():
-        return
-    if isinstance(result, Ended):
-        error = result.error
-    if error is None:
-        future.set_result(result)
-    else:
-        future.set_exception(error)
+__all__ = ["PoolExecutor"]
 
 
 class PoolExecutor(Submitting):
@@ -69,11 +45,7 @@ class PoolExecutor(Submitting):
         """Outcomes of a function for every item, in order; ValueError if a worker cannot load the function."""
         if self.submits:
             return super().map(function, items)
-        outcomes = list(self.pool.map(self._by_value(function), list(items)))
-        for outcome in outcomes:
-            if isinstance(outcome, Ended):
-                raise outcome.error
-        return outcomes
+        return [value_of(outcome) for outcome in self.pool.map(self._by_value(function), list(items))]
 
     def submit_all(self, function: Callable[[Any], Outcome], items: Sequence[Any]) -> list[Future]:
         """Futures as from `submit`, for several items; ValueError if the pool only has ``map``."""
@@ -81,21 +53,19 @@ class PoolExecutor(Submitting):
             raise ValueError(
                 f"{type(self.pool).__name__} has map and no submit: its items cannot be submitted one by one; use map"
             )
-        sent, tasks = self._by_value(function), []
+        sent, futures = self._by_value(function), []
         try:
             for item in items:
-                tasks.append(_Task())
-                self._start(tasks[-1], sent, item)
+                futures.append(self.pool.submit(sent, item))
         except BaseException:
-            self.give_up(tasks)
+            self.give_up(futures)
             raise
-        return tasks
+        return futures
 
     def give_up(self, futures: Sequence[Future], running: bool = True) -> None:
-        """Cancel items; with `running`, also ignore the results of items that the pool has started."""
+        """Cancel items that the pool has not started."""
         for future in futures:
-            if not future.cancel() and running:
-                Future.cancel(future)
+            future.cancel()
 
     def _by_value(self, function: Callable) -> SentFunction:
         """The function as it is sent to workers, pickled now if they are known to be other processes."""
@@ -103,18 +73,6 @@ class PoolExecutor(Submitting):
         if self.other_processes:
             by_value.pickled  # noqa: B018
         return SentFunction(by_value)
-
-    def _start(self, task: _Task, sent: SentFunction, item: Any) -> None:
-        def ended(inner: Future) -> None:
-            if inner.cancelled():
-                Future.cancel(task)
-            elif (error := inner.exception()) is not None:
-                resolve(task, error=error)
-            else:
-                resolve(task, inner.result())
-
-        task.inner = self.pool.submit(sent, item)
-        task.inner.add_done_callback(ended)
 
 
 class _ByValue:
