@@ -135,26 +135,17 @@ def test_fingerprint_changes_with_what_the_density_depends_on():
     assert Posterior(swapped.likelihood, traded).fingerprint not in fingerprints
 
 
-def test_fingerprint_of_a_noise_without_a_repr_of_its_values():
-    with pytest.raises(ValueError, match="repr that shows all values of NamelessNoise"):
-        _ = oscillator_posterior(noise=NamelessNoise(np.ones(2))).fingerprint
+class Vague(Distribution):
+    bounds, moments = (0.0, 1.0), (0.5, 0.3)
+    _log_density = _quantile = lambda self, x: x
 
 
-def test_fingerprint_of_a_distribution_without_a_repr_of_its_values():
-    class Vague(Distribution):
-        bounds = (0.0, 1.0)
-        moments = (0.5, 0.3)
-
-        def _log_density(self, x):
-            return 0.0 * x
-
-        def _quantile(self, u):
-            return u
-
+def test_values_that_a_repr_does_not_show_have_no_fingerprint():
     posterior = oscillator_posterior()
-    posterior = Posterior(posterior.likelihood, {**posterior.prior.distributions, "damping": Vague()})
-    with pytest.raises(ValueError, match="repr that shows all values of .*Vague"):
-        _ = posterior.fingerprint
+    vague = Posterior(posterior.likelihood, {**posterior.prior.distributions, "damping": Vague()})
+    for each, name in ((vague, "Vague"), (oscillator_posterior(noise=NamelessNoise(np.ones(2))), "NamelessNoise")):
+        with pytest.raises(ValueError, match=f"repr that shows all values of .*{name}"):
+            _ = each.fingerprint
 
 
 def test_fingerprint_is_the_same_in_another_process():

@@ -22,7 +22,6 @@ from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.signals.channels import Measurements
 from fe_likelihoods.signals.records import Record
-from tests.covering import covering
 
 ROOT = Path(__file__).parents[2]
 MODEL = LinearOscillator(Record("sine", 0.02, np.sin(np.arange(20.0))))
@@ -235,22 +234,28 @@ def cut_to_its_header(path):
 DAMAGES = [zeros, cut_off, cut_to_its_header, overwritten_in_the_middle, another_column, without_a_table]
 
 
-@pytest.mark.parametrize(("damage", "before"), covering(DAMAGES, [0, 2], strength=1))
-def test_a_damaged_file_is_set_aside(filled, thetas, expected, caplog, damage, before):
-    for n in range(1, before + 1):
-        filled.with_name(f"{filled.name}.damaged-{n}").write_text("an earlier one")
+@pytest.mark.parametrize("damage", [no_database, *DAMAGES], ids=lambda damage: damage.__name__)
+@pytest.mark.parametrize("when", ["before", "during the run"])
+def test_a_damaged_file_is_set_aside(filled, thetas, expected, caplog, damage, when):
+    likelihood = likelihood_of(filled)
+    likelihood.misfit(thetas[: 50 * (when != "before")])
+    likelihood.simulator.cache.close()  # as it happens before a fork
+    filled.with_name(f"{filled.name}.damaged-1").write_text("an earlier one")
     damage(filled)
     data = filled.read_bytes()
-    likelihood = likelihood_of(filled)
-    aside = filled.with_name(f"{filled.name}.damaged-{before + 1}")
-    assert aside.read_bytes() == data
-    assert warnings_of(caplog, f"set aside as {aside.name}") == 1
-    assert warnings_of(caplog, "were salvaged") == 1
+    if when == "before" and damage is no_database:
+        with pytest.raises(ValueError, match="is not a cache of simulations"):
+            likelihood_of(filled)
+        return
+    likelihood = likelihood if when != "before" else likelihood_of(filled)
     np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
-    assert likelihood.simulations + likelihood.simulator.disk_hits == len(thetas)
+    aside = filled.with_name(f"{filled.name}.damaged-2")
+    assert aside.read_bytes() == data
+    assert warnings_of(caplog, f"set aside as {aside.name}") == warnings_of(caplog, "were salvaged") == 1
     again = likelihood_of(filled)
-    again.misfit(thetas)
-    assert (again.simulations, again.simulator.disk_hits) == (0, len(thetas))
+    np.testing.assert_array_equal(again.misfit(thetas), expected)
+    assert again.simulations == 0 or when != "before"
+    assert again.simulator.disk_hits + likelihood.simulator.disk_hits >= len(thetas)
 
 
 @pytest.mark.parametrize(("page", "n"), [("leaf", 400), ("index", 400), ("index", 40), ("first", 400)])
@@ -275,19 +280,6 @@ def test_a_bad_page_loses_its_own_rows_only(path, thetas, expected, caplog, page
     (kept,) = (int(word) for word in message.split() if word.isdigit())
     assert kept >= likelihood.simulator.disk_hits
     assert 0 < kept < rows if page == "leaf" else likelihood.simulator.disk_hits == len(thetas)
-
-
-@pytest.mark.parametrize("damage", [no_database, *DAMAGES], ids=lambda damage: damage.__name__)
-def test_a_file_that_is_damaged_during_the_run(filled, thetas, expected, caplog, damage):
-    likelihood = likelihood_of(filled)
-    np.testing.assert_array_equal(likelihood.misfit(thetas[:50]), expected[:50])
-    likelihood.simulator.cache.close()  # as it happens before a fork
-    damage(filled)
-    np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
-    assert warnings_of(caplog, "set aside as") == 1
-    again = likelihood_of(filled)
-    np.testing.assert_array_equal(again.misfit(thetas), expected)
-    assert again.simulator.disk_hits + likelihood.simulator.disk_hits >= len(thetas)
 
 
 def test_another_file_that_takes_the_place_of_the_cache_during_the_run(filled, thetas, expected, caplog, tmp_path):
@@ -339,17 +331,12 @@ def test_damage_anywhere_is_never_a_wrong_value(filled, thetas, expected, rng, h
     "change",
     [
         "value = (SELECT value FROM rows WHERE id = 9)",
-        "value = zeroblob(16)",
         "value = zeroblob(8)",
-        "value = 'text'",
         "value = 17",
         "reason = CAST('it failed' AS BLOB)",
-        "reason = 'text'",
         "generation = generation + 1",
         "session = 'soon'",
-        "session = session + 1",
         "crc = crc + 1",
-        "crc = 'none'",
     ],
 )
 def test_a_damaged_row_is_missing(filled, thetas, expected, caplog, change):

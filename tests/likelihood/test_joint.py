@@ -101,12 +101,6 @@ def test_simulations_failures_and_report_are_those_of_all_parts(rng):
     assert posterior.fault(points[1]) == ""
 
 
-def test_nothing_is_simulated_where_a_noise_is_impossible(pieces):
-    joint = JointLikelihood(pieces, separate=["sigma_top"])
-    assert joint([1.0, 1.0, 1.0, 0.5, -0.5]) == joint([1.0, np.nan, 1.0, 0.5, 0.5]) == -np.inf
-    assert joint.simulations == 0
-
-
 def test_fingerprints(pieces, rng):
     joint = JointLikelihood(pieces)
     posterior = Posterior(joint, prior_of(joint))

@@ -429,12 +429,6 @@ def test_a_simulation_may_read_in_another_folder_and_not_what_was_written_there_
         simulate_batch(model(written), THETAS, pool)
 
 
-def test_one_process_may_write_anywhere(start, tmp_path_factory):
-    path = str(tmp_path_factory.mktemp("place") / "in.txt")
-    for options in ({"isolated": True}, {}):
-        assert_right(lambda theta: write_and_read(path, theta), None, THETAS[:3], **options)
-
-
 def test_an_input_file_that_is_written_before_each_batch_is_no_reason_to_refuse(start, pool, tmp_path_factory):
     def read(theta):
         return [[float(Path(path).read_text()), theta[1]]]
