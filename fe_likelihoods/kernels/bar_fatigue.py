@@ -36,7 +36,7 @@ from .jit import kernel
 from .menegotto_pinto import SB, XB
 from .reinforcing_steel import BRANCH, E0, MAX_TRANSITIONS, SC, XC, curve_slot, transition
 
-__all__ = ["N_FAILURE", "N_STATE", "constants", "stress_history", "stress_tangent", "update"]
+__all__ = ["N_FAILURE", "N_STATE", "constants", "update"]
 
 # Layout of the failure constants of one steel.
 CF, POWER, LOSS = range(3)
@@ -167,21 +167,3 @@ def update(eps, state, c, f):
     modulus = factor * modulus + slope * s
     s *= factor
     return s / (1.0 + eps), (modulus - s) / ((1.0 + eps) * (1.0 + eps))
-
-
-@kernel
-def stress_tangent(eps, state, c, f, trial):
-    """Return engineering stress and tangent at the trial strain `eps` without changing `state`.
-
-    `trial` (N_STATE,) is scratch; the other arguments are as for `update`.
-    """
-    for i in range(N_STATE):
-        trial[i] = state[i]
-    return update(eps, trial, c, f)
-
-
-@kernel
-def stress_history(strain, state, c, f, stress):
-    """Take one bar through `strain` (n,), write its engineering `stress` (n,), and advance its memory in place."""
-    for i in range(strain.shape[0]):
-        stress[i], _ = update(strain[i], state, c, f)

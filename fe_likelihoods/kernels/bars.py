@@ -164,7 +164,9 @@ def _try(eps, memory, trial, c, path, i):
 def bar_stress(eps, memory, trial, c, failure, path, i):
     """Return stress and tangent of bar `i` at a trial strain; only `trial` and the second curve are overwritten."""
     if failure.shape[0] > 0:
-        return bar_fatigue.stress_tangent(eps, memory, c, failure, trial)
+        for k in range(memory.shape[0]):
+            trial[k] = memory[k]
+        return bar_fatigue.update(eps, trial, c, failure)
     x = _natural(eps)
     for k in (0, SECOND):
         if path[k + LOW, i] <= x <= path[k + HIGH, i]:

@@ -37,7 +37,6 @@ __all__ = [
     "envelope",
     "stress_tangent",
     "commit",
-    "stress_history",
 ]
 
 # Layout of the concrete constants.
@@ -146,14 +145,3 @@ def stress_tangent(eps, eps_min, eps_max, eps_end, slope, tension_slope, c):
 def commit(eps, eps_min, eps_max):
     """Return the memory after the strain `eps` has been committed."""
     return min(eps_min, eps), max(eps_max, eps)
-
-
-@kernel
-def stress_history(strain, c, stress):
-    """Take one virgin fiber through `strain` (n,) and write its `stress` (n,)."""
-    eps_min, eps_max = 0.0, 0.0
-    eps_end, slope, tension_slope = unloading(eps_min, eps_max, c)
-    for i in range(strain.shape[0]):
-        stress[i], _ = stress_tangent(strain[i], eps_min, eps_max, eps_end, slope, tension_slope, c)
-        eps_min, eps_max = commit(strain[i], eps_min, eps_max)
-        eps_end, slope, tension_slope = unloading(eps_min, eps_max, c)

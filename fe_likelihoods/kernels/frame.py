@@ -28,13 +28,14 @@ __all__ = [
     "cross_jumps",
     "bars_have_fractured",
     "record",
+    "record_forces",
     "recorder",
 ]
 
 LARGEST_AXIAL_STRAIN = 0.2
 """An element that becomes longer or shorter by more than this share of its length has failed."""
 
-N_VECTORS = 16
+N_VECTORS = 13
 N_MATRICES = 5
 
 
@@ -156,7 +157,7 @@ def _append_empty_fibers(fibers: np.ndarray, multiple: int) -> np.ndarray:
 
 @kernel
 def initialise_column(column):
-    """Make the materials virgin and unload the elements, in place."""
+    """Make the materials virgin, unload the elements, and write forces and tangent without displacements, in place."""
     sections, elements = column.sections, column.elements
     fiber_section.reset(sections)
     k_axial, k_coupling, k_bending = 0.0, 0.0, 0.0
@@ -176,6 +177,10 @@ def initialise_column(column):
     elements.initial_flexibility[2] = k_axial / d
     for e in range(elements.state.shape[0]):
         initialise(e, elements)
+    u, load = column.vectors[4], column.vectors[3]
+    for i in range(u.shape[0]):
+        u[i] = load[i] = 0.0
+    assemble(u, column, column.vectors[5], column.matrices[2])
 
 
 @kernel(inline=True)
@@ -228,6 +233,25 @@ def commit_sections(column):
         for m in range(n_points):
             k = HEAD + PER_SECTION * m
             fiber_section.commit(state[e, k], state[e, k + 1], e * n_points + m, column.sections)
+
+
+@kernel(inline=True)
+def record_forces(column, force, out):
+    """Write forces to `out` (6,): restoring force at the top, e0, kappa, N and M of the base section, base shear.
+
+    The base shear is the restoring force that the column transmits to its base: no load acts between its ends, so it is
+    the sum of the nodal forces `force` (n_dof,) along x.
+    """
+    state = column.elements.state
+    out[0] = force[force.shape[0] - 3]
+    out[1] = state[0, HEAD]
+    out[2] = state[0, HEAD + 1]
+    out[3] = state[0, HEAD + 5]
+    out[4] = state[0, HEAD + 6]
+    shear = 0.0
+    for i in range(0, force.shape[0], 3):
+        shear += force[i]
+    out[5] = shear
 
 
 @kernel

@@ -220,7 +220,9 @@ def kernel(
     if function is None:
         return lambda f: kernel(f, inline=inline, fastmath=fastmath, cache=cache)
     cache = cache and not inline and CACHE_FOLDER is not None
-    compiled = numba.njit(nogil=True, error_model="numpy", forceinline=inline, fastmath=fastmath, _nrt=False)(function)
+    compiled = numba.njit(
+        nogil=True, error_model="numpy", forceinline=inline, fastmath=fastmath, _nrt=False, no_cfunc_wrapper=True
+    )(function)
     if cache and compiled is not function:  # the same where numba is switched off
         compiled._cache = _Cache(function)
         if flock is not None:

@@ -48,7 +48,6 @@ __all__ = [
     "backbone",
     "virgin_stress_tangent",
     "switch_backbone",
-    "stress_history",
     "transition",
     "update",
 ]
@@ -311,10 +310,11 @@ def _step(x, tension, state, c):
 @kernel(inline=True)
 def transition(x, state, c):
     """Make one transition of any branch at the natural strain `x`; arguments and results as for `_step`."""
-    if int(state[BRANCH]) % 2 == 1:
-        return _step(x, True, state, c)
+    tension = int(state[BRANCH]) % 2 == 1  # no literal, for which `_step` would be compiled again
+    if tension:
+        return _step(x, tension, state, c)
     _mirror(state)
-    done, s, modulus = _step(-x, False, state, c)
+    done, s, modulus = _step(-x, tension, state, c)
     _mirror(state)
     return done, -s, modulus
 
@@ -357,10 +357,3 @@ def switch_backbone(state, c):
     state[BRANCH] = _mirror_branch(b)
     state[SC] = s
     return 1
-
-
-@kernel
-def stress_history(strain, state, c, stress):
-    """Take one bar through `strain` (n,), write its engineering `stress` (n,), and advance its memory in place."""
-    for i in range(strain.shape[0]):
-        stress[i], _ = update(strain[i], state, c)

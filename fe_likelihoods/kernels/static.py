@@ -18,8 +18,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .beam_column import HEAD
-from .frame import assemble, bars_have_fractured, commit_sections, cross_jumps, initialise_column, record
+from .frame import (
+    Column,
+    Recorder,
+    assemble,
+    bars_have_fractured,
+    commit_sections,
+    cross_jumps,
+    initialise_column,
+    record,
+    record_forces,
+    recorder,
+)
 from .jit import kernel
 from .linear_solve import copy_matrix, copy_vector, solve_banded
 
@@ -46,6 +56,8 @@ LOWERING = 1e-5
 """Share of the height by which the top is lowered at a time if the column does not carry the axial load."""
 MAX_LOWERINGS = 1000
 """How often the top is lowered in succession before the column counts as collapsed."""
+_AT_REST = np.zeros(GRAVITY_STEPS)
+_AT_REST.flags.writeable = False  # the type of the targets that models pass; another one would be compiled again
 
 
 class Iteration(NamedTuple):
@@ -157,72 +169,81 @@ def lower(column, position, load, imposed, iteration):
         if downwards * position.force[vertical] >= downwards * load[vertical]:
             if count == 0:
                 return False
-            return equilibrate(column, position, load, imposed, 0.0, -1, tolerance, max_iterations) < tolerance
+            none = min(imposed, -1)
+            return equilibrate(column, position, load, imposed, 0.0, none, tolerance, max_iterations) < tolerance
     return False
 
 
 @kernel
-def _advance_to(column, position, load, total, share, imposed, increment, iteration):
-    """Add `share` of the load `total` and an imposed displacement, in halved steps if they do not converge.
+def _static_steps(column, total, share, imposed, targets, iteration, history, out):
+    """Add `share` of the load `total` (n,) at each target, in halved steps if they do not converge.
 
-    Returns the retries, -1 on failure, and how often the top was lowered until the axial load was carried again.
+    The degree of freedom `imposed` moves to the targets; -1 for none, and nothing is recorded then. The column is in
+    equilibrium before, and the other arguments are those of `impose_displacement`, as is the result.
     """
-    done, part, retries, crossings, lowerings = 0.0, 1.0, 0, 0, 0
-    smallest = 0.5**iteration.halvings
-    max_iterations = iteration.max_iterations
-    while done < 1.0:
-        for i in range(load.shape[0]):
-            load[i] += part * share * total[i]
-        move = part * increment
-        tolerance = iteration.tolerance
-        reached = equilibrate(column, position, load, imposed, move, -1, tolerance, max_iterations)
-        if reached >= tolerance:
-            retries += 1
-            tolerance *= LOOSENING
+    load, u, force = column.vectors[3], column.vectors[4], column.vectors[5]
+    position = Position(u, force, column.matrices[2])
+    none = min(imposed, -1)  # no literal, for which `equilibrate` would be compiled again
+    smallest, max_iterations = 0.5**iteration.halvings, iteration.max_iterations
+    retries, lowerings = 0, 0
+    for step in range(targets.shape[0]):
+        increment = targets[step] - u[imposed] if imposed >= 0 else 0.0
+        done, part, crossings = 0.0, 1.0, 0
+        while done < 1.0 and (imposed < 0 or increment != 0.0):
+            for i in range(load.shape[0]):
+                load[i] += part * share * total[i]
+            move = part * increment
+            tolerance = iteration.tolerance
+            reached = equilibrate(column, position, load, imposed, move, none, tolerance, max_iterations)
+            if reached >= tolerance:
+                retries += 1
+                tolerance *= LOOSENING
+                if reached < tolerance:
+                    reached = equilibrate(column, position, load, imposed, move, none, tolerance, max_iterations)
             if reached < tolerance:
-                reached = equilibrate(column, position, load, imposed, move, -1, tolerance, max_iterations)
-        if reached < tolerance:
-            done += part
-            continue
-        for i in range(load.shape[0]):
-            load[i] -= part * share * total[i]
-        part *= 0.5
-        if part < smallest:
-            crossings += 1
-            if crossings > MAX_CROSSINGS:
-                return -1, lowerings
-            if cross_jumps(column) == 0:
-                if imposed < 0 or not lower(column, position, load, imposed, iteration):
-                    return -1, lowerings
-                lowerings += 1
-            part = 1.0 - done
-    return retries, lowerings
+                done += part
+                continue
+            for i in range(load.shape[0]):
+                load[i] -= part * share * total[i]
+            part *= 0.5
+            if part < smallest:
+                crossings += 1
+                if crossings > MAX_CROSSINGS:
+                    return step + 1, retries, lowerings
+                if cross_jumps(column) == 0:
+                    if imposed < 0 or not lower(column, position, load, imposed, iteration):
+                        return step + 1, retries, lowerings
+                    lowerings += 1
+                part = 1.0 - done
+        if imposed >= 0:
+            history[0, step] = u[imposed]
+            history[1, step] = u[imposed + 1]
+            history[2, step] = u[imposed + 2]
+            record_forces(column, force, history[3:, step])
+            record(column, u, u, u, step, out)
+    return 0, retries, lowerings
 
 
-@kernel
-def apply_gravity(column, position, gravity, iteration):
-    """Make the column virgin and apply the load `gravity` (n,) [N and N m] in ten equal steps; `position` is
-    overwritten.
+def apply_gravity(column: Column, gravity: np.ndarray, iteration: Iteration) -> int:
+    """Make the column virgin and apply the load `gravity` (n,) [N and N m] in ten equal steps.
 
-    Returns the number of retries, or -1 on failure.
+    Returns the number of retries, or -1 on failure. Displacements, forces and tangent are in ``column.vectors[4]``,
+    ``column.vectors[5]`` and ``column.matrices[2]``.
     """
     initialise_column(column)
-    load = column.vectors[3]
-    for i in range(load.shape[0]):
-        position.u[i] = 0.0
-        load[i] = 0.0
-    assemble(position.u, column, position.force, position.stiffness)
-    total = 0
-    for _ in range(GRAVITY_STEPS):
-        retries, _ = _advance_to(column, position, load, gravity, 1.0 / GRAVITY_STEPS, -1, 0.0, iteration)
-        if retries < 0:
-            return -1
-        total += retries
-    return total
+    nothing = np.zeros((9, 0)), recorder(column)
+    status, retries, _ = _static_steps(column, gravity, 1.0 / GRAVITY_STEPS, -1, _AT_REST, iteration, *nothing)
+    return -1 if status else retries
 
 
-@kernel
-def impose_displacement(column, gravity, targets, iteration, history, out):
+def impose_displacement(
+    column: Column,
+    gravity: np.ndarray,
+    targets: np.ndarray,
+    iteration: Iteration,
+    history: np.ndarray,
+    out: Recorder,
+) -> tuple[int, int, int]:
     """Apply gravity, then move the top laterally through `targets`.
 
     Parameters
@@ -234,7 +255,7 @@ def impose_displacement(column, gravity, targets, iteration, history, out):
         Lateral displacement of the top [m].
     iteration : Iteration
     history : ndarray (9, n_steps)
-        Written: ux, uy and theta of the top, lateral force, e0, kappa, N and M of the base section, and base shear.
+        Written: ux, uy and theta of the top, then `frame.record_forces`.
     out : frame.Recorder
         Written at the same steps, without velocities and accelerations.
 
@@ -246,32 +267,8 @@ def impose_displacement(column, gravity, targets, iteration, history, out):
     lowerings : int
         How often the top was lowered until the axial load was carried again.
     """
-    u, force, load = column.vectors[4], column.vectors[5], column.vectors[3]
-    position = Position(u, force, column.matrices[2])
-    state = column.elements.state
-    retries = apply_gravity(column, position, gravity, iteration)
+    retries = apply_gravity(column, gravity, iteration)
     if retries < 0:
         return -1, 0, 0
-    top, lowerings = gravity.shape[0] - 3, 0
-    for step in range(targets.shape[0]):
-        increment = targets[step] - u[top]
-        if increment != 0.0:
-            more, lowered = _advance_to(column, position, load, gravity, 0.0, top, increment, iteration)
-            lowerings += lowered
-            if more < 0:
-                return step + 1, retries, lowerings
-            retries += more
-        history[0, step] = u[top]
-        history[1, step] = u[top + 1]
-        history[2, step] = u[top + 2]
-        history[3, step] = force[top]
-        history[4, step] = state[0, HEAD]
-        history[5, step] = state[0, HEAD + 1]
-        history[6, step] = state[0, HEAD + 5]
-        history[7, step] = state[0, HEAD + 6]
-        shear = 0.0
-        for i in range(0, force.shape[0], 3):
-            shear += force[i]
-        history[8, step] = shear
-        record(column, u, u, u, step, out)
-    return 0, retries, lowerings
+    found = _static_steps(column, gravity, 0.0, len(gravity) - 3, targets, iteration, history, out)
+    return found[0], retries + found[1], found[2]

@@ -83,16 +83,25 @@ def material_curves(
     peak, crack = sections.concrete[0, concrete04.E0], 5.0 * values["ft"] / values["Ec"]
     hardening = column.steel.hardening_strain
     path = _path(strains, [strain for level in (0.25, 0.5, 1.0, 1.5) for strain in (level * peak, crack)])
-    curves = [MaterialCurve(f"{part} concrete", path, np.empty_like(path)) for part in ("core", "cover")]
-    for curve, constants in zip(curves, sections.concrete, strict=True):
-        concrete04.stress_history(path, constants, curve.stress)
+    curves = [
+        MaterialCurve(f"{part} concrete", path, _concrete_stress(path, constants))
+        for part, constants in zip(("core", "cover"), sections.concrete, strict=True)
+    ]
     path = _path(strains, [sign * level * hardening for level in (0.4, 1.0, 2.0, 3.0) for sign in (1.0, -1.0)])
-    steel, memory = MaterialCurve("steel", path, np.empty_like(path)), np.zeros(sections.steel_memory.shape[-1])
-    if sections.failure.size:
-        bar_fatigue.stress_history(path, memory, sections.steel, sections.failure, steel.stress)
-    else:
-        reinforcing_steel.stress_history(path, memory, sections.steel, steel.stress)
-    return (*curves, steel)
+    memory, more = np.zeros(sections.steel_memory.shape[-1]), [sections.failure] if sections.failure.size else []
+    update = bar_fatigue.update if more else reinforcing_steel.update
+    stress = np.array([update(strain, memory, sections.steel, *more)[0] for strain in path])
+    return (*curves, MaterialCurve("steel", path, stress))
+
+
+def _concrete_stress(path: np.ndarray, constants: np.ndarray) -> np.ndarray:
+    """Stress (n,) of a virgin concrete fiber under strains (n,)."""
+    low, high, stress = 0.0, 0.0, []
+    for strain in path.tolist():
+        memory = concrete04.unloading(low, high, constants)
+        stress.append(concrete04.stress_tangent(strain, low, high, *memory, constants)[0])
+        low, high = min(low, strain), max(high, strain)
+    return np.array(stress)
 
 
 def moment_curvature(

@@ -119,11 +119,10 @@ def amplified_deflection(n_elements, corotational=True):
     )
     _, ei = stiffness_of_section(column)
     h = 100 * golden.HEIGHT
-    n = 3 * n_elements
     weight, lateral = ei / h**2, 1e-5 * ei / h**2
-    position = Position(np.zeros(n), np.zeros(n), np.zeros((n, n)))
     load = golden.gravity(n_elements, weight)
-    assert apply_gravity(column, position, load, Iteration(1e-9, 20, 0)) == 0
+    assert apply_gravity(column, load, Iteration(1e-9, 20, 0)) == 0
+    position = Position(column.vectors[4], column.vectors[5], column.matrices[2])
     load[-3] = lateral
     assert equilibrate(column, position, load, -1, 0.0, -1, 1e-9, 20) < 1e-9
     return position.u[-3] / (lateral * h**3 / (3 * ei)), 3 * (np.tan(1.0) - 1.0)

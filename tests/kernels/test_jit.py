@@ -268,7 +268,8 @@ def short_subset() -> dict[str, np.ndarray]:
     failure = np.zeros(bar_fatigue.N_FAILURE)
     bar_fatigue.constants(0.1, 0.5, 0.4, failure)
     out["fatigue"], memory = np.zeros((1, 150)), np.zeros(bar_fatigue.N_STATE)
-    bar_fatigue.stress_history(strain, memory, golden.steel_constants(golden.STEEL), failure, out["fatigue"][0])
+    c = golden.steel_constants(golden.STEEL)
+    out["fatigue"][0] = [bar_fatigue.update(each, memory, c, failure)[0] for each in strain]
 
     def column():
         return golden.column(golden.circle(4, 3), n_points=3)
@@ -283,7 +284,7 @@ def short_subset() -> dict[str, np.ndarray]:
     impose_displacement(pushed, golden.gravity(), np.linspace(0.0, 4.0, 12), iteration, out["pushover"], seen)
     out["run"] = np.zeros((len(HISTORY_ROWS), 40))
     ground = 300.0 * np.sin(np.linspace(0.0, 6.0, 40))
-    dynamics = Dynamics(golden.gravity(), golden.mass(), golden.A0, golden.A1, 0.0)
+    dynamics = Dynamics(golden.gravity(), golden.mass(), golden.A0, golden.A1)
     felt = recorder(shaken, 40, sections=True, motion=3, fibers=fibers)
     status = newmark(shaken, dynamics, ground, 0.02, 1, iteration, out["run"], felt)
     out["status"] = np.array(status)

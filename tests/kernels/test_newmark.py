@@ -1,4 +1,4 @@
-"""Time integration against reference runs, closed forms of free vibration, its order, and the balance of energy."""
+"""Time integration against reference runs, closed forms of free vibration, and its order."""
 
 import math
 
@@ -17,8 +17,6 @@ from .test_beam_column import stiffness_of_section
 pytestmark = golden.compiled_only
 
 TOLERANCE = 1e-10
-AMPLITUDE = 1e-5  # in
-KINETIC, DAMPED, ABSORBED, INPUT = range(3, 7)
 
 
 def run(
@@ -32,14 +30,13 @@ def run(
     max_iterations=50,
     halvings=6,
     every=1,
-    velocity=0.0,
     weight=golden.WEIGHT,
 ):
     """Return (status, retries, iterations) and the history; samples that the run does not reach stay NaN."""
     ground = np.asarray(ground, dtype=float)
     n_elements = column.elements.state.shape[0]
     history = np.full((len(HISTORY_ROWS), (len(ground) - 1) // every + 1), np.nan)
-    dynamics = Dynamics(golden.gravity(n_elements, weight), golden.mass(n_elements), a0, a1, velocity)
+    dynamics = Dynamics(golden.gravity(n_elements, weight), golden.mass(n_elements), a0, a1)
     iteration = Iteration(tolerance, max_iterations, halvings)
     result = newmark(column, dynamics, ground, dt, every, iteration, history, recorder(column))
     return result, history
@@ -112,30 +109,14 @@ def identified(displacement, dt):
 
 
 def free_vibration(column, dt, a0, a1, n_steps=1200):
-    omega = frequency(column)
-    result, history = run(
-        column,
-        np.zeros(n_steps),
-        a0=a0,
-        a1=a1,
-        dt=dt,
-        weight=0.0,
-        velocity=AMPLITUDE * omega,
-        tolerance=1e-13,
-    )
+    result, history = run(column, push(n_steps), a0=a0, a1=a1, dt=dt, weight=0.0, tolerance=1e-13)
     assert result[:2] == (0, 0)
-    return omega, history
+    return frequency(column), history
 
 
-def test_undamped_free_vibration_is_the_rotation_of_average_acceleration():
-    """u = v0/omega sin(2 n atan(omega dt/2)): the period is longer by the known factor, the amplitude constant."""
-    column = golden.column(golden.circle(), corotational=False, element_tolerance=1e-20)
-    dt = 0.01
-    omega, history = free_vibration(column, dt, 0.0, 0.0, 1000)
-    phase = 2.0 * math.atan(0.5 * omega * dt) * np.arange(1000)
-    np.testing.assert_allclose(history[0], AMPLITUDE * np.sin(phase), rtol=0, atol=1e-5 * AMPLITUDE)
-    total = history[KINETIC] + history[ABSORBED]
-    np.testing.assert_allclose(total, total[0], rtol=1e-8)
+def push(n_steps, size=1e-3):
+    """A motion that pushes the column once [in/s²]."""
+    return np.where(np.arange(n_steps) == 1, size, 0.0)
 
 
 @pytest.mark.parametrize("dt", [0.002, 0.02])
@@ -156,8 +137,8 @@ def test_weight_lengthens_the_period():
     for corotational in (True, False):
         column = golden.column(golden.circle(), corotational=corotational, element_tolerance=1e-24)
         # the weight softens the concrete by a few per cent in both variants
-        _, history = run(column, np.zeros(2000), a0=0.0, a1=0.0, dt=0.01, velocity=1e-6, tolerance=1e-12)
-        periods[corotational] = 2 * math.pi / identified(history[0, 1:], 0.01)[0]
+        _, history = run(column, push(2000), a0=0.0, a1=0.0, dt=0.01, tolerance=1e-12)
+        periods[corotational] = 2 * math.pi / identified(history[0, 3:], 0.01)[0]
     omega = 2 * math.pi / periods[False]
     geometric = 6.0 / 5.0 * golden.WEIGHT / golden.HEIGHT / (golden.MASS * omega**2)
     assert periods[True] / periods[False] == pytest.approx(1 + geometric / 2, rel=0.1 * geometric)
@@ -195,30 +176,6 @@ def test_second_order(row, scale):
 
     orders = observed_orders(response)
     assert np.all(np.abs(orders - 2.0) < 0.1)
-
-
-# --- energy ---
-
-
-@pytest.mark.parametrize(
-    ("scale", "cracked", "yielded"), [(0.05, False, False), (2.0, True, False), (12.0, True, True)]
-)
-@pytest.mark.parametrize("corotational", [True, False])
-def test_energy_balances(motion, scale, cracked, yielded, corotational):
-    """kinetic + damped + absorbed = input at every instant, for an elastic, a cracked and a yielding column."""
-    column = golden.column(golden.circle(), corotational=corotational)
-    (status, _, _), history = run(column, scale * motion)
-    assert status == 0
-    largest = np.abs(history[INPUT]).max()
-    balance = history[KINETIC] + history[DAMPED] + history[ABSORBED] - history[INPUT]
-    assert np.abs(balance).max() < 1e-6 * largest
-    assert bool((column.sections.virgin == 0.0).any()) == yielded
-    tension = column.sections.concrete_memory[:, 1].max()
-    assert (tension > column.sections.concrete[0, concrete04.ECT]) == cracked
-    assert (history[KINETIC] >= 0.0).all()
-    assert history[DAMPED, -1] > 0.0
-    # control: a missing term is detected
-    assert np.abs(balance - history[DAMPED]).max() > 1e-3 * largest
 
 
 # --- the run itself ---
@@ -260,8 +217,6 @@ def test_retries_are_counted_and_agree_with_a_finer_run(motion):
     assert status == 0
     assert retries > 0
     assert rrmse(history[:1], expected[:1, ::8])[0] < 0.05
-    balance = history[KINETIC] + history[DAMPED] + history[ABSORBED] - history[INPUT]
-    assert np.abs(balance).max() < 1e-6 * history[INPUT].max()
 
 
 def test_impossible_step_ends_the_run_with_its_number(column, motion):
