@@ -33,8 +33,6 @@ BENCHMARKS: dict[str, Callable[..., Iterable[tuple]]] = {
     "new_events": new_events.new_events,
     "simulation": column.simulation,
     "batch": column.batch,
-    "tolerance": column.tolerance,
-    "sensors": column.sensors,
     "bridge": bridge.simulation,
     "imports": startup.imports,
     "compilation": startup.compilation,

@@ -3,23 +3,21 @@
 import importlib.util
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from statistics import median
 from typing import Any
 
 import numba
 import numpy as np
 
-from fe_likelihoods.models import rc_column_analysis
 from fe_likelihoods.models.rc_column import RCColumn
-from fe_likelihoods.problems import BRIDGE_COLUMN_MEANS, bridge_column, bridge_column_data, bridge_column_prior
+from fe_likelihoods.problems import BRIDGE_COLUMN_MEANS, bridge_column_data, bridge_column_prior
 from fe_likelihoods.simulation.executors import LocalPool, as_executor
 from fe_likelihoods.simulation.model import misfit_batch
 from tests.opensees_column import INCH, peer_of, shake
 
 from .rows import Row
 
-__all__ = ["batch", "sensors", "simulation", "tolerance"]
+__all__ = ["batch", "simulation"]
 
 TOLERANCE = 1e-8  # norm of the last increment [in and rad]
 NOMINAL, PAPER = np.ones(5), np.array(list(BRIDGE_COLUMN_MEANS.values()))
@@ -113,55 +111,3 @@ def _pools() -> Iterator[tuple[str, Any, Callable[[], None]]]:
 
 def _speedup(seconds: dict[int, list[float]], n: int) -> str:
     return f"{median(seconds[1]) / median(seconds[n]):.2f} times one thread" if n > 1 else ""
-
-
-def sensors(repeats: int) -> list[Row]:
-    """CPU time of one simulation with the outputs of the top, with three forces, and with twelve sensors more."""
-    model = RCColumn.lhpost(bridge_column_data().record.trim(0.0, 20.0))
-    theta, bar = PAPER, model.bar_circle_radius
-    forces = ("acceleration", "displacement", "base_moment", "base_shear", "axial_force")
-    places = [f"curvature@{z}" for z in (0.0, 0.3, 0.6)] + ["rotation@0:0.6", "rotation@0.6:1.2"]
-    places += [f"strain@{z}:{x}" for z in (0.0, 0.3, 0.6) for x in (bar, -bar)]
-    cases = {"top": None, "and 3 forces": forces, "and 14 sensors": (*forces, *places)}
-    models = {case: replace(model, outputs=outputs) for case, outputs in cases.items()}
-    seconds: dict[str, list[float]] = {case: [] for case in models}
-    for case in models:
-        models[case].simulate(theta)  # compile before the measurement
-    for _ in range(10 * repeats):
-        for case, each in models.items():
-            start = time.process_time()
-            each.simulate(theta)
-            seconds[case].append(time.process_time() - start)
-    note = "smallest of {} runs in alternation; 20 s of the bundled record"
-    return [
-        Row("RCColumn, CPU time with sensors", case, min(values), "s", note.format(len(values)))
-        for case, values in seconds.items()
-    ]
-
-
-def tolerance(repeats: int) -> list[Row]:
-    """Gain and largest error, in standard deviations of noise of 10 %, with looser tolerances of iterations."""
-    posterior = bridge_column()
-    column, usual = posterior.likelihood.model, rc_column_analysis.ELEMENT_TOLERANCE
-    points = posterior.sample_prior(4, 3)[:, : len(column.parameters)]
-    factors, models = (1.0, 10.0, 100.0, 1000.0), []
-    try:
-        for factor in factors:
-            rc_column_analysis.ELEMENT_TOLERANCE = factor * usual
-            models.append(replace(column, tolerance=factor * column.tolerance))
-            models[-1].simulate(points[0])  # its constants are prepared once
-    finally:
-        rc_column_analysis.ELEMENT_TOLERANCE = usual
-    responses = [np.array([model.simulate(point) for point in points]) for model in models]
-    seconds = [
-        [_cpu_seconds(lambda m=model: [m.simulate(p) for p in points]) for model in models] for _ in range(repeats)
-    ]
-    noise = 0.1 * responses[0].std(axis=2, keepdims=True)
-    rows = []
-    for k, factor in enumerate(factors[1:], 1):
-        error = (np.abs(responses[k] - responses[0]) / noise).max()
-        gain = median(each[0] / each[k] for each in seconds)
-        rows.append(
-            Row("tolerance of Newton's iterations, gain", f"{factor:g} times looser", gain, "", f"error {error:.1e}")
-        )
-    return rows

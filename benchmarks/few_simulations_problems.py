@@ -73,11 +73,12 @@ def oscillator(seed: int, truth: tuple[float, float] = (1.15, 0.8)) -> Posterior
 
 def bridge(data: str, seed: int) -> Posterior:
     """Isolated bridge with new noise."""
+    usual = problems.isolated_bridge(data=data)
     if seed == 1:
-        return problems.isolated_bridge(data=data).marginal()
+        return usual.marginal()
     bundled = problems.isolated_bridge_data(data)
     test = bundled._replace(measurements=bridge_measurements(bundled.record, data, seed))
-    return problems.isolated_bridge(data=test, channels=6 if data == "twin" else None).marginal()
+    return problems.isolated_bridge(data=test, channels=usual.likelihood.model.outputs).marginal()
 
 
 def bridge_twin(seed: int) -> Posterior:

@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 
 from fe_likelihoods import IsolatedBridge, Measurements, Record
-from fe_likelihoods.models.isolated_bridge_channels import CHANNEL_SETS
 from fe_likelihoods.problems import table_motion
 from fe_likelihoods.signals.datasets import write_dataset
 
@@ -32,7 +31,8 @@ TRUTH = {
 }
 """Multiples of the nominal values (assumed)."""
 
-OUTPUTS = {"twin": CHANNEL_SETS[10], "means": ("mean_Ub", "mean_Fb", "mean_drift", "mean_shear", "mean_acc_p")}
+PIER_1, PIER_2 = (("Ub_1", "Fb_1", "drift_1", "shear_1", "acc_p1"), ("Ub_2", "Fb_2", "drift_2", "shear_2", "acc_p2"))
+OUTPUTS = {"twin": PIER_1 + PIER_2, "means": ("mean_Ub", "mean_Fb", "mean_drift", "mean_shear", "mean_acc_p")}
 NOISE = {"twin": 0.05, "means": 0.10}
 """Standard deviations of the noise, in root mean squares of each channel (assumed)."""
 

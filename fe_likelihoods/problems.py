@@ -38,7 +38,6 @@ import numpy as np
 from .cache.simulation_cache import SimulationCache
 from .likelihood.likelihood import FELikelihood
 from .likelihood.posterior import Posterior
-from .models.isolated_bridge_channels import CHANNEL_SETS
 from .noise.gaussian import GaussianNoise
 from .priors.distributions import HalfNormal, TruncatedNormal
 from .priors.problem_priors import bridge_column_prior, correlation_priors, isolated_bridge_prior
@@ -76,6 +75,7 @@ _COLUMN_FILES = {
     "eq1-eq2": "bridge_column_events.h5",
     "short": "templates/bridge_column_short.h5",
 }
+_BRIDGE_CHANNELS = ("Ub_1", "Fb_1", "drift_1", "shear_1", "acc_p1", "Ub_2")  # of "twin", by default
 _BRIDGE_FILES = {"twin": "templates/isolated_bridge.h5", "means": "isolated_bridge_means.h5"}
 
 
@@ -271,7 +271,7 @@ def isolated_bridge_data(data: str = "twin") -> Dataset:
 def isolated_bridge(
     *,
     data: str | Dataset = "twin",
-    channels: tuple[str, ...] | int | None = None,
+    channels: tuple[str, ...] | None = None,
     noise: Any = None,
     cache: str | os.PathLike | SimulationCache | None = None,
     **changes,
@@ -284,8 +284,8 @@ def isolated_bridge(
         Bundled synthetic test, or your own, whose step may be a multiple of that of its record. "twin" has a known
         truth and one mode. "means" has only means over the two piers, so that the devices of the piers can be
         exchanged: its posterior has exactly two modes, whose masses are proportional to the prior densities.
-    channels : tuple of str, 5, 6 or 10, optional
-        Measured channels to use. Default: six of "twin", all of any other data.
+    channels : tuple of str, optional
+        Measured channels to use. Default: those of pier 1 and ``Ub_2`` of "twin", all of any other data.
     noise : Noise, optional
         Default: white noise with one sigma for all channels, in root mean squares of the measured channels.
         Correlations ``rho_...`` of another noise are uniform between -1 and 1.
@@ -311,13 +311,10 @@ def isolated_bridge(
     """
     from .models.isolated_bridge import IsolatedBridge
 
-    channels = 6 if channels is None and data == "twin" else channels
+    channels = _BRIDGE_CHANNELS if channels is None and data == "twin" else channels
     record, measurements, _ = isolated_bridge_data(data) if isinstance(data, str) else data
-    names = CHANNEL_SETS.get(channels) if isinstance(channels, int) else channels
-    if isinstance(channels, int) and names is None:
-        raise ValueError(f"expected channels by name, or one of the sets {tuple(CHANNEL_SETS)}; got {channels}")
-    if names is not None:
-        measurements = measurements.select(names)
+    if channels is not None:
+        measurements = measurements.select(channels)
     every = max(1, round(measurements.dt / record.dt))
     outputs = tuple(channel.name for channel in measurements.channels)
     model = IsolatedBridge(record, outputs=outputs, **({"every": every} | changes))

@@ -159,28 +159,7 @@ def to_si(values: ArrayLike, unit: str, dimension: str | None = None) -> NDArray
 
 
 def from_si(values: ArrayLike, unit: str, dimension: str | None = None) -> NDArray[np.float64]:
-    """Convert values from SI units to `unit`.
-
-    This is the inverse of `to_si`.
-
-    Parameters
-    ----------
-    values : array_like
-        Numbers in SI units.
-    unit : str
-        Name of a unit in `UNITS` (see `find_unit` for the spellings).
-    dimension : str, optional
-        Required dimension of the unit, a key of `DIMENSIONS`.
-
-    Returns
-    -------
-    ndarray
-        The numbers in `unit`, float64, of the same shape (a scalar for a scalar).
-
-    Raises
-    ------
-    ValueError
-        If the unit is unknown or has another dimension.
+    """Convert values from SI units to `unit`, the inverse of `to_si`: parameters, shape and errors are the same.
 
     Examples
     --------

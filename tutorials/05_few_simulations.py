@@ -15,7 +15,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from fe_likelihoods import peak, problems, propagate
-from fe_likelihoods.plots.structures import plot_bridge
 from samplers import SMCSampler, plot_marginals
 
 plt.style.use("fe_likelihoods.plots.tutorials")
@@ -30,7 +29,6 @@ plt.style.use("fe_likelihoods.plots.tutorials")
 whole = problems.isolated_bridge(step=1e-3)
 model, measured = whole.likelihood.model, whole.likelihood.measurements
 print(f"{measured.n_steps} samples at {measured.dt:g} s of {', '.join(c.name for c in measured.channels)}")
-plot_bridge(model).figure.savefig("bridge.png")
 
 # %%
 # One parameter fewer

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..models.function import FunctionModel
-from ..models.linear_system import Parts
+from ..models.linear_structure_parts import Parts
 from ..models.undamped_modes import Modes, mode_derivatives, undamped_modes
 from ..models.user_model import ExternalModel
 from ..models.validation import check_theta

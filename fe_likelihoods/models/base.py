@@ -1,18 +1,19 @@
 """Base classes for the models of this package.
 
-`StructuralModel` checks the shape of the parameters and plots the response. `BuiltInModel` adds what the built-in
-structures share: parameters that are multiples of nominal values, and a fingerprint computed from the arguments. Models
-of your own need neither: any object with the attributes of `fe_likelihoods.simulation.model.Model` is a model.
+`StructuralModel` checks the shape of the parameters. `BuiltInModel` adds what the built-in structures share: parameters
+that are multiples of nominal values, a fingerprint computed from the arguments, and batches on threads. Models of your
+own need neither: any object with the attributes of `fe_likelihoods.simulation.model.Model` is a model.
 """
 
 from __future__ import annotations
 
 import hashlib
 import logging
-import weakref
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,13 +21,12 @@ from numpy.typing import ArrayLike
 from ..signals.channels import Channel
 from ..signals.records import DisplacementHistory, Record
 from ..signals.sampling import array_digest
-from .validation import check_theta, invalid
+from ..simulation.model import SimulationBatch, SimulationFailed
+from .validation import check_theta, check_thetas, invalid
 
 __all__ = ["BuiltInModel", "History", "StructuralModel", "digest", "remark_on_range"]
 
 logger = logging.getLogger(__name__)
-
-_REMARKS: weakref.WeakKeyDictionary[BuiltInModel, str] = weakref.WeakKeyDictionary()
 
 
 def digest(*parts: str) -> str:
@@ -87,9 +87,11 @@ class StructuralModel:
 
 
 class BuiltInModel(StructuralModel):
-    """Base class for frozen dataclasses that describe a structure with nominal values.
+    """Base class for frozen dataclasses that describe a structure with nominal values and simulate it by kernels.
 
-    A subclass has the field `parameters` and the property `nominal`.
+    A subclass has the field `parameters`, the property `nominal`, and defines `_prepare`, the work that is the same for
+    every theta, and `_respond`, which uses its result, `_prepared`. Kernels release the interpreter lock, so that
+    simulations may run at once in this process.
     """
 
     parameters: tuple[str, ...]
@@ -123,7 +125,7 @@ class BuiltInModel(StructuralModel):
     @property
     def range_remark(self) -> str:
         """Text of the warning about a simulation beyond the range of the laws; empty if there was none."""
-        return _REMARKS.get(self, "")
+        return vars(self).get("_remark", "")
 
     def physical_values(self, theta: np.ndarray) -> dict[str, float]:
         """Physical values [SI] of all parameters at the multiples `theta` (n_parameters,) of the nominal values."""
@@ -132,11 +134,60 @@ class BuiltInModel(StructuralModel):
             values[name] *= multiple
         return values
 
+    def simulate_batch(self, thetas: np.ndarray) -> SimulationBatch:
+        """Simulate rows of `thetas` (n, n_parameters) on as many threads as numba uses; rows that failed are NaN, with
+        reasons.
+        """
+        import numba  # slow to import
+
+        thetas = check_thetas(thetas, self.parameter_names)
+        _ = self._prepared  # computed here, so that not every thread computes it
+        response = np.full((len(thetas), len(self.channels), self.n_steps), np.nan)
+        reasons = [""] * len(thetas)
+
+        def one(i: int) -> None:
+            try:
+                values = self._respond(thetas[i])
+                if np.iscomplexobj(values):  # the assignment would keep the real part
+                    raise ValueError("expected real numbers, got complex ones")
+                response[i] = values
+            except SimulationFailed as failure:
+                reasons[i] = failure.reason
+
+        n_threads = min(numba.get_num_threads(), len(thetas), os.cpu_count() or 1)
+        if n_threads <= 1:
+            for i in range(len(thetas)):
+                one(i)
+            return SimulationBatch(response, reasons)
+        with ThreadPoolExecutor(n_threads) as threads:
+            try:
+                list(threads.map(one, range(len(thetas))))
+            except BaseException:  # Ctrl-C: cancel the simulations that have not begun
+                threads.shutdown(wait=False, cancel_futures=True)
+                raise
+        return SimulationBatch(response, reasons)
+
+    def _prepare(self) -> Any:
+        raise NotImplementedError
+
+    @cached_property
+    def _prepared(self) -> Any:
+        return self._prepare()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """State without cached properties, such as the prepared inputs: each process computes its own."""
+        cls = type(self)
+        return {
+            name: value
+            for name, value in vars(self).items()
+            if not isinstance(getattr(cls, name, None), cached_property)
+        }
+
 
 def remark_on_range(model: BuiltInModel, text: str) -> None:
     """Log the first warning about a model beyond the range of its laws; an empty text forbids further warnings."""
-    if model not in _REMARKS:
-        _REMARKS[model] = text
+    if "_remark" not in vars(model):
+        object.__setattr__(model, "_remark", text)
         if text:
             logger.warning("%s", text)
 

@@ -27,8 +27,7 @@ from ..simulation.model import SimulationFailed
 from ..simulation.programs import run_program
 from ..simulation.worker import describe_exit, last_lines
 from ..units import find_unit
-from .dependencies import content_digest
-from .user_model import UserModel
+from .user_model import UserModel, content_digest
 from .validation import positive_float
 
 __all__ = ["ExecutableModel", "read_table"]

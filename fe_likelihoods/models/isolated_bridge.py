@@ -23,35 +23,28 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-from scipy.sparse import csr_array
 
-from ..kernels.isolated_bridge import N_STATES
 from ..signals.channels import Channel
 from ..signals.records import Record
 from ..signals.sampling import rest_samples, same_sampling, sample_window
-from .base import History, remark_on_range
-from .isolated_bridge_channels import ALL_CHANNELS, CHANNEL_SETS, CHANNELS
-from .isolated_bridge_parts import Bearing, Damper, Pier, Rubber
+from .base import BuiltInModel, remark_on_range
+from .isolated_bridge_parts import ALL_CHANNELS, CHANNELS, Bearing, Damper, Pier, Rubber
 from .isolated_bridge_system import (
     FORMS,
     BridgeMatrices,
-    BridgeRun,
     PreparedBridge,
-    channel_matrix,
     prepare_bridge,
     run_bridge,
 )
-from .threaded import ThreadedModel
 from .validation import (
     check_fields,
     check_integer,
     check_names,
     check_nominal,
-    check_theta,
     invalid,
 )
 
-__all__ = ["PARAMETERS", "BridgeHistory", "IsolatedBridge"]
+__all__ = ["PARAMETERS", "IsolatedBridge"]
 
 PARAMETERS = ("fmin_1", "df_1", "a_1", "fmin_2", "df_2", "a_2", "Kd_1", "C0_1", "Kd_2", "C0_2")
 _NOMINAL_UNITS = {
@@ -60,28 +53,10 @@ _NOMINAL_UNITS = {
     for name, unit in zip(("a", "Kd", "C0"), ("s/m", "N/m", "N s/m"), strict=True)
 }
 _LONGEST_STEP = 0.25e-3  # of the default [s]
-_STATE_ROWS = (
-    *("deck", "pier_1", "rotation_1", "pier_2", "rotation_2"),
-    *("deck velocity", "pier_1 velocity", "rotation_1 velocity", "pier_2 velocity", "rotation_2 velocity"),
-    *("damper_1", "damper_2"),
-)
-
-
-@dataclass(frozen=True)
-class BridgeHistory(History):
-    """Time histories of one simulation of the bridge [SI].
-
-    Rows: the state (displacements and velocities relative to the table, damper forces of each pier), the hysteretic
-    variables ``Z_1`` and ``Z_2``, then all channels. Where `beyond_range` is above 1, the rubber law was continued
-    along its tangent.
-    """
-
-    beyond_range: np.ndarray  # (2,) largest bearing displacement / displacement up to which the rubber law holds
-    iterations: float  # of Newton's method per step
 
 
 @dataclass(frozen=True, eq=False)
-class IsolatedBridge(ThreadedModel):
+class IsolatedBridge(BuiltInModel):
     """Isolated bridge on a shake table; theta holds multiples of the nominal parameters.
 
     Parameters
@@ -95,9 +70,8 @@ class IsolatedBridge(ThreadedModel):
         The parts, one for each pier.
     rubber : Rubber
         Rubber devices, the same at both piers; they have no parameters in theta.
-    outputs : tuple of str, int or None
-        Names of the channels (see the notes), or the size of a measured set: 5 for the channels of pier 1, 6 for these
-        and ``Ub_2``, 10 for the channels of both piers. None: all twelve channels that are not means.
+    outputs : tuple of str or None
+        Names of the channels (see the notes). None: all twelve channels that are not means.
     parameters : tuple of str
         Names of the parameters that make up theta, in this order (`IsolatedBridge` lists them).
     friction : str
@@ -148,11 +122,11 @@ class IsolatedBridge(ThreadedModel):
 
     Examples
     --------
-    >>> bridge = IsolatedBridge(record.resample(0.005), outputs=5)
+    >>> bridge = IsolatedBridge(record.resample(0.005), outputs=("Ub_1", "Fb_1"))
     >>> bridge.parameter_names
     ('fmin_1', 'df_1', 'a_1', 'fmin_2', 'df_2', 'a_2', 'Kd_1', 'C0_1', 'Kd_2', 'C0_2')
     >>> bridge.simulate(np.ones(10)).shape
-    (5, 1991)
+    (2, 1991)
     """
 
     record: Record
@@ -161,7 +135,7 @@ class IsolatedBridge(ThreadedModel):
     bearings: tuple[Bearing, Bearing] = (Bearing(), Bearing(f_min=0.050, df=0.070, a=28.0))
     dampers: tuple[Damper, Damper] = (Damper(), Damper(2700e3, 14.80e3))
     rubber: Rubber = Rubber()
-    outputs: tuple[str, ...] | int | None = None
+    outputs: tuple[str, ...] | None = None
     parameters: tuple[str, ...] = PARAMETERS
     _nominal_units: ClassVar[dict[str, str]] = _NOMINAL_UNITS
     friction: str = "bouc-wen"
@@ -170,10 +144,8 @@ class IsolatedBridge(ThreadedModel):
     vertical: Record | None = None
 
     def __post_init__(self) -> None:
-        outputs = ALL_CHANNELS if self.outputs is None else self.outputs
-        if isinstance(outputs, int) and outputs in CHANNEL_SETS:
-            outputs = CHANNEL_SETS[outputs]
-        object.__setattr__(self, "outputs", outputs)
+        if self.outputs is None:
+            object.__setattr__(self, "outputs", ALL_CHANNELS)
         self._check_parts()
         self._check_integration()
         self._check_names()
@@ -260,35 +232,19 @@ class IsolatedBridge(ThreadedModel):
         vertical = None if self.vertical is None else self.vertical.trim(0.0, stop)
         return replace(self, record=self.record.trim(0.0, stop), vertical=vertical)
 
-    def history(self, theta: np.ndarray) -> BridgeHistory:
-        """Simulate and return states, hysteretic variables and all channels.
-
-        Parameters and errors as for `simulate`.
-        """
-        prepared = self._prepared
-        run = run_bridge(self, prepared, check_theta(theta, self.parameters))
-        beyond = np.abs(prepared.linear.kinematics @ run.values[:5]).max(axis=1) / prepared.rubber_range
-        rows = csr_array(channel_matrix(self.matrices, self.piers, ALL_CHANNELS)) @ run.drivers
-        names = (*_STATE_ROWS, "Z_1", "Z_2", *ALL_CHANNELS)
-        kept = np.concatenate([run.values[:N_STATES], run.values[14:16], rows])[:, :: self.every]
-        return BridgeHistory(names, kept, beyond, run.iterations)
-
     def _respond(self, theta: np.ndarray) -> np.ndarray:
-        return self._outputs_of(run_bridge(self, self._prepared, theta), theta)
-
-    def _outputs_of(self, run: BridgeRun, theta: np.ndarray) -> np.ndarray:
-        """Channels (n_channels, n_steps) of a simulation; warns once per model beyond the range of the rubber law."""
         prepared = self._prepared
-        largest = np.abs(prepared.linear.kinematics @ run.values[:5]).max()
+        drivers = run_bridge(self, prepared, theta)
+        largest = np.abs(prepared.linear.kinematics @ drivers[:5]).max()
         if largest > prepared.rubber_range:
             at = dict(zip(self.parameters, theta.tolist(), strict=True))
             remark_on_range(
                 self,
                 f"a bearing displacement of {1e3 * largest:.1f} mm exceeds the {1e3 * prepared.rubber_range:.1f} mm "
                 f"for which the law of the rubber holds; the law was continued along its tangent, at {at}. This model "
-                "gives no further warnings: check history(theta).beyond_range, or extend the law (Rubber.limit)",
+                "gives no further warnings: compare the displacements with the limit, or extend the law (Rubber.limit)",
             )
-        return prepared.to_channels @ run.drivers[:, :: self.every]
+        return prepared.to_channels @ drivers[:, :: self.every]
 
     def _prepare(self) -> PreparedBridge:
         return prepare_bridge(self)
@@ -340,7 +296,7 @@ class IsolatedBridge(ThreadedModel):
 
     def _check_names(self) -> None:
         """Raise ValueError for unknown or repeated names of outputs and parameters."""
-        check_names("outputs", self.outputs, CHANNELS, "give names, or 5, 6 or 10 for a set of CHANNEL_SETS")
+        check_names("outputs", self.outputs, CHANNELS, "mean_Ub and others are means over the piers")
         check_names("parameters", self.parameters, PARAMETERS, "see IsolatedBridge.nominal for their values")
         check_nominal(self.parameters, self.nominal)
 

@@ -1,4 +1,4 @@
-"""Parts of the isolated bridge: piers, bearings, dampers and rubber devices. Arguments are checked when a part is made.
+"""Parts of the isolated bridge: piers, bearings, dampers and rubber devices, checked when made; and its channels.
 
 The defaults describe the quarter-scale bridge of Tsopelas et al., NCEER 94-0002 (1994), as far as it could be
 reconstructed. Most values are **assumed**, or taken from related reports without verification;
@@ -11,9 +11,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..signals.channels import Channel
 from .validation import check_fields, check_finite, check_integer, invalid
 
-__all__ = ["Bearing", "Damper", "Pier", "Rubber"]
+__all__ = [
+    "ALL_CHANNELS",
+    "CHANNELS",
+    "OF_A_PIER",
+    "Bearing",
+    "Damper",
+    "Pier",
+    "Rubber",
+    "at_pier",
+]
 
 
 @dataclass(frozen=True)
@@ -195,3 +205,29 @@ class Rubber:
     def linear_stiffness(self) -> float:
         """Stiffness of the linear term of the skeleton curve [N/m]."""
         return self.skeleton[0] / self.scale
+
+
+OF_A_PIER = {
+    "Ub": ("bearing displacement", "mm"),
+    "Fb": ("isolator force", "kN"),
+    "drift": ("drift displacement", "mm"),
+    "shear": ("shear force", "kN"),
+    "acc_p": ("absolute acceleration", "g"),
+}
+
+
+def at_pier(name: str, i: int) -> str:
+    """Name of a channel at pier `i`."""
+    return f"{name}{i}" if name == "acc_p" else f"{name}_{i}"
+
+
+CHANNELS = {
+    **{at_pier(name, i): Channel(at_pier(name, i), *what) for name, what in OF_A_PIER.items() for i in (1, 2)},
+    "Ud": Channel("Ud", "deck displacement", "mm"),
+    "acc_d": Channel("acc_d", "absolute acceleration", "g"),
+    **{f"mean_{name}": Channel(f"mean_{name}", *what) for name, what in OF_A_PIER.items()},
+}
+"""All channels by name."""
+
+ALL_CHANNELS = tuple(name for name in CHANNELS if not name.startswith("mean_"))
+"""Names of the twelve channels that are not means."""

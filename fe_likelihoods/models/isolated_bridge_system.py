@@ -23,11 +23,10 @@ from ..kernels.bearings import BOUC_WEN, COULOMB, RubberLaw, Slider
 from ..kernels.exponential import matrix_exponential
 from ..kernels.isolated_bridge import N_OUT, N_STATES, Isolators, StepMatrices, step_isolated
 from ..simulation.model import SimulationFailed
-from .isolated_bridge_channels import OF_A_PIER, at_pier
-from .isolated_bridge_parts import Damper, Pier, Rubber
+from .isolated_bridge_parts import OF_A_PIER, Damper, Pier, Rubber, at_pier
 from .validation import check_values
 
-__all__ = ["FORMS", "BridgeMatrices", "BridgeRun", "PreparedBridge", "channel_matrix", "prepare_bridge", "run_bridge"]
+__all__ = ["FORMS", "BridgeMatrices", "PreparedBridge", "channel_matrix", "prepare_bridge", "run_bridge"]
 
 GRAVITY = 9.81  # [m/s²]
 TOLERANCE = 1e-5  # largest last correction of the isolator forces, as a multiple of the smaller bearing load
@@ -193,14 +192,6 @@ class PreparedBridge(NamedTuple):
     rubber_range: float  # bearing displacement up to which the rubber law holds [m]
 
 
-class BridgeRun(NamedTuple):
-    """Result of one simulation, up to the last sample of the response."""
-
-    values: np.ndarray  # (16, n) state, isolator forces F and Z at the samples of the record
-    drivers: np.ndarray  # (15, n) state, F and table acceleration: channels are linear combinations of them
-    iterations: float  # of Newton's method per step
-
-
 def prepare_bridge(model: Any) -> PreparedBridge:
     """Inputs of the kernel for a bridge."""
     matrices, rubber = model.matrices, model.rubber
@@ -217,8 +208,10 @@ def prepare_bridge(model: Any) -> PreparedBridge:
     )
 
 
-def run_bridge(model: Any, prepared: PreparedBridge, theta: np.ndarray) -> BridgeRun:
-    """Simulate for multiples `theta` (n_parameters,) of the nominal parameters.
+def run_bridge(model: Any, prepared: PreparedBridge, theta: np.ndarray) -> np.ndarray:
+    """State, isolator forces F and table acceleration (15, n) for multiples `theta` of the nominal parameters.
+
+    There are n samples up to the last one of the response, whose channels are linear combinations of them.
 
     Raises SimulationFailed if the parameters describe no structure, or the solution does not converge.
     """
@@ -241,7 +234,7 @@ def run_bridge(model: Any, prepared: PreparedBridge, theta: np.ndarray) -> Bridg
     ground = model.record.acceleration[: (model.n_steps - 1) * model.every + 1]  # up to the last sample of the response
     out = np.zeros((ground.size, N_OUT))
     n_sub = round(model.record.dt / step)
-    status, iterations = step_isolated(
+    status, _ = step_isolated(
         matrices,
         Isolators(sliders, prepared.law, c, FORMS[model.friction]),
         ground,
@@ -257,4 +250,4 @@ def run_bridge(model: Any, prepared: PreparedBridge, theta: np.ndarray) -> Bridg
         raise SimulationFailed(f"step {status} of {n_steps} (t = {status * step:.4g} s) did not converge")
     if coulomb:
         prepared.linear.hold_stuck_bearings(dampers, ground, out)
-    return BridgeRun(out.T, np.vstack([out.T[:14], ground]), iterations / max(1, n_sub * (ground.size - 1)))
+    return np.vstack([out.T[:14], ground])

@@ -26,10 +26,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..kernels.complex_modes import superpose_modes
 from ..signals.channels import Channel
 from ..signals.records import Record
 from ..signals.sampling import same_sampling, sample_window
-from .linear_system import Parts, complex_modes, superpose
+from ..signals.sdof import hold_integrals
+from ..simulation.model import SimulationFailed
+from .linear_structure_parts import LinearSystem, Parts
 from .undamped_modes import Modes, undamped_modes
 from .user_model import ExternalModel
 from .validation import check_theta
@@ -38,6 +41,7 @@ __all__ = ["LinearStructure", "Sensor"]
 
 
 _MOTIONS = ("displacement", "velocity", "relative_acceleration")
+_LARGEST_CONDITION = 1e8  # condition number of the complex modes at which half the digits are lost
 
 
 class Sensor(NamedTuple):
@@ -188,7 +192,7 @@ class LinearStructure(ExternalModel):
     def _respond(self, theta: np.ndarray) -> np.ndarray:
         motion = self._acceleration
         system = self.parts.assemble(theta)
-        modes = complex_modes(system)
+        modes = _complex_modes(system)
         weights, direct = system.shape, system.direct
         if self.outputs is not None:
             weights = np.array(
@@ -201,5 +205,59 @@ class LinearStructure(ExternalModel):
                 shapes[:, c] = modes.shapes[:, each.motion] @ weights[c]
                 direct[c] = -weights[c] @ system.influence if each.motion == 2 else 0.0
         out = np.einsum("cs,st->ct", direct, motion)
-        superpose(modes, shapes, motion, self.dt, out)
+        _superpose(modes, shapes, motion, self.dt, out)
         return out[:, self._window]
+
+
+class _ComplexModes(NamedTuple):
+    """Complex modes; of each conjugate pair only one is stored, with doubled shapes."""
+
+    eigenvalues: np.ndarray  # (m,) [1/s]
+    participation: np.ndarray  # (m, n_supports) forcing of the mode under unit support accelerations
+    shapes: np.ndarray  # (m, 3, n) in displacement, velocity and absolute acceleration
+
+
+def _complex_modes(system: LinearSystem) -> _ComplexModes:
+    """Compute the complex modes of a structure.
+
+    Raises SimulationFailed if two complex modes coincide, so that the equations do not uncouple (a mode with exactly
+    critical damping, or without stiffness), or if the mass is singular.
+    """
+    n = len(system.mass)
+    try:
+        lower = -np.linalg.solve(system.mass, np.hstack([system.stiffness, system.damping]))
+        eigenvalues, vectors = np.linalg.eig(np.vstack([np.hstack([np.zeros((n, n)), np.eye(n)]), lower]))
+        # scaled, because displacements and velocities differ by the size of the frequencies
+        rows = np.repeat([max(1.0, np.abs(eigenvalues).max()), 1.0], n)[:, None]
+        condition = np.linalg.cond(rows * vectors / np.linalg.norm(rows * vectors, axis=0))
+    except np.linalg.LinAlgError as error:
+        raise SimulationFailed(f"the complex modes cannot be found: {error}") from error
+    if not condition < _LARGEST_CONDITION:
+        raise SimulationFailed(
+            f"two complex modes coincide (condition {condition:.1e}): a damping is critical, or a stiffness is zero"
+        )
+    participation = np.linalg.solve(vectors, np.vstack([np.zeros_like(system.influence), -system.influence]))
+    # displacement phi, velocity lam phi, and absolute acceleration -M^-1 (C lam + K) phi = lam^2 phi
+    shapes = np.stack([vectors[:n], vectors[n:], eigenvalues * vectors[n:]]).transpose(2, 0, 1)
+    kept = eigenvalues.imag >= 0.0
+    twice = np.where(eigenvalues.imag > 0.0, 2.0, 1.0)[:, None, None]
+    return _ComplexModes(
+        eigenvalues[kept].astype(complex), participation[kept].astype(complex), (twice * shapes)[kept] + 0j
+    )
+
+
+def _superpose(
+    modes: _ComplexModes, shapes: np.ndarray, support_acceleration: np.ndarray, dt: float, out: np.ndarray
+) -> None:
+    """Add the response with these shapes (m, n_rows) of the modes to `out` (n_rows, n_steps)."""
+    decay = np.exp(modes.eigenvalues * dt)
+    constant, slope = np.array([hold_integrals(complex(z)) for z in modes.eigenvalues * dt]).T
+    superpose_modes(
+        decay,
+        dt * (constant - slope),
+        dt * slope,
+        modes.participation,
+        np.ascontiguousarray(shapes),
+        np.ascontiguousarray(support_acceleration, dtype=float),
+        out,
+    )

@@ -1,23 +1,74 @@
-"""Linear structures with few parameters: the deck of a short bridge, a shear frame, and a building as a sum of modes.
+"""Matrices of linear structures, and structures with few parameters: a bridge deck, a shear frame, a sum of modes.
 
-Each is a frozen dataclass that computes the matrices which `fe_likelihoods.models.linear_structure.LinearStructure`
-simulates. Masses are relative, because accelerations of supports identify only the ratio of stiffness to mass. The
-equations of buildings are in ``docs/theory/tall_buildings.rst``.
+They give the matrices that `fe_likelihoods.models.linear_structure.LinearStructure` simulates. Masses are relative,
+because accelerations of supports identify only the ratio of stiffness to mass. The equations of buildings are in
+``docs/theory/tall_buildings.rst``.
 """
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple, Protocol
 
 import numpy as np
+from scipy.linalg import eigh
 
 from ..simulation.model import SimulationFailed
-from .linear_system import LinearSystem, modal_damping
 from .validation import check_integer, check_positive
 
-__all__ = ["BridgeDeck", "ModalModel", "ShearFrame"]
+__all__ = ["BridgeDeck", "LinearSystem", "ModalModel", "Parts", "ShearFrame"]
 
 _MOST_MODES = 50
+
+
+class LinearSystem(NamedTuple):
+    """Matrices of a linear structure with n degrees of freedom, and the positions of its sensors.
+
+    Units need only be consistent: M^-1 C [1/s] and M^-1 K [1/s²] matter.
+    """
+
+    mass: np.ndarray  # (n, n)
+    damping: np.ndarray  # (n, n)
+    stiffness: np.ndarray  # (n, n)
+    influence: np.ndarray  # (n, n_supports) static displacements under unit support displacements [-]
+    shape: np.ndarray  # (n_channels, n) weight of each absolute acceleration in a channel [-]
+    direct: np.ndarray  # (n_channels, n_supports) weight of each support acceleration [-]
+
+
+class Parts(Protocol):
+    """Interface of the structures that `LinearStructure` simulates.
+
+    The ``repr`` of the object must contain everything that the matrices depend on, because it enters the fingerprint.
+    """
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+
+    @property
+    def n_supports(self) -> int:
+        """Number of supports."""
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Names of the channels, which are absolute accelerations."""
+
+    def assemble(self, theta: np.ndarray) -> LinearSystem:
+        """Matrices at the parameters (n_parameters,); raises `SimulationFailed` if they describe no structure."""
+
+
+def _modal_damping(mass: np.ndarray, stiffness: np.ndarray, ratios: np.ndarray) -> np.ndarray:
+    """Damping matrix (n, n) of modal damping ratios (n,): C = M Phi diag(2 zeta omega) Phi^T M.
+
+    Mass and stiffness are symmetric; Phi are the undamped modes, lowest frequency first. Raises SimulationFailed if the
+    stiffness is not positive definite.
+    """
+    squares, modes = eigh(stiffness, mass)
+    if not squares[0] > 0.0:
+        raise SimulationFailed(
+            f"the stiffness must be positive definite; its smallest eigenvalue is {squares[0]:g} 1/s2"
+        )
+    return mass @ (modes * (2.0 * np.asarray(ratios) * np.sqrt(squares))) @ modes.T @ mass
 
 
 @dataclass(frozen=True)
@@ -220,7 +271,7 @@ class ShearFrame:
         shape[np.arange(len(self.floors)), [floor - 1 for _, floor in self.floors]] = 1.0
         return LinearSystem(
             mass=mass,
-            damping=modal_damping(mass, stiffness, ratios),
+            damping=_modal_damping(mass, stiffness, ratios),
             stiffness=stiffness,
             influence=np.ones((n, 1)),
             shape=shape,

@@ -40,11 +40,19 @@ from ..signals.channels import Channel
 from ..signals.records import DisplacementHistory, Record
 from ..signals.sampling import sample_window
 from ..units import G0, to_si
-from .circular_section import Confinement, ReinforcedSection, gauss_lobatto
+from .base import BuiltInModel
 from .rc_column_analysis import ColumnHistory, PreparedColumn, check_loading, run_column
 from .rc_column_outputs import Output, Sections, check_units, display_channels, parse_outputs, section_heights
-from .rc_column_parts import Bars, Concrete, Hoops, LowCycleFatigue, Steel
-from .threaded import ThreadedModel
+from .rc_column_parts import (
+    Bars,
+    Concrete,
+    Confinement,
+    Hoops,
+    LowCycleFatigue,
+    ReinforcedSection,
+    Steel,
+    gauss_lobatto,
+)
 from .validation import (
     check_fields,
     check_integer,
@@ -66,7 +74,7 @@ PARAMETERS = (*_NOMINAL_UNITS, *_OF_FATIGUE)
 
 
 @dataclass(frozen=True, eq=False)
-class RCColumn(ThreadedModel):
+class RCColumn(BuiltInModel):
     """Circular reinforced-concrete column; theta holds multiples of the nominal parameters.
 
     Parameters

@@ -1,4 +1,4 @@
-"""Figures of structures: the section of a column, the scheme of the bridge, sensors, and hysteresis loops.
+"""Figures of structures: the section of a column, sensors, and hysteresis loops.
 
 Values are drawn in the display units of the model. Moments have units of force times length, curvatures one over
 length.
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from ..models.linear_structure import LinearStructure
     from ..models.rc_column import RCColumn
 
-__all__ = ["plot_bridge", "plot_hysteresis", "plot_section", "plot_sensors"]
+__all__ = ["plot_hysteresis", "plot_section", "plot_sensors"]
 
 _CORE = "#b9cfe4"
 
@@ -241,7 +241,8 @@ def plot_hysteresis(model: RCColumn | IsolatedBridge, theta: np.ndarray) -> Figu
     >>> figure = plot_hysteresis(column, np.ones(5))
     """
     if isinstance(model, IsolatedBridge):
-        return _bearing_loops(replace(model, every=1).history(theta))
+        outputs = [f"{kind}_{i}" for i in (1, 2) for kind in ("Ub", "Fb")]
+        return _bearing_loops(replace(model, every=1, outputs=outputs).simulate(theta))
     return _column_loops(model, model.history(theta))
 
 
@@ -269,60 +270,12 @@ def _column_loops(column: RCColumn, history: History) -> Figure:
     return figure
 
 
-def plot_bridge(bridge: IsolatedBridge, axes: Axes | None = None) -> Axes:
-    """Plot the isolated bridge with its channels: deck, bearings, blocks, piers and table.
-
-    Widths are not to scale; heights [m] are.
-    """
-    from matplotlib.patches import Rectangle
-
-    axes = new_axes(axes, (8.4, 4.6))
-    length, block = (max(getattr(pier, name) for pier in bridge.piers) for name in ("length", "height"))
-    gap, deck = 0.12 * length, 0.25 * length
-    under = length + block + gap
-    positions = (-1.0, 1.0)
-    axes.add_patch(Rectangle((-1.8, -0.08 * length), 3.6, 0.08 * length, facecolor="0.6"))
-    axes.add_patch(Rectangle((-1.6, under), 3.2, deck, facecolor="0.8", edgecolor="0.5"))
-    for x, pier in zip(positions, bridge.piers, strict=True):
-        top = pier.length + pier.height
-        axes.plot([x, x], [0.0, pier.length], color="0.4", linewidth=4.0, zorder=1)
-        axes.add_patch(Rectangle((x - 0.3, pier.length), 0.6, pier.height, facecolor="#e9ebee", edgecolor="0.5"))
-        axes.add_patch(Rectangle((x - 0.12, top), 0.1, under - top, facecolor=BLUE))  # slider
-        axes.add_patch(Rectangle((x + 0.02, top), 0.1, under - top, facecolor=ORANGE))  # rubber and damper
-    above, at_top, at_foot = under + 0.5 * gap, length + 0.5 * block, 0.25 * length
-    places = {"Ud": (0.0, under + 0.7 * deck), "acc_d": (0.0, under + 0.3 * deck)}
-    heights = {
-        "Ub": above,
-        "Fb": above - gap,
-        "drift": at_top - 0.2 * gap,
-        "acc_p": at_top - 1.2 * gap,
-        "shear": at_foot,
-    }
-    for kind, height in heights.items():
-        places[f"mean_{kind}"] = (0.0, height)
-        for i, x in enumerate(positions, 1):
-            name = f"{kind}{i}" if kind == "acc_p" else f"{kind}_{i}"
-            places[name] = (x + (0.36 if kind != "shear" else 0.08), height)
-    for channel in bridge.channels:
-        x, height = places[channel.name]
-        align = "center" if x == 0.0 else "left"
-        axes.text(x, height, f"{channel.name} [{channel.unit}]", ha=align, va="center", fontsize="small")
-    axes.annotate("", (0.5, -0.16 * length), (-0.5, -0.16 * length), arrowprops={"arrowstyle": "<->", "color": GREY})
-    axes.text(0.6, -0.16 * length, "table acceleration", va="center", fontsize="small")
-    axes.set(xlim=(-2.0, 2.0), ylim=(-0.25 * length, 1.05 * (under + deck)), ylabel="height above the table [m]")
-    axes.set_title("blue: sliding bearings; orange: rubber devices and dampers", fontsize="small")
-    axes.set_xticks(positions, ["pier 1", "pier 2"])
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    return axes
-
-
-def _bearing_loops(history: History) -> Figure:
-    """Isolator force against bearing displacement of both piers, from "Ub_1", "Ub_2", "Fb_1" and "Fb_2" [SI]."""
+def _bearing_loops(histories: np.ndarray) -> Figure:
+    """Isolator force against bearing displacement, histories of both in turn for either pier [SI]."""
     figure, (pair,) = new_figure(1, 2, (9.6, 4.2), sharex=True, sharey=True)
     for i, axes in enumerate(pair, 1):
         y_label = "isolator force [kN]" if i == 1 else ""
-        moved, force = from_si(history[f"Ub_{i}"], "mm"), from_si(history[f"Fb_{i}"], "kN")
+        moved, force = from_si(histories[2 * i - 2], "mm"), from_si(histories[2 * i - 1], "kN")
         _draw_loop(axes, moved, force, "bearing displacement [mm]", y_label, f"pier {i}")
     return figure
 

@@ -231,7 +231,7 @@ with install_recorder("numba:compile") as compiled:
     column = problems.bridge_column(duration=0.25)
     whole = problems.isolated_bridge_data()
     short = type(whole)(whole.record.trim(0.0, 0.25), whole.measurements.trim(0.0, 0.25), {})
-    bridge = problems.isolated_bridge(data=short, channels=6)
+    bridge = problems.isolated_bridge(data=short)
     values = [posterior(posterior.sample_prior(1, 1)[0]) for posterior in (column, bridge)]
     events = len(compiled.buffer)
     numba.njit(lambda x: x)(1.0)  # control: a compilation is recorded

@@ -14,10 +14,9 @@ from fe_likelihoods import (
     RCColumn,
     material_curves,
 )
-from fe_likelihoods.models.circular_section import gauss_lobatto
 from fe_likelihoods.models.rc_column_analysis import PreparedColumn, run_column
 from fe_likelihoods.models.rc_column_outputs import Output, Sections, parse_outputs
-from fe_likelihoods.models.rc_column_parts import LowCycleFatigue
+from fe_likelihoods.models.rc_column_parts import LowCycleFatigue, gauss_lobatto
 from fe_likelihoods.problems import bridge_column, bridge_column_data
 from fe_likelihoods.units import G0
 

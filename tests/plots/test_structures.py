@@ -15,21 +15,19 @@ from fe_likelihoods import (
     plot_sensors,
 )
 from fe_likelihoods.models.isolated_bridge import IsolatedBridge
-from fe_likelihoods.models.isolated_bridge_channels import CHANNELS
 from fe_likelihoods.models.rc_column import RCColumn
-from fe_likelihoods.plots.structures import plot_bridge
 from fe_likelihoods.problems import bridge_column_data, isolated_bridge_data
 from fe_likelihoods.signals.records import DisplacementHistory
 from tests.plots.reading import shows, texts
 
 
 def test_hysteresis_of_the_bridge():
-    bridge = IsolatedBridge(isolated_bridge_data().record.trim(0.0, 2.0), outputs=10, every=2, step=1e-3)
+    bridge = IsolatedBridge(isolated_bridge_data().record.trim(0.0, 2.0), every=2, step=1e-3)
     first, second = plot_hysteresis(bridge, np.ones(10)).axes
-    history = replace(bridge, every=1).history(np.ones(10))
+    moved, force = replace(bridge, every=1, outputs=("Ub_2", "Fb_2")).simulate(np.ones(10))
     x, y = second.lines[2].get_data()  # after the two lines through the origin
-    np.testing.assert_allclose(x, 1e3 * history["Ub_2"])
-    np.testing.assert_allclose(y, 1e-3 * history["Fb_2"])
+    np.testing.assert_allclose(x, 1e3 * moved)
+    np.testing.assert_allclose(y, 1e-3 * force)
     assert shows(second, [second.lines[2]])
     assert second.get_xlabel() == "bearing displacement [mm]" and first.get_ylabel() == "isolator force [kN]"
 
@@ -146,15 +144,3 @@ def test_labels_are_beside_their_sensors():
     foot = plot_sensors(RCColumn.lhpost(record, outputs=("base_moment", "base_shear", "strain@0.3:0.5")))
     heights = sorted(text.get_position()[1] for text in foot.texts)
     assert heights[0] == 0.0 and heights[-1] < 0.11 * 7.3152
-
-
-def test_the_scheme_of_the_bridge_names_every_channel_at_its_pier():
-    names, record = tuple(CHANNELS), isolated_bridge_data().record
-    axes = plot_bridge(IsolatedBridge(record, outputs=names))
-    places = {text.get_text().split(" [")[0]: text.get_position() for text in axes.texts}
-    assert set(names) <= set(places)
-    assert places["Ub_1"][0] < 0.0 < places["Ub_2"][0]
-    assert places["shear_1"][1] < places["drift_1"][1] < places["Ub_1"][1] < places["acc_d"][1]
-    assert places["mean_Ub"][0] == 0.0
-    few = plot_bridge(IsolatedBridge(record, outputs=5))
-    assert "Ub_2" not in " ".join(text.get_text() for text in few.texts)
