@@ -7,7 +7,7 @@ displacements (v2 L, v1, v3 - v2) of its free end. The tests use only the public
 import numpy as np
 import pytest
 
-from fe_likelihoods.kernels import concrete04, frame, reinforcing_steel
+from fe_likelihoods.kernels import concrete04, reinforcing_steel
 from fe_likelihoods.kernels.beam_column import HEAD, PER_SECTION
 from fe_likelihoods.kernels.static import Position, equilibrate
 
@@ -118,19 +118,6 @@ def test_elastic_cantilever_is_closed_form(n_elements, n_points):
     assert u[-2] == pytest.approx(axial * h / ea, rel=1e-8)
 
 
-@pytest.mark.parametrize("n_points", range(2, 8))
-def test_initial_stiffness_is_that_of_a_beam(n_points):
-    """4 EI/L, 2 EI/L and EA/L to machine precision; two points integrate only linear functions."""
-    column = single(n_points=n_points)
-    ea, ei = stiffness_of_section(column)
-    length = column.length
-    expected = [[ea / length, 0, 0], [0, 4 * ei / length, 2 * ei / length], [0, 2 * ei / length, 4 * ei / length]]
-    if n_points == 2:
-        expected = [[ea / length, 0, 0], [0, 2 * ei / length, 0], [0, 0, 2 * ei / length]]
-    stiffness = symmetric(column.elements.state[0, 3:9])
-    np.testing.assert_allclose(stiffness, expected, rtol=1e-13, atol=1e-12 * ei / length)
-
-
 def states(rng, column, n, size):
     """Take the element through `n` random committed deformations and yield each."""
     for _ in range(n):
@@ -238,14 +225,3 @@ def test_impossible_deformation_is_reported_and_changes_nothing(v, rng):
     converged, _, _ = advance(column, np.array(v))
     assert not converged
     np.testing.assert_array_equal(column.elements.state, before)
-
-
-def test_initialise_column_resets_everything(rng):
-    """A used column that is made virgin again equals a new one to the last bit."""
-    column, new = single(), single()
-    list(states(rng, column, 5, MILD))
-    frame.initialise_column(column)
-    for name in ("concrete_memory", "steel_memory", "virgin"):
-        np.testing.assert_array_equal(getattr(column.sections, name), getattr(new.sections, name))
-    for name in ("state", "initial_flexibility"):
-        np.testing.assert_array_equal(getattr(column.elements, name), getattr(new.elements, name))

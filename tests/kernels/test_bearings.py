@@ -50,14 +50,6 @@ def test_z_follows_its_differential_equation(start, increment, gamma):
     assert slope * 0.13e-3 == pytest.approx(direction * rate(0.0, z), abs=1e-12)
 
 
-def test_z_depends_on_the_path_only():
-    whole, _ = bouc_wen(3e-4, -0.9, 0.13e-3, C)
-    z = -0.9
-    for _ in range(100):
-        z, _ = bouc_wen(3e-6, z, 0.13e-3, C)
-    assert z == pytest.approx(whole, abs=1e-13)
-
-
 @pytest.mark.parametrize("displacement", [-0.07, -0.055, -0.01, 0.0, 0.03, 0.0601])
 @pytest.mark.parametrize("velocity", [-0.3, -0.004, 0.01, 0.25])
 def test_derivatives_are_differences(displacement, velocity):

@@ -105,25 +105,6 @@ def test_envelope_is_the_formula(args, rng):
     np.testing.assert_allclose(out, softening(strain, args), rtol=1e-12, atol=1e-14)
 
 
-def test_continuous_at_cracking_and_where_unloading_starts(args, rng):
-    c = golden.concrete_constants(args)
-    cracked = args[FT] / args[EC]
-    if cracked > 0:
-        step = 1e-12 * cracked
-        above, below = envelope(cracked + step, c)[0], envelope(cracked - step, c)[0]
-        assert above == pytest.approx(below, rel=1e-11)
-        assert below == pytest.approx(args[FT], rel=1e-11)
-    for eps_min in rng.uniform(args[ECU], 0.0, 200):
-        memory = eps_min, 0.0, *unloading(eps_min, 0.0, c)
-        step = 1e-13
-        on_envelope, steepness = stress_tangent(eps_min - step, *memory, c)
-        on_unloading = stress_tangent(eps_min + step, *memory, c)[0]
-        assert on_unloading == pytest.approx(on_envelope, abs=3 * step * (args[EC] + abs(steepness)))
-    for eps_max in rng.uniform(1e-6, max(args[ETU], 1e-3), 200):
-        memory = 0.0, eps_max, *unloading(0.0, eps_max, c)
-        assert stress_tangent(eps_max, *memory, c)[0] == pytest.approx(envelope(eps_max, c)[0], rel=1e-14, abs=1e-300)
-
-
 def test_unloading_is_karsan_and_jirsa(args):
     c = golden.concrete_constants(args)
     for eta in (0.1, 0.5, 1.0, 1.5, 1.99, 2.5):
@@ -173,15 +154,6 @@ def test_tension_closes_to_zero_strain_and_a_gap_stays_open():
     assert eps_end < -1e-4
     assert stress_tangent(0.5 * eps_end, *memory, c) == (0.0, 0.0)
     assert stress_tangent(0.0002, *memory, c)[0] == pytest.approx(0.4 * envelope(0.0005, c)[0], rel=1e-14)
-
-
-def test_without_tension_there_is_none(rng):
-    c = golden.concrete_constants(MATERIALS["no tension"])
-    assert c[np.isnan(c)].size == 0
-    for eps_max in (0.0, 1e-5, 1e-3):
-        memory = -0.002, eps_max, *unloading(-0.002, eps_max, c)
-        for strain in rng.uniform(1e-9, 2e-3, 50):
-            assert stress_tangent(strain, *memory, c) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("ecu", [-0.008, -0.06])

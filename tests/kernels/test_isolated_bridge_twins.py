@@ -50,28 +50,6 @@ def smooth():
     return {name: solve(Definition().at(theta), GROUND, DT).response for name, theta in PARAMETERS.items()}
 
 
-# --- the other implementation ---
-
-
-@pytest.mark.parametrize("record", [0, 1])
-def test_reference_results(shared, record):
-    """Four seconds of two synthetic records, computed by other solvers and stored in single precision."""
-    with np.load(shared / "golden" / "isolated_bridge" / "own_records.npz") as kept:
-        ground, dt, reference = kept[f"ag{record}"][:801], float(kept[f"dt{record}"]), kept[f"Y{record}"][..., :401]
-        assert tuple(kept["channels"]) == CHANNELS
-        for case in (record, 2 + record):
-            response = solve(Definition().at(kept["theta"][case]), ground, dt, every=2).response
-            assert peak_errors(response, reference[case]).max() < 1e-6
-
-
-def test_reference_result_with_p_delta_and_vertical_motion(shared):
-    with np.load(shared / "golden" / "isolated_bridge" / "own_records.npz") as kept:
-        ground, vertical, dt = kept["ag0"][:801], kept["av_opt"][:801], float(kept["dt0"])
-        response = solve(Definition(), ground, dt, every=2, p_delta=True, vertical=vertical).response
-        assert peak_errors(response, kept["Y_opt"][:, :401]).max() < 1e-6
-        assert peak_errors(response, kept["Y0"][0][:, :401]).max() > 1e-2
-
-
 # --- the library compared with it ---
 
 SECOND_ORDER = (3.0, 6.0)  # factor by which halving the step reduces an error

@@ -177,23 +177,6 @@ def test_series_below_yield_are_exact_to_round_off(multiplier):
         assert tangent == pytest.approx(exact_tangent, rel=1e-14)
 
 
-def test_steel_below_yield_follows_the_backbone(usual, rng):
-    """Any history that stays below yield follows the backbone in both directions."""
-    c = usual
-    limit = c[steel.YIELD_STRAIN] * (1 - 1e-9)
-    for strain in golden.random_walks(rng, 30, 200, 0.5 * limit):
-        strain = np.clip(strain, -limit, limit)
-        out = follow(strain, c)
-        for eps, stress, tangent in zip(strain[1:], out[0, 1:], out[1, 1:], strict=True):
-            exact = monotonic_stress_tangent(eps, c)
-            assert stress == pytest.approx(exact[0], rel=1e-12)
-            assert tangent == pytest.approx(exact[1], rel=1e-12)
-    # control: one committed strain beyond yield changes the path
-    beyond = 2.0 * c[steel.YIELD_STRAIN]
-    out = follow([0.0, beyond, 0.9 * beyond, 0.5 * beyond], c)
-    assert abs(out[0, 3] / monotonic_stress_tangent(0.5 * beyond, c)[0] - 1) > 0.1
-
-
 def test_bars_side_by_side_equal_update(constants, rng):
     """Trials in any order, some of which leave the curve of the bar."""
     jitter = np.concatenate([rng.normal(scale=1e-3, size=4), [0.0], rng.normal(scale=1e-4, size=2)])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fe_likelihoods.kernels import bar_fatigue, concrete04
+from fe_likelihoods.kernels import bar_fatigue
 from fe_likelihoods.kernels.frame import recorder
 from fe_likelihoods.kernels.static import (
     GRAVITY_STEPS,
@@ -71,14 +71,6 @@ def test_reference_pushovers(reference):
     assert not {key: r for key, r in results.items() if not r[1] < limits[r[0]]}
 
 
-def test_a_tensile_strength_one_percent_off_is_detected():
-    arrays = golden.load(golden.BUNDLED, "pushover")
-    for _, _, column, targets, expected in cases(arrays):
-        column.sections.concrete[:, concrete04.FT] *= 1.01
-        _, history = push(column, targets)
-        assert deviation(history, expected, arrays["_meta"]["rows"]).max() > 1e-4
-
-
 def at_gravity(column):
     """The position after `apply_gravity`."""
     return Position(column.vectors[4], column.vectors[5], column.matrices[2])
@@ -112,23 +104,6 @@ def test_imposed_displacement_is_reached_and_the_base_balances_it(column):
     assert largest > 5000.0  # cracked: kip in
     np.testing.assert_allclose(history[7], moment, atol=1e-6 * largest)
     np.testing.assert_allclose(history[6], -golden.WEIGHT, rtol=0.03)
-
-
-def test_every_closed_cycle_dissipates(column):
-    """The first cycle dissipates most, because it cracks the section; the next ones dissipate less and less."""
-    cycle = 3.0 * np.sin(np.linspace(0.0, 2.0 * np.pi, 241))
-    _, history = push(column, np.concatenate([cycle, cycle[1:], cycle[1:]]))
-    work = np.diff(history[0]) * 0.5 * (history[3, 1:] + history[3, :-1])
-    first, second, third = (work[i * 240 : (i + 1) * 240].sum() for i in range(3))
-    assert first > second > third > 0.0
-
-
-def test_repeated_analysis_gives_the_same_result(column):
-    """The analysis makes the column virgin first."""
-    targets = np.linspace(0.0, 4.0, 200)
-    _, first = push(column, targets)
-    _, again = push(column, targets)
-    np.testing.assert_array_equal(again, first)
 
 
 def test_large_steps_are_retried_and_reach_the_same_force():

@@ -67,17 +67,6 @@ def as_sorted(y, area):
     return np.array([y[order], area[order]])
 
 
-def test_reference_fibers(golden, lhpost):
-    """The dimensions of the column give the fibers of the reference results."""
-    model = RCColumn.lhpost(lhpost.loading)
-    y, area, material = golden["fibers/rms40"]
-    for fibers, tag in zip(model.section.fibers(), (CORE, COVER, STEEL), strict=True):
-        expected = as_sorted(y[material == tag], area[material == tag])
-        got = as_sorted(fibers[:, 0] / INCH, fibers[:, 1] / INCH**2)
-        assert got.shape == expected.shape
-        np.testing.assert_allclose(got, expected, rtol=1e-10, atol=1e-9)
-
-
 @pytest.mark.parametrize(
     ("n", "points", "weights"),
     [

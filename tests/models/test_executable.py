@@ -1,7 +1,6 @@
 """Models defined by a program: parameters and responses are exact, and failing programs are reported."""
 
 import os
-import pickle
 import re
 import sys
 from pathlib import Path
@@ -220,13 +219,6 @@ def test_fingerprint_and_label_depend_on_everything_that_is_run(tmp_path):
         prints.add(fingerprint())
     assert len(prints) == 9
     assert len({declared for declared, _ in prints}) == 5  # output, version, columns, function
-
-
-def test_a_pickled_copy_gives_the_same_response():
-    model = model_of()
-    copy = pickle.loads(pickle.dumps(model))
-    assert copy.fingerprint == model.fingerprint
-    np.testing.assert_array_equal(copy.simulate(THETA), line(THETA))
 
 
 def test_program_found_by_a_relative_path_is_started_in_another_folder(tmp_path, monkeypatch):

@@ -170,15 +170,6 @@ def test_a_function_of_the_number_of_samples(function, isolated):
             model.first(wrong)
 
 
-def test_parts_are_cached_apart(tmp_path):
-    for _ in range(2):
-        model = FunctionModel(vibrates, ("a",), CHANNEL, 0.02, 300)
-        whole = FELikelihood(model, Measurements(CHANNEL, 0.02, vibrates([1.2])), cache=tmp_path / "cache.sqlite")
-        part = whole.first(3.0)
-        assert whole([1.1, 0.1]) != part([1.1, 0.1])
-    assert whole.simulator.cache.info().simulations == 2
-
-
 def test_a_function_that_does_not_return_the_first_samples_ends_the_run():
     model = FunctionModel(ignores, ("a",), CHANNEL, 0.02, 300)
     likelihood = FELikelihood(model, Measurements(CHANNEL, 0.02, vibrates([1.2])))

@@ -97,12 +97,6 @@ def test_a_process_is_replaced_after_a_number_of_runs():
     assert pids[0] == pids[1] != pids[2] == pids[3]
 
 
-def test_a_pickled_copy_keeps_its_settings(guarded):
-    copy = pickle.loads(pickle.dumps(guarded))
-    assert (copy.fingerprint, copy.time_limit, copy.isolated) == (guarded.fingerprint, 1.0, True)
-    np.testing.assert_array_equal(copy.simulate(THETA), line(THETA))
-
-
 # failures ----------------------------------------------------------------------------------------------------
 
 REASONS = {
@@ -192,11 +186,6 @@ def test_wrong_arguments_are_rejected(options, advice):
     settings = {"function": line, "parameter_names": NAMES, "channels": CHANNELS, "dt": DT, "n_steps": N_STEPS}
     with pytest.raises(ValueError, match=advice):
         FunctionModel(**settings | options)
-
-
-def test_theta_of_wrong_length_is_rejected():
-    with pytest.raises(ValueError, match="expected one value for each of .*offset"):
-        model_of().simulate([1.0])
 
 
 # fingerprints -------------------------------------------------------------------------------------------------------

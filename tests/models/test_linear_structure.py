@@ -43,15 +43,6 @@ def three(rng) -> list[Record]:
     return [Record(name, DT, rng.normal(size=400)) for name in ("base", "first", "second")]
 
 
-@pytest.mark.parametrize("zeta", [0.01, 0.3, 0.95])
-def test_one_degree_of_freedom_is_the_oscillator(three, zeta):
-    a, omega = np.stack([record.acceleration for record in three]), 9.0
-    shares = np.array([0.2, 0.5, 0.3])
-    response = Matrices([[2.0]], [[4 * zeta * omega]], [[2 * omega**2]], [shares]).respond(three)
-    for ours, theirs in zip(response, respond(shares @ a, DT, omega, zeta), strict=True):
-        np.testing.assert_allclose(ours[0], theirs, rtol=0, atol=1e-12 * np.abs(theirs).max())
-
-
 @pytest.mark.parametrize("strength", [0.2, 5.0], ids=["damped", "overdamped"])
 def test_equals_state_space_solution_if_damping_couples_the_modes(three, strength):
     """With one damper between a floor and the ground, the damping matrix does not follow from modal ratios."""
@@ -70,25 +61,6 @@ def test_equals_state_space_solution_if_damping_couples_the_modes(three, strengt
     response = Matrices(mass, damping, stiffness, influence).respond(three)
     for ours, theirs in zip(response, (state[:, :2], state[:, 2:], state @ matrix[2:].T), strict=True):
         np.testing.assert_allclose(ours, theirs.T, rtol=0, atol=1e-10 * np.abs(theirs).max())
-
-
-def test_two_storeys_under_a_step_follow_their_modes():
-    """m = 1, k_1 = 3 k, k_2 = 2 k: eigenvalues k and 6 k; modes (1, 2) and (2, -1) over root 5."""
-    k, ratios, step = 50.0, np.array([0.05, 0.02]), 1.3
-    time = DT * np.arange(500)
-    model = LinearStructure(ShearFrame({"low": 1, "top": 2}, [1, 1], [3, 2]), Record("step", DT, step + 0 * time))
-    expected = np.zeros((2, 500))
-    for omega, zeta, mode in zip(np.sqrt([k, 6 * k]), ratios, np.array([[1, 2], [2, -1]]) / math.sqrt(5), strict=True):
-        damped = omega * math.sqrt(1 - zeta**2)
-        decay = np.exp(-zeta * omega * time)
-        # absolute acceleration of an oscillator under a step: a (1 - e^(-zeta omega t) (cos - zeta omega / damped sin))
-        unit = 1 - decay * (np.cos(damped * time) - zeta * omega / damped * np.sin(damped * time))
-        expected += np.outer(mode * mode.sum(), step * unit)
-    theta = np.array([k, k, *ratios])
-    np.testing.assert_allclose(model.simulate(theta), expected, rtol=0, atol=1e-11 * np.abs(expected).max())
-    heavy = LinearStructure(ShearFrame([("low", 1), ("top", 2)], [2, 2], [3, 2]), model.supports)
-    same = heavy.simulate(np.array([2 * k, 2 * k, *ratios]))  # only the ratios of stiffness to mass matter
-    np.testing.assert_allclose(same, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
 
 
 def test_floors_move_in_equilibrium(three):

@@ -7,9 +7,8 @@ import sys
 import numpy as np
 import pytest
 
-from fe_likelihoods import FunctionModel, LinearOscillator, OpenSeesModel, Record, SimulationFailed
+from fe_likelihoods import LinearOscillator, OpenSeesModel, Record, SimulationFailed
 from fe_likelihoods.models.opensees import _Codes
-from fe_likelihoods.simulation.label import ModelLabel
 from fe_likelihoods.simulation.local_pool import LocalPool
 from fe_likelihoods.simulation.model import simulate_batch, split_seconds
 from tests.opensees_column import require_opensees
@@ -84,14 +83,6 @@ def test_same_bits_in_two_workers(model, rng):
         batch = simulate_batch(model, thetas, pool)
     assert batch.reasons == [""] * 6
     np.testing.assert_array_equal(batch.response, expected)
-
-
-def test_label_depends_on_the_function_and_its_data(model, record):
-    """The record is a value of the function here, and nothing that the model declares."""
-    others = model_of(record, 5), model_of(record, 6), model_of(record.scale(2.0), 5)
-    assert {other.fingerprint for other in others} == {model.fingerprint}
-    label, *labels = (ModelLabel(each).code for each in (model, *others))
-    assert [other == label for other in labels] == [True, False, False]
 
 
 def test_an_analysis_that_stops_after_a_number_of_samples(record):
@@ -205,14 +196,6 @@ def repeats(ops, sample):
         ops.algorithm("Newton")
 
 
-def tries_in_turn(ops, sample):
-    for iterations in (1, 50):
-        ops.test("NormDispIncr", 1e-8, iterations)
-        if not ops.analyze(1, HARD_DT):
-            break
-    ops.test("NormDispIncr", 1e-8, 1)
-
-
 def in_one_call(ops, theta):
     prepare(ops, int(theta[0]))
     ops.analyze(HARD_N, HARD_DT)
@@ -275,7 +258,7 @@ UNHANDLED = {
     "breaks": (step_by_step(breaks), "returned -3 at call 1 of 1 and the script ended there"),
     "gravity": (pushed_after_gravity, "returned -3 at call 1 of 101 and the script went on with ops.loadConst"),
 }
-HANDLED = {"repeats": step_by_step(repeats), "in turn": step_by_step(tries_in_turn), "collects": collects}
+HANDLED = {"repeats": step_by_step(repeats), "collects": collects}
 
 
 def hard(function):
@@ -319,19 +302,6 @@ def test_an_exception_of_the_script_is_the_reason():
 
     with pytest.raises(SimulationFailed, match="^collapse at 0.00 s after"):
         hard(step_by_step(collapses)).simulate([1])
-
-
-def test_an_isolated_function_may_return_the_response_of_an_analysis_that_stopped():
-    require_opensees()
-
-    def padded(theta):
-        import openseespy.opensees as ops
-
-        ops.wipe()
-        return step_by_step(breaks)(ops, theta)
-
-    model = FunctionModel(padded, ("iterations",), CHANNELS[1:], HARD_DT, HARD_N, isolated=True)
-    assert not model.simulate([1]).any()
 
 
 LOOKS = {

@@ -13,11 +13,9 @@ from fe_likelihoods import (
     FunctionModel,
     LinearOscillator,
     Measurements,
-    OpenSeesModel,
     Record,
     propagate,
 )
-from tests.opensees_column import require_opensees
 from tests.opensees_oscillator import CHANNELS, DAMPING, PERIOD, Oscillator
 
 NAMES = ("stiffness", "damping")
@@ -81,15 +79,6 @@ def test_the_record_is_part_of_the_fingerprint(record):
     assert model.record is record  # with_record changes no model
     copy = pickle.loads(pickle.dumps(model.with_record(record.scale(2.0))))
     np.testing.assert_array_equal(copy.simulate([1.0, 1.0]), 2.0 * model.simulate([1.0, 1.0]))
-
-
-def test_opensees_under_another_record(record):
-    require_opensees()
-    model = OpenSeesModel(in_opensees, NAMES, CHANNELS, record=record, path_dependent=False)
-    other = record.scale(2.0)
-    prediction = propagate(model, np.ones((1, 2)), record=other, progress=False)
-    exact = LinearOscillator(other, PERIOD, DAMPING).simulate([1.0, 1.0])
-    assert (np.abs(prediction.mean - exact).max(axis=1) < 0.01 * np.abs(exact).max(axis=1)).all()
 
 
 def test_a_program_reads_the_record(record, tmp_path):

@@ -49,17 +49,6 @@ def test_histogram_of_calibrated_histories_is_within_the_band_of_chance_and_that
     plt.close("all")
 
 
-def test_correlated_errors_widen_the_band_of_chance_and_the_errors_of_the_coverage(rng):
-    white, slow = histories(rng), histories(rng, correlated=20)
-    assert (slow.effective_samples < 0.2 * white.effective_samples).all()
-    ends = [np.diff(chance(plot_scores(each).axes[0]))[0] for each in (white, slow)]
-    assert ends[1] > 2.0 * ends[0]
-    drawn = plot_scores(white).axes[1].containers[0][2][0].get_segments()[0]
-    expected = np.sqrt(0.9 * 0.1 / white.effective_samples[0])
-    assert 0.5 * np.ptp(drawn[:, 0]) == pytest.approx(expected, rel=1e-3)
-    plt.close("all")
-
-
 def test_bars_show_width_and_penalty_in_multiples_of_the_rms(rng):
     one, other = histories(rng), histories(rng, factor=0.5)
     axes = plot_scores({"one": one, "other": other}).axes[2]
@@ -96,13 +85,6 @@ def test_intervals_of_numbers_are_drawn_relative_to_the_measured_values_in_the_o
     pit = np.concatenate([each.pit for each in events.values()])
     assert shares == [np.mean(np.abs(pit - 0.5) <= 0.25), np.mean(np.abs(pit - 0.5) <= 0.45)]
     plt.close("all")
-
-
-def test_half_of_calibrated_numbers_are_between_the_quartiles(rng):
-    y = rng.normal(size=4000)
-    scores = score_values(["a"] * 4000, ["SI"] * 4000, rng.normal(size=(99, 4000)), y, 0.9)
-    inside = np.mean((scores.lower_quartile <= y) & (y <= scores.upper_quartile))
-    assert abs(inside - 0.5) < 4.0 * 0.5 / np.sqrt(4000)
 
 
 def test_scores_that_do_not_belong_together_are_refused(rng):

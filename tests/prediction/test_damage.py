@@ -22,7 +22,6 @@ from fe_likelihoods import (
     damage,
     damage_measures,
     damage_outputs,
-    limit_states,
     park_ang_constants,
     plot_damage,
     problems,
@@ -141,15 +140,6 @@ def test_strains_of_a_column_are_the_largest_so_far_at_their_places(column):
     assert (np.diff(found["bar tension"], axis=0) >= 0.0).all() and found["bar tension"].argmax(axis=1).max() == 0
 
 
-def test_the_energy_accumulates(column):
-    measures = damage_measures(column, measures=("dissipated energy",))
-    found = measured(measures, column, TRUTH)
-    assert (np.diff(found["dissipated energy"]) > 0.0).all() and list(found) == ["dissipated energy"]
-    history = column.history(TRUTH)
-    shear, u = history["base_shear"], history["displacement"]
-    np.testing.assert_allclose(found["dissipated energy"][-1], np.trapezoid(shear, u))
-
-
 def test_presence_location_and_extent(column, prediction):
     found = damage(prediction)
     tension = prediction.quantity.split(prediction.values)["bar tension"]
@@ -246,18 +236,6 @@ def test_what_cannot_be_measured_or_judged_is_refused(column, prediction):
     short = {"record": Record("short", column.dt, np.zeros(20)), "from_state": "virgin", "progress": False}
     with pytest.raises(ValueError, match="is for responses of .* samples, got 20"):
         propagate(column, TRUTH[None], quantity=prediction.quantity, **short)
-
-
-def test_default_limits_have_sources(prediction):
-    states = limit_states(prediction.quantity)
-    assert {state.measure for state in states} == {
-        "bar tension",
-        "cover compression",
-        "residual drift",
-        "Park-Ang index",
-    }
-    assert all(state.source for state in states)
-    assert limit_states(damage_measures(Loop(), displacement="u")) == ()
 
 
 def test_figure_has_the_probabilities_of_each_section(prediction):
@@ -362,14 +340,6 @@ def test_ratios_add_the_error_of_the_model_to_limit_states_and_extent():
     both = damage(prediction, states, ratios=ratios)
     assert both.presence["stays"].probability[0] == pytest.approx(t.sf(np.log(2.0)), rel=1e-2)  # stays at 0.01
     assert "and the error of the model, not that of the limits" in both.table()
-
-
-def test_ratios_of_strains_are_common_to_all_places(prediction):
-    stated = EventRatios([1.0], prior_sd=0.3, prior_events=10.0)
-    found = damage(prediction, ratios={"bar tension": stated}, noise=False)
-    place, anywhere = found.location["bar yield"].probability, found.presence["bar yield"].probability
-    np.testing.assert_allclose(anywhere, place.max(axis=(1, 2)), atol=0.02)
-    assert np.all((0.0 < anywhere) & (anywhere < 1.0))
 
 
 def test_an_error_of_the_model_that_is_left_out_is_told(prediction):

@@ -8,7 +8,6 @@ import pytest
 from fe_likelihoods import (
     Events,
     FELikelihood,
-    FunctionModel,
     IsolatedBridge,
     LinearOscillator,
     LinearStructure,
@@ -76,14 +75,6 @@ def test_default_is_named_in_a_warning_at_the_line_of_the_user(record):
     with pytest.warns(UserWarning, match='Slip may depend .* virgin structure.*from_state="end"') as caught:
         prediction = propagate(model, samples, record=record.scale(2.0), progress=False)
     assert prediction.from_state == "virgin" and caught[0].filename == __file__
-
-
-def test_no_warning_before_an_error(record):
-    model = FunctionModel(lambda theta: np.ones((1, 50)), ["k"], Slip(record).channels, 0.02, 50)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        with pytest.raises(ValueError, match="has one excitation, which its code contains"):
-            propagate(model, np.ones((2, 1)), record=record, progress=False)
 
 
 def test_no_warning_without_memory_or_without_a_record(record):

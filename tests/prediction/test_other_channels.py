@@ -146,26 +146,6 @@ def test_other_channels_that_cannot_be_predicted_are_refused(other, noise, words
         propagate(likelihood, drawn(likelihood, rng), model=other, noise=noise, progress=False)
 
 
-def test_refusals_come_before_any_simulation(rng):
-    runs = []
-    likelihood = FELikelihood(wave(MEASURED), measured(MEASURED))
-    samples = drawn(likelihood, rng)
-    with pytest.raises(ValueError, match="no measured channel"):
-        propagate(likelihood, samples, model=wave((TOP, FORCE), runs=runs), noise=True, progress=False)
-    with pytest.raises(ValueError, match="expected one value for each of the 5 parameters"):
-        propagate(likelihood, samples[:, :4], model=wave(ALL, runs=runs), noise=True, progress=False)
-    with pytest.raises(ValueError, match="to predict with a model, give it alone"):
-        propagate(wave(MEASURED), samples[:, :2], model=wave(ALL, runs=runs), progress=False)
-
-    class Own(GaussianNoise):
-        with_channels = property()
-
-    own = FELikelihood(wave(MEASURED), measured(MEASURED), Own(MEASURED))
-    with pytest.raises(ValueError, match="Own does not say what the noise of other channels is"):
-        propagate(own, samples, model=wave(ALL, runs=runs), noise=True, progress=False)
-    assert not runs
-
-
 def test_levels_per_event_are_means_of_the_channels_measured_in_the_event(rng):
     records = [Record(name, 0.02, rng.normal(size=n)) for name, n in (("EQ1", 61), ("EQ2", 51))]
     events = Events(records, rest=0.98)

@@ -5,8 +5,6 @@ import warnings
 import numpy as np
 import pytest
 
-from fe_likelihoods.likelihood.likelihood import FELikelihood
-from fe_likelihoods.likelihood.posterior import Posterior
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.prediction.propagation import propagate
@@ -21,7 +19,6 @@ from fe_likelihoods.prediction.quantities import (
     rms,
 )
 from fe_likelihoods.prediction.reliability import exceedance
-from fe_likelihoods.priors.distributions import HalfNormal, TruncatedNormal
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record
 from fe_likelihoods.units import G0
@@ -83,19 +80,6 @@ def test_an_energy_has_its_own_name_dimension_and_unit():
     assert exceedance(work, 7.5, unit="kJ").probability == 0.25
     with pytest.raises(ValueError, match="a unit of energy, got 'kip'"):
         exceedance(work, 2.0, unit="kip")
-
-
-def test_white_noise_adds_its_mean_square_to_the_arias_intensity_and_nothing_to_the_work():
-    sigma = (2.0, 5e4, 1e-9)
-    prior = {"gain": TruncatedNormal(1.0, 0.1)} | {f"sigma_{c.name}": HalfNormal(1.0) for c in CHANNELS}
-    posterior = Posterior(FELikelihood(MODEL, DATA), prior)
-    samples = np.tile([1.0, *sigma], (400, 1))
-    quantity = [arias_intensity("deck"), WORK]
-    noisy = propagate(posterior, samples, quantity=quantity, noise=True, seed=1, progress=False)
-    exact = propagate(MODEL, [[1.0]], quantity=quantity, quantiles=(), progress=False).mean
-    exact = exact + [np.pi / (2 * G0) * sigma[0] ** 2 * TIME[-1], 0.0]
-    assert (np.abs(noisy.mean - exact) < 4.0 * noisy.standard_error).all()
-    assert noisy.mean[0] > exact[0] - 0.5 * np.pi / (2 * G0) * sigma[0] ** 2 * TIME[-1]  # control: not that of no noise
 
 
 @pytest.mark.parametrize("make", (peak, rms, arias_intensity, lambda name, part: dissipated_energy(name, TIME, part)))

@@ -37,11 +37,6 @@ def test_scores_of_a_normal_distribution_are_those_of_its_definitions(y):
     assert pit_normal(mean, sd, y) == pytest.approx(stats.norm.cdf(y, mean, sd), rel=1e-12)
 
 
-def test_a_prediction_without_spread_scores_its_absolute_error():
-    assert crps_normal(1.0, 0.0, 3.5) == 2.5
-    assert crps_samples([1.0, 1.0, 1.0], 3.5) == 2.5
-
-
 def test_crps_of_samples_is_the_sum_over_pairs_and_unbiased(rng):
     values, y = rng.normal(size=(7, 3)), np.array([0.0, 1.0, -2.0])
     pairs = np.abs(values[:, None] - values[None]).sum(axis=(0, 1)) / (2.0 * 7 * 6)
@@ -243,16 +238,6 @@ def test_few_samples_are_refused(oscillator, rng):
         with pytest.raises(ValueError, match="expected 20 samples or more for intervals of 0.9; got 19"):
             predicted(19, **options).score(measured)
         predicted(20, **options).score(measured)
-
-
-def test_quantities_are_scored_for_the_effective_sample_size_of_the_prediction(oscillator, rng):
-    _, measured = noisy(oscillator, rng, SIGMA)
-    options = {"quantity": peak("displacement"), "noise": True, "seed": 1, "progress": False}
-    posterior = posterior_of(oscillator, measured)
-    prediction = propagate(posterior, samples(100), effective_sample_size=10.0, **options)
-    scores, values = prediction.score(measured), prediction.values[:, None]
-    assert scores.crps[0] == pytest.approx(crps_samples(values, scores.measured, 10.0)[0], rel=1e-12)
-    assert scores.crps[0] < crps_samples(values, scores.measured)[0]
 
 
 def test_channels_with_steps_of_their_own_are_scored_at_their_samples(oscillator, rng):

@@ -288,14 +288,6 @@ def test_draws_depend_on_the_seed_only(prior):
         np.random.set_state(state)  # noqa: NPY002
 
 
-def test_transform_maps_the_unit_cube(prior, rng):
-    u = rng.random((20, prior.dim))
-    x = prior.transform(u)
-    for j, (_, theirs) in enumerate(PAIRS.values()):
-        np.testing.assert_allclose(x[:, j], theirs.ppf(u[:, j]), rtol=1e-9)
-    np.testing.assert_array_equal(prior.transform(u[0]), x[0])
-
-
 def test_reorder_keeps_the_density(prior, seed):
     names = prior.names[::-1]
     x = prior.rvs(4, seed)
