@@ -85,7 +85,7 @@ _CONSTANTS = np.dtype(
     [(name, float) for name in ("dt", "k_uu", "k_up", "k_pp", "retardation", "deck")]
     + [(name, float) for name in ("mass", "rotary", "height", "centre", "rubber_length", "rubber_limit")]
     + [(name, float) for name in ("slip", "gamma", "beta")]
-    + [(name, float, 2) for name in ("p_uu", "p_up", "p_pp", "weight", "slow", "rise", "rate")]
+    + [(name, float, 2) for name in ("weight", "slow", "rise", "rate")]
     + [(name, float, 2) for name in ("spring", "relaxation")]
     + [("rubber", float, 6), ("loop", float, 3)]
 )
@@ -135,8 +135,8 @@ def _state(t, x, c, motion, lift, rates, out):
         force, rate = _isolator(c, i, slide, speed, x[10 + i], x[12 + i], load)
         shear = c.k_uu * u + c.k_up * turn
         moment = c.k_up * u + c.k_pp * turn
-        pushed = shear + c.retardation * (c.k_uu * du + c.k_up * dturn) + c.p_uu[i] * u + c.p_up[i] * turn
-        turned = moment + c.retardation * (c.k_up * du + c.k_pp * dturn) + c.p_up[i] * u + c.p_pp[i] * turn
+        pushed = shear + c.retardation * (c.k_uu * du + c.k_up * dturn)
+        turned = moment + c.retardation * (c.k_up * du + c.k_pp * dturn)
         of_centre = (force - pushed) / c.mass  # absolute acceleration of the centre of mass
         angular = ((c.height - c.centre) * force - turned + c.centre * pushed) / c.rotary
         rates[1 + 2 * i], rates[2 + 2 * i] = du, dturn
@@ -167,18 +167,13 @@ def _outputs(times, states, constants, motion, lift):
     return response
 
 
-def _constants(bridge, dt, p_delta) -> np.ndarray:
-    k, weight, length = bridge.stiffness, np.array(bridge.weight), bridge.length
-    on_pier = (weight + bridge.mass * GRAVITY) / (30.0 * length) * bool(p_delta)
-    overturning = (weight * bridge.height + bridge.mass * GRAVITY * bridge.centre) * bool(p_delta)
+def _constants(bridge, dt) -> np.ndarray:
+    k = bridge.stiffness
     derived = dict(
         dt=dt,
         k_uu=k[0, 0],
         k_up=k[0, 1],
         k_pp=k[1, 1],
-        p_uu=-36.0 * on_pier,
-        p_up=3.0 * length * on_pier,
-        p_pp=-4.0 * length**2 * on_pier - overturning,
         retardation=bridge.stiffness_damping,
         deck=bridge.deck_weight / GRAVITY,
         spring=bridge.dampers * np.array(bridge.spring),  # all dampers of a pier
@@ -198,18 +193,17 @@ def solve(
     method: str = "LSODA",
     tolerance: float = 1e-9,
     every: int = 1,
-    p_delta: bool = False,
     vertical: np.ndarray | None = None,
 ) -> Solution:
     """Simulate the bridge at its parameters (``Definition().at(theta)``) from rest.
 
     `acceleration` (n,) and `vertical` (n,), which changes the load on the bearings, belong to the table [m/s²], with
     step `dt` [s]; there is one output per `every` samples. `tolerance` is relative; the absolute one is a tenth of it,
-    times the typical size of each state. With `p_delta`, weights act on the deformed piers.
+    times the typical size of each state.
     """
     motion = np.ascontiguousarray(acceleration, dtype=float)
     lift = np.zeros_like(motion) if vertical is None else np.ascontiguousarray(vertical, dtype=float)
-    arguments = (_constants(bridge, dt, p_delta), motion, lift)
+    arguments = (_constants(bridge, dt), motion, lift)
     times = np.arange(len(acceleration)) * dt
     run = solve_ivp(
         _right_hand_side,
