@@ -20,7 +20,6 @@ from ..priors.distributions import TruncatedNormal
 from ..priors.mixture_prior import MixtureDistribution, fit_mixture
 from ..priors.points import as_points
 from ..priors.priors import Prior
-from ..signals.channels import Measurements
 from ..text_tables import number, text_table
 from .scales import Scales
 
@@ -61,8 +60,6 @@ class StoredPosterior:
     effective_sample_size : float, optional
         Effective number of independent samples, for the statistical errors. Default: the number of distinct samples,
         or for weighted samples the effective sample size of the weights.
-    measurements : Measurements, optional
-        What was measured in the test. `predict_new_event` warns of predictions outside the range of all tests.
     findings : sequence of Finding
         What speaks against the samples, which `stiffness_loss` passes on.
 
@@ -85,7 +82,6 @@ class StoredPosterior:
     log_evidence: float | None = None
     log_evidence_error: float = 0.0
     effective_sample_size: float | None = None
-    measurements: Measurements | None = None
     findings: Sequence[Finding] = ()
 
     @classmethod
@@ -158,8 +154,6 @@ class StoredPosterior:
                 f"StoredPosterior: prior must be the Prior with which the samples were drawn (posterior.prior); got "
                 f"{self.prior!r}"
             )
-        if self.measurements is not None and not isinstance(self.measurements, Measurements):
-            raise ValueError(f"StoredPosterior: measurements must be Measurements, or None; got {self.measurements!r}")
         points = as_points(self.samples, self.prior.names)
         if points.ndim != 2 or not len(points):
             raise ValueError(f"StoredPosterior: expected samples of shape (n, {self.prior.dim}); got {points.shape}")

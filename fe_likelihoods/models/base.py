@@ -95,7 +95,7 @@ class BuiltInModel(StructuralModel):
     """
 
     parameters: tuple[str, ...]
-    _nominal_units: ClassVar[dict[str, str]] = {}
+    nominal_units: ClassVar[dict[str, str]] = {}  # in which the nominal values are shown, by parameter
     _display_fields: ClassVar[tuple[str, ...]] = ("outputs", "unit", "units")
 
     @property
@@ -107,11 +107,6 @@ class BuiltInModel(StructuralModel):
     def nominal(self) -> dict[str, float]:
         """Nominal values of all parameters [SI]."""
         raise NotImplementedError
-
-    @property
-    def nominal_units(self) -> dict[str, str]:
-        """Units in which the nominal values are shown, by parameter."""
-        return self._nominal_units
 
     @cached_property
     def fingerprint(self) -> str:

@@ -137,7 +137,7 @@ class IsolatedBridge(BuiltInModel):
     rubber: Rubber = Rubber()
     outputs: tuple[str, ...] | None = None
     parameters: tuple[str, ...] = PARAMETERS
-    _nominal_units: ClassVar[dict[str, str]] = _NOMINAL_UNITS
+    nominal_units: ClassVar[dict[str, str]] = _NOMINAL_UNITS
     friction: str = "bouc-wen"
     step: float | None = None
     every: int = 1

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..signals.channels import Channel
-from .validation import check_fields, check_finite, check_integer, invalid
+from .validation import check_fields, check_integer, check_number, invalid
 
 __all__ = [
     "ALL_CHANNELS",
@@ -185,7 +185,7 @@ class Rubber:
             if len(values) != count:
                 raise invalid(f"{count} coefficients of the {name} of rubber", values, "set unused ones to zero")
             for value in values:
-                check_finite(f"coefficient of the {name} of rubber", value)
+                check_number("finite", f"coefficient of the {name} of rubber", value)
             object.__setattr__(self, name, values)
         check_fields(self, positive=("scale", "limit"), of="of rubber")
         s = np.linspace(0.0, self.limit, 200)

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg import eigh
 
 from ..simulation.model import SimulationFailed
-from .validation import check_integer, check_positive
+from .validation import check_integer, check_number
 
 __all__ = ["BridgeDeck", "LinearSystem", "ModalModel", "Parts", "ShearFrame"]
 
@@ -218,7 +218,7 @@ class ShearFrame:
     def __post_init__(self) -> None:
         floors = tuple(self.floors.items() if isinstance(self.floors, Mapping) else self.floors)
         for value in (*self.masses, *self.stiffnesses):
-            check_positive("mass or stiffness of a ShearFrame", value)
+            check_number("positive", "mass or stiffness of a ShearFrame", value)
         n = len(self.masses)
         if n < 1 or len(self.stiffnesses) != n:
             raise ValueError(f"ShearFrame: expected a stiffness for each of {n} masses; got {len(self.stiffnesses)}")

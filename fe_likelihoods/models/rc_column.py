@@ -230,7 +230,7 @@ class RCColumn(BuiltInModel):
     max_increment: float | None = None
     outputs: tuple[str, ...] | None = None
     units: tuple[tuple[str, str], ...] = ()
-    _nominal_units: ClassVar[dict[str, str]] = _NOMINAL_UNITS
+    nominal_units: ClassVar[dict[str, str]] = _NOMINAL_UNITS
     tolerance: float = 1e-8
 
     @classmethod

@@ -40,7 +40,6 @@ class MomentCurvature(NamedTuple):
 
     curvature: np.ndarray  # (n,) positive where the column bends towards positive displacements [1/m]
     moment: np.ndarray  # (n,) with the sign of the curvature in the elastic range [N m]
-    axial_strain: np.ndarray  # (n,) at the axis, positive in tension
     axial_force: float  # positive in tension [N]
 
 
@@ -145,14 +144,14 @@ def moment_curvature(
     if axial_force is None:
         axial_force = -(column.axial_load if column.axial_load is not None else values["mass"] * G0)
     tolerance = 1e-9 * values["fc"] * float(sections.area.sum())
-    strain, moment = np.empty_like(curvature), np.empty_like(curvature)
+    moment = np.empty_like(curvature)
     reset(sections)
     axial = _advance(sections, 0.0, 0.0, 0.0, axial_force, tolerance, 0)
     for k, target in enumerate(curvature):
         start = curvature[k - 1] if k else 0.0
-        axial = strain[k] = _advance(sections, axial, start, target, axial_force, tolerance, _MAX_HALVINGS)
+        axial = _advance(sections, axial, start, target, axial_force, tolerance, _MAX_HALVINGS)
         moment[k] = -forces(axial, -target, 0, sections)[1]
-    return MomentCurvature(curvature, moment, strain, float(axial_force))
+    return MomentCurvature(curvature, moment, float(axial_force))
 
 
 def _advance(

@@ -16,7 +16,7 @@ from ..signals.channels import Channel
 from ..simulation.faults import ChangedModel, TransientReason, UnusableModel, reason_of
 from ..simulation.model import SimulationFailed, simulate_batch, split_seconds
 from .user_model import ExternalModel
-from .validation import check_integer, check_non_negative, positive_float
+from .validation import check_integer, check_number, positive_float
 
 __all__ = ["UMBridgeModel", "UMBridgeServer", "serve"]
 
@@ -88,7 +88,7 @@ class UMBridgeModel(ExternalModel):
         super().__init__(parameter_names, channels, dt, 1 if n_steps is None else n_steps, depends_on)
         self.time_limit = None if time_limit is None else positive_float(time_limit, "time_limit", "seconds")
         check_integer("number of retries", retries, 0, 1000)
-        check_non_negative("retry_wait", retry_wait)
+        check_number("zero or positive", "retry_wait", retry_wait)
         self.url, self.name, self.output, self.retries, self.retry_wait = url, name, output, retries, retry_wait
         self.config = dict(sorted((config or {}).items()))
         self.input_sizes, self.output_sizes = sizes = self._sizes()

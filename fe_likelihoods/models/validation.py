@@ -18,12 +18,10 @@ from ..simulation.model import SimulationFailed
 
 __all__ = [
     "check_fields",
-    "check_finite",
     "check_integer",
     "check_names",
     "check_nominal",
-    "check_non_negative",
-    "check_positive",
+    "check_number",
     "check_theta",
     "check_thetas",
     "check_values",
@@ -43,22 +41,11 @@ def _is_finite(value: object) -> bool:
     return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def check_finite(name: str, value: object) -> None:
-    """Raise ValueError if `value` is not a finite number."""
-    if not _is_finite(value):
-        raise invalid(f"a finite {name}", value, _ADVICE)
-
-
-def check_positive(name: str, value: object) -> None:
-    """Raise ValueError if `value` is not a finite number above zero."""
-    if not (_is_finite(value) and value > 0.0):
-        raise invalid(f"a positive {name}", value, _ADVICE)
-
-
-def check_non_negative(name: str, value: object) -> None:
-    """Raise ValueError if `value` is not a finite number, zero or positive."""
-    if not (_is_finite(value) and value >= 0.0):
-        raise invalid(f"a zero or positive {name}", value, _ADVICE)
+def check_number(kind: str, name: str, value: object) -> None:
+    """Raise ValueError if `value` is not a finite number that is "positive", "zero or positive" or any ("finite")."""
+    least = {"positive": math.ulp(0.0), "zero or positive": 0.0, "finite": -math.inf}[kind]
+    if not (_is_finite(value) and value >= least):
+        raise invalid(f"a {kind} {name}", value, _ADVICE)
 
 
 def check_integer(name: str, value: object, low: int, high: int) -> None:
@@ -76,16 +63,16 @@ def check_fields(
     optional: Sequence[str] = (),
     of: str = "",
 ) -> None:
-    """Check numeric fields of a dataclass instance with the functions `positive`, `non_negative` and `finite`.
+    """Check numeric fields of a dataclass instance by `check_number`.
 
     Fields named in `optional` may be None; `of`, such as ``"of a pier"``, is appended to the names in messages of
     ValueError.
     """
-    for check, names in ((check_positive, positive), (check_non_negative, non_negative), (check_finite, finite)):
+    for kind, names in (("positive", positive), ("zero or positive", non_negative), ("finite", finite)):
         for name in names:
             value = getattr(instance, name)
             if value is not None or name not in optional:
-                check(f"{name} {of}".rstrip(), value)
+                check_number(kind, f"{name} {of}".rstrip(), value)
 
 
 def positive_float(value: Any, name: str, unit: str) -> float:

@@ -16,7 +16,7 @@ from ..simulation.model import is_collapse, split_seconds
 from .model_error import ModelError
 from .quantities import Evaluator
 
-__all__ = ["Accumulator", "RunningMoments", "quantiles_with_errors"]
+__all__ = ["Accumulator", "RunningMoments"]
 
 _IN_DOUBLE = 2**29  # bytes of histories; larger ones are kept in single precision, which has seven digits
 _MOST = 2**32  # bytes in single precision: 500 samples of 20 channels with 100 000 steps
@@ -180,40 +180,19 @@ class Accumulator:
         """Values (m, ...) of samples that did not fail."""
         return self._kept[self.result_of_sample[samples]]
 
-    def quantiles(
-        self, samples: np.ndarray, probabilities: Sequence[float], effective: float
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Quantiles over samples that did not fail, and their errors, each (n_probabilities, ...)."""
+    def quantiles(self, samples: np.ndarray, probabilities: Sequence[float]) -> np.ndarray:
+        """Quantiles (n_probabilities, ...) over samples that did not fail."""
         kept = self._kept.reshape(len(self._kept), -1)
         results, size = self.result_of_sample[samples], kept.shape[1]
-        out = np.empty((2, len(probabilities), size))
-        columns = max(1, _CHUNK // len(results))
+        n, out = len(results), np.empty((len(probabilities), size))
+        columns = max(1, _CHUNK // n)
         for start in range(0, size, columns):
             part = slice(start, start + columns)
-            out[:, :, part] = quantiles_with_errors(kept[results, part].astype(float), probabilities, effective)
-        return tuple(out.reshape(2, len(probabilities), *self.shape))
-
-
-def quantiles_with_errors(
-    values: np.ndarray, probabilities: Sequence[float], effective: float
-) -> tuple[np.ndarray, np.ndarray]:
-    r"""Quantiles (n_probabilities, k) of values (n, k) and their standard errors, inf for a single sample.
-
-    The number of samples below the p-quantile is binomial, so that its rank has the standard error
-    :math:`s = n \sqrt{p (1 - p) / n_\mathrm{eff}}`. The error of the quantile is a quarter of the distance between the
-    sorted samples at the ranks 2 s below and 2 s above it, the 95 % interval.
-    """
-    n, ascending = len(values), np.sort(values, axis=0)
-
-    def at(position: float) -> np.ndarray:
-        low = min(int(position), n - 1)
-        value, share = ascending[low], position - low
-        return value if share == 0.0 else value + share * (ascending[low + 1] - value)
-
-    quantiles, errors = np.empty((2, len(probabilities), values.shape[1]))
-    for k, p in enumerate(probabilities):
-        position, spread = (n - 1) * p, n * np.sqrt(p * (1.0 - p) / effective)
-        low, high = max(position - 2.0 * spread, 0.0), min(position + 2.0 * spread, n - 1.0)
-        quantiles[k] = at(position)
-        errors[k] = (at(high) - at(low)) * (spread / (high - low)) if high > low else np.inf
-    return quantiles, errors
+            ascending = np.sort(kept[results, part].astype(float), axis=0)
+            for k, p in enumerate(probabilities):
+                low = int((n - 1) * p)
+                share = (n - 1) * p - low
+                out[k, part] = ascending[low]
+                if share:
+                    out[k, part] += share * (ascending[low + 1] - ascending[low])
+        return out.reshape(len(probabilities), *self.shape)

@@ -72,15 +72,13 @@ def average_predictions(predictions: Mapping[str, Prediction], probabilities: Ma
     mean = np.tensordot(weights, [part.mean for part in parts], axes=1)
     within = np.tensordot(weights, [part.variance for part in parts], axes=1)
     between = np.tensordot(weights, [np.square(part.mean - mean) for part in parts], axes=1)
-    none = np.zeros((0, *mean.shape))
     return replace(
         parts[0],
         mean=mean,
         variance=within + between,
         standard_error=np.sqrt(np.tensordot(weights**2, [np.square(part.standard_error) for part in parts], axes=1)),
         probabilities=(),
-        quantiles=none,
-        quantile_error=none,
+        quantiles=np.zeros((0, *mean.shape)),
         values=None,
         n_samples=sum(part.n_samples for part in parts),
         effective_sample_size=sum(part.effective_sample_size for part in parts),

@@ -331,7 +331,6 @@ def _corrected(
     """The predicted values times the ratio of a new event: exact quantiles, and n draws that have them."""
     order = rng.permuted(np.tile(np.arange(n).reshape(-1, *[1] * predicted.ndim), (1, *predicted.shape)), axis=0)
     quantiles = [predicted * ratios.quantile(each, predicted) for each in probabilities]
-    shape = (len(probabilities), *predicted.shape)
     unknown = np.full(predicted.shape, np.nan)  # exp(t) of Student's t has no mean
     return replace(
         prediction,
@@ -339,8 +338,7 @@ def _corrected(
         variance=unknown,
         standard_error=unknown,
         probabilities=tuple(probabilities),
-        quantiles=np.reshape(quantiles, shape),
-        quantile_error=np.zeros(shape),
+        quantiles=np.reshape(quantiles, (len(probabilities), *predicted.shape)),
         values=predicted * ratios.quantile((order + 0.5) / n, predicted),
         n_samples=n,
         effective_sample_size=float(n),

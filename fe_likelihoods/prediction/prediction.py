@@ -44,8 +44,6 @@ class Prediction:
         Probabilities of the quantiles.
     quantiles : ndarray, shape (n_probabilities, ...)
         Quantiles.
-    quantile_error : ndarray, shape (n_probabilities, ...)
-        Monte Carlo errors of the quantiles.
     values : ndarray, shape (n_samples, ...), or None
         The quantity of every sample that did not fail, in their order. None for histories.
     n_samples : int
@@ -86,7 +84,6 @@ class Prediction:
     standard_error: np.ndarray
     probabilities: tuple[float, ...]
     quantiles: np.ndarray
-    quantile_error: np.ndarray
     values: np.ndarray | None
     n_samples: int
     effective_sample_size: float
@@ -259,12 +256,6 @@ class Prediction:
         """The quantile for a probability that is known up to round-off."""
         return self.quantile(next((p for p in self.probabilities if abs(p - probability) < 1e-9), probability))
 
-    def __repr__(self) -> str:
-        names = f"channels {', '.join(channel.name for channel in self.channels)}, " if self.channels else ""
-        noise = "with noise" if self.noise else "without noise"
-        state = f", from_state={self.from_state!r}" if self.from_state != "virgin" else ""
-        return f"<Prediction of shape {self.mean.shape}: {names}{self.n_samples} samples, {noise}{state}>"
-
     def __str__(self) -> str:
         noise = "with measurement noise" if self.noise else "without measurement noise"
         if self.ratios is not None:
@@ -298,6 +289,8 @@ class Prediction:
             for (name, unit, factor), column in zip(known, table.T, strict=True):
                 rows.append((name, unit, *map(number, column / factor)))
         return "\n".join([*lines, text_table(rows)])
+
+    __repr__ = __str__
 
     def _compared(self, measurements: Measurements) -> np.ndarray | Comparison:
         """Return what the histories are compared with, in the order of `channels`."""

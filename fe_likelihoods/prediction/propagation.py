@@ -296,18 +296,15 @@ def _prediction(accumulator: Accumulator, probabilities: tuple[float, ...], effe
         added = accumulator.noise_variance.mean
         per_step = noise.of_response is not None
         variance = variance + (added if per_step else noise.over_time(added, variance.shape[1]))
-    quantiles = quantile_error = np.zeros((0, *accumulator.shape))
-    if probabilities and alone:
-        quantiles = quantile_error = np.array([unknown] * len(probabilities))
-    elif probabilities:
-        quantiles, quantile_error = accumulator.quantiles(used, probabilities, effective)
+    quantiles = np.zeros((0, *accumulator.shape))
+    if probabilities:
+        quantiles = np.array([unknown] * len(probabilities)) if alone else accumulator.quantiles(used, probabilities)
     return Prediction(
         mean=unknown if alone else accumulator.moments.mean,
         variance=variance,
         standard_error=error,
         probabilities=probabilities,
         quantiles=quantiles,
-        quantile_error=quantile_error,
         values=None if histories else accumulator.values_of(used),
         n_samples=len(used),
         effective_sample_size=float(effective),

@@ -44,8 +44,7 @@ def test_moment_curvature_is_that_of_the_simulated_base(column):
     curve = moment_curvature(column, [1.0, 1.0, 1.0], -history["base curvature"])
     assert curve.axial_force == pytest.approx(history["base axial force"][0], rel=1e-9)
     np.testing.assert_allclose(curve.moment, -history["base moment"], atol=1e-6 * np.ptp(history["base moment"]))
-    np.testing.assert_allclose(curve.axial_strain, history["base axial strain"], atol=1e-7)
-    assert np.ptp(curve.moment) > 8e6 and curve.axial_strain.max() > 2e-3  # it has yielded
+    assert np.ptp(curve.moment) > 8e6  # it has yielded
     halved = moment_curvature(column, [1.0, 1.0, 1.0], -history["base curvature"], axial_force=-1e6)
     assert halved.moment.max() < 0.95 * curve.moment.max()
 
