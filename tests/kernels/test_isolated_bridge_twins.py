@@ -83,14 +83,6 @@ def test_uplift_between_samples_against_solve_ivp():
     assert not too_large(by_kind(response, reference), **{kind: 2.0 * bound for kind, bound in SMOOTH.items()})
 
 
-def test_default_step_of_coulombs_law():
-    """Compared with a hundredth of the step, at every sample: no sample is on the wrong side of a jump."""
-    fine = ours(PARAMETERS["nominal"], friction="coulomb", step=2.5e-6)
-    bounds = dict(Ub=2e-5, Fb=1e-4, drift=5e-5, shear=5e-5, acc_p=3e-4, Ud=2e-5, acc_d=1e-4)
-    assert not too_large(by_kind(ours(PARAMETERS["nominal"], friction="coulomb"), fine), **bounds)
-    assert too_large(by_kind(ours(PARAMETERS["nominal"], friction="coulomb", step=2.5e-3), fine), **bounds)
-
-
 @pytest.mark.parametrize("place", range(10))
 def test_a_wrong_parameter_is_detected(smooth, place):
     """Control: an error of one per cent in any of the ten parameters exceeds the bounds."""

@@ -172,15 +172,6 @@ def test_normal_scores_of_a_distribution_with_quantiles_only():
 
 
 @both
-def test_draws_follow_the_distribution(ours, theirs, seed):
-    draws = ours.rvs(4000, seed)
-    assert draws.shape == (4000,)
-    uniform = theirs.cdf(draws)
-    assert stats.kstest(uniform, "uniform").pvalue > 1e-3
-    assert stats.kstest(uniform**1.2, "uniform").pvalue < 1e-3  # the test can fail
-
-
-@both
 def test_moments_are_those_after_truncation(ours, theirs):
     np.testing.assert_allclose(ours.moments, (theirs.mean(), theirs.std()), rtol=1e-8)
 
