@@ -6,17 +6,7 @@ For a strain limit, the location is the same probability at each section and sid
 quantiles of the measures.
 
 The samples contain the uncertainty of the parameters only. The model error, which is often larger, enters as ratios of
-measured to fitted values (``ratios=``).
-
-References
-----------
-M. J. Kowalsky (2000), Deformation limit states for circular reinforced concrete bridge columns, Journal of Structural
-Engineering 126(8), 869-878, doi:10.1061/(ASCE)0733-9445(2000)126:8(869).
-California Department of Transportation (2013), Seismic Design Criteria, version 1.7, section 3.2.3.
-K. Kawashima, G. A. MacRae, J. Hoshikuma, K. Nagaya (1998), Residual displacement response spectrum, Journal of
-Structural Engineering 124(5), 523-530, doi:10.1061/(ASCE)0733-9445(1998)124:5(523).
-Y. J. Park, A. H.-S. Ang, Y. K. Wen (1985), Seismic damage analysis of reinforced concrete buildings, Journal of
-Structural Engineering 111(4), 740-757, doi:10.1061/(ASCE)0733-9445(1985)111:4(740).
+measured to fitted values (``ratios=``). ``docs/damage.rst`` has the references.
 """
 
 from __future__ import annotations
@@ -32,7 +22,7 @@ from ..events.ratios import EventRatios
 from ..prediction.prediction import Prediction
 from ..prediction.reliability import Exceedance, check_level, estimate, outcomes, warn_of_missing_error
 from ..priors.distributions import Distribution
-from ..text_tables import number, text_table
+from ..text_tables import text_table
 from ..units import DIMENSIONS, find_unit, from_si
 from .measures import DamageMeasures
 
@@ -60,23 +50,15 @@ class LimitState(NamedTuple):
     Examples
     --------
     >>> from fe_likelihoods.column_damage.damage import LimitState
-    >>> wide = LimitState("wide cracks", "bar tension", 0.015, source="own tests")
-    >>> print(wide._replace(limit=LogNormal(0.015, 0.3)))
-    wide cracks: bar tension beyond LogNormal(median=0.015, log_sd=0.3) (own tests)
+    >>> wide = LimitState("wide cracks", "bar tension", LogNormal(0.015, 0.3), source="own tests")
+    >>> wide.limit
+    LogNormal(median=0.015, log_sd=0.3)
     """
 
     name: str
     measure: str
     limit: ArrayLike | Distribution
     source: str = ""
-
-    def __str__(self) -> str:
-        unit, value = _UNITS.get(self.measure, "1"), f"{self.limit}"
-        if not isinstance(self.limit, Distribution):
-            limits = from_si(np.ravel(self.limit), unit)
-            value = number(limits[0]) if len(limits) == 1 else f"{number(limits.min())} to {number(limits.max())}"
-            value += "" if unit == "1" else f" {unit}"
-        return f"{self.name}: {self.measure} beyond {value}" + (f" ({self.source})" if self.source else "")
 
 
 _ASSUMED = (
@@ -137,11 +119,6 @@ class Damage(NamedTuple):
             said[-1] += " too low"
         return "; ".join(said)
 
-    def __str__(self) -> str:
-        return self.table()
-
-    __repr__ = __str__
-
     def table(self) -> str:
         """Return the probabilities of the limit states and the quantiles of the measures after each event as text.
 
@@ -162,6 +139,8 @@ class Damage(NamedTuple):
         closing = [f"The probabilities contain {self.uncertainty}."]
         closing += [f"{self.failures}."] if self.failures else []
         return "\n".join([*lines, "", *closing, *labelled(self.prediction.findings)])
+
+    __str__ = __repr__ = table
 
 
 def limit_states(measures: DamageMeasures) -> tuple[LimitState, ...]:

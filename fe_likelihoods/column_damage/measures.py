@@ -184,7 +184,7 @@ def damage_measures(
     if park_ang is None and not is_column:
         structure = [name for name in structure if name != "Park-Ang index"]
     known = (*structure, *(STRAIN_MEASURES if is_column else ()))
-    chosen = known if measures is None else (measures,) if isinstance(measures, str) else tuple(measures)
+    chosen = known if measures is None else tuple(measures)
     if not chosen or len(set(chosen)) != len(chosen) or set(chosen) - set(known):
         raise ValueError(
             f"measures must be some of {', '.join(known) or 'none'}, each once; got {measures!r}. Of a model that is "
