@@ -260,6 +260,7 @@ class Prediction:
         noise = "with measurement noise" if self.noise else "without measurement noise"
         if self.ratios is not None:
             noise = f"of measured values, by the ratios of {len(self.ratios.values)} events"
+        noise += "" if self.from_state == "virgin" else f", from_state={self.from_state!r}"
         title = "Prediction" if self.dt is None else "Prediction of histories"
         size = f"effective sample size {self.effective_sample_size:.0f}"
         lines = [f"{title}: {self.n_samples} samples, {noise}; {size}"]

@@ -26,7 +26,7 @@ def test_stress_against_strain():
 
 def test_moment_against_curvature():
     curvature = np.linspace(0.0, 0.02, 5)
-    curve = MomentCurvature(curvature, 1e8 * curvature, 0.0 * curvature, -2.5e6)
+    curve = MomentCurvature(curvature, 1e8 * curvature, -2.5e6)
     axes = plot_moment_curvature({"nominal": curve, "updated": curve._replace(moment=2e8 * curvature)})
     assert axes.get_xlabel() == "curvature [1/m]" and axes.get_ylabel() == "moment [kN m]"
     assert texts(axes) == ["nominal, axial force -2500 kN", "updated, axial force -2500 kN"]
