@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..cache.simulation_cache import SimulationCache
+from ..checks.compared import data_sets_of
 from ..checks.finding import NOTE, labelled
 from ..checks.rehearsal import ModelCheck, check_model
 from ..checks.screening import repair_lines, screen
@@ -18,7 +19,6 @@ from ..units import from_si
 from .events import Event, read_events
 from .job import Job, read_job
 from .models import Problem, make_problem
-from .results import names_of
 from .runs import CACHE, default_folder, is_free, make_sampler
 
 __all__ = ["check_job"]
@@ -172,7 +172,7 @@ def _draw(problem: Problem, seconds: float, picture: Path) -> list[Path]:
     posterior, files = problem.posterior, []
     n = int(np.clip(PICTURE_SECONDS / max(seconds, 1e-6), FEWEST_DRAWS, MOST_DRAWS))
     points = posterior.sample_prior(n, np.random.RandomState(1))
-    for key, (part, columns) in zip(names_of(posterior.likelihood), posterior.likelihood.parts(), strict=True):
+    for key, part, columns in data_sets_of(posterior):
         draws, measured = points[:, columns[: len(part.model.parameter_names)]], part.measurements
         files.append(picture.with_name(f"{picture.stem}-{key}{picture.suffix}") if key else picture)
         if part.is_modal:

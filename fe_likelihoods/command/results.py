@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks.compared import ModalFit
+from ..checks.compared import Fit, ModalFit, data_sets_of
 from ..checks.finding import Judgement
 from ..checks.result import JudgedRun
 from ..checks.run import FinishedRun
@@ -15,9 +15,8 @@ from ..checks.table import moments_of
 from ..likelihood.likelihood import FELikelihood
 from ..prediction.prediction import Prediction
 from ..reporting.other_events import OtherEvent
-from ..signals.error_measures import rrmse
 
-__all__ = ["names_of", "write_events", "write_samples", "write_tables"]
+__all__ = ["write_events", "write_samples", "write_tables"]
 
 
 def write_tables(folder: Path, run: FinishedRun, judged: JudgedRun, agreement: str = "") -> tuple[str, ...]:
@@ -34,9 +33,9 @@ def write_tables(folder: Path, run: FinishedRun, judged: JudgedRun, agreement: s
         cv = sd / np.abs(mean)
     moments = summary(run.samples, labels)._replace(mean=mean, sd=sd, cv=cv, mean_error=errors, sd_error=of_sd)
     fits = {}  # of each data set: rows of a table, and lines of text
-    for key, (part, columns) in zip(names_of(posterior.likelihood), posterior.likelihood.parts(), strict=True):
-        modal = next((fit.modal for fit in judged.fits.fits if fit.modal and fit.title == key), None)
-        fits[key] = _modes(modal) if modal else _fit(part, run.samples[:, columns])
+    for key, _, _ in data_sets_of(posterior):
+        own = [fit for fit in judged.fits.fits if not key or fit.title == key or fit.title.startswith(f"{key}, ")]
+        fits[key] = _modes(own[0].modal) if own[0].modal else _responses(own)
     lines = [
         str(judged.judgement),
         "",
@@ -45,7 +44,7 @@ def write_tables(folder: Path, run: FinishedRun, judged: JudgedRun, agreement: s
         f"log-evidence {run.sampler.log_evidence:.2f} +- {run.sampler.log_evidence_error:.2g}",
         str(run.verdict),
         *filter(None, [agreement]),
-        *_model_runs(next(iter(posterior.likelihood.parts()))[0], run.sampler.simulations),
+        *_model_runs(data_sets_of(posterior)[0][1], run.sampler.simulations),
         "",
     ]
     lines += [line for _, text in fits.values() for line in text]
@@ -76,20 +75,15 @@ def _model_runs(likelihood: FELikelihood, simulations: float) -> list[str]:
     ]
 
 
-def names_of(likelihood: Any) -> list[str]:
-    """Names of the data sets of a likelihood, an empty one for a single data set."""
-    return list(getattr(likelihood, "likelihoods", {"": likelihood}))
-
-
 Table = tuple[list[dict[str, Any]], list[str]]
 
 
-def _fit(likelihood: FELikelihood, samples: np.ndarray) -> Table:
-    """RRMSE of every channel at the posterior mean, as rows and as lines; one simulation."""
-    measured = likelihood.measurements
-    errors = rrmse(measured.values - likelihood.residuals(samples.mean(axis=0)), measured.values)
-    rows = [{"channel": c.name, "rrmse": float(error)} for c, error in zip(measured.channels, errors, strict=True)]
-    shown = [f"  {row['channel']}: {100 * row['rrmse']:.1f} %" for row in rows]
+def _responses(fits: Sequence[Fit]) -> Table:
+    """RRMSE of every channel of each event, as in the report, as rows and as lines."""
+    event = {fit.title: {"event": fit.title} if len(fits) > 1 else {} for fit in fits}
+    found = [(fit, each) for fit in fits for each in fit.channels]
+    rows = [event[fit.title] | {"channel": each.channel.name, "rrmse": each.after} for fit, each in found]
+    shown = [f"  {' '.join(map(str, [*row.values()][:-1]))}: {100 * row['rrmse']:.1f} %" for row in rows]
     return rows, ["Relative RMS error of the response (RRMSE):", *shown]
 
 

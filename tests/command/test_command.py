@@ -496,6 +496,9 @@ def test_quantities_and_priors_as_text():
         assert read_quantity(value, dimension) == pytest.approx(expected, rel=1e-12)
     with pytest.raises(ValueError, match='a plain number is in Pa, and 6.1 Pa .* "6.1 ksi"'):
         read_quantity(6.1, "stress")
+    for value in ("48", "48 kg", "inf m", True):
+        with pytest.raises(ValueError, match="expected a number in m, or a text with a unit such as '1 m'"):
+            read_quantity(value, "displacement")
     assert parse_prior("half-normal(5mm)", "displacement").sd == 5e-3
     assert parse_prior("half-normal(0.1 g)", "acceleration").sd == pytest.approx(0.980665)
     assert parse_prior("normal(1, 0.5, 0.2, inf)").bounds == (0.2, float("inf"))

@@ -58,6 +58,7 @@ def test_noises_are_those_of_python(folder, keys, parameters, options):  # noqa:
         ('kind = "autoregresive"', "got 'autoregresive'; did you mean autoregressive?"),
         ('kind = "autoregressive"\ngroups = "all"', '[noise] groups: the kind "autoregressive" has no such key'),
         ('level = "response"\nwindow = "1 g"\n' + SENSOR, "[noise] window: expected a number in s"),
+        ('groups = [1.0, "a"]', "[noise] groups: expected a text in quotes, or a list, each a number"),
         ("groups = true\n" + SENSOR, "[noise] groups: expected a text in quotes, or a list, each a number"),
         ('marginal = true\nlevel = "measured"', "[noise] marginal() integrates out the standard deviations"),
         ('sensor = {acceleration = "1 mm"}', "[noise] sensor: acceleration: expected a number in m/s"),
