@@ -49,9 +49,8 @@ def check_job(file: Path, picture: Path, say: Callable[[str], None], progress: b
         for line in repairs:
             say(f"  {line}")
     for event in events:
-        steps = f"{event.record.n_steps} samples at {event.record.dt:g} s"
         compared = "without measurements" if event.measured is None else "compared with measurements"
-        say(f"Event {event.name}: {event.record.name}, {steps}, {compared}")
+        say(f"Event {event.name}: {event.record}, {compared}")
     _say_cost(make_problem(job).posterior, job, sampler, say)
     pictures = _draw(problem, checked.seconds, picture)
     names = ", ".join(map(str, pictures))
@@ -67,8 +66,7 @@ def check_job(file: Path, picture: Path, say: Callable[[str], None], progress: b
 def _say_data(problem: Problem, say: Callable[[str], None]) -> None:
     posterior, record = problem.posterior, problem.record
     if record is not None:
-        peak = from_si(np.abs(record.acceleration).max(), "g").item()
-        say(f"Record: {record.name}, {record.n_steps} samples at {record.dt:g} s, peak {peak:.3g} g")
+        say(f"Record: {record}")
         if record.source:
             say(f"  from {record.source}")
     for likelihood, _ in posterior.likelihood.parts():

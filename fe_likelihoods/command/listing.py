@@ -13,7 +13,6 @@ from ..checks.sensor_faults import find_sensor_faults
 from ..modal.modal_readers import read_modal_data
 from ..signals.datasets import read_dataset
 from ..signals.read import read_record, recognise_format
-from ..signals.records import Record
 from ..signals.strong_motion import find_channels
 from ..signals.tables import (
     Statements,
@@ -134,10 +133,6 @@ def _several(path: Path, form: str) -> _Lines:
     return _Lines(text, {"record": [f"{line}    # the base motion"], "measurements": measured + repair_lines(screened)})
 
 
-def _record_text(record: Record) -> list[str]:
-    return [text_table([("record", *_HEAD), (record.name, *_cells(record.acceleration, record.dt))]), record.source]
-
-
 def _single(path: Path) -> _Lines:
     """A ground motion in a file of its own."""
     given, lines = {}, []
@@ -153,7 +148,7 @@ def _single(path: Path) -> _Lines:
         record = read_record(path, **given)
     note = ["The unit is not stated: the peak is that of samples in g."] if "units" in given else []
     note += _texts(screen_motion(record))
-    return _Lines(["a ground motion", *_record_text(record), *note], {"record": lines})
+    return _Lines(["a ground motion", str(record), record.source, *note], {"record": lines})
 
 
 def _dataset(path: Path) -> _Lines:
@@ -162,7 +157,7 @@ def _dataset(path: Path) -> _Lines:
     rows = [("channel", "quantity", "samples", "step [s]", "missing")]
     for channel, step, values in zip(measured.channels, measured.steps, measured.values, strict=True):
         rows.append((channel.name, channel.quantity, str(values.size), f"{step:g}", str(int(np.isnan(values).sum()))))
-    text = ["a data set", *_record_text(found.record), text_table(rows), measured.description]
+    text = ["a data set", str(found.record), found.record.source, text_table(rows), measured.description]
     text += [f"CAUTION: {each}" for each in check_data(measured, found.record) if each.severity != NOTE]
     return _Lines(text, {"record": [], "measurements": repair_lines(screen(measured))})
 

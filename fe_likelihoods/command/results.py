@@ -12,7 +12,6 @@ from ..checks.finding import Judgement
 from ..checks.result import JudgedRun
 from ..checks.run import FinishedRun
 from ..checks.table import moments_of
-from ..likelihood.likelihood import FELikelihood
 from ..prediction.prediction import Prediction
 from ..reporting.other_events import OtherEvent
 
@@ -44,7 +43,6 @@ def write_tables(folder: Path, run: FinishedRun, judged: JudgedRun, agreement: s
         f"log-evidence {run.sampler.log_evidence:.2f} +- {run.sampler.log_evidence_error:.2g}",
         str(run.verdict),
         *filter(None, [agreement]),
-        *_model_runs(data_sets_of(posterior)[0][1], run.sampler.simulations),
         "",
     ]
     lines += [line for _, text in fits.values() for line in text]
@@ -61,18 +59,6 @@ def write_tables(folder: Path, run: FinishedRun, judged: JudgedRun, agreement: s
         files.append(name)
     (folder / "stages.txt").write_text(ladder_table(run.sampler) + "\n", encoding="utf-8")
     return tuple(files)
-
-
-def _model_runs(likelihood: FELikelihood, simulations: float) -> list[str]:
-    """How many model runs are stored if a guide has made some with parts of the record, as a line of text."""
-    if likelihood.simulator.cache is None or float(simulations).is_integer():
-        return []
-    stored = likelihood.simulator.cache.info()
-    return [
-        f"{stored.simulations} runs of the model are stored, {stored.failures} of which failed, those for tables, "
-        f"report and predictions included. The sampling counts as {simulations:.0f} full simulations, since the guide "
-        "starts with short parts of the record."
-    ]
 
 
 Table = tuple[list[dict[str, Any]], list[str]]

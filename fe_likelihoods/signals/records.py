@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..units import from_si
 from .response_spectrum import ResponseSpectrum, response_spectrum
 from .sampling import array_digest, check_samples, check_step, rest_samples, same_step, sample_window
 
@@ -61,8 +62,8 @@ class Record:
         object.__setattr__(self, "acceleration", check_samples(self.acceleration, "acceleration", self.name))
 
     def __str__(self) -> str:
-        peak = np.abs(self.acceleration).max()
-        return f"{self.name}: {self.n_steps} samples at {self.dt:g} s, peak {peak:.3g} m/s²"
+        peak = from_si(np.abs(self.acceleration).max(), "g")
+        return f"{self.name}, {self.n_steps} samples at {self.dt:g} s, peak {peak:.3g} g"
 
     @property
     def n_steps(self) -> int:

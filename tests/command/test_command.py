@@ -242,10 +242,8 @@ def test_run_writes_its_files(run_once):
         "settings.toml",
     ):
         assert (results / name).stat().st_size > 0, name
-    told = (results / "summary.txt").read_text()
-    stored, counted = (int(re.search(words, told)[1]) for words in (r"(\d+) runs of the model", r"as (\d+) full simul"))
-    assert stored == SimulationCache(results / "simulations.sqlite").info().simulations > counted
-    assert f" from {counted} simulations." in told
+    counted = int(re.search(r" from (\d+) simulations\.", (results / "summary.txt").read_text())[1])
+    assert counted < SimulationCache(results / "simulations.sqlite").info().simulations  # short parts are fractions
     assert "sigma_displacement [cm]" in (results / "summary.csv").read_text()
     assert "prior of sigma" not in output
 

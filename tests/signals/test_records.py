@@ -21,7 +21,7 @@ class TestRecord:
             record.acceleration[0] = 1.0
         assert (record.n_steps, record.duration) == (4, 1.5)
         np.testing.assert_array_equal(record.time, [0, 0.5, 1.0, 1.5])
-        assert str(record) == "ramp: 4 samples at 0.5 s, peak 3 m/s²"
+        assert str(record) == "ramp, 4 samples at 0.5 s, peak 0.306 g"
 
     @pytest.mark.parametrize(
         ("dt", "samples", "message"),
