@@ -166,9 +166,10 @@ def _table(path: Path) -> _Lines:
     """A table of samples, of modes or of load cases."""
     table = read_table(path)
     try:
-        return _Lines(["a table of modes", str(read_modal_data(path))], {"modes": []})
+        if table.time is None or table.clock is not None:  # days of several identifications are clocks as well
+            return _Lines(["a table of modes", str(read_modal_data(path))], {"modes": []})
     except ValueError as error:
-        if "unit of the frequencies is not stated" in str(error):
+        if "unit of the frequencies is not stated" in str(error) and table.clock is None:
             return _Lines(["a table of modes"], {"modes": ['unit = "?"    # write it: the file does not state it']})
     options, remarks, step = _sampling(table)
     rows: list[tuple[str, ...]] = [("column", "unit", "numbers", "missing", "smallest", "largest")]
@@ -211,10 +212,13 @@ def _table(path: Path) -> _Lines:
         )
     if not columns:
         return _Lines(text)
-    if table.time is None and table.columns[0].kind == "text":
-        return _Lines(
-            [*text, "a line for each load case"], {"load_test": [*measured[:1], *measured[1 + len(options) :]]}
-        )
+    places = re.search(r"case|load|truck|position|place", names[0], re.IGNORECASE)
+    if table.time is None and len(names) > 1 and (table.columns[0].kind == "text" or places):
+        own = [pair for pair in columns if pair[1] != names[0]]
+        lines = [f"columns = {_inline(own)}    # channel of the model = column"]
+        if unknown := [pair for pair in unstated if pair[0] in dict(own)]:
+            lines.append(f"units = {_inline(unknown)}    # write them: the file does not state them")
+        return _Lines([*text, "a line for each load case"], {"load_test": lines})
     base = [f"column = {_quoted(columns[0][1])}    # the base motion, if it is in this file"]
     if unstated and columns[0][0] == unstated[0][0]:
         base.append('units = "?"    # write it: the file does not state it')

@@ -67,6 +67,13 @@ def test_what_a_file_does_not_state_must_be_written(tmp_path):
     assert listed(path)[1]["record"]["dt"] == "? s"
 
 
+def test_histories_are_no_modes(tmp_path):
+    path = tmp_path / "a.csv"
+    for text in ("time_s,f [kN],f1\n0,1,2\n0.1,2,4\n0.2,3,3\n", "f [kN],b [mm]\n1,2\n2,4\n"):
+        path.write_text(text)
+        assert set(listed(path)[1]) == {"record", "measurements"}
+
+
 @pytest.mark.parametrize("line", ["# units: gal", "Units: gal", "RAW PGA VALUES (gal) : 4.0"])
 def test_a_unit_above_the_table_is_listed_as_it_is_read(tmp_path, line):
     path = tmp_path / "a.csv"
@@ -130,6 +137,8 @@ def test_a_data_set_and_a_file_that_cannot_be_read(tmp_path):
             "load_test",
             {"columns": {"mid": "mid [mm]", "end": "end"}, "units": {"end": "?"}},
         ),
+        ("truck at [m],mid [mm]\n1,2\n4,5\n", "load_test", {"columns": {"mid": "mid [mm]"}}),
+        ("date,f1_Hz,f2_Hz\n2024-05-01,1.1,3.2\n2024-05-02,1.2,3.3\n", "modes", {}),
     ],
 )
 def test_data_without_time_have_sections_of_their_own(tmp_path, text, section, given):
