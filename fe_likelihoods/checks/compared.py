@@ -28,6 +28,7 @@ from .run import FinishedRun
 from .slow_motion import FEWEST_DRAWS, SlowMotion, slow_motions
 
 __all__ = [
+    "MOST_DRAWS",
     "ChannelFit",
     "Fit",
     "Fits",

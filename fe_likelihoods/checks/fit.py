@@ -5,7 +5,6 @@ from collections.abc import Container, Iterable, Sequence
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
 
 from ..likelihood.parameters import Parameter
 from ..likelihood.posterior import Posterior
@@ -15,10 +14,10 @@ from ..priors.points import as_points
 from ..signals.error_measures import relative_errors
 from ..simulation.model import simulate_batch
 from ..text_tables import listed
-from .compared import ChannelFit, Fit, checks_of, compare, data_sets_of, draws_to_compare
+from .compared import MOST_DRAWS, ChannelFit, Fit, checks_of, compare, data_sets_of, draws_to_compare
 from .data_faults import EXPLAINED, Fault, describe_unit, find_faults
 from .finding import CARE, CORRELATED, HALF, NOTE, SMALL_PROBABILITY, SURE, WRONG, Finding, percent
-from .modal_faults import check_modes
+from .modal_faults import check_modes, check_squares
 from .slow_motion import find_slow_faults, support_gains, supports_apart
 from .steps import motions_to_replace
 from .table import Moments, ParameterRow, rows_of
@@ -136,11 +135,11 @@ def check_faults(fit: Fit) -> list[Finding]:
     ]
     known = {fault.kind for fault in (*faults, *(fault for fault, _ in slow.values()))}
     if fit.after is not None:
-        before, how = (
-            find_faults(fit.measurements, fit.draws),
-            " at the best draw of the prior, and the fit may make up for it",
-        )
-        found += [_of_a_fault(fit, fault, CARE, how) for fault in before if fault.kind not in known]
+        how = " at the best draw of the prior; the fit hides it by other parameters"
+        # of right real events, 5 to 20 draws blame 19 of 396, 50 or 70 draws 3 of 264, and 100 draws 0 of 43
+        severity = WRONG if len(fit.draws) >= HALF * MOST_DRAWS else CARE
+        before = [each for each in find_faults(fit.measurements, fit.draws) if each.kind not in known]
+        found += [_of_a_fault(fit, fault, severity, how) for fault in before]
         found += _check_offset(fit) if fit.is_history else []
     return found
 
@@ -158,9 +157,8 @@ def _of_a_fault(fit: Fit, fault: Fault, severity: str, how: str = "") -> Finding
         "units": f", about the ratio of {units}" if units else "",
     }
     kind, text, action = (each.format(**words) for each in FAULTS[fault.kind])
-    return Finding(
-        kind, severity, text, action, {"before": fault.before, "after": fault.after, fault.kind: fault.value}
-    )
+    numbers = {"before": fault.before, "after": fault.after, fault.kind: fault.value}
+    return Finding(kind, severity, text, action, numbers)
 
 
 def check_supports(model: Any) -> list[Finding]:
@@ -226,10 +224,10 @@ def check_errors(fits: Sequence[Fit]) -> list[Finding]:
         (
             useless,
             "The model does not follow the measurements",
-            "The update leaves more than half of the power unexplained: the error (RRMSE) of {}; 71 % is half.",
+            "The update leaves more than half of the power unexplained: the error (RRMSE) is {}; 71 % is half.",
             PLACES,
         ),
-        (poor, "A channel is hardly reproduced", "After the update, the error (RRMSE) is still large: {}.", PLACES),
+        (poor, "A channel is hardly reproduced", "After the update, the error (RRMSE) is still {}.", PLACES),
         (
             far,
             "The prior does not reach the measurements",
@@ -246,7 +244,7 @@ def check_errors(fits: Sequence[Fit]) -> list[Finding]:
 
 
 def _shares(named: dict[str, float]) -> str:
-    return listed([f"{name} ({percent(share)})" for name, share in named.items()])
+    return listed([f"{percent(share)} in {name}" for name, share in named.items()])
 
 
 def edges(rows: Sequence[ParameterRow]) -> dict[str, tuple[str, float, float]]:
@@ -371,15 +369,13 @@ def check_stated_errors(fits: Iterable[Fit]) -> list[Finding]:
         if fit.deviations is None or fit.residuals is None:
             continue
         squares = np.square(fit.residuals / fit.deviations)
-        square, n = float(np.nansum(squares)), int(np.isfinite(squares).sum())
-        if chi2.sf(square, n) < SMALL_PROBABILITY:
-            factor = float(np.sqrt(square / n))
-            text = (
-                f"The {n} values{f' of {fit.title}' if fit.title else ''} differ from the model by {factor:.2g} times "
-                "their stated errors (root mean square): intervals of the parameters are too narrow."
-            )
-            action = "Look for a wrong load case, sensor or value, and at the model. Or leave out known errors."
-            found.append(Finding("Values differ more than their stated errors", CARE, text, action, {"factor": factor}))
+        n = int(np.isfinite(squares).sum())
+        what = f"The {n} values{f' of {fit.title}' if fit.title else ''}"
+        action = (
+            "Look for a wrong load case, sensor or value, and at the model. If all of them are right, leave the stated "
+            "errors out, which makes them unknown."
+        )
+        found += check_squares(float(np.nansum(squares)), n, what, action)
     return found
 
 

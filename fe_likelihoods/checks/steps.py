@@ -22,6 +22,7 @@ from ..simulation.model import SimulationBatch
 from .finding import CARE, WRONG, Finding
 
 __all__ = [
+    "LARGE_SHIFT",
     "NOTHING",
     "NO_STEP",
     "StepTest",
