@@ -1,4 +1,4 @@
-"""Failed simulations of a run: how many, why, where in the space of the parameters, and whether near the samples.
+"""Failed simulations of a run: how many, why, and whether near the samples.
 
 Failures are counted where simulations are counted: in the likelihood, with the simulations of the first parts of the
 record that a guide makes, or in the sampler for a log-density of the user's own.
@@ -8,24 +8,21 @@ from collections import Counter
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import ks_2samp
 
 from samplers.judgement.failures import NearFailures, failures_near
 
 from ..likelihood.failure_log import reason_without_numbers
 from ..likelihood.likelihood import FELikelihood
-from .finding import SMALL_PROBABILITY
 from .run import FinishedRun
 
 __all__ = ["Failure", "Failures", "failures"]
 
 
 class Failure(NamedTuple):
-    """Failures for one reason: how many, and where."""
+    """Failures for one reason."""
 
     reason: str  # with "#" for numbers
     count: int
-    where: str  # the parameter that tells these failures from successes best, in words
     example: str  # parameters of one failure, after its reason where `reason` has "#"
 
 
@@ -105,20 +102,15 @@ def _joined(
 
 def _by_reason(run: FinishedRun, source: _Source) -> list[Failure]:
     """Failures of one model; reasons that differ in their numbers only are one."""
-    counts, rows = Counter(), []
+    counts, examples = Counter(), dict[str, str]()
     for text, count in source.counts.items():
         counts[reason_without_numbers(text)] += count
-    names = [run.names[column] for column in source.columns]
-    for reason, count in counts.items():
-        chosen = [row for row, each in enumerate(source.reasons) if reason_without_numbers(each) == reason]
-        where = example = ""
-        if chosen:
-            failed, text = source.failed[chosen], source.reasons[chosen[0]]
-            example = ", ".join(f"{name} = {value:.4g}" for name, value in zip(names, failed[0], strict=True))
-            example = example if text == reason else f"{text}: {example}"
-            where = _where(run, source, failed)
-        rows.append(Failure(reason, count, where, example))
-    return rows
+    for text, point in zip(source.reasons, source.failed, strict=True):
+        reason = reason_without_numbers(text)
+        named = zip(source.columns, point, strict=True)
+        shown = ", ".join(f"{run.names[column]} = {value:.4g}" for column, value in named)
+        examples.setdefault(reason, shown if text == reason else f"{text}: {shown}")
+    return [Failure(reason, count, examples.get(reason, "")) for reason, count in counts.items()]
 
 
 def _are_among(points: np.ndarray, others: np.ndarray) -> np.ndarray:
@@ -130,17 +122,3 @@ def _are_among(points: np.ndarray, others: np.ndarray) -> np.ndarray:
 def _was_here(run: FinishedRun, likelihood: FELikelihood, source: _Source) -> bool:
     """Whether this process simulated, read or recalled as many points as there are samples."""
     return likelihood.simulator.failures.outcomes >= len(np.unique(run.samples[:, source.columns], axis=0))
-
-
-def _where(run: FinishedRun, source: _Source, failed: np.ndarray) -> str:
-    """The parameter whose values tell these failures from the successes best, by the Kolmogorov-Smirnov distance."""
-    succeeded = np.concatenate([source.succeeded, run.samples[:, source.columns]])
-    tests = [ks_2samp(failed[:, i], succeeded[:, i]) for i in range(failed.shape[1])]
-    i = int(np.argmax([test.statistic for test in tests]))
-    test, name = tests[i], run.names[source.columns[i]]
-    if test.pvalue > SMALL_PROBABILITY:
-        return "no single parameter tells them from the successful ones"
-    low = test.statistic_sign > 0  # the failures have the smaller values
-    inside = [np.mean((values <= test.statistic_location) == low) for values in (failed[:, i], succeeded[:, i])]
-    shares = "{:.3g} % of these failures, {:.3g} % of the successful points".format(*(100.0 * each for each in inside))
-    return f"at {name} {'up to' if low else 'above'} {test.statistic_location:.4g} ({shares})"

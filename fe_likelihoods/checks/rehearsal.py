@@ -4,7 +4,6 @@ A model that returns something else the second time, or the same under every mot
 result. `check_model` simulates a few times what a run would simulate thousands of times.
 """
 
-from collections.abc import Mapping
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -20,7 +19,6 @@ from .screening import check_data, check_gaps
 from .steps import (
     NO_STEP,
     NOTHING,
-    check_same_response,
     check_stronger_motion,
     halved,
     motions_to_replace,
@@ -39,19 +37,17 @@ class ModelCheck(NamedTuple):
     seconds: float  # per simulation [s]
 
 
-def check_model(posterior: Posterior, events: Mapping[str, Any] | None = None, *, progress: bool = False) -> ModelCheck:
+def check_model(posterior: Posterior, *, progress: bool = False) -> ModelCheck:
     """Try the model and the data of a posterior before a run.
 
-    It simulates the mean of the prior twice, under twice the motion and the motion of another event, with half of step
-    and mesh, and draws of the prior, which are compared with the measurements as in `fe_likelihoods.check_fit`.
+    It simulates the mean of the prior twice, under twice the motion, with half of step and mesh, and draws of the
+    prior, which are compared with the measurements as in `fe_likelihoods.check_fit`.
     `fe_likelihoods.check_data` looks at the data. Whether the steps are fine enough is judged after a run
     (`fe_likelihoods.check_result`), where the precision of the parameters is known.
 
     Parameters
     ----------
     posterior : Posterior
-    events : mapping of str to Record, optional
-        Other motions that will be predicted, as for ``model.with_record``.
     progress : bool
         Whether to show a progress bar.
 
@@ -101,7 +97,7 @@ def check_model(posterior: Posterior, events: Mapping[str, Any] | None = None, *
                     batch.response[0], simulate(model, np.tile(theta, (2, 1)), likelihood.simulator.pool)
                 )
                 # where responses differ by chance, other differences say nothing
-                found += chance or _check_motions(simulate, model, theta, batch.response[0], events or {})
+                found += chance or check_stronger_motion(model, theta, batch.response[0], simulate)
                 if not chance and likelihood.measurements.is_history:
                     steps |= _halve_steps(simulate, model, theta, batch.response[0], key)
                 found += check_supports(model) + list(check_data(likelihood.measurements, motions_to_replace(model)))
@@ -153,26 +149,6 @@ def _check_failures(posterior: Posterior) -> list[Finding]:
     text = f"{report['failure_count']} of the simulations of this check failed, {count} of them: {often}."
     action = "A failed simulation counts as impossible: mend the model where its parameters are plausible."
     return [Finding("Simulations failed", CARE, text, action, {"count": report["failure_count"]})]
-
-
-def _check_motions(
-    simulate: Any, model: Any, theta: np.ndarray, response: np.ndarray, events: Mapping[str, Any]
-) -> list[Finding]:
-    """Whether the response follows the motion: twice the motion, and one other event; all are read in the same way."""
-    found = check_stronger_motion(model, theta, response, simulate)
-    if not motions_to_replace(model) or any(each.severity == WRONG for each in found):
-        return found
-    for name, record in list(events.items())[:1]:
-        other = model.with_record(record)
-        batch = simulate(other, theta[None])
-        if batch.reasons[0]:
-            text = f"Event {name}: the simulation at the mean of the prior fails: {batch.reasons[0]}."
-            found.append(Finding("An event fails", CARE, text, "Check its motion and the steps of the model."))
-        elif other.fingerprint != model.fingerprint:
-            n = min(batch.response.shape[2], response.shape[1])
-            change = relative_difference(batch.response[0][:, :n] - response[:, :n], response[:, :n])
-            found += check_same_response(change, name)
-    return found
 
 
 def _halve_steps(simulate: Any, model: Any, theta: np.ndarray, response: np.ndarray, key: str) -> dict[str, str]:

@@ -16,7 +16,7 @@ from ..information.identifiability import identifiability
 from ..likelihood.posterior import Posterior
 from ..signals.error_measures import rrmse
 from ..units import from_si
-from .events import Event, read_events
+from .events import read_events
 from .job import Job, read_job
 from .models import Problem, make_problem
 from .runs import CACHE, default_folder, is_free, make_sampler
@@ -40,7 +40,7 @@ def check_job(file: Path, picture: Path, say: Callable[[str], None], progress: b
     sampler = make_sampler(job, problem)
     events = read_events(job, problem)
     _say_data(problem, say)
-    checked = _say_simulation(problem, events, say, progress)
+    checked = _say_simulation(problem, say, progress)
     parts = [part for part, _ in problem.posterior.likelihood.parts()]
     given = {} if job.measurements is None else job.measurements.given()
     repairs = [line for part in parts for line in repair_lines(screen(part.measurements), given)]
@@ -101,9 +101,7 @@ def _cache_of_the_run(job: Job, folder: Path) -> SimulationCache | None:
     return SimulationCache(folder / CACHE)
 
 
-def _say_simulation(
-    problem: Problem, events: tuple[Event, ...], say: Callable[[str], None], progress: bool
-) -> ModelCheck:
+def _say_simulation(problem: Problem, say: Callable[[str], None], progress: bool) -> ModelCheck:
     """Check the model, and say what was found."""
     posterior = problem.posterior
     likelihood, mean = posterior.likelihood, posterior.prior.mean()
@@ -114,7 +112,7 @@ def _say_simulation(
             f"the simulation at the mean of the prior has failed: {likelihood.fault(point) or 'no finite likelihood'}; "
             "check [model] and [priors]"
         )
-    checked = check_model(posterior, {event.name: event.record for event in events}, progress=progress)
+    checked = check_model(posterior, progress=progress)
     say(f"One simulation takes {checked.seconds:.2g} s")
     for part, columns in likelihood.parts():
         theta, measured = mean[None, columns[: len(part.model.parameter_names)]], part.measurements

@@ -82,23 +82,9 @@ class AutoregressiveNoise:
     def log_likelihood(
         self, statistics: np.ndarray, n_samples: int | SampleCounts, parameters: np.ndarray
     ) -> np.ndarray:
-        """Log-likelihood of the measurements.
+        """Log-likelihood (n,) of statistics J, D and E of all channels (`lag_one_sums`); never NaN.
 
-        Parameters
-        ----------
-        statistics : (n, 3 n_channels) float
-            J of all channels, then D, then E (`lag_one_sums`) [SI unit of the channel, squared]; NaN where the
-            simulation failed. With missing samples, see `lag_one_sums`.
-        n_samples : int or SampleCounts
-            Samples per channel; `SampleCounts` where samples are missing.
-        parameters : (n, 2 n_channels) float
-            Standard deviations of all channels [SI], then their lag-one correlations.
-
-        Returns
-        -------
-        (n,) float
-            -inf where a sigma is impossible (see `GaussianNoise.log_likelihood`), where a rho is not between -1 and 1,
-            and where a statistic is NaN or infinite; never NaN.
+        It is -inf where a sigma is impossible (`GaussianNoise`), or a rho is not between -1 and 1.
         """
         statistics = np.asarray(statistics, dtype=float)
         if isinstance(n_samples, SampleCounts):
@@ -137,18 +123,7 @@ class AutoregressiveNoise:
         return np.where(possible, terms, -np.inf).sum(axis=-1)
 
     def standard_deviations(self, parameters: np.ndarray) -> np.ndarray:
-        """Standard deviation of the errors per channel, sensor noise included.
-
-        Parameters
-        ----------
-        parameters : (n, 2 n_channels) float
-            Parameters of the noise.
-
-        Returns
-        -------
-        (n, n_channels) float
-            [SI unit of the channel]; NaN for a negative parameter.
-        """
+        """Standard deviations (n, n_channels) [SI] of the errors with the sensors; NaN for a negative parameter."""
         sigma = np.asarray(parameters, dtype=float)[..., : len(self.channels)]
         with np.errstate(invalid="ignore"):
             return np.where(sigma >= 0.0, np.hypot(sigma, 0.0 if self.sensor is None else self.sensor), np.nan)

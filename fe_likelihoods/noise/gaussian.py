@@ -494,28 +494,10 @@ class GaussianNoise:
     def log_likelihood(
         self, statistics: np.ndarray, n_samples: int | SampleCounts, parameters: np.ndarray
     ) -> np.ndarray:
-        """Log-likelihood of the measurements.
+        """Log-likelihood (n,) of the measurements, as of `fe_likelihoods.noise.protocol.Noise`; never NaN.
 
-        Parameters
-        ----------
-        statistics : (n, n_numbers) float
-            Sums of squared residuals (n, n_channels), or results of `statistic` [SI unit of the channel, squared]; NaN
-            where the simulation failed.
-        n_samples : int or SampleCounts
-            Samples per channel; `SampleCounts` where samples are missing.
-        parameters : (n, n_noise) float
-            Parameters of the noise, in the order of `parameter_names`.
-
-        Returns
-        -------
-        (n,) float
-            -inf for impossible parameters (negative; zero without sensor noise; for shares of the measured channel 1
-            or more), and where the statistics are not finite; never NaN.
-
-        Raises
-        ------
-        ValueError
-            If the noise does not know the measurements, or knows others.
+        Parameters are impossible if they are negative, zero without sensor noise, or for shares of the measured channel
+        1 or more. ValueError if the noise does not know the measurements, or knows others.
         """
         statistics, n_channels = np.asarray(statistics, dtype=float), len(self.channels)
         samples, power = samples_per_channel(n_samples), None
@@ -593,18 +575,9 @@ class GaussianNoise:
 
     @only_if(lambda noise: noise._kind != "event")
     def standard_deviations(self, parameters: np.ndarray) -> np.ndarray:
-        """Standard deviation of the errors per channel, sensor noise included.
+        """Standard deviations (n, n_channels) [SI] of the errors, sensor noise included; NaN for impossible parameters.
 
-        Parameters
-        ----------
-        parameters : (n, n_noise) float
-            Parameters of the noise.
-
-        Returns
-        -------
-        (n, n_channels) float
-            [SI unit of the channel]; NaN for impossible parameters. With shares of the response, this is the sensor
-            noise alone; `response_deviations` returns the standard deviations for a response.
+        With shares of the response, the sensor noise alone: see `response_deviations`.
         """
         values, levels = self._values(parameters, 1.0), np.ones(1)
         if self.level == "response":
@@ -630,22 +603,10 @@ class GaussianNoise:
     def response_deviations(
         self, parameters: np.ndarray, response: np.ndarray, dt: float | Sequence[float] | None = None
     ) -> np.ndarray:
-        """Standard deviations of the errors at each step, given a simulated response.
+        """Standard deviations (n_channels, n_steps) [SI] of the errors for a simulated response; NaN where it is NaN.
 
-        Parameters
-        ----------
-        parameters : (n_noise,) float
-            Parameters of the noise.
-        response : (n_channels, n_steps) float
-            Response [SI unit of each channel]; NaN where a sample is missing.
-        dt : float or sequence of float, optional
-            Time step [s] of a response that begins at time zero. Default: the response is at the measured samples.
-            Shares of the measured channel need it.
-
-        Returns
-        -------
-        (n_channels, n_steps) float
-            [SI unit of each channel]; NaN where the response is NaN.
+        A response with a step `dt` [s] begins at time zero; by default it is at the measured samples. Shares of the
+        measured channel need the step.
         """
         if self.level == "measured":
             level = local_level(response, None if self.window is None else self.window / dt)
@@ -672,16 +633,9 @@ class GaussianNoise:
         dt: float | Sequence[float] | None = None,
         sensor: bool = True,
     ) -> np.ndarray:
-        """Errors (n_channels, n_steps) [SI] of a simulated response, from independent standard normal numbers.
+        """Errors (n_channels, n_steps) [SI] of a simulated response, from standard normal numbers of this shape.
 
-        Parameters
-        ----------
-        parameters, response, dt
-            As for `response_deviations`.
-        normal : (n_channels, n_steps) float
-            The standard normal numbers.
-        sensor : bool
-            Whether the errors contain sensor noise. Without it they are model errors.
+        `dt` as for `response_deviations`. Without the sensor noise, they are model errors.
         """
         response = np.asarray(response, dtype=float)
         sums, deviations = self._of_response(parameters, response, dt)
@@ -691,21 +645,9 @@ class GaussianNoise:
 
     @only_if(lambda noise: noise.level == "response" or noise._kind == "bands")
     def whitened(self, residuals: np.ndarray, response: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        """Residuals divided by their standard deviations: white, with a standard deviation of one, if the noise fits.
+        """Residuals (n_channels, n_samples) by their standard deviations, with bands those of their coefficients.
 
-        With bands, the coefficients of the residuals are divided.
-
-        Parameters
-        ----------
-        residuals, response : (n_channels, n_samples) float
-            At the measured samples [SI unit of each channel]; NaN where a sample is missing.
-        parameters : (n_noise,) float
-            Parameters of the noise.
-
-        Returns
-        -------
-        (n_channels, n_samples) float
-            [-], for `fe_likelihoods.residual_checks`.
+        They are white, with a standard deviation of one, if the noise fits. All at the measured samples [SI].
         """
         return self._whitened(residuals, response, parameters)[0]
 

@@ -198,26 +198,11 @@ def effective_samples(residuals: np.ndarray) -> np.ndarray:
 
 
 def innovations(residuals: np.ndarray, lag_one: np.ndarray) -> np.ndarray:
-    """Innovations of an AR(1) process: if the residuals are AR(1), white with the standard deviation of the residuals.
+    """Innovations (n_channels, n_steps - 1) [SI] of residuals (n_channels, n_steps), white if these are AR(1).
 
-    Parameters
-    ----------
-    residuals : (n_channels, n_steps) float
-        [SI unit of the channel]; NaN where a sample is missing.
-    lag_one : (n_channels,) float
-        Correlations of successive residuals, between -1 and 1.
-
-    Returns
-    -------
-    (n_channels, n_steps - 1) float
-        (r_t - rho r_{t-1}) / sqrt(1 - rho^2) [SI unit of the channel]. After a gap, with the last sample before the
-        gap: (r_t - rho^g r_{t-g}) / sqrt(1 - rho^(2 g)). NaN where r_t is missing or is the channel's first sample.
-
-    Raises
-    ------
-    ValueError
-        If the residuals have another shape, fewer than two samples, non-finite values, or only zeros in a channel; for
-        a wrong number of correlations, or one that is not between -1 and 1.
+    With the correlations rho (n_channels,) of successive residuals they are (r_t - rho r_{t-1}) / sqrt(1 - rho^2), and
+    after a gap of g steps (r_t - rho^g r_{t-g}) / sqrt(1 - rho^(2 g)); NaN where r_t is missing or is the first sample.
+    ValueError as `residual_checks`, or for a correlation that is not between -1 and 1.
 
     Examples
     --------

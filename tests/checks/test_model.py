@@ -12,7 +12,6 @@ from fe_likelihoods import (
     LinearOscillator,
     Measurements,
     Posterior,
-    Record,
     SimulationFailed,
     TruncatedNormal,
     check_model,
@@ -63,7 +62,7 @@ def test_a_good_model_has_no_findings_and_its_simulations_are_counted():
         made.append(1)
         return central_differences(theta, record, 8)
 
-    found = check_model(posterior_of(fine), {"weaker": MOTION.scale(0.5)})
+    found = check_model(posterior_of(fine))
     assert names(found) == [] and found.simulations == len(made) and found.seconds > 0.0
     assert found.steps["Time step"].startswith("half of the time step changes the response at the mean of the prior by")
 
@@ -137,13 +136,7 @@ def test_a_random_model_is_named_and_a_run_refuses_it():
 
 def test_a_motion_that_is_not_read_is_named():
     unread = posterior_of(lambda theta, record: central_differences(theta, MOTION)[:, : record.n_steps])
-    assert names(check_model(unread, {"double": MOTION.scale(2.0)})) == ["The motion changes nothing"]
-
-    # twice the motion, and no other one
-    peak = np.abs(MOTION.acceleration).max()
-    by_peak = posterior_of(lambda theta, r: np.abs(r.acceleration).max() / peak * central_differences(theta, MOTION))
-    rolled = Record("rolled", 0.01, np.roll(MOTION.acceleration, 40))
-    assert names(check_model(by_peak, {"rolled": rolled})) == ["The motion changes nothing"]
+    assert names(check_model(unread)) == ["The motion changes nothing"]
 
 
 def test_failures_and_sizes_are_named():

@@ -133,23 +133,6 @@ def test_student_errors_have_the_density_of_scipy(rng):
         ModalLikelihood(FRAME, data, student_t=1)
 
 
-@pytest.mark.slow
-def test_a_wrong_identification_moves_student_errors_little(rng):
-    from samplers import SMCSampler
-
-    data = identified(np.ones(4), [1, 2, 3, 4], rng, cv=0.005, error=0.02)
-    frequencies = data.frequencies[0] * [1.0, 1.0, 1.1, 1.0]
-    data = ModalData(frequencies, data.shapes[0], data.sensors, frequency_cv=0.005, shape_error=0.02)
-    distances = []
-    for student in (None, 4):
-        posterior = Posterior(ModalLikelihood(FRAME, data, student_t=student), PRIOR)
-        sampler = SMCSampler(100, 4, posterior, guide=posterior.guide(starts=3), seed=1, vectorize=True)
-        sampler.run_mcmc(None, 1)
-        samples = sampler.get_chain(flat=True)
-        distances.append(np.abs((samples.mean(axis=0) - 1.0) / samples.std(axis=0)).max())
-    assert distances[0] > 6.0 and distances[1] < 4.0
-
-
 def test_frequencies_of_several_days_have_a_common_temperature_slope(rng):
     truth, slope = np.array([1.0, 0.9, 1.1, 1.0]), -2e-3
     temperatures = np.array([-5.0, 5.0, 12.0, 25.0, 33.0])
@@ -192,20 +175,6 @@ def test_derivatives_agree_with_differences(kind, rng):
     for p, unit in enumerate(np.eye(len(theta))):
         difference = (model.simulate(theta + 1e-6 * unit) - model.simulate(theta - 1e-6 * unit)) / 2e-6
         np.testing.assert_allclose(found[p], difference, atol=1e-6 * max(1.0, abs(difference).max()))
-
-
-def test_a_guide_finds_the_frame_with_few_simulations(rng):
-    from samplers import SMCSampler
-
-    truth = np.array([1.0, 0.8, 1.2, 1.1])
-    posterior = Posterior(
-        ModalLikelihood(FRAME, identified(truth, [1, 2, 3], rng, n_sets=3, frequency_cv=0.01, shape_error=0.03)), PRIOR
-    )
-    sampler = SMCSampler(100, 4, posterior, guide=posterior.guide(starts=4), seed=1, vectorize=True)
-    sampler.run_mcmc(None, 1)
-    samples = sampler.get_chain(flat=True)
-    assert (abs(samples.mean(axis=0) - truth) < 4 * samples.std(axis=0)).all()
-    assert posterior.likelihood.simulations < 500
 
 
 def test_frequencies_alone_are_paired_by_number():

@@ -82,15 +82,6 @@ def test_data_of_an_event_are_the_same_after_another_event_and_alone(model, even
     )
     assert both.data_fingerprint == turned.data_fingerprint == JointLikelihood(alone).data_fingerprint
     assert both.data_fingerprint not in (after.data_fingerprint, alone["EQ1"].data_fingerprint)
-    other_pause = Events(events.records, 0.5, events.names)
-    assert FELikelihood(model.with_record(other_pause), measured).data_fingerprint == both.data_fingerprint
-    short = measured["EQ2"].trim(0.0, 0.8)
-    digests = {FELikelihood(model, {"EQ2": each}).data_fingerprint for each in (short, short.shift(0.1))}
-    assert len(digests | {after.data_fingerprint}) == 3  # other times are other data
-    whole = Measurements(model.channels, 0.02, model.simulate([1.0, 1.0]))  # as are samples in the pauses
-    parts = events.split(whole.values)
-    cut = {name: Measurements(model.channels, 0.02, part) for name, part in parts.items()}
-    assert FELikelihood(model, whole).data_fingerprint != FELikelihood(model, cut).data_fingerprint
 
 
 def test_an_event_without_measurement_changes_the_state_only(model, events, measured):

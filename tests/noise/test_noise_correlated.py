@@ -110,34 +110,8 @@ class Line(lines.Line):
     n_steps = 12
 
 
-class BatchLine(lines.Batched):
-    channels = CHANNELS
-    n_steps = 12
-
-
 def measured_by(model, rng):
     return Measurements(model.channels, model.dt, rng.normal(size=(2, model.n_steps)))
-
-
-@pytest.mark.parametrize("kind", [Line, BatchLine])
-def test_sigmas_and_correlations_need_no_simulation(rng, kind):
-    model = kind()
-    likelihood = FELikelihood(model, measured_by(Line(), rng), AutoregressiveNoise(CHANNELS))
-    assert likelihood.fast_parameters == (2, 3, 4, 5)
-    x = np.column_stack([rng.normal(size=(30, 2)), rng.uniform(0.5, 1.0, (30, 2)), rng.uniform(-0.9, 0.9, (30, 2))])
-    values = likelihood.log_likelihood(x)
-    assert np.array_equal(np.isneginf(values), x[:, 1] > 1.0) and 0 < np.isneginf(values).sum() < 30
-    x[:, 2:] = 0.9 * x[:, 2:]
-    likelihood.log_likelihood(x)
-    assert likelihood.simulations == model.runs == 30
-    good = x[x[:, 1] <= 1.0]
-    residuals = np.array([likelihood.measurements.values - Line().simulate(theta[:2]) for theta in good])
-    expected = AutoregressiveNoise(CHANNELS).log_likelihood(
-        np.array([lag_one_sums(r) for r in residuals]), 12, good[:, 2:]
-    )
-    np.testing.assert_allclose(likelihood.log_likelihood(good), expected, rtol=1e-12)
-    # the sums of squares are unchanged
-    np.testing.assert_allclose(likelihood.misfit(good[:, :2]), np.square(residuals).sum(axis=2), rtol=1e-13)
 
 
 def test_a_noise_of_other_channels_is_refused(rng):

@@ -133,18 +133,6 @@ def test_draws_have_the_covariance_of_the_density(kind, rng):
             assert np.abs(lag_one).mean() > 0.2
 
 
-@pytest.mark.parametrize("kind", ["modulated", "shares in bands"])
-def test_shares_scale_with_the_motion_and_levels_in_si_units_do_not(kind):
-    noise = likelihood_of(kind, response([1.0])).noise
-    parameters = PARAMETERS[kind]
-    strong, weak = (np.square(noise.response_deviations(parameters, response([f]), DT)) for f in (1.0, 0.1))
-    floor = np.square(np.array(SENSOR))[:, None]
-    np.testing.assert_allclose(weak - floor, 0.01 * (strong - floor), rtol=1e-6, atol=1e-14)
-    fixed = likelihood_of("levels in bands", response([1.0])).noise
-    levels = [fixed.response_deviations(PARAMETERS["levels in bands"], response([f]), DT) for f in (1.0, 0.1)]
-    np.testing.assert_array_equal(*levels)
-
-
 def draw(noise, parameters, simulated, rng):
     normal = rng.standard_normal(simulated.shape)
     if noise.n_bands > 1:
@@ -197,22 +185,6 @@ def test_gaps_and_times_of_channels(kind, rng):
     assert errors.shape == (500, N // 2)
     ratio = errors.std(axis=0) / np.sqrt(np.diag(matrices[1]))
     assert np.abs(ratio - 1.0).max() < 5.0 / np.sqrt(1000)
-
-
-@EVERY
-def test_blocks_of_time_add_up_and_are_those_of_the_whole_response(kind, rng):
-    values = response([1.0]) + rng.standard_normal((2, N)) * [[0.1], [0.001]]
-    likelihood, parameters = likelihood_of(kind, values), PARAMETERS[kind]
-    names = likelihood.noise.parameter_names
-    posterior = Posterior(likelihood, {"factor": TruncatedNormal(1.0, 0.1)} | {name: HalfNormal(1.0) for name in names})
-    rows = np.array([[1.0, *parameters], [1.3, *(0.7 * parameters)]])
-    blocks = posterior.predictive_draws(rows, block=0.8).blocks
-    np.testing.assert_allclose(blocks.values.sum(axis=1), likelihood(rows), rtol=1e-10)
-    assert blocks.values.shape == (2, 6) and ("whitened" in blocks.note) == (kind != "modulated")
-    if kind == "modulated":
-        sd = likelihood.noise.response_deviations(parameters, response([1.0]))
-        expected = stats.norm.logpdf(values, response([1.0]), sd)[:, 40:80].sum()
-        assert blocks.values[0, 1] == pytest.approx(expected, rel=1e-10)
 
 
 @EVERY

@@ -95,30 +95,6 @@ def test_a_prediction_of_a_weaker_motion_has_the_noise_of_the_weaker_response(re
     np.testing.assert_allclose(fixed.sd[0], 0.3, rtol=1e-9)
 
 
-@pytest.mark.parametrize("own_times", (False, True))
-def test_replicated_measurements_have_the_noise_of_a_prediction(record, own_times):
-    """Strong and quiet parts of the response have the same noise in both, also where samples have their own times."""
-    model = LinearOscillator(record)
-    response = model.simulate([1.0, 1.0])
-    if own_times:  # every second step, and gaps
-        response = response[:, 1::2].copy()
-        response[0, 100:110] = np.nan
-        measured = Measurements(model.channels, 2.0 * model.dt, response, start=model.dt)
-    else:
-        measured = Measurements(model.channels, model.dt, response)
-    posterior = posterior_of(model, measured, window=1.0)
-    samples = np.tile([1.0, 1.0, 0.6, 0.2], (400, 1))
-    sd = propagate(posterior, samples, noise=True, seed=1, progress=False).sd
-    draws = posterior.predictive_draws(samples)
-    for k, name in enumerate(("acceleration", "displacement")):
-        there = np.isfinite(measured.values[k])
-        errors = draws.replicates[name] - draws.responses[name]
-        expected = (sd[k, 1::2] if own_times else sd[k])[there]
-        ratio = errors.std(axis=0) / expected
-        assert abs(ratio.mean() - 1.0) < 0.01 and np.abs(ratio - 1.0).max() < 5.0 / np.sqrt(800)
-        assert expected.max() > 10.0 * expected.min()  # control: one level would differ
-
-
 def test_what_has_no_level_is_refused():
     model = FunctionModel(lambda theta: [theta[0] * np.ones(5)], ["a"], [TOP], 0.1, 5)
     likelihood = FELikelihood(

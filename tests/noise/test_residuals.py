@@ -6,16 +6,12 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from fe_likelihoods import plot_residuals
-from fe_likelihoods.checks.fit import describe_residuals
 from fe_likelihoods.noise.residuals import (
     autocorrelation,
     effective_samples,
     innovations,
-    lag_one_sums,
     residual_checks,
 )
-from fe_likelihoods.signals.channels import Channel
 
 N = 4000
 
@@ -24,22 +20,6 @@ def autoregressive(rng, rho, n=N, n_channels=1):
     z = rng.standard_normal((n_channels, n))
     z[:, 1:] *= math.sqrt(1.0 - rho**2)
     return signal.lfilter([1.0], [1.0, -rho], z, axis=1)
-
-
-def test_autocorrelation_is_its_definition(rng):
-    residuals = rng.normal(size=(2, 30)) * [[1e-200], [3.0]]
-    got = autocorrelation(residuals)
-    scaled = residuals / np.abs(residuals).max(axis=1, keepdims=True)
-    for lag in range(30):
-        expected = (scaled[:, lag:] * scaled[:, : 30 - lag]).sum(axis=1) / np.square(scaled).sum(axis=1)
-        np.testing.assert_allclose(got[:, lag], expected, atol=1e-13)
-
-
-def test_sums_are_their_definition(rng):
-    residuals = rng.normal(size=(2, 9))
-    expected = [(r**2).sum() for r in residuals]
-    expected += [((r[1:] - r[:-1]) ** 2).sum() for r in residuals] + [r[0] ** 2 + r[-1] ** 2 for r in residuals]
-    np.testing.assert_allclose(lag_one_sums(residuals), expected)
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.5, 0.9, -0.9])
@@ -83,19 +63,3 @@ def test_invalid_residuals_are_refused(function):
     ):
         with pytest.raises(ValueError, match=message):
             function(residuals)
-
-
-def test_what_checks_say_of_residuals(rng):
-    white, slow = rng.normal(size=800), autoregressive(rng, 0.9, n=800)[0]
-    heavy = rng.standard_t(2.5, size=800)
-    checks = residual_checks(np.array([white, slow, heavy]))
-    first, second, third = describe_residuals(checks)
-    assert first == "White: no correlation from sample to sample was found."
-    assert second.startswith(f"Correlated ({checks.lag_one[1]:.2f} from sample to sample): 800 samples are worth ")
-    assert f"worth {checks.n_effective[1]:.0f} independent ones" in second
-    assert "Not normal" in third and "Not normal" not in first
-    gappy = slow.copy()
-    gappy[100:300] = np.nan
-    assert residual_checks(gappy[None]).n_samples == [600]
-    title = plot_residuals(slow[None], [Channel("top", "displacement", "mm")], 0.01).axes[0].get_title(loc="left")
-    assert " ".join(title.split()) == second

@@ -10,16 +10,10 @@ from fe_likelihoods import (
     FELikelihood,
     FunctionModel,
     GaussianNoise,
-    HalfNormal,
     Measurements,
-    Posterior,
-    TruncatedNormal,
 )
-from fe_likelihoods.checks.compared import fit_data_sets
-from fe_likelihoods.checks.run import read_run
 from fe_likelihoods.noise.draws import sample_noise
-from fe_likelihoods.reporting.contents import residual_sentences
-from samplers import SMCSampler, compare_models, to_arviz
+from samplers import compare_models
 
 N, DT, TOP = 400, 0.02, (Channel("top", "acceleration", "m/s2"),)
 SENSOR = (0.05,)
@@ -75,27 +69,3 @@ def test_the_evidence_prefers_the_noise_that_made_the_data(truth, rng):
         GaussianNoise(measured.channels, level="measured", sensor=SENSOR), [SHARES[SHARES < 1.0]], measured
     )
     assert abs(relative - found["white"][0]) < 2.0
-
-
-@pytest.mark.parametrize("name", ["envelope", "bands"])
-def test_reports_check_whitened_residuals_and_arviz_has_the_blocks(name, rng):
-    noise, _, parameters = NOISES[name]
-    measured = data_of(noise, parameters, rng)
-    likelihood = FELikelihood(MODEL, measured, noise)
-    names = likelihood.noise.parameter_names
-    posterior = Posterior(likelihood, {"factor": TruncatedNormal(1.0, 0.3)} | {each: HalfNormal(1.0) for each in names})
-    sampler = SMCSampler(60, posterior.ndim, posterior, vectorize=True, seed=1)
-    sampler.run_mcmc(None, 1, progress=False)
-    fits = fit_data_sets(read_run(sampler, posterior))
-    checks = fits.fits[0].channels[0].checks
-    assert checks.standard_deviation[0] == pytest.approx(1.0, abs=0.15)  # of whitened residuals
-    assert checks.white[0] > 1e-3 and checks.normal[0] > 1e-3
-    assert "White: " in residual_sentences(fits)[0]
-    # the residuals themselves are neither
-    plain = posterior.likelihood.residuals(sampler.get_chain(flat=True).mean(axis=0))
-    assert abs(np.std(plain) - 1.0) > 0.3
-    data = to_arviz(sampler, posterior, draws=20)
-    replicates = data.posterior_predictive["top"].values.reshape(-1, N)
-    assert replicates.shape == (20, N) and np.isfinite(replicates).all()
-    blocks = next(iter(data.log_likelihood.data_vars.values()))
-    assert blocks.shape[-1] > 3 and np.isfinite(blocks.values).all()

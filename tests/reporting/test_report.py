@@ -1,6 +1,5 @@
 """The report of a run: well-formed, complete, self-contained, and right in what it says."""
 
-from dataclasses import replace
 from types import MappingProxyType, SimpleNamespace
 
 import emcee
@@ -184,30 +183,6 @@ def test_correlated_errors_and_edges_are_named():
     notes = {note.kind: note for note in check_run(finished, rows, fits, Failures((), 30, 100)).findings}
     assert "30 of 100 simulations failed (30 %)" in notes["Simulations failed"].text
     assert notes["Simulations failed"].severity == "care"
-
-
-def test_a_sensor_with_the_opposite_sign_is_named(vibrating):
-    finished = read_run(*vibrating)
-    rows, fits = parameter_rows(finished), fit_data_sets(finished)
-    (one,) = fits.fits
-    turned = fits._replace(fits=(replace(one, after=-one.after, draws=-one.draws),))
-    notes = {n.kind: n for n in check_run(finished, rows, turned, Failures((), 0, 1)).findings}
-    assert notes["A sign may be wrong"].text.startswith("top: measured and computed values have opposite signs")
-    assert "The model does not follow the measurements" not in notes  # the sign explains it
-    quiet = {n.kind for n in check_run(finished, rows, fits, Failures((), 0, 1)).findings}
-    assert not quiet & {"A sign may be wrong", "The model does not follow the measurements"}
-
-
-def test_parameters_that_the_data_leave_alone_and_those_that_they_move_far_are_named(vibrating):
-    sampler, posterior = vibrating
-    finished = read_run(sampler, posterior)
-    rows = parameter_rows(finished)
-    fits = fit_data_sets(finished)
-    known = {note.kind for note in check_run(finished, rows, fits, Failures((), 0, 1)).findings}
-    for title, shift in (("Not informed by the data", 0.0), ("Far from the prior", 4.0)):
-        moved = [row._replace(prior_mean=row.mean - shift * row.sd, prior_sd=1.01 * row.sd) for row in rows]
-        notes = {note.kind: note for note in check_run(finished, moved, fits, Failures((), 0, 100)).findings}
-        assert "sigma_top [mm]" in notes[title].text and title not in known
 
 
 def test_moments_are_those_of_the_more_accurate_sample(rng):
