@@ -137,5 +137,6 @@ def _draw_chain(axes: "Axes", sampler: Any) -> None:
     steps = np.arange(1, len(middle) + 1)
     style = {"fmt": "o-" if len(steps) < 40 else "-", "color": BLUE, "markersize": 3, "ecolor": BLUE + "60"}
     axes.errorbar(steps, middle, [middle - low, high - middle], label="median and 90 % of the walkers", **style)
+    axes.set_xlim(0.5, len(steps) + 0.5)
     axes.xaxis.get_major_locator().set_params(integer=True)
     axes.legend(frameon=False, fontsize="small", loc="lower right")

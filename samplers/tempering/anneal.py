@@ -42,7 +42,7 @@ from ..proposals.transforms import find_support_bounds
 from ..reports import EarlyStop, GuidedStart, Report, Restart, Stage, warn
 from ..resampling import systematic
 from ..settings import Settings
-from .early_stop import NothingToReport, StoppedEarly
+from .early_stop import StoppedEarly
 from .guided import FEWEST_DRAWS, Guidance, RoundsOfGuide, better_of, draw_rounds, start_from_guide, stopped_rounds
 from .mutation import MoveSchedule, Mutated, VisitedPoints, move_together
 from .pending_points import PendingPoints
@@ -267,7 +267,7 @@ def _finish_early(stop: StoppedEarly, size: int, random: np.random.RandomState, 
     if len(log_weights) == 0 or np.max(log_weights) == -np.inf:
         search = f", besides {searched:.0f} simulations of the search by the guide" if searched > 0.0 else ""
         advice = f", or {WHERE_TO_LOOK}" if len(log_weights) > 0 else ""
-        raise NothingToReport(
+        raise ValueError(
             f"the limit of simulations (max_simulations) ended the run after {len(log_weights)} evaluated points, none "
             f"of which has a finite log-probability{search}: there is nothing to report. Call run_mcmc again with a "
             f"larger limit (the simulations made so far are kept){advice}"

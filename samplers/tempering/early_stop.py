@@ -6,11 +6,7 @@ from ..estimates.importance import tail_variance
 from ..estimates.weights import effective_sample_size, log_mean_weight
 from .population import Population
 
-__all__ = ["NothingToReport", "StoppedEarly", "stop_at"]
-
-
-class NothingToReport(ValueError):
-    """The limit of simulations has ended an annealing without a possible point."""
+__all__ = ["StoppedEarly", "stop_at"]
 
 
 class StoppedEarly(Exception):
