@@ -132,6 +132,7 @@ def test_a_data_set_and_a_file_that_cannot_be_read(tmp_path):
     [
         ("frequency_Hz,top\n1.5,1.0\n4.6,-0.7\n", "modes", {}),
         ("frequency,top\n1.5,1.0\n4.6,-0.7\n", "modes", {"unit": "?"}),
+        ("T [s],top [mm]\n0.0,1.0\n0.1,-0.7\n", "measurements", {"columns": {"top": "top [mm]"}}),
         (
             "case,mid [mm],end\none,1,2\ntwo,2,3\n",
             "load_test",
@@ -144,7 +145,7 @@ def test_a_data_set_and_a_file_that_cannot_be_read(tmp_path):
 def test_data_without_time_have_sections_of_their_own(tmp_path, text, section, given):
     path = tmp_path / "a.csv"
     path.write_text(text)
-    assert listed(path)[1] == {section: {"file": str(path)} | given}
+    assert listed(path)[1][section] == {"file": str(path)} | given
 
 
 def test_channels_of_a_real_structure_in_a_zip_archive(shared):

@@ -130,6 +130,8 @@ LOGGERS = {
     ),
     "quoted names": (lines('"Time, s","Acceleration, m/s²"', *POINTS), {}),
     "separators at ends": (lines("time_s;acc_m/s2;", *(f"{row};" for row in SEMICOLONS)), {}),
+    "separators at ends of rows": (lines("time_s;acc_m/s2", *(f"{row};" for row in SEMICOLONS)), {}),
+    "separator at the end of the header line": (lines("time_s;acc_m/s2;", *SEMICOLONS), {}),
     "more columns": (
         lines("No;time_s;acc_m/s2", *(f"{k};{row}" for k, row in enumerate(SEMICOLONS))),
         {"column": "acc_m/s2"},
