@@ -57,7 +57,6 @@ _PATIENCE = 4  # iterations after which an ascent that is far below a known end 
 _LEFT = 6.0  # iterations like the last one that would be needed to reach the known end
 _ROUGH = 5.0  # gain that the quadratic approximation may promise where no step gains anything
 _STALLED = 0.1, 0.02  # gain in log-density below which a step counts as failed, and the same as a share of what is left
-_MISLED = 0.7  # share of the promised gain below which an ascent with derivatives of its own makes new differences
 _KEPT_PROMISE = 0.5  # share of the promised gain from which one damping is enough for the next step
 _HOPELESS = 200.0  # log-density below the best end at which another one is given up
 _SAME_MODE = 4.0  # squared distance per dimension, in units of the Laplace approximation
@@ -68,8 +67,6 @@ _ALONG = np.array([0.207, 0.414, 0.732])  # points of this line, unequal so that
 _DIP = 3.0  # depth of a valley in log-density that separates modes
 _ROUGHNESS = 4.0  # depth of a valley between points of one rough mode, as a multiple of the cost of a step
 _DEEPEST = 9.0  # at most: along wrong axes, steps cost hundreds
-_TOO_SHORT = 0.02  # squared length of a step, in units of the Laplace approximation, with which a design is repeated
-_DESIGNS = 4  # at most, around one end
 _DESIGN_FROM = 0.25  # log-density per dimension still to gain at which the first one is made
 _LONGEST = 4  # such directions along which steps are simulated
 _FAR = 2.0  # standard deviations that are simulated along such directions
@@ -198,7 +195,7 @@ class _Climb:
         number: int,
         designed: bool = True,
     ) -> None:
-        self._number, self._shared, self._designed = number, np.isinf(apart), designed
+        self._number, self._designed = number, designed
         self._target, self._jacobians, self._centre, self._known = target, jacobians, centre, known
         self._apart = apart
         self.here: _Point
@@ -339,18 +336,15 @@ class _Climb:
             moves *= np.minimum(1.0, _LARGEST_STEP / np.abs(moves).max(axis=1, keepdims=True))
             points = self._target.moved(at.coords, moves)
             runs = yield points
-            higher, misled = self.highest(points, runs, at.value), False
+            higher = self.highest(points, runs, at.value)
             gain = 0.0 if higher is None else higher.value - at.value
             if higher is not None:
                 k = int(np.argmin(np.square(points - higher.coords).sum(axis=1)))
                 promised = float(at.gradient @ moves[k] - 0.5 * moves[k] @ at.hessian @ moves[k])
                 good, damping = gain > _KEPT_PROMISE * promised, float(np.clip(dampings[k], *_DAMPING_LIMITS))
-                misled = gain < _MISLED * promised
                 self.here = higher
             if gain > max(_STALLED[0], _STALLED[1] * at.gain_left):
                 failures = 0
-                if misled and not self._shared and not own:
-                    yield from self._own_differences(at, 1.0)
                 continue
             good, failures = False, failures + 1
             damping = max(damping, _FIRST_DAMPING)
@@ -444,22 +438,16 @@ def ascend(
     if joined is not None:
         del known[number]
         return joined
-    around, axes = (None, np.eye(len(start))) if steps is None else (start, steps)
-    for _ in range(_DESIGNS if designed else 0):
-        end = known[number]
-        short = np.einsum("kd,de,ke->k", axes, end.hessian, axes).min() < _TOO_SHORT
-        if around is not None and not short and _squared_distance(around, end) < _SAME_MODE * len(around):
-            break
-        around, axes = end.coords, axes_of(end)
-        points = target.moved(around, axes)
-        axes = points - around
+    end = known[number]
+    if designed and (steps is None or _squared_distance(start, end) >= _SAME_MODE * len(start)):
+        points = target.moved(end.coords, axes_of(end))
         runs = yield points
         # at a saddle, such as the axis of symmetry of an even response, a point of the design is higher
         higher = climb.highest(points, runs, end.value + tolerance)
         # a step of a standard deviation costs 0.5; on a rough likelihood it costs more, and so do points on a line
         cost = end.value - float(np.median(climb.values or end.value))
         climb.dip = float(np.clip(_ROUGHNESS * cost, _DIP, _DEEPEST))
-        yield from climb.difference(axes, runs)
+        yield from climb.difference(points - end.coords, runs)
         climb.here = higher or climb.here
         yield from climb.climb(False, tolerance)
     end = climb.quadratic()

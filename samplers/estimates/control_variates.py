@@ -171,7 +171,8 @@ def _log_mean_squares(rounds: Sequence[Round], used: Sequence[int], log_evidence
         known = rounds[k].known.log_density(coords)
         larger, smaller = np.maximum(posterior, known), np.minimum(posterior, known)
         some = larger > -np.inf
-        log_square = 2.0 * (larger + np.log1p(-np.exp(smaller - larger) * (1.0 - np.finfo(float).eps)))[some]
+        larger, smaller = larger[some], smaller[some]
+        log_square = 2.0 * (larger + np.log1p(-np.exp(smaller - larger) * (1.0 - np.finfo(float).eps)))
         found.append(np.logaddexp.reduce(log_square - densities[some, k] - mixture[some]))
     return np.array(found)
 
