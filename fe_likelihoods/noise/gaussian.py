@@ -81,12 +81,10 @@ class GaussianNoise:
     effective_samples : mapping of channel names to float, or sequence of float, optional
         Number of independent samples that each channel is worth (`fe_likelihoods.effective_samples`), at most the
         number of samples, which is also the default for names that are left out.
-    scales : mapping of channel names to float, or sequence of float, optional
-        Positive scales [SI unit of the channel]: the level of ``groups="all"`` and the shares of ``level="measured"``
-        are multiples of them. Default: root mean squares of the measured channels.
-    layout, events, measured, of_parts
-        Sample times; events; the measured (event, channel) pairs; the events of parts of the time. Set by the
-        likelihood (`with_measurements`, `under`) and by predictions.
+    scales, layout, events, measured, of_parts
+        Root mean squares of the measured channels [SI], of which the level of ``groups="all"`` and the shares of
+        ``level="measured"`` are multiples; sample times; events; the measured (event, channel) pairs; the events of
+        parts of the time. Set by the likelihood (`with_measurements`, `under`) and by predictions.
 
     Raises
     ------
@@ -146,7 +144,7 @@ class GaussianNoise:
     local: float | None = None
     sensor: PerChannel = None
     effective_samples: PerChannel = None
-    scales: PerChannel = None
+    scales: tuple[float, ...] | None = None
     layout: Layout | None = None
     events: tuple[EventWindow, ...] = ()
     measured: tuple[tuple[int, int], ...] = ()
@@ -206,18 +204,12 @@ class GaussianNoise:
                 "units"
             )
         whole = 'groups="channel" and "all", with level="si" or "measured"'
-        for name, means, where, default, unit in (
-            ("effective_samples", self._whole, whole, math.inf, "of samples"),
-            ("scales", self._scaled, 'groups="all" in SI units, and level="measured"', None, "in SI units"),
-        ):
-            given = self._option(name, means, where)
-            values = per_channel(self, self.channels, name, given, default, unit)
-            if values is not None and not all(value > 0.0 for value in values):
-                raise ValueError(
-                    f"GaussianNoise: {name} must be positive numbers {unit}; got {given!r}: leave out channels without "
-                    "a signal"
-                )
-            object.__setattr__(self, name, values)
+        given = self._option("effective_samples", self._whole, whole)
+        values = per_channel(self, self.channels, "effective_samples", given, math.inf, "of samples")
+        if values is not None and not all(value > 0.0 for value in values):
+            raise ValueError(f"GaussianNoise: effective_samples must be positive numbers of samples; got {given!r}")
+        object.__setattr__(self, "effective_samples", values)
+        object.__setattr__(self, "scales", None if self.scales is None else tuple(map(float, self.scales)))
 
     def _option(self, name: str, means: bool, where: str, default: float | None = None) -> Any:
         """A given option, else its default; ValueError for one that is given and has no meaning here."""
@@ -378,6 +370,8 @@ class GaussianNoise:
         if names != got:
             raise ValueError(f"expected measurements of {', '.join(names)}; got {', '.join(got)}: select({names!r})")
         if self._scaled and self.scales is None:
+            if silent := [name for name, rms in zip(names, measurements.root_mean_squares, strict=True) if not rms]:
+                raise ValueError(f"GaussianNoise: {', '.join(silent)} is zero at all samples: leave it out, select()")
             return replace(self, scales=measurements.root_mean_squares)
         if self._whole:
             return self

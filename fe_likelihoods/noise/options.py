@@ -68,12 +68,9 @@ def numbers(noise: Any, what: str, given: Any, unit: str) -> tuple[float, ...]:
 
 
 def per_channel(
-    noise: Any, channels: Sequence[Channel], what: str, given: PerChannel, default: float | None, unit: str
+    noise: Any, channels: Sequence[Channel], what: str, given: PerChannel, default: float, unit: str
 ) -> tuple[float, ...] | None:
-    """One number per channel, or None if none are given.
-
-    Names that a mapping leaves out get the `default`; without a default they are refused.
-    """
+    """One number per channel, or None if none are given; names that a mapping leaves out get the `default`."""
     if given is None:
         return None
     names, kind = [channel.name for channel in channels], type(noise).__name__

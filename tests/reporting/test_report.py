@@ -20,7 +20,6 @@ from fe_likelihoods import (
     Record,
     SimulationFailed,
     TruncatedNormal,
-    Uniform,
     peak,
     propagate,
     report,
@@ -169,20 +168,14 @@ def test_the_fit_is_that_of_the_posterior_mean_and_its_simulations_are_counted(v
     assert fit_data_sets(read_run(sampler, posterior)).simulations == 0
 
 
-def test_correlated_errors_and_edges_are_named():
-    slow = np.convolve(np.random.default_rng(2).standard_normal(len(TIME) + 30), np.ones(20) / 20, "same")
-    prior = PRIOR | {ODD: Uniform(0.5, 1.08), "sigma_top": HalfNormal(0.02)}
-    posterior = vibration("measured", 0.02 * slow[None, : len(TIME)], prior)
-    finished = read_run(run(posterior), posterior)
-    fits, rows = fit_data_sets(finished), parameter_rows(finished)
-    notes = {note.kind: note for note in check_run(finished, rows, fits, Failures((), 0, 100)).findings}
-    assert "top" in notes["The errors are correlated"].text
-    assert f"{ODD} at 1.08" in notes["At the edge of the prior"].text
-    assert "Synthetic data" not in notes and "Simulations failed" not in notes
-    assert "are worth" in residual_sentences(fits)[0]
-    notes = {note.kind: note for note in check_run(finished, rows, fits, Failures((), 30, 100)).findings}
-    assert "30 of 100 simulations failed (30 %)" in notes["Simulations failed"].text
-    assert notes["Simulations failed"].severity == "care"
+def test_many_failed_simulations_limit_a_result(vibrating):
+    finished = read_run(*vibrating)
+    rows, fits = parameter_rows(finished), fit_data_sets(finished)
+    for count, severity in ((0, []), (4, ["note"]), (30, ["care"])):
+        found = check_run(finished, rows, fits, Failures((), count, 100)).findings
+        named = [each for each in found if each.kind == "Simulations failed"]
+        assert [each.severity for each in named] == severity
+        assert all(f"{count} of 100 simulations failed ({count} %)" in each.text for each in named)
 
 
 def test_moments_are_those_of_the_more_accurate_sample(rng):
