@@ -103,10 +103,10 @@ def check_run(
     A run that says nothing about the parameters gets no findings that compare its samples with prior, truth or noise.
     """
     model = StepTest([], {}) if model is None else model
-    found = _check_sampling(run) + _check_chain(run) + _check_failures(run, failed)
+    found = check_responses(fits.fits) + model.findings  # first, because they explain a sampling that is not good
+    found += _check_sampling(run) + _check_chain(run) + _check_failures(run, failed)
     for text in fits.failures:
         found.append(Finding("A response is missing", CARE, f"{text}.", "Use another point or mend the model."))
-    found += check_responses(fits.fits) + model.findings
     for likelihood, columns in [] if run.likelihood is None else run.likelihood.parts():
         found += [] if run.is_inconclusive else check_damping(likelihood.model, run.centre[columns], fits.fits)
         found += check_supports(likelihood.model)

@@ -91,7 +91,7 @@ def check_excluded_runs(simulated: np.ndarray, emulated: np.ndarray) -> list[Fin
     text = f"the emulated posterior excludes {excluded} of {np.sum(probable)} probable simulations, "
     if np.median(differences) > ROUGH:
         text += (
-            "and hardly agrees with the others: the response is rough, as it jumps by as much as the noise between "
+            "and disagrees with most of them: the response is rough, as it jumps by as much as the noise between "
             "parameters that hardly differ, or the data are far from all that the prior allows. The result is wrong by "
             "far more than its errors. Use smaller steps or a tighter tolerance of the solver, and look at the data"
         )

@@ -116,16 +116,17 @@ def test_draws_have_the_conditional_distribution(rng):
 
 
 @pytest.mark.parametrize(
-    "noise", [AutoregressiveNoise([TOP]), GaussianNoise([TOP], sensor=[0.1]), "white"], ids=["AR", "sensor", "name"]
+    ("noise", "name", "text"),
+    [
+        *((each, "sigma_top", "keep the parameters of this noise") for each in (AutoregressiveNoise([TOP]), "white")),
+        (GaussianNoise([TOP], sensor=[0.1]), "sigma_top", "keep the parameters of this noise"),
+        (GaussianNoise([TOP]), "sigma", "expected priors of the noise parameters sigma_top; got priors of sigma"),
+    ],
+    ids=["AR", "name", "sensor", "priors"],
 )
-def test_noises_that_cannot_be_integrated_out_are_refused(noise):
-    with pytest.raises(ValueError, match="keep the parameters of this noise"):
-        MarginalNoise(noise, {"sigma_top": HalfNormal(1.0)})
-
-
-def test_priors_must_be_of_the_noises_parameters():
-    with pytest.raises(ValueError, match="expected priors of the noise parameters sigma_top; got priors of sigma"):
-        MarginalNoise(GaussianNoise([TOP]), {"sigma": HalfNormal(1.0)})
+def test_noises_that_cannot_be_integrated_out_are_refused(noise, name, text):
+    with pytest.raises(ValueError, match=text):
+        MarginalNoise(noise, {name: HalfNormal(1.0)})
 
 
 # posteriors -----------------------------------------------------------------------------------------------------------
