@@ -62,12 +62,12 @@ def test_warning_of_another_process_is_repeated_once(drift, expected, path, capl
 @pytest.mark.parametrize("drift", [0.2, 0.05])
 def test_a_stored_remark_is_a_finding_of_the_result(drift, path):
     """The second run takes all simulations from the file, so that its model has made no remark."""
-    for _ in range(2):
+    for again in (False, True):
         run = likelihood(path, drift)
         sigmas = {name: HalfNormal(1e6) for name in run.noise.parameter_names}
         posterior = Posterior(run, {"fy": TruncatedNormal(1.0, 0.05)} | sigmas)
         sampler = SMCSampler(24, posterior.ndim, posterior, vectorize=True, seed=1, min_moves=1, max_moves=1)
         sampler.run_mcmc(None, 1)
+        assert not (again and run.simulations)  # check_result compares more draws where a simulation took less time
         titles = [finding.kind for finding in check_result(sampler).findings]
         assert ("Beyond the range of a law of the model" in titles) == (drift > 0.1)
-    assert run.simulations == 0
