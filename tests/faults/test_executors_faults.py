@@ -148,30 +148,6 @@ def test_dask_retries_and_gives_up_on_the_item_that_kills_its_worker_only(tmp_pa
         np.testing.assert_array_equal(np.delete(values, 3), np.delete(expected, 3))
 
 
-@needs("mpi4py")
-def test_mpi_gives_the_same_bits():
-    """mpi4py.futures with two workers."""
-    code = (
-        "from mpi4py.futures import MPICommExecutor; from fe_likelihoods.simulation.executors import as_executor;"
-        "from fe_likelihoods.simulation.model import simulate_batch;"
-        "from tests.faults.treacherous import *; x = np.array([[.1 * k, .2, .5] for k in range(1, 9)])\n"
-        "with MPICommExecutor() as pool:\n"
-        "    if pool is not None:\n"
-        "        print(posterior_of(Treacherous(), pool=pool)(x).tolist() == posterior_of(Treacherous())(x).tolist())\n"
-        "        print(set(simulate_batch(Large(), x[:, :2], as_executor(pool)).response[:, 0, 0].tolist()))\n"
-        "        queue = posterior_of(Treacherous(), pool=pool).evaluation_queue()\n"
-        "        tickets, values = queue.submit(x), {}\n"
-        "        while len(values) < len(x):\n"
-        "            values.update(queue.collect())\n"
-        "        print([values[ticket] for ticket in tickets] == posterior_of(Treacherous())(x).tolist())\n"
-    )
-    mpiexec = Path(sys.executable).with_name("mpiexec")
-    command = [mpiexec if mpiexec.exists() else "mpiexec", "--oversubscribe", "-n", "3", sys.executable, "-c", code]
-    environment = os.environ | {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
-    run = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120)
-    assert run.stdout.split() == ["True", "{1.0}", "True"], run.stderr  # the model is loaded once per rank
-
-
 # parents that die ---------------------------------------------------------------------------------------------------
 
 PARENTS = [
@@ -212,20 +188,6 @@ def test_nothing_outlives_a_parent_that_is_killed(pool, tmp_path, tmp_path_facto
 
 def third(**options):
     return posterior_of(FunctionModel(bad.third, NAMES, CHANNELS, DT, N_STEPS), **options)
-
-
-def test_sampler_with_nan_in_a_third_of_the_prior(seed):
-    posterior = third()
-    sampler = SMCSampler(60, posterior.ndim, posterior, vectorize=True, seed=seed)
-    sampler.run_mcmc(None, 2)
-    assert np.isfinite(sampler.get_log_prob()).all()
-    assert sampler.get_chain()[..., 0].min() >= 1.0 / 3.0
-    report = posterior.report()
-    reasons = report["failure_reasons"]
-    assert reasons.pop("ValueError: too stiff", 0) < reasons.pop("the response of channel 'a' is not finite")
-    assert reasons == {}
-    # a third of the draws of the prior fail, fewer of the later points
-    assert 0 < report["failure_count"] < 0.5 * report["simulations"]
 
 
 @pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning:emcee")  # emcee subtracts -inf from -inf

@@ -25,7 +25,6 @@ from fe_likelihoods.simulation.executors import LocalPool
 from fe_likelihoods.simulation.faults import ChangedModel
 from tests.faults import treacherous as bad
 from tests.faults.treacherous import Gated, Treacherous, posterior_of
-from tests.likelihood.linear_gaussian import likelihood_of
 
 SECONDS = 60.0  # after which a test gives up
 LONG = np.array([[0.95, 0.1, 0.5], [0.96, 0.1, 0.5]])
@@ -192,20 +191,6 @@ def test_a_joint_likelihood_simulates_later_parts_where_earlier_ones_are_possibl
             assert queue.workers == {2: 3, 1: 2, 0: 1}[sum(pooled)]
             np.testing.assert_array_equal(collect(queue, queue.submit(x)), expected)
     assert posterior.report()["simulations"] == reference.report()["simulations"]
-
-
-def test_points_that_share_the_parameters_of_a_part_share_its_simulation(rng):
-    """Whether it runs or has ended: the parts of a joint likelihood make fewer simulations than there are points."""
-    with ThreadPoolExecutor(2) as pool:
-        parts = {}
-        for key, names in (("component", ("a", "b")), ("system", ("b", "c"))):
-            part = likelihood_of(names, rng)
-            parts[key] = FELikelihood(part.model, part.measurements, part.noise, pool=pool)
-        posterior = Posterior(JointLikelihood(parts), {name: Uniform(0.0, 9.0) for name in "abc"})
-        with posterior.evaluation_queue() as queue:
-            for x in ([[1.0, 1.0, 1.0], [1.0, 1.0, 2.0], [2.0, 1.0, 1.0]], [[1.0, 1.0, 3.0]]):
-                assert np.isfinite(collect(queue, queue.submit(x))).all()
-    assert [part["simulations"] for part in posterior.report()["likelihoods"].values()] == [2, 3]
 
 
 def test_the_same_failures_end_a_run_as_in_a_call(tmp_path):

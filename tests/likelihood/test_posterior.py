@@ -336,9 +336,10 @@ def test_reasons_are_bounded_and_later_ones_are_counted_apart():
         log.add(np.array([k]), f"no convergence at step {k}")
     log.add(np.array([0.0]), "buckled")
     assert log.reasons["no convergence at step #"] == 200 and log.reasons["buckled"] == 1
-    for k in range(300):
+    for k in range(900):
         log.add(np.array([k]), f"error {'a' * k}")
-    assert len(log.reasons) == 201 and log.reasons["other reasons"] == 202 and log.reasons.total() == 601
+    assert len(log.reasons) == 201 and log.reasons["other reasons"] == 802 and log.reasons.total() == log.count == 1201
+    assert len(log.records) == 1000
 
 
 def test_nan_from_a_noise_is_a_failure():

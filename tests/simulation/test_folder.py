@@ -18,7 +18,6 @@ import numpy as np
 import pytest
 
 from fe_likelihoods.models.function import FunctionModel
-from fe_likelihoods.models.opensees import OpenSeesModel
 from fe_likelihoods.signals.channels import Channel
 from fe_likelihoods.simulation import folder
 from fe_likelihoods.simulation.executors import LocalPool, as_executor
@@ -467,40 +466,10 @@ def opened(kind, workers):
         yield pool
 
 
-def bar(ops, theta, recorder=None):
-    ops.model("basic", "-ndm", 1, "-ndf", 1)
-    for node in (1, 2):
-        ops.node(node, 0.0)
-    ops.fix(1, 1)
-    ops.uniaxialMaterial("Elastic", 1, theta[0])
-    ops.element("zeroLength", 1, 1, 2, "-mat", 1, "-dir", 1)
-    ops.timeSeries("Linear", 1)
-    ops.pattern("Plain", 1, 1)
-    ops.load(2, theta[1])
-    if recorder is not None:
-        ops.recorder("Node", "-file", recorder, "-precision", 17, "-node", 2, "-dof", 1, "disp")
-    for command, word in (("constraints", "Plain"), ("numberer", "Plain"), ("system", "BandGeneral")):
-        getattr(ops, command)(word)
-    ops.algorithm("Linear")
-    ops.integrator("LoadControl", 1.0)
-    ops.analysis("Static")
-    found = []
-    for _ in range(2):
-        if ops.analyze(1) != 0:
-            raise RuntimeError("no convergence")
-        found.append(ops.nodeDisp(2, 1))
-    if recorder is not None:
-        ops.wipe()
-        found = np.loadtxt(recorder)
-    return [found]
-
-
 CASES = {
     "relative": relative,
     "in a subfolder": lambda theta: write_and_read("results/in.txt", theta),
     "program": of_program,
-    "recorder": lambda ops, theta: bar(ops, theta, "disp.out"),
-    "recorder in a subfolder": lambda ops, theta: bar(ops, theta, "results/disp.out"),
 }
 
 
@@ -513,18 +482,10 @@ CASES = {
 def test_no_simulation_reads_files_of_another(case, kind, workers, start):
     n = 300 if case == "relative" else 60
     thetas = np.random.default_rng(2).uniform(0.5, 1.5, (n, 2))
-    for name in ("in.txt", "out.txt", "disp.out", "results/in.txt", "results/disp.out"):
+    for name in ("in.txt", "out.txt", "results/in.txt"):
         old(start / name, "1.0 1.0\n")
-    user = model(CASES[case])
-    expected = thetas[:, None]
-    if case.startswith("recorder"):
-        pytest.importorskip("openseespy")
-        user = OpenSeesModel(CASES[case], ["a", "b"], CHANNELS, 0.01, 2)
-        expected = simulate_batch(OpenSeesModel(bar, ["a", "b"], CHANNELS, 0.01, 2), thetas).response
     with opened(kind, workers) as pool:
-        batch = simulate_batch(user, thetas, as_executor(pool))
-    assert batch.reasons == [""] * n
-    np.testing.assert_allclose(batch.response, expected, rtol=1e-12)
+        assert_right(CASES[case], pool, thetas)
 
 
 def simulated(theta):
