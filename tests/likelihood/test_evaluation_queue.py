@@ -155,6 +155,7 @@ def test_points_come_back_while_others_are_submitted(tmp_path, shared_pool):
             for row in SHORT[:3]:
                 (ticket,) = queue.submit(row[None])
                 assert [done for done, _ in queue.collect()] == [ticket]
+                assert [done for done, _ in queue.ended()] == [ticket]  # the caller may not have received it
             other = LONG[:1] * [1.0, 1.0, 1.1]  # another noise
             same = queue.submit(np.concatenate([LONG[:1], other]))
             (tmp_path / "go").touch()
