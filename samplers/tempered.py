@@ -341,11 +341,11 @@ class TemperedSampler(RunResults, EnsembleSampler):
                     self._must_repeat = self._must_repeat and self._result.early_stop is not None
                 self.seconds += time.perf_counter() - start
                 self._evaluator.evaluates_parts = False
-                self._output.trim()
                 moves, probabilities = get_moves(self)
                 set_moves(self, without_unfitted(moves), probabilities)
                 state.blobs = self._evaluator.typed(state.blobs)
                 if store:
+                    self._output.trim()
                     self._output.check_blobs(state.blobs)
                 ended, advanced, stored, new = self._must_repeat, None, State(state, copy=True), 0
                 steps = (

@@ -295,6 +295,7 @@ def test_a_file_that_is_only_read(kind, tmp_path):
     sampler = KINDS[kind][0](N, NDIM, Counted(), backend=backend, **KINDS[kind][1])
     assert sampler.ladder == whole.ladder and sampler.log_evidence == whole.log_evidence
     assert np.array_equal(sampler.get_chain(), whole.get_chain()) and sampler.verdict == whole.verdict
+    sampler.run_mcmc(None, 1, store=False)
     assert sorted((path.name, path.read_bytes()) for path in tmp_path.iterdir()) == before
 
 
