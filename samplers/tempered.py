@@ -182,8 +182,9 @@ class TemperedSampler(RunResults, EnsembleSampler):
             self._evaluator: Evaluator = AsynchronousEvaluator(*common, queue=queue)
         else:
             self._evaluator = Evaluator(*common)
-        if self._reopened and self._record.start.header["log_prob_fn"] == getattr(target.function, "fingerprint", None):
-            target.recall(self._record.latest(self._record.count))
+        known = self._record.latest(self._record.count) if self._reopened else None
+        if known and self._record.start.header["log_prob_fn"] == getattr(target.function, "fingerprint", None):
+            target.recall(known)
         self._seed = None if seed is None else np.ravel(seed).tolist()
         # also drawn where it is not used, so that a script draws the same numbers after a restart
         stream = np.random.randint(2**32, size=8, dtype=np.uint32) if seed is None else seed  # noqa: NPY002

@@ -146,6 +146,28 @@ def test_a_reopened_run_counts_the_failures_of_its_record(what, tmp_path):
     assert [row.reason for row in found.rows] == [row.reason for row in before.rows]
 
 
+def test_a_run_that_ended_before_its_first_evaluation_goes_on(tmp_path):
+    def log_prob(theta):
+        if not (tmp_path / "go").exists():
+            raise KeyboardInterrupt
+        return -5.0 * np.sum((theta - 1.0) ** 2)
+
+    def opened():
+        prior = {name: TruncatedNormal(1.0, 0.3) for name in ("stiffness", "damping")}
+        posterior, backend = (
+            Posterior(FunctionLikelihood(log_prob, list(prior)), prior),
+            HDFBackend(tmp_path / "run.h5"),
+        )
+        return SMCSampler(20, 2, posterior, vectorize=True, seed=1, max_moves=3, backend=backend)
+
+    with pytest.raises(KeyboardInterrupt):
+        opened().run_mcmc(None, 1)
+    (tmp_path / "go").touch()
+    sampler = opened()
+    sampler.run_mcmc(None, 1)
+    assert sampler.iteration == 1 and sampler.evaluations > 0
+
+
 def test_failures_in_the_first_parts_of_the_record_count():
     posterior = posterior_of([1.0, 0.8])
     sampler = run(posterior, steps=1)
