@@ -6,11 +6,6 @@ The index adds the largest displacement and the dissipated energy,
 
 with the ultimate displacement :math:`\delta_u` under monotonic loading, the yield strength :math:`Q_y` and a factor
 :math:`\beta` of strength deterioration. See ``docs/damage.rst``.
-
-References
-----------
-Y.-J. Park, A. H.-S. Ang (1985), Mechanistic seismic damage model for reinforced concrete, Journal of Structural
-Engineering 111(4), 722-739, doi:10.1061/(ASCE)0733-9445(1985)111:4(722).
 """
 
 from __future__ import annotations

@@ -11,11 +11,6 @@ each test alone. The likelihood of the hyper-parameters is the product over the 
 the expectation over the posterior of test k, with its prior density :math:`p_k` and its evidence :math:`Z_k`.
 `HierarchicalPosterior` is the posterior density of the hyper-parameters, for any sampler. See
 ``docs/theory/hierarchy.rst``.
-
-References
-----------
-D. W. Hogg, A. D. Myers, J. Bovy (2010), Inferring the eccentricity distribution, The Astrophysical Journal 725,
-2166-2175, doi:10.1088/0004-637X/725/2/2166, eq. (9).
 """
 
 import copy

@@ -8,11 +8,6 @@ that differ from event to event. The log ratios in K events are described by
 with the predicted value :math:`g_k` and the scatter :math:`s_k` that is expected before the events. The factor
 :math:`\lambda` says how much more, or less, this structure scatters. All unknowns are integrated out, so that the
 logarithm of a new ratio has Student's t distribution. The equations are on the page ``docs/theory/prediction.rst``.
-
-References
-----------
-A. Gelman, J. B. Carlin, H. S. Stern, D. B. Dunson, A. Vehtari, D. B. Rubin (2013), Bayesian Data Analysis, 3rd edition,
-Chapman and Hall/CRC, sections 3.2, 3.3 and 14.8.
 """
 
 from collections.abc import Mapping

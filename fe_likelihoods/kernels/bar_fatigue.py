@@ -15,16 +15,6 @@ law give the half cycles of rainflow counting: a nested reversal starts a new ha
 ends at an earlier reversal closes a loop, after which the interrupted half cycle continues.
 
 ``docs/theory/reinforcing_steel.rst`` has the equations and compares them with OpenSees.
-
-References
-----------
-S. S. Manson, Fatigue: a complex subject - some simple approximations, Experimental Mechanics 5(7), 1965,
-doi:10.1007/BF02321056.
-
-J. Brown, S. K. Kunnath, Low-cycle fatigue failure of reinforcing steel bars, ACI Materials Journal 101(6), 2004.
-
-S. K. Kunnath, Y. Heo, J. F. Mohle, Nonlinear uniaxial material model for reinforcing steel bars, Journal of Structural
-Engineering 135(4), 2009, doi:10.1061/(ASCE)0733-9445(2009)135:4(335).
 """
 
 from __future__ import annotations

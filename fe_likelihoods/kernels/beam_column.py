@@ -13,15 +13,6 @@ Softening concrete makes sections locally unstable, and this iteration sometimes
 order: the initial section flexibilities in every pass; the initial section flexibilities in the first pass only; a
 tenth of the increment at a time, up to four times in succession. If all attempts fail, the element reports failure.
 ``docs/theory/beam_column.rst`` has the equations.
-
-References
-----------
-E. Spacone, F. C. Filippou, F. F. Taucer, Fibre beam-column model for non-linear analysis of R/C frames: part I,
-Earthquake Engineering and Structural Dynamics 25(7), 1996,
-doi:10.1002/(SICI)1096-9845(199607)25:7<711::AID-EQE576>3.0.CO;2-9.
-
-A. Neuenhofer, F. C. Filippou, Evaluation of nonlinear frame finite-element models, Journal of Structural Engineering
-123(7), 1997, doi:10.1061/(ASCE)0733-9445(1997)123:7(958).
 """
 
 from __future__ import annotations

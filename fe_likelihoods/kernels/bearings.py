@@ -18,18 +18,6 @@ between the loading and unloading branches::
 
 Beyond ``|s|`` = s_max the skeleton continues along its tangent and D keeps its value.
 ``docs/theory/isolated_bridge.rst`` has all equations.
-
-References
-----------
-M. C. Constantinou, A. Mokha, A. Reinhorn, Teflon bearings in base isolation II: modeling, Journal of Structural
-Engineering 116(2), 1990, doi:10.1061/(ASCE)0733-9445(1990)116:2(455).
-
-Y.-K. Wen, Method for random vibration of hysteretic systems, Journal of the Engineering Mechanics Division 102(2),
-1976, doi:10.1061/JMCEA3.0002106.
-
-P. Tsopelas, S. Okamoto, M. C. Constantinou, D. Ozaki, S. Fujii, NCEER-Taisei Corporation research program on sliding
-seismic isolation systems for bridges: experimental and analytical study of systems consisting of sliding bearings,
-rubber restoring force devices and fluid dampers, report NCEER-94-0002, 1994.
 """
 
 import math

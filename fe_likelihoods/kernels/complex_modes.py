@@ -6,11 +6,6 @@ exact with three constants (Nigam & Jennings 1969, in complex form)::
     q(t + dt) = decay q(t) + before f(t) + after f(t + dt)
 
 ``docs/theory/time_integration.rst`` derives the constants.
-
-References
-----------
-N. C. Nigam, P. C. Jennings, Calculation of response spectra from strong-motion earthquake records, Bulletin of the
-Seismological Society of America 59(2), 1969, 909-922.
 """
 
 from .jit import kernel

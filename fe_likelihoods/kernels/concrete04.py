@@ -14,14 +14,6 @@ The stress is a single-valued function of the strain and of the memory. It does 
 and a trial evaluation changes nothing. A section can therefore evaluate its fibers side by side (SIMD).
 
 OpenSees has the same law as its material Concrete04. ``docs/theory/concrete.rst`` derives it.
-
-References
-----------
-S. Popovics, A numerical approach to the complete stress-strain curve of concrete, Cement and Concrete Research 3(5),
-1973, doi:10.1016/0008-8846(73)90096-3.
-
-I. D. Karsan, J. O. Jirsa, Behavior of concrete under compressive loadings, Journal of the Structural Division 95(12),
-1969.
 """
 
 from __future__ import annotations

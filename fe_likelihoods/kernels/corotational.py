@@ -13,10 +13,6 @@ therefore hold all of T: one along the chord (ax, ay) and one along its normal (
 
 The linear variant uses the direction and the length of the undeformed chord and no Kg.
 ``docs/theory/beam_column.rst`` derives the matrices.
-
-References
-----------
-M. A. Crisfield, Non-linear finite element analysis of solids and structures, volume 1, Wiley, 1991, chapter 7.
 """
 
 from __future__ import annotations

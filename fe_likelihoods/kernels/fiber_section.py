@@ -13,12 +13,6 @@ series (`reinforcing_steel.virgin_stress_tangent`), which is also evaluated side
 
 Empty fibers (no area, at y = 0) may be appended to fill whole SIMD registers. Without them the remaining few fibers
 would take as long as all others. ``docs/theory/fiber_section.rst`` has the equations and the mesh.
-
-References
-----------
-E. Spacone, F. C. Filippou, F. F. Taucer, Fibre beam-column model for non-linear analysis of R/C frames: part I,
-Earthquake Engineering and Structural Dynamics 25(7), 1996,
-doi:10.1002/(SICI)1096-9845(199607)25:7<711::AID-EQE576>3.0.CO;2-9.
 """
 
 from __future__ import annotations

@@ -91,24 +91,10 @@ def allocate(
 ) -> Column:
     """Return a `Column` with allocated memory, whose material constants are still to be set.
 
-    Parameters
-    ----------
-    n_elements : int
-    height : float
-        Height of the column [m].
-    corotational : bool
-        False for linear geometry.
-    element_tolerance : float
-        Largest work of the last compatibility correction of an element [J].
-    points, weights : ndarray (n_points,)
-        Gauss-Lobatto rule on [0, 1].
-    core, cover, bars : ndarray (n, 2)
-        Position y [m] and area [m²] of the fibers.
-    penetration : float
-        Length below the base over which the deformations of the base section continue (bar strains in the foundation)
-        [m].
-    bars_fail : bool
-        Whether the bars have fatigue (`bar_fatigue`), whose constants are also still to be set.
+    `points` and `weights` (n_points,) are a Gauss-Lobatto rule on [0, 1]; `core`, `cover` and `bars` (n, 2) have the
+    position y [m] and the area [m²] of the fibers. The deformations of the base section continue over the length
+    `penetration` [m] below the base (bar strains in the foundation). With `bars_fail`, bars have fatigue, whose
+    constants are also still to be set. `element_tolerance` is as in `Elements` [J].
     """
     n_bar_state = bar_fatigue.N_STATE if bars_fail else reinforcing_steel.N_STATE
     concrete = _append_empty_fibers(np.concatenate([core, cover]), 16)

@@ -17,10 +17,6 @@ The recursion is written for r_n = x_n - H1 F_n, so that one step is one product
     [r_{n+1}, Q r_{n+1}] = T [r_n, a_n, a_{n+1}, F_n],     the columns of T for F_n contain Phi H1 + H0
 
 ``docs/theory/time_integration.rst`` derives the scheme, ``docs/theory/isolated_bridge.rst`` the equations of motion.
-
-References
-----------
-M. Hochbruck, A. Ostermann, Exponential integrators, Acta Numerica 19, 2010, doi:10.1017/S0962492910000048.
 """
 
 from typing import NamedTuple
@@ -115,8 +111,6 @@ def step_isolated(matrices, isolators, ground, weights, n_sub, tolerance, max_it
     -------
     status : int
         0, or the number (from 1) of the step that did not converge or is not finite, halved steps not counted.
-    iterations : int
-        Newton iterations over all steps.
     """
     step_matrices, ends, compliances = matrices.transposed, matrices.end, matrices.compliance
     n_halvings = max(0, step_matrices.shape[0] // 4 - 1)
@@ -129,7 +123,6 @@ def step_isolated(matrices, isolators, ground, weights, n_sub, tolerance, max_it
     f0 = f1 = before0 = before1 = 0.0  # F at the last two instants
     z0 = z1 = 0.0
     d0 = d1 = 0.0  # bearing displacements
-    iterations = 0
     total = n_sub << n_halvings
     for k in range(ground.size - 1):
         position, halvings = 0, 0  # in the sample interval, in steps of the smallest size; of the present step
@@ -196,7 +189,6 @@ def step_isolated(matrices, isolators, ground, weights, n_sub, tolerance, max_it
                 n0 -= x0
                 n1 -= x1
                 change = max(abs(x0), abs(x1)) if x0 == x0 and x1 == x1 else np.nan
-            iterations += iteration
             converged = change <= tolerance
             if halvings < n_halvings:
                 # half of a step in which a bearing begins or ceases to stick
@@ -204,7 +196,7 @@ def step_isolated(matrices, isolators, ground, weights, n_sub, tolerance, max_it
                     halvings += 1
                     continue
             if not converged:
-                return k * n_sub + (position >> n_halvings) + 1, iterations
+                return k * n_sub + (position >> n_halvings) + 1
             position += size
             last_size = size
             # Z and its displacement are both kept from before the last correction, so that they stay consistent
@@ -222,4 +214,4 @@ def step_isolated(matrices, isolators, ground, weights, n_sub, tolerance, max_it
             out[k + 1, i] = u[i] + ends[0, i, 0] * f0 + ends[0, i, 1] * f1
         out[k + 1, 12], out[k + 1, 13] = f0, f1
         out[k + 1, 14], out[k + 1, 15] = z0, z1
-    return 0, iterations
+    return 0

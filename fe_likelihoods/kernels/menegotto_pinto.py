@@ -11,13 +11,6 @@ Q and s_ch make it end at (xb, sb) with slope Eb. They follow from the root A in
     Q = (Es/Ea - A)/(1-A),   s_ch = sa + Ea (xb-xa) A/(1-A^R)^(1/R)
 
 ``docs/theory/reinforcing_steel.rst`` has the limiting cases.
-
-References
-----------
-M. Menegotto, P. E. Pinto, Method of analysis for cyclically loaded R.C. plane frames, IABSE Symposium, Lisbon, 1973.
-
-G. A. Chang, J. B. Mander, Seismic energy based fatigue damage analysis of bridge columns, part I, report
-NCEER-94-0006, 1994.
 """
 
 from __future__ import annotations

@@ -15,11 +15,6 @@ there may be no equilibrium before some fibers have crossed a stress jump, and t
 No step is accepted unconverged.
 
 ``docs/theory/time_integration.rst`` derives the scheme.
-
-References
-----------
-N. M. Newmark, A method of computation for structural dynamics, Journal of the Engineering Mechanics Division 85(3),
-1959, doi:10.1061/JMCEA3.0000098.
 """
 
 from __future__ import annotations
@@ -80,7 +75,7 @@ def _integrate(column, dynamics, ground, dt, every, iteration, history, out):
     record_forces(column, force, history[3:, 0])
     record(column, u, v, a, n - n, out)  # no literal, for which it would be compiled again
     smallest = 0.5**halvings
-    retries = total_iterations = 0
+    retries = 0
 
     for step in range(1, ground.shape[0]):
         done, part, loose, crossings = 0.0, 1.0, False, 0
@@ -102,7 +97,6 @@ def _integrate(column, dynamics, ground, dt, every, iteration, history, out):
 
             converged, least = False, math.inf
             for _ in range(max_iterations):
-                total_iterations += 1
                 for i in range(n):
                     r = gravity[i] - force[i] - mass[i] * (a[i] + a0 * v[i])
                     for k in range(n):
@@ -145,7 +139,7 @@ def _integrate(column, dynamics, ground, dt, every, iteration, history, out):
                 if part < smallest:
                     crossings += 1
                     if crossings > MAX_CROSSINGS or cross_jumps(column) == 0:
-                        return step, retries, total_iterations
+                        return step, retries
                     part = 1.0 - done
                 continue
 
@@ -154,7 +148,7 @@ def _integrate(column, dynamics, ground, dt, every, iteration, history, out):
             done += part
             loose = False
         if abs(u[top]) > dynamics.collapse:
-            return -1 - step, retries, total_iterations
+            return -1 - step, retries
         if step % every == 0:
             m = step // every
             history[0, m] = u[top]
@@ -162,7 +156,7 @@ def _integrate(column, dynamics, ground, dt, every, iteration, history, out):
             history[2, m] = u[top + 1]
             record_forces(column, force, history[3:, m])
             record(column, u, v, a, m, out)
-    return 0, retries, total_iterations
+    return 0, retries
 
 
 def newmark(
@@ -174,7 +168,7 @@ def newmark(
     iteration: Iteration,
     history: np.ndarray,
     out: Recorder,
-) -> tuple[int, int, int]:
+) -> tuple[int, int]:
     """Apply gravity, then the base acceleration `ground` along x.
 
     Parameters
@@ -197,10 +191,10 @@ def newmark(
     -------
     status : int
         0 on success, -1 when gravity failed, k when step k failed, -1 - k when the column had collapsed after step k.
-    retries, iterations : int
+    retries : int
     """
     retries = apply_gravity(column, dynamics.gravity, iteration)
     if retries < 0:
-        return -1, 0, 0
-    status, more, iterations = _integrate(column, dynamics, ground, dt, every, iteration, history, out)
-    return status, retries + more, iterations
+        return -1, 0
+    status, more = _integrate(column, dynamics, ground, dt, every, iteration, history, out)
+    return status, retries + more

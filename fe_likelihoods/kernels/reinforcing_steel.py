@@ -20,17 +20,6 @@ same rules with the signs of all strains and stresses changed.
 
 OpenSees has the same law as its material ReinforcingSteel with default options: no buckling, no fatigue, no isotropic
 hardening. `bar_fatigue` adds fatigue. ``docs/theory/reinforcing_steel.rst`` lists all rules.
-
-References
-----------
-G. A. Chang, J. B. Mander, Seismic energy based fatigue damage analysis of bridge columns, part I, report
-NCEER-94-0006, 1994.
-
-L. L. Dodd, J. I. Restrepo-Posada, Model for predicting cyclic behavior of reinforcing steel, Journal of Structural
-Engineering 121(3), 1995, doi:10.1061/(ASCE)0733-9445(1995)121:3(433).
-
-S. K. Kunnath, Y. Heo, J. F. Mohle, Nonlinear uniaxial material model for reinforcing steel bars, Journal of Structural
-Engineering 135(4), 2009, doi:10.1061/(ASCE)0733-9445(2009)135:4(335).
 """
 
 from __future__ import annotations

@@ -8,11 +8,6 @@ except friction and the higher terms of the rubber is linear and is integrated e
 
 The equations, the laws of the devices and the channels are in ``docs/theory/isolated_bridge.rst``. Most nominal values
 are assumed, so the results describe a bridge *like* the tested one.
-
-References
-----------
-P. Tsopelas, S. Okamoto, M. C. Constantinou, D. Ozaki, S. Fujii, NCEER-TAISEI Corporation Research Program on Sliding
-Seismic Isolation Systems for Bridges, Report NCEER 94-0002, State University of New York, Buffalo, 1994 (the tests).
 """
 
 from __future__ import annotations

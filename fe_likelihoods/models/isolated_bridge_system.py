@@ -234,7 +234,7 @@ def run_bridge(model: Any, prepared: PreparedBridge, theta: np.ndarray) -> np.nd
     ground = model.record.acceleration[: (model.n_steps - 1) * model.every + 1]  # up to the last sample of the response
     out = np.zeros((ground.size, N_OUT))
     n_sub = round(model.record.dt / step)
-    status, _ = step_isolated(
+    status = step_isolated(
         matrices,
         Isolators(sliders, prepared.law, c, FORMS[model.friction]),
         ground,

@@ -12,10 +12,6 @@ has a closed-form solution without time-stepping error (``docs/theory/time_integ
 
 `LinearStructure` makes a model from any object that computes these matrices from parameters: a bridge deck, a frame, or
 a building as a sum of modes (`fe_likelihoods.models.linear_structure_parts`).
-
-References
-----------
-A. K. Chopra, Dynamics of Structures, 4th edition, Prentice Hall, 2012.
 """
 
 from __future__ import annotations

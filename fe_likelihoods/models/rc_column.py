@@ -19,11 +19,6 @@ Other channels are forces, moments, motions, curvatures, strains, stresses and r
 The structural parameters are multiples of the nominal values in `RCColumn.nominal`. Choices that the literature leaves
 open (peak strain of the concrete, softening in tension, geometry, rotational inertia, mesh) change the response of the
 tested column by up to 75 %, so each is an argument.
-
-References
-----------
-M. K. Ramancha, R. Astroza, J. P. Conte, J. I. Restrepo, M. D. Todd, Bayesian nonlinear finite element model updating of
-a full-scale bridge-column using sequential Monte Carlo (2022): the tested column and the five parameters.
 """
 
 from __future__ import annotations

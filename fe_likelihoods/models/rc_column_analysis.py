@@ -148,7 +148,7 @@ def run_column(model: Any, prepared: PreparedColumn, theta: np.ndarray) -> tuple
         mass[:, 0], mass[:, 1], mass[-1, 2] = own, own, model.rotational_inertia
         dt, limit = model.dt / model.substeps, model.collapse_drift * model.height
         dynamics = Dynamics(gravity, mass.ravel(), float(values["a0"]), float(values["a1"]), limit)
-        status, retries, _ = newmark(column, dynamics, excitation, dt, model.substeps, iteration, history, out)
+        status, retries = newmark(column, dynamics, excitation, dt, model.substeps, iteration, history, out)
         if status < -1:
             raise SimulationFailed(
                 f"collapse: at t = {-(status + 1) * dt:.4g} s, the displacement of the top exceeded the limit of "

@@ -5,11 +5,6 @@ axial strain and curvature follow the polynomial through the points of the eleme
 integral of this polynomial over an element is the sum that the element uses, so that the rotation between two nodes is
 the difference of their rotations. The second integral of the curvature is the deflection from the chord of the element.
 Velocities and accelerations belong to nodes with a mass, stresses to the sections, whose fibers have a history.
-
-References
-----------
-A. Neuenhofer, F. C. Filippou, Geometrically nonlinear flexibility-based frame finite element, Journal of Structural
-Engineering 124(6), 1998, 704-711, doi:10.1061/(ASCE)0733-9445(1998)124:6(704).
 """
 
 from __future__ import annotations

@@ -10,13 +10,6 @@ an error of 0.6 % with 40 strips, and of 10 to 18 % with rings and 20 wedges (``
 
 Confinement follows Mander et al. (1988): effective lateral pressure of circular hoops or spirals, then strength and
 strain at the peak. The ultimate strain follows from the approximate energy balance by Priestley et al. (1996).
-
-References
-----------
-J. B. Mander, M. J. N. Priestley, R. Park, Theoretical stress-strain model for confined concrete, Journal of Structural
-Engineering 114(8), 1988, 1804-1826, doi:10.1061/(ASCE)0733-9445(1988)114:8(1804).
-
-M. J. N. Priestley, F. Seible, G. M. Calvi, Seismic Design and Retrofit of Bridges, Wiley, 1996.
 """
 
 from __future__ import annotations

@@ -3,11 +3,6 @@
 If several models explain the data, each with its posterior probability, the prediction is the mixture of their
 predictions. By the law of total variance its variance is the sum of two parts: the mean variance within the models, and
 the variance between the models' means. See ``docs/theory/prediction.rst``.
-
-References
-----------
-J. A. Hoeting, D. Madigan, A. E. Raftery, C. T. Volinsky (1999), Bayesian model averaging: a tutorial, Statistical
-Science 14(4), 382-417, doi:10.1214/ss/1009212519.
 """
 
 from collections.abc import Mapping

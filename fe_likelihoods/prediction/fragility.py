@@ -6,11 +6,6 @@ Under each record the probability of an exceedance is that of `fe_likelihoods.ex
 
 with the median :math:`m` and the dispersion :math:`s` is fitted to these points by maximum likelihood. See
 ``docs/theory/prediction.rst``.
-
-References
-----------
-J. W. Baker (2015), Efficient analytical fragility function fitting using dynamic structural analysis, Earthquake
-Spectra 31(1), 579-599, doi:10.1193/021113EQS025M.
 """
 
 from __future__ import annotations

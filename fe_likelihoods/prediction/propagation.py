@@ -11,11 +11,6 @@ estimated from samples :math:`\theta_j` of the posterior. The samples are simula
 because resampling makes many copies. Failed simulations are counted by reason and left out.
 
 See ``docs/theory/prediction.rst``.
-
-References
-----------
-C. Papadimitriou, J. L. Beck, L. S. Katafygiotis (2001), Updating robust reliability using structural test data,
-Probabilistic Engineering Mechanics 16(2), 103-113, doi:10.1016/S0266-8920(00)00012-6.
 """
 
 import logging

@@ -6,13 +6,6 @@ the fraction of the samples whose quantity exceeds the threshold, and its uncert
 Clopper & Pearson (1934), which is also valid if none or all of the samples exceed. The model error is in the prediction
 (``propagate(..., noise="model")``, `predict_new_event`) or in ``ratios=``. See ``docs/theory/prediction.rst``.
 Fragility curves are in `fe_likelihoods.prediction.fragility`.
-
-References
-----------
-C. Papadimitriou, J. L. Beck, L. S. Katafygiotis (2001), Updating robust reliability using structural test data,
-Probabilistic Engineering Mechanics 16(2), 103-113, doi:10.1016/S0266-8920(00)00012-6.
-C. J. Clopper, E. S. Pearson (1934), The use of confidence or fiducial limits illustrated in the case of the binomial,
-Biometrika 26(4), 404-413, doi:10.1093/biomet/26.4.404.
 """
 
 from __future__ import annotations

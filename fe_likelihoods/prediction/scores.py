@@ -13,14 +13,6 @@ PIT                    Probability integral transform: the predicted probability
 =====================  ===============================================================================================
 
 Missing measurements are NaN and have scores of NaN. Equations are on the page ``docs/theory/prediction.rst``.
-
-References
-----------
-T. Gneiting, A. E. Raftery (2007), Strictly proper scoring rules, prediction, and estimation, Journal of the American
-Statistical Association 102, 359-378, doi:10.1198/016214506000001437.
-
-C. A. T. Ferro (2014), Fair scores for ensemble forecasts, Quarterly Journal of the Royal Meteorological Society 140,
-1917-1923, doi:10.1002/qj.2270.
 """
 
 import math
