@@ -213,7 +213,12 @@ class HierarchicalPosterior:
         total = np.full(len(rows), -np.inf)
         inside = np.atleast_1d(self.prior.logpdf(rows)) > -np.inf
         if inside.any():
-            total[inside] = self.log_marginals(rows[inside]).sum(axis=1)
+            population = self.population(rows[inside])
+            of_tests = [
+                population_marginal(each, *population) + (self.tests[name].log_evidence or 0.0)
+                for name, each in self.described.items()
+            ]
+            total[inside] = np.stack(of_tests, axis=1).sum(axis=1)
         return total if points.ndim == 2 else float(total[0])
 
     def prior_transform(self, u: np.ndarray) -> np.ndarray:
@@ -223,25 +228,6 @@ class HierarchicalPosterior:
     def sample_prior(self, n: int, rng: RandomState = None) -> np.ndarray:
         """Draws (n, ndim) of the prior; arguments as for `Posterior.sample_prior`."""
         return self.prior.rvs(n, rng)
-
-    def log_marginals(self, x: Any) -> np.ndarray:
-        """Logarithms of the marginal likelihoods of the tests.
-
-        Parameters
-        ----------
-        x : (n, ndim) float, or mapping
-            Hyper-parameters within the bounds of their prior.
-
-        Returns
-        -------
-        (n, n_tests) float
-        """
-        center, sd = self.population(x)
-        columns = [
-            population_marginal(each, center, sd) + (self.tests[name].log_evidence or 0.0)
-            for name, each in self.described.items()
-        ]
-        return np.stack(columns, axis=1)
 
     def population(self, x: Any) -> tuple[np.ndarray, np.ndarray]:
         """Population center and spread of the varying parameters, on their scales.
