@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 from .jit import kernel
 
-__all__ = ["BasicForces", "Chord", "deformations", "add_to_stiffness"]
+__all__ = ["Chord", "deformations", "add_to_stiffness"]
 
 
 class Chord(NamedTuple):
@@ -34,23 +34,6 @@ class Chord(NamedTuple):
     c: float  # direction cosines of the chord against +Y
     s: float
     length: float  # of the deformed chord, or of the undeformed chord in the linear variant [m]
-
-
-class BasicForces(NamedTuple):
-    """Basic forces of one element (axial force [N] and end moments [N m]) and the upper half of its basic stiffness.
-
-    The k are derivatives of q with respect to the elongation [m] and the rotations [rad].
-    """
-
-    q1: float
-    q2: float
-    q3: float
-    k11: float
-    k12: float
-    k13: float
-    k22: float
-    k23: float
-    k33: float
 
 
 @kernel
@@ -86,10 +69,11 @@ def add_to_stiffness(first, basic, direction, corotational, force, stiffness):
     place.
 
     `first` is the number of the degree of freedom ux at end I; -3 at the fixed base, where only end J is free. The
-    geometric stiffness is added if `corotational`.
+    geometric stiffness is added if `corotational`. `basic` begins like a row of `beam_column.Elements.state`: axial
+    force [N] and end moments [N m], and the upper half of their derivatives by elongation [m] and rotations [rad].
     """
-    q1, q2, q3 = basic.q1, basic.q2, basic.q3
-    k11, k12, k13, k22, k23, k33 = basic.k11, basic.k12, basic.k13, basic.k22, basic.k23, basic.k33
+    q1, q2, q3 = basic[0], basic[1], basic[2]
+    k11, k12, k13, k22, k23, k33 = basic[3], basic[4], basic[5], basic[6], basic[7], basic[8]
     c, s, chord = direction.c, direction.s, direction.length
     ax, ay = -s, c
     nx, ny = c / chord, s / chord

@@ -14,7 +14,7 @@ import numpy as np
 from . import bar_fatigue, concrete04, fiber_section, reinforcing_steel
 from .bars import N_PATH
 from .beam_column import HEAD, PER_SECTION, Elements, advance, initialise
-from .corotational import BasicForces, add_to_stiffness, deformations
+from .corotational import add_to_stiffness, deformations
 from .fiber_section import Sections
 from .jit import kernel
 
@@ -195,18 +195,7 @@ def assemble(u, column, force, stiffness):
             return False
         if not advance(chord.elongation, chord.theta_i, chord.theta_j, e, column.elements, column.sections):
             return False
-        basic = BasicForces(
-            state[e, 0],
-            state[e, 1],
-            state[e, 2],
-            state[e, 3],
-            state[e, 4],
-            state[e, 5],
-            state[e, 6],
-            state[e, 7],
-            state[e, 8],
-        )
-        add_to_stiffness(first, basic, chord, column.corotational, force, stiffness)
+        add_to_stiffness(first, state[e], chord, column.corotational, force, stiffness)
     return True
 
 

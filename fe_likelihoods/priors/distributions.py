@@ -149,7 +149,7 @@ class Distribution(ABC):
         If z is standard normal, the result has this distribution. It is within the bounds, to which infinite z are
         mapped; NaN where z is NaN.
         """
-        return self._mapped(self._from_normal, z, -np.inf, np.inf, self.bounds)
+        return self._mapped(self._from_normal, z, (-np.inf, np.inf), self.bounds)
 
     def to_normal(self, x: np.ndarray | float) -> np.ndarray | float:
         """Map from the parameter x, of any shape, to a standard normal variable, the inverse of `from_normal`.
@@ -157,18 +157,12 @@ class Distribution(ABC):
         The log density at x is the standard normal log density at z minus log(dx / dz). -inf at and below the lower
         bound, inf at and above the upper one; NaN where x is NaN.
         """
-        return self._mapped(self._to_normal, x, *self.bounds, (-np.inf, np.inf))
+        return self._mapped(self._to_normal, x, self.bounds, (-np.inf, np.inf))
 
     @staticmethod
-    def _mapped(
-        function: Callable[[np.ndarray], np.ndarray],
-        values: np.ndarray | float,
-        low: float,
-        high: float,
-        ends: tuple[float, float],
-    ) -> np.ndarray | float:
-        """An increasing function of values between `low` and `high`; `ends`, which are also its bounds, beyond them."""
-        values = np.asarray(values, dtype=float)
+    def _mapped(function: Callable, values: np.ndarray | float, domain: tuple, ends: tuple) -> np.ndarray | float:
+        """An increasing function of values inside `domain`; `ends`, which are also its bounds, beyond it."""
+        values, (low, high) = np.asarray(values, dtype=float), domain
         result = np.where(values <= low, ends[0], np.where(values >= high, ends[1], np.nan))
         inside = (values > low) & (values < high)
         with np.errstate(all="ignore"):

@@ -194,9 +194,7 @@ def fit_mixture(
     """
     points = as_points(samples, prior.names)
     names = prior.names if names is None else tuple(names)
-    if unknown := sorted(set(names) - set(prior.names)):
-        raise ValueError(f"the prior has no parameters {', '.join(unknown)}; it has {', '.join(prior.names)}")
-    dim = len(names)
+    part, dim = prior.subset(names), len(names)
     if points.ndim != 2 or len(np.unique(points, axis=0)) < 20 * dim:
         raise ValueError(
             f"a fit of {dim} parameters needs {20 * dim} different samples or more, in an array (n, {prior.dim}); got "
@@ -205,12 +203,10 @@ def fit_mixture(
     if not np.isfinite(np.atleast_1d(prior.logpdf(points))).all():
         raise ValueError("some samples are impossible under the prior; give the prior with which they were drawn")
     chosen = points[:, [prior.names.index(name) for name in names]]
-    part = prior.subset(names)
     z = np.clip(part.to_normal(chosen), -_LARGEST_SCORE, _LARGEST_SCORE)
     _check_independent(z, names)
     rng = np.random.default_rng(seed)
-    distinct = len(np.unique(z, axis=0))
-    effective = float(distinct if effective_sample_size is None else effective_sample_size)
+    effective = float(len(np.unique(z, axis=0)) if effective_sample_size is None else effective_sample_size)
     if not 1.0 <= effective:
         raise ValueError(f"effective_sample_size must be 1 or more; got {effective_sample_size!r}")
     fitted = fit_normals(z, effective)

@@ -124,12 +124,15 @@ class Prior:
 
     def transform(self, u: np.ndarray) -> np.ndarray:
         """Map from the unit cube, u (dim,) or (n, dim) in [0, 1], to the parameters, for nested samplers."""
-        u = self._checked(u, "u")
+        from scipy.special import ndtri  # slow to import, and not needed for densities
+
+        u = probabilities_of(self._checked(u, "u"))
         x = np.empty(u.shape)
         for column, distribution in self._single:
             x[..., column] = distribution.ppf(u[..., column])
         for columns, distribution in self._joint:
-            x[..., columns] = distribution.from_normal(_scores(u[..., columns]))
+            # infinite scores would give NaN in a sum of correlated scores
+            x[..., columns] = distribution.from_normal(ndtri(np.clip(u[..., columns], 1e-300, 1.0 - 1e-16)))
         return x
 
     def from_normal(self, z: np.ndarray) -> np.ndarray:
@@ -220,11 +223,3 @@ def _moments(distribution: MultivariateDistribution) -> tuple[np.ndarray, np.nda
     """Means and standard deviations (dim,) of a joint distribution, by 10 000 draws with a fixed seed."""
     draws = distribution.rvs(10_000, 0)
     return draws.mean(axis=0), draws.std(axis=0)
-
-
-def _scores(u: np.ndarray) -> np.ndarray:
-    """Standard normal scores of uniform numbers."""
-    from scipy.special import ndtri  # slow to import, and not needed for densities
-
-    # infinite scores would give NaN in a sum of correlated scores
-    return ndtri(np.clip(probabilities_of(u), 1e-300, 1.0 - 1e-16))

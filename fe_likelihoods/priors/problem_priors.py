@@ -1,12 +1,4 @@
-"""Priors of the ready-made problems in `fe_likelihoods.problems`.
-
-References
-----------
-M. K. Ramancha, R. Astroza, J. P. Conte, J. I. Restrepo, M. D. Todd (2022), Bayesian nonlinear finite element model
-updating of a full-scale bridge-column using sequential Monte Carlo.
-"""
-
-from __future__ import annotations
+"""Priors of the ready-made problems in `fe_likelihoods.problems`."""
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
@@ -24,7 +16,7 @@ def bridge_column_prior(
     noise_parameters: Sequence[str] = ("sigma_acceleration", "sigma_displacement"),
     measured: Mapping[str, float] = MappingProxyType({}),
 ) -> Prior:
-    """Make the prior of Ramancha et al. (2022).
+    """Make the prior of Ramancha et al. (2022), whose title is in docs/theory/concrete.rst.
 
     The structural parameters are normal with mean 1, truncated at zero, with the coefficients of variation 0.30 (Ec),
     0.20 (Es), 0.60 (a0), 0.60 (a1) and 0.40 (ft). The noise levels are half-normal. Their 0.1 g and 1.2 in are taken as

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fe_likelihoods.kernels.corotational import BasicForces, add_to_stiffness, deformations
+from fe_likelihoods.kernels.corotational import add_to_stiffness, deformations
 from fe_likelihoods.kernels.jit import kernel
 from fe_likelihoods.kernels.static import Iteration, Position, apply_gravity, equilibrate
 
@@ -16,29 +16,23 @@ STIFFNESS = np.array([7.0, 0.4, -0.3, 3.0, 1.1, 2.5])
 
 
 @kernel
-def end_forces(u, q0, k, length, corotational, force, stiffness):
+def end_forces(u, q0, k, length, corotational, basic, force, stiffness):
     """Write end forces and tangent of an element with basic forces q0 + k v at the displacements of both ends (6,)."""
     chord = deformations(u[3] - u[0], u[4] - u[1], u[2], u[5], length, corotational)
     v1, v2, v3 = chord.elongation, chord.theta_i, chord.theta_j
     force[:] = 0.0
     stiffness[:] = 0.0
-    basic = BasicForces(
-        q0[0] + k[0] * v1 + k[1] * v2 + k[2] * v3,
-        q0[1] + k[1] * v1 + k[3] * v2 + k[4] * v3,
-        q0[2] + k[2] * v1 + k[4] * v2 + k[5] * v3,
-        k[0],
-        k[1],
-        k[2],
-        k[3],
-        k[4],
-        k[5],
-    )
+    basic[0] = q0[0] + k[0] * v1 + k[1] * v2 + k[2] * v3
+    basic[1] = q0[1] + k[1] * v1 + k[3] * v2 + k[4] * v3
+    basic[2] = q0[2] + k[2] * v1 + k[4] * v2 + k[5] * v3
+    for i in range(6):
+        basic[3 + i] = k[i]
     add_to_stiffness(0, basic, chord, corotational, force, stiffness)
 
 
 def element(u, q0=(0.0, 0.0, 0.0), k=STIFFNESS, corotational=True):
     force, stiffness = np.zeros(6), np.zeros((6, 6))
-    end_forces(np.asarray(u, float), np.asarray(q0, float), k, LENGTH, corotational, force, stiffness)
+    end_forces(np.asarray(u, float), np.asarray(q0, float), k, LENGTH, corotational, np.empty(9), force, stiffness)
     return force, stiffness
 
 
