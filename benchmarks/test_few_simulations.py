@@ -16,12 +16,9 @@ def test_stored_references_are_complete_and_precise():
         assert entry["log_evidence_error"] < 0.15, key
 
 
-def test_a_stored_reference_belongs_to_its_data():
+def test_a_problem_and_seed_have_a_reference_or_none():
     posterior = PROBLEMS["oscillator"].posterior(2)
-    found = few_simulations.reference_of("oscillator", 2, posterior)
-    assert found.mean.shape == (2,)
-    with pytest.raises(ValueError, match="was made with other data"):
-        few_simulations.reference_of("oscillator", 2, PROBLEMS["oscillator"].posterior(3))
+    assert np.isfinite(few_simulations.reference_of("oscillator", 2, posterior).log_evidence)
     assert few_simulations.reference_of("oscillator", 99, posterior) is None
 
 
