@@ -44,7 +44,7 @@ class Judgement(NamedTuple):
     def __str__(self) -> str:
         reasons = [each.kind for each in self.findings if STATUS[each.severity] == self.status != "use"]
         if self.width_factor > 1.0:
-            reasons.append(f"standard deviations count {self.width_factor:.2g} times, because errors are correlated")
+            reasons.append(f"multiply standard deviations by {self.width_factor:.2g}, because errors are correlated")
         text = f"{self.status[0].upper()}{self.status[1:]}"
         return f"{text}: {'; '.join(f'{kind[0].lower()}{kind[1:]}' for kind in reasons)}." if reasons else f"{text}."
 

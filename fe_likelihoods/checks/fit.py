@@ -368,12 +368,18 @@ def check_stated_errors(fits: Iterable[Fit]) -> list[Finding]:
     for fit in fits:
         if fit.deviations is None or fit.residuals is None:
             continue
-        squares = np.square(fit.residuals / fit.deviations)
+        measured, squares = fit.measurements, np.square(fit.residuals / fit.deviations)
         n = int(np.isfinite(squares).sum())
         what = f"The {n} values{f' of {fit.title}' if fit.title else ''}"
+        largest = np.argsort(-np.nan_to_num(squares), axis=None)[:3]
+        places = [
+            f"{measured.channels[row].name} at {measured.points[column] if measured.points else column + 1}"
+            for row, column in np.transpose(np.unravel_index(largest, squares.shape))
+        ]
         action = (
-            "Look for a wrong load case, sensor or value, and at the model. If all of them are right, leave the stated "
-            "errors out, which makes them unknown."
+            f"Most do {listed(places)}. Look for a wrong value, sensor or load case (exchanged ones, another place or "
+            "unit of the load), and at the model. If all of them are right, leave the stated errors out: they are then "
+            "estimated."
         )
         found += check_squares(float(np.nansum(squares)), n, what, action)
     return found

@@ -125,8 +125,8 @@ def _check_frequencies(draws: Any) -> list[Finding]:
             9.81**0.5: "a weight instead of a mass",
         }
         near = [f", as with {each}" for r, each in ratios.items() if abs(abs(median) - np.log(r)) < np.log(SAME_UNITS)]
-        which, factor = "measured" if median > 0.0 else "computed", np.exp(abs(median))
-        text = f"The {which} frequencies are about {factor:.3g} times the others{''.join(near[:1])}."
+        two, factor = ("measured", "computed")[:: 1 if median > 0.0 else -1], np.exp(abs(median))
+        text = f"The {two[0]} frequencies are about {factor:.3g} times the {two[1]} ones{''.join(near[:1])}."
         action = "Check the unit of the measured frequencies, and the units of stiffness and mass in the model (SI)."
         return [Finding("A unit may be wrong", WRONG, text, action, numbers)]
     # further from the nearest draw than all draws are from each other, and than one more of these few draws would be
@@ -232,7 +232,8 @@ def _check_sensors(modes: Any) -> tuple[list[Finding], Any]:
         for k in np.flatnonzero(data.has_shape.any(axis=0)):
             in_mode = np.where(np.arange(data.n_modes)[:, None] == k, signs, 1.0)
             after, each, _ = best(replace(data, shapes=data.shapes * in_mode))
-            found |= {f"{what} in mode {_number(modes, k)}": (after, each)} if after > fitted else {}
+            in_words = f"the sign of {name} is turned in mode {_number(modes, k)}"
+            found |= {in_words: (after, each)} if after > fitted else {}
         if n > 3 and not one_mode:  # a shape of two sensors fits nearly anything
             after, each, draw = best(data.at([other for other in data.sensors if other != name]))
             after = 1.0 - (1.0 - after) * (n - 1) / (n - 2)  # as if the others were as many as all of them
@@ -243,7 +244,10 @@ def _check_sensors(modes: Any) -> tuple[list[Finding], Any]:
         return [], modes
     said = f"If {text}, the mean MAC of the best sample is {after:.2f} instead of {before:.2f}."
     action = "Check directions, places, gains and names of sensors, and the rows or channels of the model."
-    action += " If they are right, leave this mode out." if " in mode " in text else ""
+    if " in mode " in text:
+        action = (
+            "Check this number in the table of shapes, and its phase in the identification; or leave this mode out."
+        )
     return [Finding("A sensor may be wrong", WRONG, said, action, {"before": before, "after": after})], corrected
 
 

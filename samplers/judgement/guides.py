@@ -32,7 +32,7 @@ HEAVY = 0.01  # largest weight of a draw of the emulated posterior; 0.006 in rig
 # On ridges E h^3 with uniform priors, 20 runs: 4 of 7 wrong runs, among them the 2 that change little from round to
 # round, and none of 12 right ones; none of 40 right runs with other priors and on four problems.
 PROBABLE, EXCLUDED = 3.0, 4.0
-# Median difference of the two among probable simulations, above which the response is rough: 0.00 on seven ridges, 0.4
+# Median difference of the two among probable simulations, above which the response is rough: 0.00 on four ridges, 0.4
 # with a roughness of 3 % of the noise, 0.6 to 1 with 10 %, 2 to 5 with 30 %.
 ROUGH = 0.1
 

@@ -176,7 +176,7 @@ def test_a_fault_that_is_named_before_a_run_is_named_after_it():
             for samples in (None, fitted(posterior)):
                 found = check_fit(posterior, samples)
                 assert {each.kind for each in found if each.severity == "wrong"} == wanted, (seed, factor)
-                assert any("floor 4 counts the other way round in mode 2" in each.text for each in found)
+                assert any("the sign of floor 4 is turned in mode 2" in each.text for each in found)
 
 
 def test_values_far_beyond_their_stated_errors_are_not_used():

@@ -75,7 +75,7 @@ def test_correlated_errors_are_a_note_with_the_factor_in_the_first_sentence(rng)
     assert judgement.status == "use" and judgement.width_factor == found.numbers["factor"]
     assert (
         str(judgement)
-        == f"Use: standard deviations count {found.numbers['factor']:.2g} times, because errors are correlated."
+        == f"Use: multiply standard deviations by {found.numbers['factor']:.2g}, because errors are correlated."
     )
     assert check_residuals(fits_of(slow, found.numbers["factor"] ** -2 * 4000)) == []
     assert describe_residuals(residual_checks(white[None]))[0].startswith("White: ")
