@@ -12,10 +12,10 @@ measured to fitted values (``ratios=``). ``docs/damage.rst`` has the references.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from numbers import Real
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ..checks.finding import labelled
 from ..events.ratios import EventRatios
@@ -41,9 +41,8 @@ class LimitState(NamedTuple):
         Name of the state that is reached when the measure exceeds the limit.
     measure : str
         Name of the measure, such as "bar tension" or "residual drift".
-    limit : float, Distribution, or ndarray, shape (n_samples,)
-        Limit [SI]; the distribution of limits of such structures; or one limit for each sample of the prediction, such
-        as fy/Es.
+    limit : float or Distribution
+        Limit [SI], or the distribution of limits of such structures.
     source : str
         Where the limit comes from.
 
@@ -57,7 +56,7 @@ class LimitState(NamedTuple):
 
     name: str
     measure: str
-    limit: ArrayLike | Distribution
+    limit: float | Distribution
     source: str = ""
 
 
@@ -75,7 +74,7 @@ _ASSUMED = (
 
 
 class Damage(NamedTuple):
-    """Damage of a structure after each event, given the data.
+    """Damage of a column after each event, given the data.
 
     Attributes
     ----------
@@ -154,7 +153,7 @@ def limit_states(measures: DamageMeasures) -> tuple[LimitState, ...]:
     Returns
     -------
     tuple of LimitState
-        For a column: yield of a bar at the nominal fy/Es, and limits from the literature, which are **assumed**. Use
+        Yield of a bar at the nominal fy/Es, and limits from the literature, which are **assumed**. Use
         ``limit._replace(limit=...)`` to change one.
 
     Examples
@@ -171,10 +170,8 @@ def limit_states(measures: DamageMeasures) -> tuple[LimitState, ...]:
     beyond repair Park-Ang index 0.4
     collapse Park-Ang index 1.0
     """
-    # the strains are of a column, and the limit of drift is for a length that was divided by its height
-    of_column = set(measures.names) if np.isfinite(measures.yield_strain) else {"Park-Ang index"} & set(measures.names)
     bar_yield = LimitState("bar yield", "bar tension", measures.yield_strain, "nominal fy/Es of the steel")
-    return tuple(state for state in (bar_yield, *_ASSUMED) if state.measure in of_column)
+    return tuple(state for state in (bar_yield, *_ASSUMED) if state.measure in measures.names)
 
 
 def damage(
@@ -191,7 +188,7 @@ def damage(
     Parameters
     ----------
     prediction : Prediction
-        The result of ``propagate(model, samples, quantity=damage_measures(model))``.
+        The result of ``propagate(column, samples, quantity=damage_measures(column))``.
     limits : sequence of LimitState, optional
         The limit states. Default: `limit_states`.
     ratios : EventRatios, or mapping of str to these, optional
@@ -212,8 +209,8 @@ def damage(
     Raises
     ------
     ValueError
-        If the prediction is of another quantity or contains noise, a limit is not positive, has an unknown measure or
-        does not have one value or one for each sample, or ratios are for an unknown measure or several quantities.
+        If the prediction is of another quantity or contains noise, a limit is not positive or has an unknown measure,
+        or ratios are for an unknown measure or several quantities.
 
     Warns
     -----
@@ -242,8 +239,8 @@ def damage(
     measures = prediction.quantity
     if not isinstance(measures, DamageMeasures):
         raise ValueError(
-            "damage needs a prediction of damage measures: propagate(model, samples, "
-            f"quantity=damage_measures(model)); this one has quantity={measures!r}"
+            "damage needs a prediction of damage measures: propagate(column, samples, "
+            f"quantity=damage_measures(column)); this one has quantity={measures!r}"
         )
     if prediction.noise or noise:
         raise ValueError(
@@ -271,7 +268,7 @@ def damage(
                 "damage_measures(measures=...) chooses them"
             )
         found, limit = values[state.measure], _limits(state, len(every), np.random.default_rng(seed))
-        reported = np.asarray(state.limit if np.isscalar(state.limit) else np.mean(limit), dtype=float)
+        reported = np.asarray(np.mean(limit))
         shown = {"threshold": reported, "unit": DIMENSIONS[find_unit(_UNITS.get(state.measure, "1")).dimension]}
         ratios_of = errors.get(state.measure)
         if found.ndim == 4:
@@ -302,14 +299,12 @@ def _limits(state: LimitState, n: int, rng: np.random.Generator) -> np.ndarray:
     """Limits of n samples, shape (n,) or (1,); of a distribution quantiles in random order."""
     if isinstance(state.limit, Distribution) and state.limit.bounds[0] >= 0.0:
         return state.limit.ppf((rng.permutation(n) + 0.5) / n)
-    limit = np.asarray(state.limit)
-    known = limit.dtype.kind in "iuf" and limit.shape in ((), (n,)) and ((limit > 0.0) & (limit < np.inf)).all()
-    if not known:
+    if not isinstance(state.limit, Real) or not 0.0 < state.limit < np.inf:
         raise ValueError(
-            f"the limit of {state.name!r} must be a positive number, or one for each of the {n} samples, or a "
-            f"distribution of positive numbers; got {state.limit!r}"
+            f"the limit of {state.name!r} must be a positive number or a distribution of positive numbers; got "
+            f"{state.limit!r}"
         )
-    return limit.reshape(-1)
+    return np.array([float(state.limit)])
 
 
 def _ratios_of_measures(ratios: Any, measures: tuple[str, ...]) -> dict[str, EventRatios]:

@@ -1,4 +1,4 @@
-"""Damage measures: what a response says about the state of a structure after each event.
+"""Damage measures: what a response says about the state of a column after each event.
 
 `damage_measures` makes the quantities that `fe_likelihoods.propagate` evaluates for every sample, and
 `fe_likelihoods.damage` turns the prediction into probabilities of limit states. The definitions are in
@@ -12,7 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from numbers import Real
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,6 +22,9 @@ from ..signals.events import Events
 from ..signals.records import Record
 from .park_ang import ParkAng, park_ang_constants
 
+if TYPE_CHECKING:
+    from ..models.rc_column import RCColumn
+
 __all__ = ["STRAIN_MEASURES", "DamageMeasures", "damage_measures", "damage_outputs"]
 
 STRAIN_MEASURES = ("bar tension", "cover compression")
@@ -30,10 +33,10 @@ STRAIN_MEASURES = ("bar tension", "cover compression")
 _NEEDED = {
     "peak drift": ("displacement",),
     "residual drift": ("displacement",),
-    "dissipated energy": ("displacement", "force"),
-    "Park-Ang index": ("displacement", "force"),
+    "dissipated energy": ("displacement", "base_shear"),
+    "Park-Ang index": ("displacement", "base_shear"),
 }
-"""Measures of the whole structure, and the channels that they need."""
+"""Measures of the whole structure, and the outputs that they need."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,11 +55,11 @@ class DamageMeasures(Sequence):
     heights : ndarray, shape (n_sections,)
         Heights at which strains are known [m].
     height : float
-        Height to which drifts refer [m]; 1 for another model than a column.
+        Height to which drifts refer [m].
     park_ang : ParkAng or None
         Constants of the damage index.
     yield_strain : float
-        Nominal yield strain of the bars; NaN for another model.
+        Nominal yield strain of the bars.
     """
 
     quantities: tuple[ChannelQuantity, ...]
@@ -97,7 +100,7 @@ class DamageMeasures(Sequence):
         return named
 
 
-def damage_outputs(column: Any) -> tuple[str, ...]:
+def damage_outputs(column: RCColumn) -> tuple[str, ...]:
     """Return the outputs of a column that the measures of damage need.
 
     Parameters
@@ -123,11 +126,9 @@ def damage_outputs(column: Any) -> tuple[str, ...]:
 
 
 def damage_measures(
-    model: Any,
+    column: RCColumn,
     *,
     measures: Sequence[str] | None = None,
-    displacement: str = "",
-    force: str = "",
     park_ang: ParkAng | None = None,
     settle: float = 5.0,
 ) -> DamageMeasures:
@@ -135,18 +136,14 @@ def damage_measures(
 
     Parameters
     ----------
-    model : Model
-        The model that will be propagated. An `RCColumn` under a `Record` needs the outputs `damage_outputs`. Under
-        `Events` (``model.record``), there are measures after each event.
+    column : RCColumn
+        The column that will be propagated, under a `Record`, with the outputs `damage_outputs`. Under `Events` there
+        are measures after each event.
     measures : sequence of str, optional
         Names of measures: "peak drift", "residual drift", "dissipated energy", "Park-Ang index", "bar tension" and
-        "cover compression" (``docs/damage.rst``). Default: all for a column; for another model, all measures whose
-        channels are named.
-    displacement, force : str
-        Channels of a model that is not a column: relative displacement [m], which its drifts are, and the restoring
-        force that does work on it [N].
+        "cover compression" (``docs/damage.rst``). Default: all.
     park_ang : ParkAng, optional
-        Constants of the damage index. Default for a column: `park_ang_constants` at nominal parameters.
+        Constants of the damage index. Default: `park_ang_constants` at nominal parameters.
     settle : float
         The residual drift is the mean over this length at the end of an event and of the pause after it [s].
 
@@ -158,62 +155,46 @@ def damage_measures(
     Raises
     ------
     ValueError
-        If a measure is unknown or needs a channel that the model lacks, the column is not under a `Record`, or
-        a setting is out of range.
+        If a measure is unknown or needs an output that the column lacks, the model is no column under a `Record`, or a
+        setting is out of range.
 
     Examples
     --------
-    >>> measures = damage_measures(model, displacement="displacement", measures=["peak drift"])
-    >>> predicted = propagate(posterior, samples, quantity=measures)
-    >>> measures.split(predicted.mean)["peak drift"].round(4)  # doctest: +SAMPLED
-    array([0.0825])
+    >>> measures = damage_measures(column, measures=["peak drift"])
+    >>> predicted = propagate(column, np.ones((3, 5)), quantity=measures)
+    >>> measures.split(predicted.mean)["peak drift"].round(4)
+    array([0.0091])
     """
-    from ..models.rc_column import RCColumn
-
     if not isinstance(settle, Real) or not 0.0 < settle < math.inf:
         raise ValueError(f"settle must be positive [s]; got {settle!r}")
-    is_column, height, yield_strain = isinstance(model, RCColumn), 1.0, math.nan
-    heights, places = _places(model) if is_column else (np.zeros(0), ())
-    if is_column:
-        if displacement or force:
-            raise ValueError("the channels of an RCColumn are known; leave these arguments out")
-        displacement, force, height = "displacement", "base_shear", model.height
-        yield_strain = model.steel.fy / model.steel.es
-    place = {"displacement": displacement, "force": force}
-    structure = [name for name, needed in _NEEDED.items() if all(map(place.get, needed))]
-    if park_ang is None and not is_column:
-        structure = [name for name in structure if name != "Park-Ang index"]
-    known = (*structure, *(STRAIN_MEASURES if is_column else ()))
+    heights, places = _places(column)
+    known = (*_NEEDED, *STRAIN_MEASURES)
     chosen = known if measures is None else tuple(measures)
     if not chosen or len(set(chosen)) != len(chosen) or set(chosen) - set(known):
-        raise ValueError(
-            f"measures must be some of {', '.join(known) or 'none'}, each once; got {measures!r}. Of a model that is "
-            "no RCColumn, name displacement=, force= and, for the index, park_ang=ParkAng(...)"
-        )
+        raise ValueError(f"measures must be some of {', '.join(known)}, each once; got {measures!r}")
     if not set(chosen) & set(STRAIN_MEASURES):
         heights, places = np.zeros(0), ()
-    structure = [name for name in structure if name in chosen]
-    needed = dict.fromkeys(place[kind] for name in structure for kind in _NEEDED[name])
-    names = [channel.name for channel in model.channels]
+    structure = [name for name in _NEEDED if name in chosen]
+    needed = dict.fromkeys(output for name in structure for output in _NEEDED[name])
+    names = [channel.name for channel in column.channels]
     if lacking := [name for name in (*needed, *(name for each in places for name in each)) if name not in names]:
-        how = "dataclasses.replace(column, outputs=damage_outputs(column))" if is_column else ", ".join(sorted(names))
         raise ValueError(
-            f"the model lacks the outputs {', '.join(lacking)} that {', '.join(chosen)} need; "
-            + (f"add them, {how}, or choose other measures=" if is_column else f"its channels are {how}")
+            f"the column lacks the outputs {', '.join(lacking)} that {', '.join(chosen)} need; add them, "
+            "dataclasses.replace(column, outputs=damage_outputs(column)), or choose other measures="
         )
     if "Park-Ang index" in chosen:
-        park_ang = park_ang_constants(model) if park_ang is None else park_ang
+        park_ang = park_ang_constants(column) if park_ang is None else park_ang
         park_ang.check()
-    mean, index = MeanOfLast(max(1, round(settle / model.dt))), functools.partial(_index, constants=park_ang)
+    mean, index = MeanOfLast(max(1, round(settle / column.dt))), functools.partial(_index, constants=park_ang)
     quantities: list[ChannelQuantity] = []
-    windows = _windows(getattr(model, "loading" if is_column else "record", None), model.n_steps, model.dt)
+    windows = _windows(column.loading, column.n_steps, column.dt)
     for event, first, stop, rest in windows:
         so_far = slice(0, rest)
         found = {
-            "peak drift": peak(displacement, slice(first, stop)),
-            "residual drift": ChannelQuantity(displacement, mean, slice(first, rest)),
-            "dissipated energy": dissipated_energy(force, displacement, so_far),
-            "Park-Ang index": ChannelQuantity(displacement, index, so_far, (force,), describe=_of_index),
+            "peak drift": peak("displacement", slice(first, stop)),
+            "residual drift": ChannelQuantity("displacement", mean, slice(first, rest)),
+            "dissipated energy": dissipated_energy("base_shear", "displacement", so_far),
+            "Park-Ang index": ChannelQuantity("displacement", index, so_far, ("base_shear",), describe=_of_index),
         }
         found = {name: found[name] for name in structure}
         for z, (left_bar, left, right_bar, right) in zip(heights, places, strict=True):
@@ -222,16 +203,16 @@ def damage_measures(
                 found[f"bar tension {at}"] = ChannelQuantity(bar, np.max, so_far)
                 found[f"cover compression {at}"] = ChannelQuantity(surface, _compression, so_far)
         quantities += (
-            replace(each, name=f"{name} after {event}", n_steps=int(model.n_steps)) for name, each in found.items()
+            replace(each, name=f"{name} after {event}", n_steps=int(column.n_steps)) for name, each in found.items()
         )
     return DamageMeasures(
         tuple(quantities),
         tuple(event for event, *_ in windows),
         tuple(structure),
         heights,
-        float(height),
+        float(column.height),
         park_ang if "Park-Ang index" in chosen else None,
-        float(yield_strain),
+        float(column.steel.fy / column.steel.es),
     )
 
 
@@ -248,7 +229,7 @@ def _compression(strain: np.ndarray) -> float:
     return float(-np.min(strain))
 
 
-def _places(column: Any) -> tuple[np.ndarray, tuple[tuple[str, ...], ...]]:
+def _places(column: RCColumn) -> tuple[np.ndarray, tuple[tuple[str, ...], ...]]:
     """Heights of the sections, and outputs of the bar and the surface at the negative, then the positive side."""
     from ..models.rc_column import RCColumn
 
@@ -259,10 +240,10 @@ def _places(column: Any) -> tuple[np.ndarray, tuple[tuple[str, ...], ...]]:
     return heights, tuple(tuple(f"strain@{z:.10g}:{x:.10g}" for x in (left, -surface, right, surface)) for z in heights)
 
 
-def _windows(events: Any, n_steps: int, dt: float) -> list[tuple[str, int, int, int]]:
+def _windows(events: Record, n_steps: int, dt: float) -> list[tuple[str, int, int, int]]:
     """Of each event: name, first sample, one past its last, and one past the last in the pause that follows."""
     if not isinstance(events, Events):
-        return [(getattr(events, "name", "event"), 0, n_steps, n_steps)]
+        return [(events.name, 0, n_steps, n_steps)]
     firsts = [math.ceil(w.start / dt - 1e-6) for w in events.windows]
     stops = [min(math.floor(w.end / dt + 1e-6) + 1, n_steps) for w in events.windows]
     return list(zip(events.names, firsts, stops, [*firsts[1:], n_steps], strict=True))

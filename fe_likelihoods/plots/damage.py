@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
-
-import numpy as np
 
 from .style import new_figure
 
@@ -19,13 +16,6 @@ __all__ = ["plot_damage"]
 
 _COLOURS = ("#eef1f4", "#fbdca6", "#e8893a", "#a81c1c")
 """Colours of the probabilities from 0 to 1."""
-_EXTENT = (
-    ("peak drift", "peak drift", 100.0, "%"),
-    ("residual drift", "residual drift", 100.0, "%"),
-    ("dissipated energy", "energy", 1e-3, "kJ"),
-    ("Park-Ang index", "Park-Ang index", 1.0, ""),
-)
-"""Measures that are written beside the columns: name, label, factor, unit."""
 
 
 def plot_damage(damage: Damage) -> Figure:
@@ -33,8 +23,7 @@ def plot_damage(damage: Damage) -> Figure:
 
     Each row is an event and each column a limit state of strains. The two sides of every section are coloured by the
     probability that the limit was exceeded there, with the probability in per cent; the title has the probability that
-    it was exceeded anywhere. At the right are the other probabilities, and the quantiles of the measures: the middle
-    one of `probabilities` with the range from the lowest to the highest.
+    it was exceeded anywhere. `Damage.table` has the other probabilities and the quantiles of the measures.
 
     Parameters
     ----------
@@ -70,18 +59,16 @@ def plot_damage(damage: Damage) -> Figure:
             "'cover compression' and limit states of them; use damage.table() otherwise"
         )
     colours = LinearSegmentedColormap.from_list("probability", _COLOURS)
-    widths = [*[1.0] * len(located), 2.2]
-    size = (1.5 * sum(widths) + 0.6, 2.75 * len(damage.events) + 1.0)
-    figure, panels = new_figure(len(damage.events), len(widths), size, grid=False, width_ratios=widths)
+    size = (max(1.5 * len(located) + 0.6, 4.5), 2.75 * len(damage.events) + 1.0)
+    figure, panels = new_figure(len(damage.events), len(located), size, grid=False)
     for event, (row, name) in enumerate(zip(panels, damage.events, strict=True)):
-        for axes, state in zip(row, located, strict=False):
+        for axes, state in zip(row, located, strict=True):
             _draw_column(axes, damage, state, event, colours)
         row[0].set_ylabel(f"{name}\nheight [m]")
-        _write_extent(row[-1], damage, event, [state for state in damage.presence if state not in located])
     bar = figure.colorbar(
-        ScalarMappable(Normalize(0.0, 1.0), colours), ax=panels[:, :-1], location="bottom", aspect=50, pad=0.02
+        ScalarMappable(Normalize(0.0, 1.0), colours), ax=panels, location="bottom", aspect=50, pad=0.02
     )
-    label = f"probability, from {damage.prediction.effective_sample_size:.0f} effective samples; {damage.uncertainty}"
+    label = f"probability, from {damage.prediction.effective_sample_size:.0f} effective samples;\n{damage.uncertainty}"
     bar.set_label(label + (f"\n{damage.failures}" if damage.failures else ""), fontsize=7)
     bar.ax.tick_params(labelsize=7)
     return figure
@@ -125,33 +112,3 @@ def _per_cent(probability: float) -> str:
     if 0.0 < value < 1.0:
         return "<1"
     return ">99" if 99.0 < value < 100.0 else f"{value:.0f}"
-
-
-def _number(value: float) -> str:
-    """Return a number with three significant digits and without an exponent, and where it is small a bound of it."""
-    if 0.0 < value < 1e-3:
-        return "<0.001"
-    return np.format_float_positional(value, precision=3, unique=False, fractional=False, trim="-")
-
-
-def _write_extent(axes: Axes, damage: Damage, event: int, states: Sequence[str]) -> None:
-    """Write the probabilities of limit states without a place, and the quantiles of the measures."""
-    axes.set_axis_off()
-    lines = []
-    if damage.prediction.probabilities:
-        order = np.argsort(damage.prediction.probabilities)
-        low, middle, high = order[0], order[len(order) // 2], order[-1]
-        for name, label, factor, unit in _EXTENT:
-            if name in damage.extent:
-                values = factor * damage.extent[name][:, event]
-                text = _number(values[middle]) + (f" {unit}" if unit else "")
-                ends = _number(values[low]), _number(values[high])
-                between = " to ".join(ends) if ends[0] != ends[1] else ""
-                lines.append((label, text, between))
-    for state in states:
-        lines.append((f"P({state})", f"{_per_cent(float(damage.presence[state].probability[event]))} %", ""))
-    for k, (label, text, between) in enumerate(lines):
-        y = 0.97 - 0.094 * k
-        axes.text(0.0, y, label, transform=axes.transAxes, fontsize=8, va="top")
-        axes.text(0.47, y, text, transform=axes.transAxes, fontsize=8, va="top", ha="left", fontweight="bold")
-        axes.text(0.74, y - 0.008, between, transform=axes.transAxes, fontsize=6.5, va="top", color="0.35")
