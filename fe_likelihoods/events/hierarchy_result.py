@@ -1,7 +1,7 @@
-"""Result of a hierarchical model of several tests: population, parameters of each test, and of a new test.
+"""Result of a hierarchical model of several tests: the population, and the parameters of a new test.
 
 `Hierarchy` combines a `HierarchicalPosterior` with samples of its hyper-parameters, which any sampler has drawn. It
-checks where the stored posteriors do not suffice, and draws the parameters of the tests and of a further one.
+checks where the stored posteriors do not suffice, and draws the parameters of a further test.
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,6 @@ from ..priors.distributions import RandomState, as_generator
 from ..priors.points import as_points, complete_repr
 from ..text_tables import number, text_table
 from .hierarchical_posterior import HierarchicalPosterior
-from .population_marginal import draw_parameters
 from .reweighting import check_hierarchy
 
 __all__ = ["Hierarchy"]
@@ -203,37 +202,6 @@ class Hierarchy:
         center, _ = self.posterior.population(self.samples)
         names = [*self.posterior.varying, *self.posterior.common]
         return dict(zip(names, self.posterior.scales.from_scale(center.mean(axis=0)).tolist(), strict=True))
-
-    def draw_test(self, test: str, rng: RandomState = None) -> dict[str, np.ndarray]:
-        """Draw the varying and common parameters of one test, one draw for each sample of the hyper-parameters.
-
-        Given the other tests, the parameters of a test are better known than from the test alone: its posterior shrinks
-        towards the population. Points between the stored samples are drawn from the fitted mixture. The draws and the
-        rows of `samples` belong together.
-
-        Parameters
-        ----------
-        test : str
-            Name of the test.
-        rng : int, numpy.random.Generator, numpy.random.RandomState or None
-            As for `Posterior.sample_prior`.
-
-        Returns
-        -------
-        dict of str to (n,) float
-
-        Raises
-        ------
-        ValueError
-            If the test is unknown.
-        """
-        if test not in self.posterior.tests:
-            known = ", ".join(map(repr, self.posterior.tests))
-            raise ValueError(f"there is no test {test!r}; the tests are {known}")
-        center, sd = self.posterior.population(self.samples)
-        draws = draw_parameters(self.posterior.described[test], center, sd, as_generator(rng))
-        names = [*self.posterior.varying, *self.posterior.common]
-        return dict(zip(names, self.posterior.scales.from_scale(draws).T, strict=True))
 
     def _prior_draws(self, name: str, n: int, rng: np.random.Generator) -> np.ndarray:
         """Prior draws of a parameter that belongs to each test alone."""

@@ -19,13 +19,12 @@ import numpy as np
 
 from .stored_posterior import DescribedPosterior
 
-__all__ = ["draw_parameters", "draw_products", "inverse_prior", "population_marginal"]
+__all__ = ["draw_products", "inverse_prior", "population_marginal"]
 
 _LOG_TWO_PI = np.log(2.0 * np.pi)
 _LARGEST_EXCESS = 3.0  # by which the log inverse prior density may exceed its largest value at the samples
 _CHUNK = 2**15  # values of a temporary array, which fits into the cache of the processor
 _RANDOM_NODES = 128
-_DRAWS = 16
 _JITTER = 1e-12
 
 
@@ -46,20 +45,6 @@ def population_marginal(described: DescribedPosterior, center: np.ndarray, sd: n
     size = max(1, _CHUNK // (len(_nodes(sd.shape[-1])[0]) * len(described.means) * center.shape[-1]))
     parts = [_marginal(described, center[i : i + size], sd[i : i + size]) for i in range(0, max(len(center), 1), size)]
     return np.concatenate(parts)
-
-
-def draw_parameters(
-    described: DescribedPosterior, center: np.ndarray, sd: np.ndarray, rng: np.random.Generator
-) -> np.ndarray:
-    """One draw (n, d) of a test's parameters given each of n hyper-parameters.
-
-    It is chosen among random points of the product of mixture and population by the inverse prior density. Without any
-    possible point (a test beside the population) the product itself is the best description.
-    """
-    points = draw_products(described, center, sd, _DRAWS, rng)
-    cumulative = np.cumsum(inverse_prior(described, points), axis=1)
-    chosen = (cumulative < rng.random((len(center), 1)) * cumulative[:, -1:]).sum(axis=1)
-    return points[np.arange(len(center)), chosen]
 
 
 def draw_products(

@@ -232,11 +232,6 @@ class EventRatios:
         center, scale = self._center_and_scale(np.log(predicted))
         return np.exp(center + scale * special.stdtrit(self.degrees_of_freedom, probability))
 
-    def of_event(self, k: int, log_predicted: np.ndarray) -> np.ndarray:
-        """Ratio of event `k`, moved along the line to logarithms of predicted values."""
-        own = 0.0 if self.levels is None else log_predicted - np.log(np.asarray(self.levels, dtype=float)[k])
-        return self.values[k] * np.exp(self._slope * own)
-
     def draw(self, predicted: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Draw a ratio of a new event for each predicted value (n, ...), which is positive; all are independent."""
         center, scale = self._center_and_scale(np.log(predicted))

@@ -179,9 +179,7 @@ def fragility(
     if len(contains) > 1:
         raise ValueError(f"fragility needs predictions of one kind; their probabilities contain {' / '.join(contains)}")
     arrays = zip(*(each.exceedance[1:5] for each in estimates), strict=True)
-    by_events = [each.exceedance.upper_by_events for each in estimates]
-    found = Exceedance(limit, *map(np.array, arrays), known.effective, *contains)
-    found = found._replace(upper_by_events=None if by_events[0] is None else np.array(by_events), unit=known.unit)
+    found = Exceedance(limit, *map(np.array, arrays), known.effective, *contains, known.unit)
     collapsed = np.array([len(each.collapsed) for each in predictions])
     failed = np.array([each.n_failed for each in predictions]) - collapsed
     try:

@@ -38,7 +38,7 @@ __all__ = [
 ]
 
 _DRAWS = 1000  # of the population of ratios
-_ARRAYS = ("probability", "standard_error", "lower", "upper", "upper_by_events")  # of an `Exceedance`
+_ARRAYS = ("probability", "standard_error", "lower", "upper")  # of an `Exceedance`
 
 
 class Exceedance(NamedTuple):
@@ -65,10 +65,6 @@ class Exceedance(NamedTuple):
         Effective number of independent samples.
     uncertainty : str
         Which uncertainties the probability contains.
-    upper_by_events : ndarray or None
-        With `EventRatios`, the upper end of the Clopper-Pearson interval for the share of events whose ratio exceeds,
-        averaged over the samples: what the events tell without assuming normal log ratios. Where it is far above
-        `upper`, no event was near the threshold, and the probability depends on the assumed tail. None without ratios.
     unit : str
         SI unit of the threshold; "SI" where its dimension is not known.
     """
@@ -80,18 +76,14 @@ class Exceedance(NamedTuple):
     upper: np.ndarray
     effective_sample_size: float
     uncertainty: str = ""
-    upper_by_events: np.ndarray | None = None
     unit: str = "SI"
 
     def __str__(self) -> str:
         arrays = [self.threshold, self.probability, self.standard_error, self.lower, self.upper]
-        by_events = self.upper_by_events is not None
-        arrays += [self.upper_by_events] if by_events else []
         first = "threshold" if self.unit == "1" else f"threshold [{self.unit}]"
-        rows = [(first, "probability", "MC error", "interval", *(["upper end by the events alone"] * by_events))]
-        for limit, share, error, low, high, *rest in zip(*map(np.ravel, np.broadcast_arrays(*arrays)), strict=True):
-            cells = number(limit), number(share), number(error, 2), f"{number(low)} to {number(high)}"
-            rows.append((*cells, *map(number, rest)))
+        rows = [(first, "probability", "MC error", "interval")]
+        for limit, share, error, low, high in zip(*map(np.ravel, np.broadcast_arrays(*arrays)), strict=True):
+            rows.append((number(limit), number(share), number(error, 2), f"{number(low)} to {number(high)}"))
         said = f"\nThe probability contains {self.uncertainty}." if self.uncertainty else ""
         return text_table(rows) + said
 
@@ -151,8 +143,8 @@ def exceedance(
     --------
     >>> peaks = propagate(posterior, samples, quantity=peak("displacement"))
     >>> print(exceedance(peaks, 8.0, unit="cm", ratios=EventRatios([0.93, 1.10, 1.02])))  # doctest: +SAMPLED
-    threshold [m]  probability  MC error       interval  upper end by the events alone
-    0.08                 0.631    0.0017  0.222 to 0.95                          0.992
+    threshold [m]  probability  MC error       interval
+    0.08                 0.631    0.0017  0.222 to 0.95
     The probability contains the uncertainty of the parameters and the error of the model, from the ratios of 3
     events.
     """
@@ -293,10 +285,7 @@ def estimate(
     lower, upper = np.nanquantile(draws, [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=0)
     # far in a tail the mean over populations can be above nearly all of their probabilities
     ends = np.minimum(lower, share), np.maximum(upper, share)
-    moved = [values * ratios.of_event(k, logs) > limits for k in range(len(ratios.values))]  # each event is one trial
-    by_events = _binomial_interval(np.mean(moved, axis=0).sum(axis=0) / number_of, len(ratios.values), level)[1]
-    found = Exceedance(limits[0], share, error, *ends, effective, upper_by_events=by_events)
-    return Estimate(found, single, counted, draws)
+    return Estimate(Exceedance(limits[0], share, error, *ends, effective), single, counted, draws)
 
 
 def _contents(has_noise: bool, ratios: EventRatios | None) -> str:
