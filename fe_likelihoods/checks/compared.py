@@ -67,7 +67,7 @@ class ChannelFit(NamedTuple):
     assumed: float  # independent samples that the noise assumes
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Fit:
     """Measurements of one data set or event, and the responses to them [SI], NaN outside of the event."""
 

@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from ..likelihood.posterior import Posterior
 from ..simulation.model import SimulationBatch, simulate_batch
-from .compared import compare, data_sets_of, draws_to_compare
+from .compared import Fit, compare, data_sets_of, draws_to_compare
 from .finding import CARE, WRONG, Finding, by_severity, percent
 from .fit import check_responses, check_supports
 from .screening import check_data, check_gaps
@@ -35,6 +35,7 @@ class ModelCheck(NamedTuple):
     steps: dict[str, str]  # what half of step and mesh changes at the mean of the prior, in words, by name
     simulations: int  # number of simulations made
     seconds: float  # per simulation [s]
+    fits: tuple[Fit, ...]  # measurements beside the draws of the prior that were simulated
 
 
 def check_model(posterior: Posterior, *, progress: bool = False) -> ModelCheck:
@@ -66,7 +67,7 @@ def check_model(posterior: Posterior, *, progress: bool = False) -> ModelCheck:
     >>> [finding.kind for finding in checked.findings if finding.severity == "wrong"]
     []
     """
-    mean, found, fits, seconds, before = posterior.prior.mean(), list[Finding](), [], 0.0, _made(posterior)
+    mean, found, fits, seconds, before = posterior.prior.mean(), list[Finding](), list[Fit](), 0.0, _made(posterior)
     steps = dict[str, str]()
     with tqdm(disable=not progress, unit="simulation", desc="check") as bar:
         posterior.when_simulated(bar.update)
@@ -106,7 +107,7 @@ def check_model(posterior: Posterior, *, progress: bool = False) -> ModelCheck:
         finally:
             posterior.when_simulated(None)
     found += [*check_responses(fits), *_check_failures(posterior)]
-    return ModelCheck(by_severity(found), steps, made + _made(posterior) - before, seconds)
+    return ModelCheck(by_severity(found), steps, made + _made(posterior) - before, seconds, tuple(fits))
 
 
 def _made(posterior: Posterior) -> int:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..cache.simulation_cache import SimulationCache
-from ..checks.compared import data_sets_of
+from ..checks.compared import data_sets_of, draws_to_compare
 from ..checks.finding import NOTE, labelled
 from ..checks.rehearsal import ModelCheck, check_model
 from ..checks.screening import repair_lines, screen
@@ -23,9 +23,7 @@ from .runs import CACHE, default_folder, is_free, make_sampler
 
 __all__ = ["check_job"]
 
-PICTURE_SECONDS = 10.0
 SEARCH_SECONDS, MOST_SEARCHED = 60.0, 150  # of a search for what the data determine, and its simulations
-FEWEST_DRAWS, MOST_DRAWS = 5, 40
 
 
 def check_job(file: Path, picture: Path, say: Callable[[str], None], progress: bool = False) -> None:
@@ -51,15 +49,15 @@ def check_job(file: Path, picture: Path, say: Callable[[str], None], progress: b
     for event in events:
         compared = "without measurements" if event.measured is None else "compared with measurements"
         say(f"Event {event.name}: {event.record}, {compared}")
-    _say_cost(make_problem(job).posterior, job, sampler, say)
-    pictures = _draw(problem, checked.seconds, picture)
-    names = ", ".join(map(str, pictures))
+    uncached = make_problem(job).posterior
+    _say_cost(uncached, job, sampler, say)
+    names = ", ".join(map(str, _draw(problem, checked, picture)))
     say(f"{names}: the measurements should lie within the band of the simulations at draws of the prior")
-    made, cache = checked.simulations, parts[0].simulator.cache
+    made, cache = checked.simulations + uncached.report()["simulations"], parts[0].simulator.cache
     stored = (
         "" if cache is None else f", those of the calibrated model are stored in {default_folder(file)}/ for the run"
     )
-    say(f"This check made {made} simulations besides those of the picture{stored}")
+    say(f"This check made {made} simulations{stored}")
     say(f"Next: fe-likelihoods run {file} (writes to {default_folder(file)}/)")
 
 
@@ -104,17 +102,9 @@ def _cache_of_the_run(job: Job, folder: Path) -> SimulationCache | None:
 def _say_simulation(problem: Problem, say: Callable[[str], None], progress: bool) -> ModelCheck:
     """Check the model, and say what was found."""
     posterior = problem.posterior
-    likelihood, mean = posterior.likelihood, posterior.prior.mean()
-    n = len(mean) if likelihood.ndim == len(mean) else len(likelihood.model.parameter_names)
-    point = mean[:n]
-    if not np.isfinite(likelihood.log_likelihood(point)):
-        raise ValueError(
-            f"the simulation at the mean of the prior has failed: {likelihood.fault(point) or 'no finite likelihood'}; "
-            "check [model] and [priors]"
-        )
-    checked = check_model(posterior, progress=progress)
+    mean, checked = posterior.prior.mean(), check_model(posterior, progress=progress)
     say(f"One simulation takes {checked.seconds:.2g} s")
-    for part, columns in likelihood.parts():
+    for part, columns in posterior.likelihood.parts():
         theta, measured = mean[None, columns[: len(part.model.parameter_names)]], part.measurements
         if part.is_modal:
             say(f"At the mean of the prior:\n{part.predict_modes(theta)}")
@@ -128,7 +118,8 @@ def _say_simulation(problem: Problem, say: Callable[[str], None], progress: bool
     for name, how in checked.steps.items():
         say(f"{name}: {how}")
     most = min(MOST_SEARCHED, SEARCH_SECONDS / max(checked.seconds, 1e-6))
-    if most > 10 * n and all(each.severity == NOTE for each in checked.findings):  # of wrong data, nothing is known
+    # of wrong data, nothing is known
+    if most > 10 * posterior.ndim and all(each.severity == NOTE for each in checked.findings):
         with suppress(ValueError, np.linalg.LinAlgError):
             told = identifiability(posterior, max_simulations=most)
             say(f"{told}")
@@ -158,25 +149,27 @@ def _say_cost(posterior: Posterior, job: Job, sampler: Any, say: Callable[[str],
             )
 
 
-def _draw(problem: Problem, seconds: float, picture: Path) -> list[Path]:
-    """Simulations at draws of the prior with the measurements, as a PNG file for each data set."""
+def _draw(problem: Problem, checked: ModelCheck, picture: Path) -> list[Path]:
+    """The draws of the prior that a check has simulated, with the measurements, as a PNG file for each data set."""
     from ..plots.predictions import plot_bands
     from ..plots.without_time import plot_modes, plot_points
     from ..prediction.propagation import propagate
     from ..reporting.pictures import save_picture
 
     posterior, files = problem.posterior, []
-    n = int(np.clip(PICTURE_SECONDS / max(seconds, 1e-6), FEWEST_DRAWS, MOST_DRAWS))
-    points = posterior.sample_prior(n, np.random.RandomState(1))
+    points, modes = draws_to_compare(posterior, checked.seconds), {fit.title: fit.modal for fit in checked.fits}
     for key, part, columns in data_sets_of(posterior):
-        draws, measured = points[:, columns[: len(part.model.parameter_names)]], part.measurements
+        if part.is_modal and modes[key].draws is None:  # the log says why
+            continue
         files.append(picture.with_name(f"{picture.stem}-{key}{picture.suffix}") if key else picture)
         if part.is_modal:
-            figure = plot_modes(part.predict_modes(draws), label=f"{n} draws of the prior, 90 %")
+            drawn = modes[key].draws
+            figure = plot_modes(drawn, label=f"{len(drawn.frequencies)} draws of the prior, 90 %")
         else:
-            prediction = propagate(part.model, draws, quantiles=(0.05, 0.95), progress=False)
-            history = measured.is_history
-            figure = plot_bands(prediction, measured) if history else plot_points(measured, prediction=prediction)
-            figure.suptitle(f"{n} draws of the prior and the measurements")
+            draws, measured = points[:, columns[: len(part.model.parameter_names)]], part.measurements
+            options = {"quantiles": (0.05, 0.95), "cache": part.simulator, "progress": False}
+            drawn = propagate(part.model, draws, **options)
+            figure = plot_bands(drawn, measured) if measured.is_history else plot_points(measured, prediction=drawn)
+            figure.suptitle(f"{drawn.n_samples} draws of the prior and the measurements")
         save_picture(figure, files[-1])
     return files

@@ -81,7 +81,7 @@ def propagate(
     quantiles: Sequence[float] = (0.05, 0.5, 0.95),
     effective_sample_size: float | None = None,
     pool: Any = None,
-    cache: SimulationCache | str | os.PathLike | None = None,
+    cache: SimulationCache | Simulator | str | os.PathLike | None = None,
     calibrated: Sequence[Measurements] | None = None,
     check: bool = True,
     seed: int | None = None,
@@ -218,8 +218,8 @@ def propagate(
     together = source.executor is not None or hasattr(model, "simulate_batch")
     batch = _BATCH_VALUES // (len(model.channels) * model.n_steps)
     batch = max(1, min(batch, _LARGEST_BATCH if together else _LARGEST_SERIAL_BATCH))
-    stored = None
-    if cache is not None:
+    stored = cache if isinstance(cache, Simulator) else None  # of the model that predicts, with its memory
+    if cache is not stored:
         nothing = Measurements(model.channels, model.dt, np.zeros((len(model.channels), model.n_steps)))
         stored = Simulator(
             model, nothing, pool=source.executor, cache=cache, memory_rows=0, memory_bytes=0, responses_only=True

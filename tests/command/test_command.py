@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from fe_likelihoods import Channel, SimulationCache, read_columns, read_record
+from fe_likelihoods import Channel, LinearOscillator, SimulationCache, read_columns, read_record
 from fe_likelihoods.command.job import parse_job, read_job
 from fe_likelihoods.command.keys import parse_prior, read_quantity
 from fe_likelihoods.command.main import TEMPLATES, _plain_warnings, main
@@ -49,7 +49,6 @@ draws = 10
 
 def write_oscillator(folder: Path) -> None:
     """Record, measurements and settings of the test of an oscillator."""
-    from fe_likelihoods import LinearOscillator
     from fe_likelihoods.problems import table_motion
 
     record = table_motion().trim(0.0, 6.0).resample(0.02)
@@ -200,8 +199,17 @@ def test_a_program_needs_a_time_limit_and_zero_may_be_a_clock_time(tmp_path):
             measured(old, new)
 
 
-def test_check_says_what_was_read_and_what_a_run_costs(folder):
+def test_check_says_what_was_read_and_what_a_run_costs(folder, monkeypatch):
+    simulated, simulate = [], LinearOscillator.simulate
+
+    def counted(model, theta):
+        simulated.append((model.fingerprint, *theta))
+        return simulate(model, theta)
+
+    monkeypatch.setattr(LinearOscillator, "simulate", counted)
     output = call("check", "oscillator.toml")
+    # the mean of the prior is simulated four times, and four draws that are timed are not taken from the cache
+    assert len(simulated) - len(set(simulated)) <= 3 + 4
     assert "Record: base, 301 samples at 0.02 s" in output
     assert "displacement: 301 samples" in output and "One simulation takes" in output
     assert (folder / "check-oscillator.png").stat().st_size > 10_000
