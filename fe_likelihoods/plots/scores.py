@@ -1,8 +1,8 @@
-"""Figure of prediction scores: calibration, coverage with its error, and sharpness beside it.
+"""Figure of predicted numbers, such as peaks: calibration, intervals, and shares of measured values in them.
 
-A single share of samples in a band says little. The figure shows where measured values are in the predicted
-distributions (histogram of the probability integral transform, PIT), the coverage, and the cost: the band's width, and
-the interval score, which adds a penalty for every value outside it.
+A single share of values in an interval says little. The figure shows where measured values are in the predicted
+distributions (histogram of the probability integral transform, PIT), and the cost: the width of the intervals, and the
+interval score, which adds a penalty for every value outside.
 """
 
 from __future__ import annotations
@@ -19,58 +19,47 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from ..prediction.scores import HistoryScores, QuantityScores
+    from ..prediction.scores import QuantityScores
 
 __all__ = ["plot_scores"]
 
 _BAND = 0.9  # probability of the bands for calibrated predictions
 _BINS = 10
-_FEWEST = 3  # events whose scatter is drawn as standard errors
 
 
-def plot_scores(
-    scores: HistoryScores | QuantityScores | Mapping[str, HistoryScores] | Mapping[str, QuantityScores],
-) -> Figure:
-    """Plot scores of predicted histories, or of predicted numbers such as peaks, of one event or of several.
+def plot_scores(scores: QuantityScores | Mapping[str, QuantityScores]) -> Figure:
+    """Plot scores of predicted numbers, such as peaks, of one event or of several.
 
     Parameters
     ----------
-    scores : HistoryScores, QuantityScores, or mapping from names of events to them
-        Results of `Prediction.score`, all of histories or all of numbers, with one level.
+    scores : QuantityScores, or mapping from names of events to them
+        Results of `Prediction.score` for numbers, with one level.
 
     Returns
     -------
     matplotlib Figure
-        Three axes. Left: shares of the PIT in equal parts of 0 to 1 (ten for histories), with the band that contains
-        90 % of the shares of calibrated predictions (binomial, for the number of independent samples), and standard
-        errors of their mean between histories for three events or more. Histories: coverage of each channel, with its
-        standard error between events for three events or more, else binomial for the number of independent samples; and
-        the interval score, which is the width of the band and a penalty, as multiples of the root mean square of the
-        measured channel. Numbers: median, 50 % and outer
-        interval divided by the measured value, in the order of the events, and the shares of measured values in the
-        intervals, with the mean width and score of the outer ones.
+        Three axes. Shares of the PIT in equal parts of 0 to 1, with the band that contains 90 % of the shares of
+        calibrated predictions (binomial); median, 50 % and outer interval divided by the measured value, in the order
+        of the events; and the shares of measured values in the intervals, with the mean width and score of the outer
+        ones.
 
     Raises
     ------
     ValueError
-        If there are no scores, scores of histories and of numbers are mixed, levels differ, or a measured number is
-        zero.
+        If there are no scores, scores are of histories, levels differ, or a measured number is zero.
 
     Examples
     --------
-    >>> figure = plot_scores(prediction.score(measurements))
+    >>> peaks = propagate(posterior, samples, quantity=[peak("acceleration"), peak("displacement")], noise=True)
+    >>> figure = plot_scores(peaks.score(measurements))
     """
     events = dict(scores) if isinstance(scores, Mapping) else {"": scores}
-    histories = {hasattr(each, "coverage") for each in events.values()}
-    if len(histories) != 1 or len({each.level for each in events.values()}) != 1:
+    levels = {each.level for each in events.values()}
+    if len(levels) != 1 or any(hasattr(each, "coverage") for each in events.values()):
         raise ValueError(
-            "plot_scores: expected scores of one event or more, all of histories or all of numbers, with one level; "
-            f"got {[(name, type(each).__name__, getattr(each, 'level', None)) for name, each in events.items()]}"
+            "plot_scores: expected scores of numbers such as peaks, of one event or more, with one level; got "
+            f"{[(name, type(each).__name__, getattr(each, 'level', None)) for name, each in events.items()]}"
         )
-    if histories == {True}:
-        figure, axes = new_figure(1, 3, (12.0, 3.8))
-        _history_axes(axes[0], events)
-        return figure
     rows = sum(len(each.names) for each in events.values())
     size = (11.0, max(3.6, 1.3 + (0.24 if rows <= 30 else 0.15) * rows))
     figure, (axes,) = new_figure(1, 3, size, width_ratios=(1.0, 1.6, 0.8))
@@ -80,44 +69,6 @@ def plot_scores(
             each.set_box_aspect(ratio)
             each.set_anchor("N")
     return figure
-
-
-def _history_axes(axes: np.ndarray, events: Mapping[str, HistoryScores]) -> None:
-    level = next(iter(events.values())).level
-    shares = np.concatenate([each.pit for each in events.values()])
-    worth = sum(float(each.effective_samples.sum()) for each in events.values())
-    _draw_histogram(axes[0], np.nanmean(shares, axis=0), worth)
-    if len(events) >= _FEWEST:
-        known = shares[np.isfinite(shares).all(axis=1)]
-        error = known.std(axis=0, ddof=1) / np.sqrt(len(known))
-        at = (np.arange(shares.shape[1]) + 0.5) / shares.shape[1]
-        axes[0].errorbar(at, known.mean(axis=0), error, fmt="none", color=ORANGE, linewidth=1.2, label="between events")
-    _add_room_for_legend(axes[0])
-
-    found: dict[str, list[tuple[float, ...]]] = {}  # of each channel: coverage, independent samples, width, penalty
-    for each in events.values():
-        penalty = (each.interval_score - each.width) / each.rms
-        columns = each.coverage, each.effective_samples, each.width / each.rms, penalty
-        for channel, *row in zip(each.channels, *columns, strict=True):
-            found.setdefault(channel.name, []).append(row)
-    for place, rows in enumerate(found.values()):
-        share, worth, width, penalty = np.transpose(rows)
-        error = np.sqrt(level * (1.0 - level) * np.sum(1.0 / np.maximum(worth, 1.0))) / len(rows)
-        error = share.std(ddof=1) / np.sqrt(len(rows)) if len(rows) >= _FEWEST else error
-        axes[1].errorbar(share.mean(), place, xerr=error, fmt="o", markersize=4, linewidth=1, color=BLUE)
-        text = ("width", "penalty of values outside") if place == 0 else (None, None)
-        axes[2].barh(place, width.mean(), 0.6, color=BLUE, alpha=0.6, label=text[0])
-        axes[2].barh(place, penalty.mean(), 0.6, width.mean(), color=ORANGE, label=text[1])
-    axes[1].axvline(level, color=GREY, linewidth=0.8)
-    axes[1].set_xlabel(f"share in the {level:.0%} band [-]")
-    axes[1].set_title("coverage", fontsize="medium")
-    axes[1].set_xlim(min(level - 0.1, axes[1].dataLim.xmin - 0.02), 1.03)
-    axes[2].set_xlabel("interval score / RMS measured [-]")
-    axes[2].set_title(f"sharpness: score of the {level:.0%} band", fontsize="medium")
-    add_legend(axes[2], ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.2))
-    for each in axes[1:]:
-        each.set_yticks(range(len(found)), found)
-        each.set_ylim(len(found) - 0.4, -0.6)
 
 
 def _number_axes(axes: np.ndarray, events: Mapping[str, QuantityScores]) -> None:
@@ -176,22 +127,17 @@ def _label(event: str, scores: QuantityScores, k: int) -> str:
     return f"{name}: {value:.3g} {unit}"
 
 
-def _draw_histogram(axes: Axes, shares: np.ndarray, independent: float) -> None:
-    """Shares of the PIT in equal parts of 0 to 1, and the band of chance for a number of independent values."""
-    n, probability = max(1, round(independent)), 1.0 / len(shares)
+def _draw_histogram(axes: Axes, shares: np.ndarray, n: int) -> None:
+    """Shares of the PIT in equal parts of 0 to 1, and the band of chance for n values."""
+    probability = 1.0 / len(shares)
     low, high = _chance(n, probability)
     at = (np.arange(len(shares)) + 0.5) * probability
     axes.bar(at, shares, 0.94 * probability, color=BLUE, alpha=0.75)
     axes.fill_between([0.0, 1.0], low, high, color=GREY, alpha=0.35, linewidth=0.0, label=f"{_BAND:.0%} by chance")
     axes.axhline(probability, color=GREY, linewidth=0.8)
     axes.set(xlim=(0.0, 1.0), xlabel="predicted probability\nbelow measured (PIT)", ylabel="share [-]")
-    axes.set_title(f"calibration: worth {n} value{'s' if n > 1 else ''}", fontsize="medium")
-    _add_room_for_legend(axes)
-
-
-def _add_room_for_legend(axes: Axes) -> None:
-    """A legend of one row above the bars."""
-    axes.set_ylim(0.0, 1.18 * max(axes.dataLim.ymax, 1e-9))
+    axes.set_title(f"calibration: {n} value{'s' if n > 1 else ''}", fontsize="medium")
+    axes.set_ylim(0.0, 1.18 * max(axes.dataLim.ymax, 1e-9))  # room for a legend of one row above the bars
     add_legend(axes, ncols=2, loc="upper center", columnspacing=1.0, borderaxespad=0.1)
 
 

@@ -170,7 +170,7 @@ class Prediction:
         Notes
         -----
         Measurements contain the model error and sensor noise: score a prediction with ``noise=True``. A band of the
-        response alone covers fewer of them. For histories, CRPS and PIT are computed for normal
+        response alone covers fewer of them. For histories, the CRPS is computed for normal
         distributions with the predicted means and standard deviations, because the samples of histories are not kept.
 
         Examples

@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import ndtr
 
-from ..noise.residuals import effective_samples
 from ..signals.channels import Channel
 from ..signals.error_measures import rrmse
 from ..text_tables import text_table
@@ -37,14 +36,11 @@ __all__ = [
     "crps_normal",
     "crps_samples",
     "interval_score",
-    "pit_normal",
     "pit_samples",
     "score_histories",
     "score_values",
     "share_within",
 ]
-
-_BINS = 10  # of the histograms of the PIT
 
 
 def crps_normal(mean: ArrayLike, sd: ArrayLike, observed: ArrayLike) -> np.ndarray:
@@ -112,15 +108,6 @@ def interval_score(lower: ArrayLike, upper: ArrayLike, observed: ArrayLike, leve
         )
     outside = np.maximum(lower - observed, 0.0) + np.maximum(observed - upper, 0.0)
     return (upper - lower) + 2.0 / (1.0 - level) * outside
-
-
-def pit_normal(mean: ArrayLike, sd: ArrayLike, observed: ArrayLike) -> np.ndarray:
-    """Predicted probability (...) of a value below the measured one, for normal distributions; NaN where missing.
-
-    Where the standard deviation is zero, it is 0 or 1, and NaN for a measured value that is the mean.
-    """
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return ndtr((np.asarray(observed, dtype=float) - mean) / sd)
 
 
 def pit_samples(values: ArrayLike, observed: ArrayLike) -> np.ndarray:
@@ -231,13 +218,6 @@ class HistoryScores(NamedTuple):
         Width of this band: the sharpness of the prediction.
     coverage : ndarray, shape (n_channels,)
         Share of the measured samples in the band.
-    pit : ndarray, shape (n_channels, 10)
-        Shares of the measured samples whose PIT (for the normal distributions) is in each tenth of 0 to 1: about 0.1
-        each for a calibrated prediction; high at both ends if the prediction is too narrow, in the middle if too wide.
-        A sample with a predicted standard deviation of zero is at an end, or left out if it equals the mean.
-    effective_samples : ndarray, shape (n_channels,)
-        Number of independent samples that the measured ones are worth, from the autocorrelation of the normalised
-        errors (`fe_likelihoods.effective_samples`).
     """
 
     channels: tuple[Channel, ...]
@@ -249,8 +229,6 @@ class HistoryScores(NamedTuple):
     interval_score: np.ndarray
     width: np.ndarray
     coverage: np.ndarray
-    pit: np.ndarray
-    effective_samples: np.ndarray
 
     def __str__(self) -> str:
         head = ["channel", "unit", "RMS", "RRMSE", "CRPS", "interval score", "width"]
@@ -348,9 +326,6 @@ def score_histories(
     error = rrmse(moments[0], measured, [channel.name for channel in channels])
     there = np.isfinite(measured)
     inside = (band[0] <= measured) & (measured <= band[1])
-    spread = there & (moments[1] > 0.0)
-    shares = [_histogram(row[np.isfinite(row)]) for row in pit_normal(*moments, measured)]
-    worth = _effective(np.where(spread, measured - moments[0], np.nan) / np.where(spread, moments[1], 1.0))
     return HistoryScores(
         channels=tuple(channels),
         level=level,
@@ -361,8 +336,6 @@ def score_histories(
         interval_score=np.nanmean(interval_score(*band, measured, level), axis=1),
         width=np.nanmean(np.where(there, band[1] - band[0], np.nan), axis=1),
         coverage=inside.sum(axis=1) / there.sum(axis=1),
-        pit=np.array(shares),
-        effective_samples=worth,
     )
 
 
@@ -398,18 +371,3 @@ def central_interval(ascending: np.ndarray, level: float) -> tuple[np.ndarray, n
     n = len(ascending)
     rank = max(1, math.ceil(0.5 * (1.0 - level) * (n + 1) - 0.5))  # as `share_within` of the PIT (rank + 0.5) / (n + 1)
     return ascending[rank - 1], ascending[n - rank]
-
-
-def _effective(errors: np.ndarray) -> np.ndarray:
-    """Independent samples (n_channels,) that normalised errors are worth; 1 where they are fewer than two, or zero."""
-    worth = np.ones(len(errors))
-    for k, row in enumerate(errors):
-        if np.isfinite(row).sum() > 1 and np.nan_to_num(row).any():
-            worth[k] = effective_samples(row[None])[0]
-    return worth
-
-
-def _histogram(transforms: np.ndarray) -> np.ndarray:
-    """Shares of PIT values in each tenth, NaN without any."""
-    counts = np.histogram(transforms, _BINS, (0.0, 1.0))[0]
-    return counts / len(transforms) if len(transforms) else np.full(_BINS, np.nan)

@@ -226,34 +226,20 @@ def draw_event(event: OtherEvent) -> list[Picture]:
 
 
 def draw_scores_of_events(events: Sequence[OtherEvent]) -> list[Picture]:
-    """Calibration, coverage and sharpness of the predictions for all events with measurements: numbers, histories."""
+    """Calibration and intervals of the predicted numbers of all events with measurements."""
     from ..plots.scores import plot_scores
 
     numbers = {event.name: event.values[0] for event in events if event.values and event.values[0].measured.all()}
-    histories = {event.name: event.histories[0] for event in events if event.histories}
-    about = (
-        "Left: bars outside of the grey band show predictions that are too narrow (high at both ends), too wide (high "
-        "in the middle) or biased (high at one end). "
-    )
-    pictures = []
-    if numbers:
-        pictures.append(
-            _picture(
-                "Predicted and measured numbers of all events",
-                about + "Middle: intervals divided by the measured value; those that cross the line contain it. "
-                "Right: shares of measured values in the intervals, which should be in the grey bars.",
-                f"Predicted intervals by measured values of {', '.join(numbers)}.",
-                lambda: plot_scores(numbers),
-            )
+    if not numbers:
+        return []
+    return [
+        _picture(
+            "Predicted and measured numbers of all events",
+            "Left: bars outside of the grey band show predictions that are too narrow (high at both ends), too wide "
+            "(high in the middle) or biased (high at one end). Middle: intervals divided by the measured value; those "
+            "that cross the line contain it. Right: shares of measured values in the intervals, which should be in the "
+            "grey bars.",
+            f"Predicted intervals by measured values of {', '.join(numbers)}.",
+            lambda: plot_scores(numbers),
         )
-    if histories:
-        pictures.append(
-            _picture(
-                "Scores of the histories of all events",
-                about + "Coverage is right near the grey line; of two predictions, the one with the smaller interval "
-                "score is better.",
-                f"Calibration, coverage and interval scores of the histories of {', '.join(histories)}.",
-                lambda: plot_scores(histories),
-            )
-        )
-    return pictures
+    ]
