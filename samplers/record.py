@@ -104,7 +104,8 @@ class Record:
     """Evaluations and remembered arrays of a run, in a file that is written and locked from `begin` or `open` on.
 
     `slow` are indices of the parameters that a simulation depends on. `start` belongs to the last annealing; `failed`
-    are points with reasons, in order. `is_complete`: the run reached beta = 1 before, so nothing new may be asked for.
+    are points with reasons, in order, and `counted` those whose failures the function counts itself. `is_complete`:
+    the run reached beta = 1 before, so nothing new may be asked for.
     """
 
     def __init__(self, path: Path | None = None, slow: Sequence[int] | None = None):
@@ -118,6 +119,7 @@ class Record:
         self.start: RunStart | None = None
         self.count, self.is_complete = 0, False
         self.failed: list[tuple[np.ndarray, str]] = []
+        self.counted: list[tuple[np.ndarray, str]] = []
         self._batches: list[EvaluatedBatch] = []
         self._known: dict[bytes, tuple[EvaluatedBatch, int]] = {}  # batch and row of each point
         self.simulated: set[bytes] = set()  # keys of the points
@@ -173,6 +175,7 @@ class Record:
         self.simulated.update(self.keys(coords))
         self.count += len(coords)
         self.failed += [(coords[row].copy(), reason) for row, reason in batch.reasons.items()]
+        self.counted += [(coords[row].copy(), reason) for row, reason in batch.counted.items()]
 
     def keys(self, coords: np.ndarray) -> list[bytes]:
         """The slow parameters of points (n, ndim) as bytes: points with the same key share a simulation."""

@@ -52,9 +52,18 @@ class RunResults:
         return len(self._record.failed)
 
     @property
+    def _failed_simulations(self) -> int:
+        """Failed simulations of this run that the function counts itself, also in the search of a guide."""
+        since = (self._target.failure_count or 0) - self._failed_before
+        return max(len(self._record.counted), since)
+
+    @property
     def failures(self) -> list[dict]:
-        """``{"parameters": array (ndim,), "reason": str}`` of the first thousand failures."""
-        failed = self._record.failed[:KEPT_FAILURES]
+        """``{"parameters": array (ndim,), "reason": str}`` of the first thousand failed points.
+
+        Failed simulations of a posterior are among them, but not those of a guide's search (``posterior.report()``).
+        """
+        failed = (self._record.failed + self._record.counted)[:KEPT_FAILURES]
         return [{"parameters": parameters, "reason": reason} for parameters, reason in failed]
 
     @property

@@ -182,6 +182,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
             self._evaluator: Evaluator = AsynchronousEvaluator(*common, queue=queue)
         else:
             self._evaluator = Evaluator(*common)
+        self._failed_before = target.failure_count or 0
         known = self._record.latest(self._record.count) if self._reopened else None
         if known and self._record.start.header["log_prob_fn"] == getattr(target.function, "fingerprint", None):
             target.recall(known)
@@ -389,7 +390,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         if self.failure_count > failures:
             warn(
                 f"{self.failure_count - failures} evaluations failed and count as impossible "
-                f"({most_common_reasons(reason for _, reason in self._record.failed)}); see failures"
+                f"({most_common_reasons(reason for _, reason in self._record.failed[failures:])}); see failures"
             )
 
     @property
@@ -422,6 +423,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
         """Store the verdict on an annealing by this object, or keep the verdict of the backend."""
         if self._result.independent_points is not None or self._verdict is None:
             failed = f"{self.failure_count} of {self.evaluations} evaluations" if self.failure_count else ""
+            if simulations := self._failed_simulations:
+                failed = f"{simulations} of {self.simulations:.0f} simulations"
             latest = self._record.latest()
             self._near = None if latest is None else judged_failures(latest, coords, self._target)
             numbers = self.nwalkers, self.ndim, self.simulations
@@ -523,6 +526,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         run["log_prior"] = float(np.sum(log_prior))
         start = RunStart(self._header() | run, coords, self.random_state)
         self._record.begin(start)
+        self._failed_before = self._target.failure_count or 0
         self._output.begin(run["run"])
         if state.log_prob is not None:
             self._record.evaluated(EvaluatedBatch(coords, np.asarray(state.log_prob, dtype=float), state.blobs, {}))

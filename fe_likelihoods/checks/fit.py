@@ -377,7 +377,7 @@ def check_stated_errors(fits: Iterable[Fit]) -> list[Finding]:
             for row, column in np.transpose(np.unravel_index(largest, squares.shape))
         ]
         action = (
-            f"Most do {listed(places)}. Look for a wrong value, sensor or load case (exchanged ones, another place or "
+            f"The largest: {listed(places)}. Look for a wrong value, sensor or load case (exchanged ones, another place or "
             "unit of the load), and at the model. If all of them are right, leave the stated errors out: they are then "
             "estimated."
         )

@@ -61,12 +61,20 @@ def _check_errors(fit: Any) -> list[Finding]:
     sums = likelihood.simulator.statistics(fit.points[:, : len(likelihood.model.parameter_names)])
     deviations = np.repeat(np.concatenate(noise.deviations(np.zeros((1, 0))), axis=1), noise.n_sets, axis=1)
     squares = sums[:, len(noise.channels) :] / np.square(deviations)
+    n_modes, best = fit.samples.data.n_modes, squares[np.nanargmin(squares.sum(axis=1))]
+    largest = np.argsort(-np.nan_to_num(best))[:2]
+    of_shape, numbers = largest // (n_modes * noise.n_sets), largest // noise.n_sets % n_modes
+    places = [
+        f"the {'shape' if shape else 'frequency'} of mode {_number(fit.samples, k)}"
+        for shape, k in zip(of_shape, numbers, strict=True)
+    ]
     action = (
-        "Look for a wrong mode or sensor, and at the model. If both are right, add an unknown error: "
+        f"The largest: {listed(places)}. Look for a wrong number or sensor, and at the model. If both are right, add an "
+        "unknown error: "
         'frequency_error="common", shape_error="common" (unknown_errors in a TOML file).'
     )
     what, data = "At the best sample, frequencies and shapes", sum(noise.counts) + sum(noise.freedoms)
-    return check_squares(float(np.nanmin(squares.sum(axis=1))), data, what, action)
+    return check_squares(float(best.sum()), data, what, action)
 
 
 def check_squares(square: float, n: int, what: str, action: str) -> list[Finding]:
@@ -115,9 +123,10 @@ def _check_frequencies(draws: Any) -> list[Finding]:
     logs = np.log(draws.data.mean_frequencies / draws.frequencies)[:, resemble]
     if not logs.size:
         return []
-    common, median = logs.mean(axis=1), float(np.median(logs))
+    median, most = float(np.median(logs)), (logs.shape[1] - 1) // 2
     numbers = {"factor": float(np.exp(median))}
-    if np.abs(common).min() > np.log(FACTOR) and len(set(np.sign(common))) == 1:
+    common = np.sort(np.sign(median) * logs, axis=1)[:, most]  # of half of the modes: one wrong number is no unit
+    if common.min() > np.log(FACTOR):
         ratios = {  # square roots of factors of stiffness or mass, besides those of frequencies
             2.0 * np.pi: "rad/s instead of Hz",
             60.0: "1/min instead of Hz",

@@ -7,6 +7,7 @@ histories have gigabytes, so histories and products are in temporary files, of w
 """
 
 import tempfile
+import weakref
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -27,6 +28,7 @@ class _Numbers:
     def __init__(self, dtype: type) -> None:
         self._dtype = np.dtype(dtype)
         self._file = tempfile.TemporaryFile(buffering=0)
+        weakref.finalize(self, self._file.close)
 
     def __reduce__(self) -> tuple:
         self._file.seek(0)

@@ -168,7 +168,7 @@ class Verdict(_Stored):
         if others:
             stated += f" ({'; '.join(f'{name} {x:.2f} +- {error:.2g}{note}' for name, x, error, note in others)})"
         failed = f"{run.failure_count} of {run.evaluations} evaluations failed"
-        if simulations := run._target.failure_count:
+        if simulations := run._failed_simulations:
             failed = f"{simulations} simulations failed"
         elif not run.failure_count:
             failed = "no failed evaluations"

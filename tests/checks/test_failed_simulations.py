@@ -146,6 +146,20 @@ def test_a_reopened_run_counts_the_failures_of_its_record(what, tmp_path):
     assert [row.reason for row in found.rows] == [row.reason for row in before.rows]
 
 
+def test_runs_on_one_posterior_count_their_own_failures():
+    """Other runs of the same posterior had been counted as well; the verdict and `failures` had named none."""
+    posterior, counts = posterior_of([1.0, 0.8]), []
+    for seed in (1, 2):
+        before = posterior.report()["failure_count"]
+        sampler = SMCSampler(20, posterior.ndim, posterior, vectorize=True, seed=seed, max_moves=3)
+        sampler.run_mcmc(None, 1)
+        counts.append(posterior.report()["failure_count"] - before)
+        assert f"{counts[-1]} simulations failed" in sampler.verdict.summary
+        assert f"{counts[-1]} of {sampler.verdict.simulations:.0f} simulations failed" in str(sampler.verdict)
+        assert len(sampler.failures) >= counts[-1] > 5
+        assert all(posterior(each["parameters"]) == -np.inf and each["reason"] for each in sampler.failures[:3])
+
+
 def test_a_run_that_ended_before_its_first_evaluation_goes_on(tmp_path):
     def log_prob(theta):
         if not (tmp_path / "go").exists():
