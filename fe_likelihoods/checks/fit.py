@@ -377,9 +377,9 @@ def check_stated_errors(fits: Iterable[Fit]) -> list[Finding]:
             for row, column in np.transpose(np.unravel_index(largest, squares.shape))
         ]
         action = (
-            f"The largest: {listed(places)}. Look for a wrong value, sensor or load case (exchanged ones, another place or "
-            "unit of the load), and at the model. If all of them are right, leave the stated errors out: they are then "
-            "estimated."
+            f"The largest: {listed(places)}. Look for a wrong value, sensor or load case (exchanged, another place "
+            "or unit of the load), and at the model. If all of them are right, leave the stated errors out: they are "
+            "then estimated."
         )
         found += check_squares(float(np.nansum(squares)), n, what, action)
     return found

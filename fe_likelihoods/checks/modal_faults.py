@@ -69,9 +69,8 @@ def _check_errors(fit: Any) -> list[Finding]:
         for shape, k in zip(of_shape, numbers, strict=True)
     ]
     action = (
-        f"The largest: {listed(places)}. Look for a wrong number or sensor, and at the model. If both are right, add an "
-        "unknown error: "
-        'frequency_error="common", shape_error="common" (unknown_errors in a TOML file).'
+        f"The largest: {listed(places)}. Look for a wrong number or sensor, and at the model. If both are right, add "
+        'an unknown error: frequency_error="common", shape_error="common" (unknown_errors in a TOML file).'
     )
     what, data = "At the best sample, frequencies and shapes", sum(noise.counts) + sum(noise.freedoms)
     return check_squares(float(best.sum()), data, what, action)
