@@ -25,11 +25,8 @@ from fe_likelihoods import (
     GaussianNoise,
     HalfNormal,
     LinearOscillator,
-    LinearStructure,
     Measurements,
     Posterior,
-    RCColumn,
-    ShearFrame,
     TruncatedNormal,
     Uniform,
     material_curves,
@@ -42,7 +39,6 @@ from fe_likelihoods import (
     plot_section,
     plot_sensors,
     problems,
-    rank_sensors,
 )
 from samplers import SMCSampler, plot_corner
 
@@ -111,28 +107,6 @@ def model_figures() -> dict:
     }
 
 
-def ranked_sensors() -> dict:
-    """Ranks of sensors on the column and on a frame of eight floors."""
-    record = problems.bridge_column_data("short").record
-    column = RCColumn.lhpost(record)
-    heights, bar = np.round(column.height * np.array([0.0, 0.125, 0.25, 0.375, 0.5, 0.75]), 2), column.bar_circle_radius
-    outputs = [f"displacement@{z}" for z in (*heights[1:], 7.3152)]
-    outputs += [f"curvature@{z}" for z in heights] + [f"strain@{z}:{x:.3f}" for z in heights for x in (bar, -bar)]
-    column = replace(column, outputs=("acceleration", *outputs))
-    noise = {"acceleration": 0.1, "displacement": 2e-3, "curvature": 2e-4, "strain": 1e-4}
-    options = {"noise": noise, "effective_samples": 50.0}
-    best = rank_sensors(column, problems.bridge_column_prior(()), **options).chosen
-    floors = {f"floor {i}": i for i in range(1, 9)}
-    drifts = [f"displacement@floor {i + 1}:floor {i}" for i in (1, 3, 5, 7)]
-    building = LinearStructure(ShearFrame(floors, [1.0] * 8, [900.0] * 8), record, outputs=(*floors, *drifts))
-    prior = {f"stiffness_{i}": TruncatedNormal(1.0, 0.2) for i in range(1, 9)}
-    prior |= {f"damping_{i}": TruncatedNormal(0.03, 0.01) for i in range(1, 9)}
-    figure, (left, right) = plt.subplots(1, 2, figsize=(12.4, 6.0), layout="constrained")
-    plot_sensors(column, left, best)
-    plot_sensors(building, right, rank_sensors(building, prior, effective_samples=50.0).chosen)
-    return {"sensors_ranked": figure}
-
-
 def _oscillator(seed: int) -> tuple[Measurements, LinearOscillator, np.ndarray]:
     """Synthetic measurements with errors that are correlated from sample to sample."""
     motion = problems.bridge_column_data().record
@@ -192,7 +166,7 @@ def column_update() -> dict:
 
 if __name__ == "__main__":
     TARGET.mkdir(exist_ok=True)
-    made = model_figures() | ranked_sensors() | correlated_errors() | column_update()
+    made = model_figures() | correlated_errors() | column_update()
     with tempfile.TemporaryDirectory() as folder:
         for name, figure in made.items():
             figure.savefig(Path(folder) / f"{name}.png", dpi=85)

@@ -6,7 +6,7 @@ length.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from ..models.base import History
-    from ..models.linear_structure import LinearStructure
     from ..models.rc_column import RCColumn
 
 __all__ = ["plot_hysteresis", "plot_section", "plot_sensors"]
@@ -82,14 +81,13 @@ def plot_section(column: RCColumn, axes: Axes | None = None) -> Axes:
     return axes
 
 
-def plot_sensors(model: RCColumn | LinearStructure, axes: Axes | None = None, ranks: Sequence[str] = ()) -> Axes:
-    """Plot where the sensors of a column or of a building are: its elevation with every channel at its place.
+def plot_sensors(column: RCColumn, axes: Axes | None = None, ranks: Sequence[str] = ()) -> Axes:
+    """Plot where the sensors of a column are: its elevation with every channel at its place.
 
     Parameters
     ----------
-    model : RCColumn or LinearStructure
-        The column, or a building whose parts have floors (`ShearFrame`); its channels
-        have the names of its outputs.
+    column : RCColumn
+        The column; its channels have the names of its outputs.
     axes : matplotlib Axes, optional
         Where to draw. Default: a new figure.
     ranks : sequence of str
@@ -99,26 +97,24 @@ def plot_sensors(model: RCColumn | LinearStructure, axes: Axes | None = None, ra
     Returns
     -------
     matplotlib Axes
-        The axes with the figure; lengths in metres, floors by their number.
+        The axes with the figure, in metres.
 
     Raises
     ------
     ValueError
-        If a rank is of no channel, or the structure has no floors.
+        If a rank is of no channel.
 
     Examples
     --------
     >>> axes = plot_sensors(RCColumn.lhpost(record, outputs=("displacement", "strain@0.1:0.5")))
     """
-    names, ranks = [channel.name for channel in model.channels], list(ranks)
+    names, ranks = [channel.name for channel in column.channels], list(ranks)
     if unknown := [name for name in ranks if name not in names]:
         raise ValueError(f"ranks has the unknown channels {', '.join(unknown)}; the channels are {', '.join(names)}")
     axes = new_axes(axes, (6.8, 6.4))
-    draw = _draw_building if hasattr(model, "parts") else _draw_column
-    radius, height, sensor = draw(model, axes)
-    places = sorted(
-        (_draw_sensor(axes, radius, *sensor(name), bool(ranks) and name not in ranks) for name in names), key=_rank
-    )
+    radius, height = 0.5 * column.diameter, column.height
+    _draw_column(axes, column)
+    places = sorted((_draw_sensor(axes, column, name, bool(ranks) and name not in ranks) for name in names), key=_rank)
     places = [each for each in places if not ranks or each[2] in ranks]
     ends = _label_heights([z for _, z, _ in places], height)
     for (x, z, name), end in zip(places, ends, strict=True):
@@ -131,11 +127,7 @@ def plot_sensors(model: RCColumn | LinearStructure, axes: Axes | None = None, ra
     return axes
 
 
-Drawn = tuple[float, float, Callable[[str], tuple[str, list[float], str]]]
-"""Half the width, the height, and a function from a channel to its kind, its place and its name."""
-
-
-def _draw_column(column: RCColumn, axes: Axes) -> Drawn:
+def _draw_column(axes: Axes, column: RCColumn) -> None:
     from matplotlib.patches import Rectangle
 
     radius, height = 0.5 * column.diameter, column.height
@@ -147,43 +139,13 @@ def _draw_column(column: RCColumn, axes: Axes) -> Drawn:
     axes.set_xticks([-radius, 0.0, radius], [f"{x:.3g}" for x in (-radius, 0.0, radius)])
     axes.set_title("dotted: sections of the elements", fontsize="small")
 
-    def sensor(name: str) -> tuple[str, list[float], str]:
-        kind, _, place = name.partition("@")
-        values = [float(number) for number in place.split(":")] if place else []
-        at_top = kind in ("acceleration", "relative_acceleration", "velocity", "displacement", "force")
-        return kind, values or [height if at_top else 0.0], name
 
-    return radius, height, sensor
-
-
-def _draw_building(model: LinearStructure, axes: Axes) -> Drawn:
-    parts = model.parts
-    places = dict(getattr(parts, "floors", ()))
-    if not places:
-        raise ValueError(
-            f"expected a building whose parts have floors; got {type(parts).__name__}: its channels have no places"
-        )
-    height, radius = len(parts.masses), 0.25 * len(parts.masses)
-    axes.vlines([-radius, radius], 0.0, height, color="0.5", linewidth=1.5)
-    axes.hlines(np.arange(1, height + 1), -radius, radius, color="0.5", linewidth=3.0)
-    axes.hlines(0.0, -2.0 * radius, 2.0 * radius, color="0.4", linewidth=4.0)
-    axes.set_ylabel("floor")
-    axes.set_xticks([])
-    names = list(places)
-
-    def sensor(name: str) -> tuple[str, list[float], str]:
-        its = next(each for each in model.sensors if each.name == name)
-        ends = [places[names[k]] for k in (its.to, its.row) if k is not None]
-        return "rotation" if len(ends) == 2 else "motion", sorted(ends), name
-
-    return radius, float(height), sensor
-
-
-def _draw_sensor(
-    axes: Axes, radius: float, kind: str, place: list[float], name: str, faint: bool
-) -> tuple[float, float, str]:
+def _draw_sensor(axes: Axes, column: RCColumn, name: str, faint: bool) -> tuple[float, float, str]:
     """Draw one sensor at its place, faintly or not; return the place at which its label points, and its name."""
-    alpha = 0.35 if faint else 1.0
+    alpha, radius = 0.35 if faint else 1.0, 0.5 * column.diameter
+    kind, _, numbers = name.partition("@")
+    at_top = kind in ("acceleration", "relative_acceleration", "velocity", "displacement", "force")
+    place = [float(number) for number in numbers.split(":")] if numbers else [column.height if at_top else 0.0]
     if kind in ("strain", "bar_stress", "concrete_stress"):
         axes.plot(place[1], place[0], "o", color=ORANGE, markersize=5, zorder=3, alpha=alpha)
         return place[1], place[0], name

@@ -7,9 +7,6 @@ import pytest
 
 from fe_likelihoods import (
     Bars,
-    LinearStructure,
-    ModalModel,
-    ShearFrame,
     plot_hysteresis,
     plot_section,
     plot_sensors,
@@ -107,7 +104,7 @@ def test_sensors_are_drawn_at_their_places(record):
 
 
 def test_ranks_are_at_the_places_of_their_sensors(record):
-    """The chosen sensors are numbered, on a column and on a building; others have no label."""
+    """The chosen sensors are numbered; others have no label."""
     bar = RCColumn.lhpost(record).bar_circle_radius
     outputs = ("acceleration", "displacement@2.5", f"bar_stress@0:{bar:.3f}", "strain@0.3:-0.5", "velocity")
     axes = plot_sensors(RCColumn.lhpost(record, outputs=outputs), ranks=(outputs[2], outputs[1]))
@@ -118,19 +115,11 @@ def test_ranks_are_at_the_places_of_their_sensors(record):
         if len(line.get_xdata()) == 1
     }
     assert drawn == {(0.0, 7.3152): 0.35, (0.0, 2.5): 1.0, (round(bar, 3), 0.0): 1.0, (-0.5, 0.3): 0.35}
-    frame = ShearFrame({"low": 1, "top": 3}, [1.0] * 3, [900.0] * 3)
-    outputs = ("low", "top", "displacement@top:low")
-    axes = plot_sensors(LinearStructure(frame, record, outputs=outputs), ranks=("displacement@top:low", "low"))
-    assert {text.get_text() for text in axes.texts} == {"1. displacement@top:low", "2. low"}
-    drawn = [np.round(np.column_stack(line.get_data()), 9).tolist() for line in axes.lines]
-    assert [[0.9, 1.0], [0.9, 3.0]] in drawn and [[0.0, 1.0]] in drawn and [[0.0, 3.0]] in drawn
 
 
-def test_ranks_of_other_channels_and_structures_without_heights_are_refused(record):
+def test_ranks_of_other_channels_are_refused(record):
     with pytest.raises(ValueError, match="unknown channels strain; the channels are acceleration, displacement"):
         plot_sensors(RCColumn.lhpost(record), ranks=("strain",))
-    with pytest.raises(ValueError, match="floors; got ModalModel"):
-        plot_sensors(LinearStructure(ModalModel(["roof"], 1), record))
 
 
 def test_labels_are_beside_their_sensors():
