@@ -43,7 +43,7 @@ _FACTORS = {
         "mg": 1e-3 * G0,
     },
     "velocity": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3, "in/s": INCH, "ft/s": FOOT},
-    "displacement": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": INCH, "ft": FOOT},
+    "displacement": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": INCH, "ft": FOOT},
     "force": {"N": 1.0, "kN": 1e3, "MN": 1e6, "lbf": POUND_FORCE, "kip": 1e3 * POUND_FORCE},
     "stress": {
         "Pa": 1.0,
@@ -105,8 +105,8 @@ def find_unit(name: str, dimension: str | None = None) -> Unit:
 
     The spellings of common file formats are understood: ``cm/sec/sec``, ``cm/sec2``, ``cm/s^2`` and ``cm_s2`` are all
     ``cm/s2``; ``kN-m``, ``kN*m``, ``kN.m``, ``kN_m`` and ``kNm`` are ``kN m``; ``seconds`` is ``s``; ``ue`` is
-    ``microstrain``, ``mg`` a thousandth of g. Letter case is ignored, because file headers are often in capitals,
-    except for the prefix of ``MN`` and ``MPa``: ``mN`` would be smaller by a factor of 10⁹.
+    ``microstrain``, ``µm`` is ``um``, ``mg`` a thousandth of g. Letter case is ignored, because file headers are often
+    in capitals, except for the prefix of ``MN`` and ``MPa``: ``mN`` would be smaller by a factor of 10⁹.
     """
     if dimension is not None and dimension not in DIMENSIONS:
         raise ValueError(f"unknown dimension {dimension!r}; known dimensions: {', '.join(DIMENSIONS)}")
@@ -178,6 +178,7 @@ def _lookup(name: str) -> Unit | None:
     if text.lower() in _MICROSTRAIN:
         return UNITS["microstrain"]
     text = re.sub(r"(?<=[A-Za-z])[-*·.](?=[A-Za-z])", "", text)
+    text = re.sub(f"^[{_MICRO}](?=m$)", "u", text, flags=re.IGNORECASE)
     for prefix, letter in (("milli", "m"), ("micro", "u"), (f"[{_MICRO}]", "u")):
         text = re.sub(rf"{prefix}(?=s(ec|$))", letter, text, flags=re.IGNORECASE)
     text = re.sub(r"sec(onds?|s)?(?![a-z])", "s", text, flags=re.IGNORECASE)

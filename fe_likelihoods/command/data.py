@@ -64,7 +64,7 @@ def read_base_motion(job: Job) -> Record | None:
     dataset = _dataset(job, "record")
     if dataset is None:
         path = job.path("record", "file", given.file)
-        options = given.given("channel", "column", "units", *given.READING)
+        options = given.given("channel", "column", "units", "missing", *given.READING)
         record = job.located("record", lambda: read_record(path, **options))
     else:
         record = dataset.record
@@ -150,6 +150,8 @@ def _read_columns(path: Path, given: Measured, channels: Sequence[Channel]) -> M
         )
     options = given.given("zero", *given.READING)
     marks = [each for each in given.missing or () if not isinstance(each, list)]
+    if named := [each for each in marks if each in by_name]:
+        raise ValueError(f"missing: a time span is a list of its own, missing = [[{named[0]!r}, 12.3, 12.8]]")
     if marks or given.missing == []:
         options["missing"] = marks
     return read_columns(

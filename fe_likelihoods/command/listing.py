@@ -34,6 +34,7 @@ from ..units import from_si, to_si
 
 __all__ = ["describe_data"]
 
+_MOST_TEXTS = 3  # that stand for missing samples; a column with more is no column of numbers
 _HEAD = ("samples", "step [s]", "duration [s]", "peak [g]")
 
 
@@ -162,9 +163,23 @@ def _dataset(path: Path) -> _Lines:
     return _Lines(text, {"record": [], "measurements": repair_lines(screen(measured))})
 
 
+def _readable(path: Path) -> tuple[Table, list[str], list[str]]:
+    """A table, texts in its columns of numbers, which may stand for missing samples, and what is said about them."""
+    texts, said = list[str](), list[str]()
+    while True:
+        try:
+            return read_table(path, missing=texts), texts, said
+        except ValueError as error:
+            found = re.search(r"got '(.+)'; if it stands for a missing sample", str(error))
+            if found is None or len(texts) == _MOST_TEXTS:
+                raise
+            texts.append(found[1])
+            said.append(str(error))
+
+
 def _table(path: Path) -> _Lines:
     """A table of samples, of modes or of load cases."""
-    table = read_table(path)
+    table, texts, said = _readable(path)
     try:
         if table.time is None or table.clock is not None:  # days of several identifications are clocks as well
             return _Lines(["a table of modes", str(read_modal_data(path))], {"modes": []})
@@ -172,6 +187,7 @@ def _table(path: Path) -> _Lines:
         if "unit of the frequencies is not stated" in str(error) and table.clock is None:
             return _Lines(["a table of modes"], {"modes": ['unit = "?"    # write it: the file does not state it']})
     options, remarks, step = _sampling(table)
+    remarks += said
     rows: list[tuple[str, ...]] = [("column", "unit", "numbers", "missing", "smallest", "largest")]
     columns, unstated, marks, screened = [], [], set(), list[Screened]()
     taken: set[str] = set()
@@ -200,9 +216,9 @@ def _table(path: Path) -> _Lines:
         if unit is None or dimension_of(unit) is None:
             unstated.append((columns[-1][0], "?"))
     text = [f"a table of {len(table.lines)} rows", text_table(rows), *remarks, *_texts(screened)]
-    repairs = repair_lines(screened, {"missing": sorted(marks)})
-    if marks and not any(each.startswith("missing") for each in repairs):
-        repairs.append(f"missing = [{', '.join(f'{mark:g}' for mark in sorted(marks))}]")
+    repairs = repair_lines(screened, {"missing": [*texts, *sorted(marks)]})
+    if (texts or marks) and not any(each.startswith("missing") for each in repairs):
+        repairs.append(f"missing = [{', '.join([*map(_quoted, texts), *(f'{mark:g}' for mark in sorted(marks))])}]")
     measured = [f"columns = {_inline(columns)}    # channel of the model = column", *options]
     if unstated:
         measured.append(f"units = {_inline(unstated)}    # write them: the file does not state them")
@@ -220,6 +236,8 @@ def _table(path: Path) -> _Lines:
             lines.append(f"units = {_inline(unknown)}    # write them: the file does not state them")
         return _Lines([*text, "a line for each load case"], {"load_test": lines})
     base = [f"column = {_quoted(columns[0][1])}    # the base motion, if it is in this file"]
+    if texts:
+        base.append(f"missing = [{', '.join(map(_quoted, texts))}]")
     if unstated and columns[0][0] == unstated[0][0]:
         base.append('units = "?"    # write it: the file does not state it')
     return _Lines(text, {"record": [*base, *options], "measurements": measured + repairs})
@@ -243,7 +261,9 @@ def _sampling(table: Table) -> tuple[list[str], list[str], float | None]:
             times = row_times(table)
             even = uniform_times(times, None, table.file)
         except ValueError:
-            return [], [f"times: {error}"], None
+            unknown = "give time_unit=" in str(error)
+            lines = ['time_unit = "?"    # write it: the file does not state it'] if unknown else []
+            return lines, [f"times: {error}"], None
         steps = np.diff(times)
         text = f"times: uneven, steps of {steps.min():.4g} to {steps.max():.4g} s"
         if even.gaps.size:

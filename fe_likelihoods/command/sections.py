@@ -133,6 +133,9 @@ class Motion(Table):
     column: Any = key("text", "Column of a CSV file or workbook, component (GeoNet), or file in an archive (V2)")
     channel: Any = key("whole number", "Channel of a V2 file")
     units: Any = key("text", "Unit of the acceleration, if the file does not state it")
+    missing: Any = key(
+        "list of number or text", "Numbers and texts that stand for missing samples, where other columns have some"
+    )
     scale: Any = key("number", "Factor by which the record is multiplied; -1 for a reversed sensor")
     duration: Any = key("time", "Length of the first part that is used")
 
@@ -172,9 +175,9 @@ class Measured(Table):
     channels: Any = key("list of text", "Channels to use; by default all")
     zero: Any = key(CLOCK, "Time in the file at which the base motion begins")
     missing: Any = key(
-        "list of number or time span",
-        "Numbers that stand for missing samples, and times [first, last] that are left out, with the name of a channel "
-        "before them for this one alone [s after zero]",
+        "list of number or text or time span",
+        'Numbers and texts, such as "OL", that stand for missing samples, and times [first, last] that are left out, '
+        "with the name of a channel before them for this one alone [s after zero]",
     )
     baseline: Any = key("table of points", "Channel = points [time, value] of an offset or a drift that is subtracted")
 

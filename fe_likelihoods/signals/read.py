@@ -41,7 +41,7 @@ def read_record(
     path: str | Path,
     channel: int | str | None = None,
     units: str | None = None,
-    missing: Sequence[float] | None = None,
+    missing: Sequence[float | str] | None = None,
     member: str | None = None,
     resample: float | None = None,
     *,
@@ -79,11 +79,11 @@ def read_record(
         several.
     units : str, optional
         Unit of the acceleration, if an AT2, CSV, miniSEED or SAC file does not state it.
-    missing : sequence of float, optional
-        Numbers in a table that stand for missing samples; they are read as NaN, which an excitation must not have. A
-        warning names the numbers that the column does not have. If not listed, -9999, -999.25, 1e30 and 9.97e36 are
-        refused unless further numbers lie within 1 % of them; -999, 99999, -99999, 32767 and -32768 unless a further
-        number has half their size. ``()`` takes all numbers as measured.
+    missing : sequence of float or str, optional
+        Numbers and texts, such as ``"OL"``, in a table that stand for missing samples; they are read as NaN, which an
+        excitation must not have. A warning names those that are not there. If not listed, -9999, -999.25, 1e30 and
+        9.97e36 are refused unless further numbers lie within 1 % of them; -999, 99999, -99999, 32767 and -32768 unless
+        a further number has half their size. ``()`` takes all numbers as measured.
     member : str, optional
         End of a file name in the archive, such as ``"Free Field.zip/CHAN012.V2"``, if several have the channel.
     resample : float, optional
@@ -189,10 +189,10 @@ def _table_series(
     time: int | str | None,
     time_unit: str | None,
     skip: int | None,
-    missing: Sequence[float] | None,
+    missing: Sequence[float | str] | None,
 ) -> Series:
     """One column of a table, checked against what the file states."""
-    table = read_table(path, skip, time_unit, time, along_rows=column == "rows")
+    table = read_table(path, skip, time_unit, time, column == "rows", missing)
     rows = column == "rows" and "rows" not in [each.name for each in table.columns]
     wanted = (None if rows else column, "acceleration", units, table.file)
     ((values, unit),) = table_values(table, [wanted], missing, stacklevel=3)
@@ -236,7 +236,7 @@ def read_columns(
     time_unit: str | None = None,
     skip: int | None = None,
     zero: float | str = 0.0,
-    missing: Sequence[float] | None = None,
+    missing: Sequence[float | str] | None = None,
     resample: float | None = None,
 ) -> Measurements:
     """Read measured responses from the columns of a table, a CSV file or workbook as `read_record` reads it.
@@ -292,7 +292,7 @@ def read_columns(
                 "missing out"
             )
         return _recorded(path, channels, columns, description, zero, resample)
-    table = read_table(path, skip, time_unit, time)
+    table = read_table(path, skip, time_unit, time, missing=missing)
     values = np.array([to_si(*each) for each in table_values(table, wanted, missing, stacklevel=2)])
     if resample is None:
         step = table_step(table, dt)
@@ -336,7 +336,7 @@ def read_imposed_test(
     description: str = "",
     *,
     skip: int | None = None,
-    missing: Sequence[float] | None = None,
+    missing: Sequence[float | str] | None = None,
 ) -> ImposedTest:
     """Read a quasi-static laboratory test from a CSV file: the imposed displacement, and channels at its steps.
 
@@ -369,7 +369,7 @@ def read_imposed_test(
     """
     imposed = (displacement, "displacement", displacement_unit, f"{path}, column {displacement!r}")
     wanted = [imposed, *_wanted(path, channels, columns, units)]
-    found = table_values(read_table(path, skip), wanted, missing, stacklevel=2)
+    found = table_values(read_table(path, skip, missing=missing), wanted, missing, stacklevel=2)
     history, *values = (to_si(*each) for each in found)
     measurements = Measurements(tuple(channels), 1.0, values, description)
     return ImposedTest(DisplacementHistory(Path(path).stem, history, Path(path).name), measurements)

@@ -364,6 +364,10 @@ _DATE = r"(?P<first>\d{1,4})(?P<mark>[-/.])(?P<month>\d{1,2})(?P=mark)(?P<last>\
 _AFTER = r"(?:[ \u00a0\u202f]?(?:([AP])\.?M\.?|(Z|UTC|[-+]\d{2}:?\d{2})))?"
 _CLOCK = re.compile(rf"(?:{_DATE}(?:T| +))?(\d{{1,2}}):([0-5]\d):([0-5]\d)(?:[.,](\d+))?{_AFTER}", re.IGNORECASE)
 _DAY_ONLY = re.compile(_DATE)
+# Letters of day, month, year, hour and second in English, German, French, Spanish and Italian, each part once or more
+_DATE_FORMAT = re.compile(
+    r"([DTJGMYAHS])\1+(?:(?:[-/.:, ]{1,2}|T(?=HH))([DTJGMYAHS])\2+)+(?:[.,](?:0+|F+))?(?: ?AM/PM)?", re.IGNORECASE
+)
 _HOUR, _DAY = 3600, 86400
 _EPOCH = datetime.date(1970, 1, 1).toordinal()
 
@@ -503,6 +507,7 @@ class Table(NamedTuple):
     time: int | None = None  # column of times
     time_unit: str | None = None  # as given by the caller
     chosen: bool = False  # whether the caller has chosen the column of times
+    marks: frozenset[str] = frozenset()  # texts of missing samples that the caller has named and the rows have
 
 
 def read_table(
@@ -511,14 +516,15 @@ def read_table(
     time_unit: str | None = None,
     time: int | str | None = None,
     along_rows: bool = False,
+    missing: Sequence[float | str] | None = None,
 ) -> Table:
     """Read columns of numbers from a text file, or from the first sheet of an Excel workbook (needs openpyxl).
 
     `skip` lines are above the table, None finds them; lines with ``#`` are comments. `time` is the name or number of
     the column of times, by default found; with `time_unit`, the first column of a file without a header line has them.
-    With `along_rows` the numbers are one column, row after row, and the last row may be shorter. ValueError if the file
-    cannot be read, has no rows or rows of different length, has a cell that is no finite number, or states another
-    number of samples.
+    With `along_rows` the numbers are one column, row after row, and the last row may be shorter. Cells of rows with the
+    texts in `missing` are missing samples. ValueError if the file cannot be read, has no rows or rows of different
+    length, has a cell that is no finite number, or states another number of samples.
     """
     if skip is not None and (isinstance(skip, bool) or not isinstance(skip, int) or skip < 0):
         raise ValueError(f"skip must be a number of lines, zero or more, got {skip!r}")
@@ -532,6 +538,8 @@ def read_table(
     separator = "\t" if is_book else _separator([line for _, line in lines[-_LAST_LINES:]])
     rows = [(number, _split(line, separator, f"{file}, line {number}")) for number, line in lines]
     rows, stated = _logger_table(rows, file)
+    _, marks = _listed(missing)
+    found_marks = _blank(rows, marks)
     along_rows = along_rows and not any("rows" in row for _, row in rows[:_LAST_LINES])
     announced = None if along_rows or stated else _announced(rows, file)
     if rows and announced is None:
@@ -542,11 +550,13 @@ def read_table(
         rows, stated = announced
     names, below, rows = _header(rows, file)
     rows, commas = _with_points(rows, separator, file)
-    columns, clock = _columns(names, below, rows, file)
+    columns, clock = _columns(names, below, rows, file, marks)
     above = [line for number, line in lines if number < rows[0][0]]
     found = read_statements([*comments, *stated, *above], commas)
     title = "".join([*comments, *stated][:1])
-    table = Table(file, bool(names), columns, tuple(n for n, _ in rows), title, found, clock, None, time_unit)
+    table = Table(
+        file, bool(names), columns, tuple(n for n, _ in rows), title, found, clock, None, time_unit, marks=found_marks
+    )
     for words, count in found.counts:
         check_count(len(rows), count, f"{file}: {words!r}", f". {_SKIP}")
     if time is None:
@@ -613,6 +623,16 @@ def _separator(lines: Sequence[str]) -> str:
     if most == (0, 0):  # no line of numbers: the separator that is there, for the message
         best = next((each for each in _SEPARATORS if any(each in line for line in lines)), " ")
     return best
+
+
+def _blank(rows: Sequence[_Line], marks: Sequence[str]) -> frozenset[str]:
+    """Write NaN for the marks of missing samples in rows, which have a number or nothing else; the marks found."""
+    found = set()
+    for _, cells in rows if marks else ():
+        if any(map(_known, cells)) or all(cell in marks or _is_missing(cell) for cell in cells):
+            found |= {*cells} & {*marks}
+            cells[:] = ["nan" if cell in marks else cell for cell in cells]
+    return frozenset(found)
 
 
 def _is_missing(cell: str) -> bool:
@@ -790,20 +810,27 @@ def _names(lines: Sequence[_Line], width: int, spare: bool) -> tuple[list[str], 
         return [], [], len(lines)
     place, last = found[-1]
     if len(found) > 1 and found[-2][0] == place - 1 and _are_units(last):
-        return found[-2][1], [cell.strip("[]() ") for cell in last], place + 1
+        return found[-2][1], ["" if _states_nothing(cell) else cell.strip("[]() ") for cell in last], place + 1
     return last, [], place + 1
 
 
 def _are_units(cells: Sequence[str]) -> bool:
     """Whether a line below a header line has units: all cells are units, one is a unit of time, or all are in brackets.
 
-    Cells that are no known unit are refused when their column is read. A capital S may be the direction south.
+    Cells that are no known unit are refused when their column is read. A capital S may be the direction south. A dash
+    or the format of a date says nothing.
     """
     given = [cell for cell in cells if cell]
-    units = [cell.strip("[]() ") for cell in given]
+    units = [cell.strip("[]() ") for cell in given if not _states_nothing(cell)]
     dimensions = [dimension_of(unit) for unit in units]
     time = any(unit != "S" and dimension == "time" for unit, dimension in zip(units, dimensions, strict=True))
-    return time or all(dimensions) or all(cell[0] + cell[-1] in ("()", "[]") for cell in given)
+    known = bool(units) and all(dimensions)
+    return time or known or all(cell[0] + cell[-1] in ("()", "[]") for cell in given)
+
+
+def _states_nothing(cell: str) -> bool:
+    """Whether a cell in a line of units is empty, a dash or the format of a time, such as DD.MM.YYYY hh:mm:ss."""
+    return not cell.strip("-\u2013") or _DATE_FORMAT.fullmatch(cell.strip("[]() ")) is not None
 
 
 def _check_names(lines: Sequence[_Line], separator: str, along_rows: bool, file: str) -> None:
@@ -876,9 +903,9 @@ _PLAUSIBLE_SENTINELS = (-999.0, 99999.0, -99999.0, 32767.0, -32768.0)
 
 
 def _columns(
-    names: list[str], below: list[str], rows: list[_Line], file: str
+    names: list[str], below: list[str], rows: list[_Line], file: str, marks: Sequence[str]
 ) -> tuple[tuple[Column, ...], ClockTime | None]:
-    """Columns of numbers, clock times and text, and the first clock time."""
+    """Columns of numbers, clock times and text, and the first clock time; `marks` are for the message."""
     columns, first, lines = [], None, [f"{file}, line {number}" for number, _ in rows]
     for k, cells in enumerate(zip(*(row for _, row in rows), strict=True)):
         filled = [cell for cell in cells if cell]
@@ -893,11 +920,22 @@ def _columns(
             kind, values = "text", [math.nan] * len(cells)
         else:
             pairs = zip(cells, lines, strict=True)
-            values = [parse_number(cell, where) if cell else math.nan for cell, where in pairs]
+            values = [_parse_cell(cell, where, marks) if cell else math.nan for cell, where in pairs]
             decimals = max(map(decimals_of, filled), default=0)
         name, unit = names[k] if names else str(k + 1), below[k] if below else ""
         columns.append(Column(name, np.array(values), decimals, unit, kind, cells))
     return tuple(columns), first
+
+
+def _parse_cell(cell: str, where: str, marks: Sequence[str]) -> float:
+    """The number in a cell; the message for text without a number says how to read it as a missing sample."""
+    try:
+        return parse_number(cell, where)
+    except ValueError as error:
+        if not _is_word(cell) and any(map(str.isdigit, cell)):  # a damaged number
+            raise
+        listed = [*marks, cell[:100]]
+        raise ValueError(f"{error}; if it stands for a missing sample, give missing={listed}") from None
 
 
 def _is_word(cell: str) -> bool:
@@ -995,22 +1033,22 @@ def value_column(table: Table, column: int | str | None = None) -> int:
     return places[0]
 
 
-def column_values(table: Table, place: int, missing: Sequence[float] | None = None) -> NDArray[np.float64]:
+def column_values(table: Table, place: int, missing: Sequence[float | str] | None = None) -> NDArray[np.float64]:
     """The numbers of a column, with NaN for numbers that are in `missing`.
 
     ValueError for a number that usually stands for missing samples and is not in `missing`, unless `missing` is empty
     or the number may have been measured: the column has other numbers within 1 % of it, or, for -999 and the limits of
     integers, other numbers of half its size, like the samples next to a measured peak.
     """
-    values, listed = table.columns[place].values, _listed(missing)
+    values, (listed, marks) = table.columns[place].values, _listed(missing)
     if missing is not None:
         values = np.where(np.isin(values, listed), np.nan, values)
-    for sentinel in (*_SENTINELS, *_PLAUSIBLE_SENTINELS) if missing is None or listed.size else ():
+    for sentinel in (*_SENTINELS, *_PLAUSIBLE_SENTINELS) if missing is None or listed.size or marks else ():
         found = np.flatnonzero(values == sentinel)
         close = sentinel in _SENTINELS
         similar = np.abs(values - sentinel) <= 0.01 * abs(sentinel) if close else np.abs(values) >= 0.5 * abs(sentinel)
         if found.size and np.count_nonzero(similar) == found.size:
-            numbers = ", ".join(f"{number:g}" for number in (*listed, sentinel))
+            numbers = ", ".join([*map(repr, marks), *(f"{number:g}" for number in (*listed, sentinel))])
             raise ValueError(
                 f"{table.file}, line {table.lines[found[0]]}: expected a measured number, got {sentinel:g} in "
                 f"{found.size} rows, which usually stands for a missing sample; give missing=[{numbers}] to read it "
@@ -1019,34 +1057,40 @@ def column_values(table: Table, place: int, missing: Sequence[float] | None = No
     return values
 
 
-def _listed(missing: Sequence[float] | None) -> NDArray[np.float64]:
-    """Numbers that stand for missing samples; ValueError if they are not finite numbers."""
+def _listed(missing: Sequence[float | str] | None) -> tuple[NDArray[np.float64], list[str]]:
+    """Numbers and texts that stand for missing samples; ValueError for other values, and for numbers in quotes."""
     given = [] if missing is None else [missing] if np.ndim(missing) == 0 else list(missing)
-    if not all(isinstance(number, Real) and math.isfinite(number) for number in given):
-        raise ValueError(f"missing must be finite numbers, such as (-9999,), or () for none; got {missing!r}")
-    return np.array(given, dtype=float)
+    marks = [each.strip() for each in given if isinstance(each, str)]
+    numbers = [each for each in given if not isinstance(each, str)]
+    quoted = any(not mark or (_known(mark) and any(map(str.isdigit, mark))) for mark in marks)
+    if quoted or not all(isinstance(number, Real) and math.isfinite(number) for number in numbers):
+        raise ValueError(
+            f"missing must be finite numbers and texts, such as (-9999, 'OL'), or () for none; got {missing!r}"
+        )
+    return np.array(numbers, dtype=float), marks
 
 
 def table_values(
     table: Table,
     columns: Sequence[tuple[str | int | None, str, str | None, str]],
-    missing: Sequence[float] | None,
+    missing: Sequence[float | str] | None,
     stacklevel: int,
 ) -> list[tuple[NDArray[np.float64], str]]:
     """Samples of columns (n_rows,) with their units; a column is its name, dimension and unit, and words for messages.
 
-    Warns if a number in `missing` is in none of the columns: the file may write it in another way.
+    Warns if a number in `missing` is in none of the columns, or a text in no row: the file may write it in another way.
     """
     found, places = [], []
     for name, dimension, unit, where in columns:
         places.append(value_column(table, name))
         values = column_values(table, places[-1], missing)
         found.append((values, column_unit(table, places[-1], values, unit, dimension, where)))
-    listed = _listed(missing)
-    absent = listed[~np.isin(listed, [table.columns[place].values for place in places])]
-    if absent.size:
+    listed, marks = _listed(missing)
+    absent = [f"{each:g}" for each in listed[~np.isin(listed, [table.columns[place].values for place in places])]]
+    absent += [repr(mark) for mark in marks if mark not in table.marks]
+    if absent:
         warnings.warn(
-            f"{table.file}: missing={', '.join(f'{number:g}' for number in absent)} is in none of the columns that "
+            f"{table.file}: missing={', '.join(absent)} is in none of the columns that "
             "were read: check how the file writes missing samples, or leave it out",
             UserWarning,
             stacklevel=stacklevel + 1,

@@ -344,6 +344,14 @@ def test_errors_name_the_key(folder, old, new, message):
     assert not (folder / "results-oscillator").exists()
 
 
+def test_the_error_says_why_the_first_simulation_has_failed(tmp_path, monkeypatch):
+    write_function(tmp_path, "collapsing", "    return response", '    raise RuntimeError("the deck has collapsed")')
+    monkeypatch.chdir(tmp_path)
+    last = call("check", "collapsing.toml", code=1).splitlines()[-1]
+    assert last.startswith("Error: the simulation at the mean of the prior has failed: ")
+    assert "the deck has collapsed; check [model] and [priors]" in last
+
+
 def test_a_damaged_table_and_a_missing_file_are_named(folder):
     (folder / "top.csv").write_text("time_s,top [g],top [mm]\n0.00,1.0,1\n0.02,1,abc\n0.04,1,1\n")
     assert "[measurements] top.csv, line 3" in call("check", "oscillator.toml", code=1)

@@ -65,6 +65,31 @@ def test_what_a_file_does_not_state_must_be_written(tmp_path):
     assert lines["measurements"]["columns"]["top_2"] == "top [1]" and lines["measurements"]["missing"] == [-9999]
     path.write_text("base [g]\n1\n2\n")
     assert listed(path)[1]["record"]["dt"] == "? s"
+    path.write_text("t,base [g]\n0.00,1\n0.02,2\n0.04,1\n")
+    output, lines = listed(path)
+    assert "the column 't' has no unit" in output
+    assert lines["record"]["time_unit"] == lines["measurements"]["time_unit"] == "?"
+
+
+def test_texts_for_lost_samples_have_lines(tmp_path):
+    path, job = tmp_path / "a.csv", tmp_path / "a.toml"
+    rows = [f"{0.02 * k:.2f},{np.sin(k):.4f},{'OL' if k in (3, 9) else k % 7},{k % 5}" for k in range(30)]
+    path.write_text("\n".join(["time_s,base [g],acceleration [g],displacement [µm]", *rows, ""]), encoding="utf-8")
+    output, lines = listed(path)
+    assert "line 5: expected a number, got 'OL'" in output
+    assert lines["record"]["missing"] == lines["measurements"]["missing"] == ["OL"]
+    text = '[model]\nkind = "oscillator"\nperiod = "0.4 s"\n[priors]\nstiffness = "normal(1, 0.3)"\n'
+    text += 'damping = "normal(1, 0.3)"\n' + output.partition("# lines for the TOML file")[2]
+    text = text.replace('base = "base [g]", ', "")
+    job.write_text(text, encoding="utf-8")
+    problem = make_problem(read_job(job))
+    values = problem.posterior.likelihood.measurements.values
+    assert problem.record.n_steps == 30 and np.flatnonzero(np.isnan(values[0])).tolist() == [3, 9]
+    np.testing.assert_allclose(values[1], 1e-6 * (np.arange(30) % 5), rtol=1e-15)
+    head, _, tail = text.rpartition('missing = ["OL"]')
+    job.write_text(f'{head}missing = ["acceleration", 0.1, 0.2]{tail}', encoding="utf-8")
+    with pytest.raises(ValueError, match="missing: a time span is a list of its own"):
+        make_problem(read_job(job))
 
 
 def test_histories_are_no_modes(tmp_path):

@@ -62,4 +62,64 @@ def test_micro_and_milli():
         assert to_si(1.0, name, "time") == 1e-6
     for name in ("ms", "milliseconds", "msec"):
         assert to_si(1.0, name, "time") == 1e-3
+    for name in ("um", "µm", "μm", "UM"):
+        assert to_si(1.0, name, "displacement") == 1e-6
     assert to_si(1.0, "mg", "acceleration") == 1e-3 * G0
+
+
+@pytest.mark.parametrize("name", ["Top [µm]", "Top (μm)", "top_um"])
+def test_micrometres_in_names_and_labels(tmp_path, name):
+    (tmp_path / "a.csv").write_text(f"time_s,{name}\n0.00,1\n0.01,-2500\n0.02,3\n", encoding="utf-8")
+    found = read_columns(tmp_path / "a.csv", [Channel("top", "displacement", "µm")], [name])
+    np.testing.assert_allclose(found.values, [[1e-6, -2.5e-3, 3e-6]], rtol=1e-15)
+
+
+@pytest.mark.parametrize(
+    "first", ["TT.MM.JJJJ hh:mm:ss", "dd/mm/yyyy HH:mm:ss.fff", "yyyy-mm-ddTHH:MM:SS", "-", "hh:mm:ss"]
+)
+def test_a_dash_or_a_date_format_in_a_line_of_units_says_nothing(tmp_path, first):
+    path, rows = tmp_path / "a.csv", ["14.05.2024 10:32:07,000;0,5;1,25", "14.05.2024 10:32:07,020;0,25;-3,5"]
+    path.write_text("\n".join(["Logger;Nr. 12;", "Zeit;Basis;Weg", f"{first};g;mm", *rows, ""]))
+    found = read_columns(path, [TOP, Channel("d", "displacement", "mm")], ["Basis", "Weg"])
+    np.testing.assert_allclose(found.values, [[0.5 * G0, 0.25 * G0], [1.25e-3, -3.5e-3]], rtol=1e-15)
+    path.write_text("\n".join(["Zeit;Basis;Weg", f"{first};g;mm", "0,00;0,5;1,25", "0,02;0,25;-3,5", ""]))
+    with pytest.raises(ValueError, match="the column 'Zeit' has no unit"):
+        read_columns(path, [TOP], ["Basis"])
+    assert read_columns(path, [TOP], ["Basis"], time_unit="s").dt == 0.02
+    # names that are no units remain the header line
+    path.write_text("\n".join(["Logger;Nr.;12", f"{first};Basis;Weg", "0,00;0,5;1,25", "0,02;0,25;-3,5", ""]))
+    assert read_columns(path, [TOP], ["Basis"], "g", 0.02).values[0, 0] == 0.5 * G0
+
+
+@pytest.mark.parametrize("mark", ["OL", "***", "#DIV/0!", "Inf"])
+@pytest.mark.parametrize("place", [0, 1, 3])
+def test_texts_for_missing_samples(tmp_path, mark, place):
+    path, cells = tmp_path / "a.csv", ["1", "2", "-9999", "4"]
+    cells[place] = mark
+    path.write_text("Flag,time_s,acc_g,OL\n" + "".join(f"OL,{0.01 * k:.2f},{c},1\n" for k, c in enumerate(cells)))
+    with pytest.raises(ValueError, match=f"line {place + 2}: expected a .*number, got .*; .* give missing=") as caught:
+        read_columns(path, [TOP], ["acc_g"])
+    assert str([mark]) in str(caught.value)
+    with pytest.raises(ValueError, match=r"got -9999 in 1 rows, .*give missing=\['.*', -9999\]"):
+        read_columns(path, [TOP], ["acc_g"], missing=[mark])
+    expected = [np.nan if cell in (mark, "-9999") else float(cell) * G0 for cell in cells]
+    found = read_columns(path, [TOP], ["acc_g"], missing=[mark, -9999])
+    np.testing.assert_array_equal(found.values, [expected])
+    assert read_record(path, column="OL", units="g", missing=mark).n_steps == 4
+    with pytest.raises(ValueError, match="an excitation needs all samples, 2 are missing"):
+        read_record(path, column="acc_g", missing=[mark, -9999])
+    with pytest.warns(UserWarning, match="missing='UL' is in none of the columns"):
+        read_columns(path, [TOP], ["acc_g"], missing=[mark, "UL", -9999])
+
+
+@pytest.mark.parametrize("missing", [["9999"], ["1,5"], [" "], [None], ["10:32:07"]])
+def test_texts_that_stand_for_no_missing_sample_are_refused(tmp_path, missing):
+    (tmp_path / "a.csv").write_text("time_s,acc_g\n0.00,1\n0.01,2\n")
+    with pytest.raises(ValueError, match="missing must be finite numbers and texts"):
+        read_record(tmp_path / "a.csv", missing=missing)
+
+
+def test_a_first_sample_that_is_a_mark_is_no_header_line(tmp_path):
+    (tmp_path / "a.csv").write_text("acc_g\nOL\n1\n2\n")
+    found = read_columns(tmp_path / "a.csv", [TOP], ["acc_g"], dt=0.01, missing=["OL"])
+    np.testing.assert_array_equal(found.values, [[np.nan, G0, 2 * G0]])
