@@ -919,23 +919,25 @@ def _columns(
         elif filled and all(_is_date(cell) or _is_word(cell) for cell in filled):
             kind, values = "text", [math.nan] * len(cells)
         else:
-            pairs = zip(cells, lines, strict=True)
-            values = [_parse_cell(cell, where, marks) if cell else math.nan for cell, where in pairs]
+            values = [math.nan] * len(cells)
+            for place, (cell, where) in enumerate(zip(cells, lines, strict=True)):
+                try:
+                    values[place] = parse_number(cell, where) if cell else math.nan
+                except ValueError as error:
+                    raise ValueError(f"{error}{_advice(cell, rows[place][1], names, marks)}") from None
             decimals = max(map(decimals_of, filled), default=0)
         name, unit = names[k] if names else str(k + 1), below[k] if below else ""
         columns.append(Column(name, np.array(values), decimals, unit, kind, cells))
     return tuple(columns), first
 
 
-def _parse_cell(cell: str, where: str, marks: Sequence[str]) -> float:
-    """The number in a cell; the message for text without a number says how to read it as a missing sample."""
-    try:
-        return parse_number(cell, where)
-    except ValueError as error:
-        if not _is_word(cell) and any(map(str.isdigit, cell)):  # a damaged number
-            raise
-        listed = [*marks, cell[:100]]
-        raise ValueError(f"{error}; if it stands for a missing sample, give missing={listed}") from None
+def _advice(cell: str, row: Sequence[str], names: Sequence[str], marks: Sequence[str]) -> str:
+    """How text in a row is read as a missing sample; nothing for a damaged number, and for a second header line."""
+    word = _is_word(cell) or not any(map(str.isdigit, cell))
+    alone = len(row) == 1 and cell not in names
+    if not word or not (alone or any(map(_known, row))):
+        return ""
+    return f"; if it stands for a missing sample, give missing={[*marks, cell[:100]]}"
 
 
 def _is_word(cell: str) -> bool:

@@ -119,6 +119,13 @@ def test_texts_that_stand_for_no_missing_sample_are_refused(tmp_path, missing):
         read_record(tmp_path / "a.csv", missing=missing)
 
 
+@pytest.mark.parametrize("line", ["time_s,acc_g", "0.02,1x", "end,end"])
+def test_a_second_header_line_and_a_damaged_number_are_no_missing_samples(tmp_path, line):
+    (tmp_path / "a.csv").write_text(f"time_s,acc_g\n0.00,1\n0.01,2\n{line}\n0.03,2\n")
+    with pytest.raises(ValueError, match="line 4: expected a number, got '[^']*'$"):
+        read_record(tmp_path / "a.csv")
+
+
 def test_a_first_sample_that_is_a_mark_is_no_header_line(tmp_path):
     (tmp_path / "a.csv").write_text("acc_g\nOL\n1\n2\n")
     found = read_columns(tmp_path / "a.csv", [TOP], ["acc_g"], dt=0.01, missing=["OL"])
