@@ -349,7 +349,7 @@ def test_the_error_says_why_the_first_simulation_has_failed(tmp_path, monkeypatc
     monkeypatch.chdir(tmp_path)
     last = call("check", "collapsing.toml", code=1).splitlines()[-1]
     assert last.startswith("Error: the simulation at the mean of the prior has failed: ")
-    assert "the deck has collapsed; check [model] and [priors]" in last
+    assert "the deck has collapsed" in last
 
 
 def test_a_damaged_table_and_a_missing_file_are_named(folder):
