@@ -53,7 +53,7 @@ from .prediction.new_event import event_ratios, predict_new_event
 from .prediction.propagation import propagate
 from .prediction.quantities import final_value, peak, rms
 from .prediction.reliability import exceedance
-from .prediction.scores import interval_score, share_within
+from .prediction.scores import share_within
 from .priors.distributions import HalfNormal, LogNormal, TruncatedNormal, Uniform
 from .priors.mixture_prior import fit_mixture
 from .priors.multivariate import MultivariateNormal
@@ -133,7 +133,6 @@ __all__ = [
     "fragility",
     "from_si",
     "identifiability",
-    "interval_score",
     "leave_one_out",
     "limit_states",
     "material_curves",

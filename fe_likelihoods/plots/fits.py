@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..signals.channels import Measurements
 from ..signals.error_measures import relative_errors
 from ..units import from_si
 from .style import BLUE, ORANGE, add_figure_legend, channel_label, marker_of, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from ..signals.channels import Measurements
 
 __all__ = ["plot_fit", "strongest_window"]
 
@@ -25,7 +25,7 @@ _STRONGEST = 5.0  # length of the part that is drawn on a longer scale [s]
 
 def plot_fit(
     measurements: Measurements,
-    responses: Mapping[str, Measurements | np.ndarray] | Measurements | np.ndarray,
+    responses: Mapping[str, np.ndarray] | np.ndarray,
     title: str | None = None,
 ) -> Figure:
     """Plot measurements with the response of a model, such as before and after an update.
@@ -38,8 +38,8 @@ def plot_fit(
     ----------
     measurements : Measurements
         The measured histories; ``measurements.select(names)`` has some of them.
-    responses : mapping of str to (Measurements or ndarray), or one of these
-        Responses by their titles. An array has the shape, samples and channels of ``measurements.values`` [SI], such as
+    responses : mapping of str to ndarray, or ndarray
+        Responses by their titles, with the samples and channels of ``measurements.values`` [SI], such as
         ``measurements.values - posterior.likelihood.residuals(x)`` for parameters x.
     title : str, optional
         Title of the figure. Default: the description of the measurements.
@@ -52,7 +52,7 @@ def plot_fit(
     Raises
     ------
     ValueError
-        If there is no response, or an array has another shape than the measurements.
+        If there is no response, or one has another shape than the measurements.
 
     Examples
     --------
@@ -63,7 +63,13 @@ def plot_fit(
     given = responses if isinstance(responses, Mapping) else {"model": responses}
     if not given:
         raise ValueError("no response to draw: pass a mapping of titles to responses")
-    shown = {str(text): _as_measurements(measurements, response, text) for text, response in given.items()}
+    shown = {str(text): np.asarray(response, dtype=float) for text, response in given.items()}
+    for text, response in shown.items():
+        if response.shape != np.shape(measurements.values):
+            raise ValueError(
+                f"response {text!r}: expected the shape of the measured values, {np.shape(measurements.values)}; got "
+                f"{response.shape}"
+            )
     times_of = {channel.name: measurements.times(channel.name) for channel in measurements.channels}
     windows = {
         name: strongest_window(times, measurements.channel(name), _STRONGEST)
@@ -74,24 +80,19 @@ def plot_fit(
     size = (max(4.4 * n_columns, 6.5), 1.0 + 2.1 * len(times_of))
     figure, rows = new_figure(len(times_of), n_columns, size)
     whole = min(0.0, *(times[0] for times in times_of.values())), max(times[-1] for times in times_of.values())
-    for row, channel in zip(rows, measurements.channels, strict=True):
-        name, window = channel.name, windows.get(channel.name)
-        measured = from_si(measurements.channel(name), channel.unit)
+    for i, (row, channel) in enumerate(zip(rows, measurements.channels, strict=True)):
+        name, window, own = channel.name, windows.get(channel.name), measurements.channel(channel.name)
+        measured = from_si(own, channel.unit)
         style = {"color": _MEASURED, "linewidth": 1.0, "label": "measured", "marker": marker_of(measured)}
         for axes in row:
             axes.plot(times_of[name], measured, markersize=2.0, **style)
             axes.set_xlim(*whole)
         for k, (text, response) in enumerate(shown.items()):
-            if name not in {c.name for c in response.channels}:
-                row[k].set_title(f"{text}: no such channel", fontsize="small")
-                continue
-            drawn = (response.times(name), from_si(response.channel(name), channel.unit))
+            drawn = from_si(response[i], channel.unit)
             shade = _SHADES[k % len(_SHADES)] if len(shown) > 1 else BLUE
             for axes in (row[k], *row[len(shown) :]):
-                axes.plot(*drawn, color=shade, linewidth=0.9, label=text)
-            error, own = np.nan, measurements.channel(name)
-            if np.array_equal(drawn[0], times_of[name]):
-                error = relative_errors(response.channel(name) - own, own)
+                axes.plot(times_of[name], drawn, color=shade, linewidth=0.9, label=text)
+            error = relative_errors(response[i] - own, own)
             row[k].set_title(text + (f", RRMSE {_percent(error)} %" if np.isfinite(error) else ""), fontsize="small")
         row[0].set_ylabel(channel_label(channel))
         for axes in row[1 : len(shown)]:
@@ -124,15 +125,3 @@ def strongest_window(times: np.ndarray, values: np.ndarray, length: float) -> tu
     total = np.concatenate([[0.0], np.cumsum(np.nan_to_num(values) ** 2)])
     first = int(np.argmax(total[size:] - total[:-size]))
     return float(times[first]), float(times[first] + length)
-
-
-def _as_measurements(measurements: Measurements, response: Measurements | np.ndarray, text: str) -> Measurements:
-    if isinstance(response, Measurements):
-        return response
-    values = np.asarray(response, dtype=float)
-    if values.shape != np.shape(measurements.values):
-        raise ValueError(
-            f"response {text!r}: an array must have the shape of the measured values, {np.shape(measurements.values)}; "
-            f"got {values.shape}. Pass Measurements for a response with other channels or times"
-        )
-    return replace(measurements, values=values, description="")

@@ -330,16 +330,7 @@ def _work(force: np.ndarray, displacement: np.ndarray) -> float:
 
 
 def find_failure(force: np.ndarray, displacement: np.ndarray) -> int:
-    """First sample of the excursion in which a structure fails (`displacement_before_failure`); n_steps if none.
-
-    Examples
-    --------
-    >>> from fe_likelihoods.prediction.quantities import find_failure
-    >>> displacement = np.array([0.0, 1.0, 0.0, -1.0, 0.0, 2.0, 0.0, -2.0, 0.0])
-    >>> force = np.array([0.0, 10.0, 0.0, -10.0, 0.0, 9.5, 0.0, -7.0, 0.0])
-    >>> find_failure(force, displacement)
-    7
-    """
+    """First sample of the excursion in which a structure fails (`displacement_before_failure`); n_steps if none."""
     size, largest_force = np.abs(displacement), np.abs(force).max()
     ends = [0, *(np.flatnonzero(np.diff(np.sign(displacement)) != 0) + 1), len(displacement)]
     reached = 0.0
