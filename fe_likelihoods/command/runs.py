@@ -258,8 +258,9 @@ def _changes(old: str, new: str) -> list[str]:
 
 
 def _drawn(job: Job, problem: Problem, sampler: Any) -> np.ndarray:
-    """Draws of the posterior to predict with, evenly from the chain."""
-    samples, n = sampler.get_chain(flat=True), job.prediction.draws
+    """Draws of the posterior to predict with, those that `samplers.to_arviz` takes from one chain."""
+    chain, n = sampler.get_chain()[:, np.argsort(sampler.founders, kind="stable")], job.prediction.draws
+    samples = chain.swapaxes(0, 1).reshape(-1, sampler.ndim)
     rows = np.unique(np.linspace(0, len(samples) - 1, min(n, len(samples))).round().astype(int))
     return problem.posterior.draw_noise(samples[rows], job.sampler.seed) if job.marginal else samples[rows]
 
