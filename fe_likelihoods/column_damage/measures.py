@@ -56,8 +56,6 @@ class DamageMeasures(Sequence):
         Heights at which strains are known [m].
     height : float
         Height to which drifts refer [m].
-    park_ang : ParkAng or None
-        Constants of the damage index.
     yield_strain : float
         Nominal yield strain of the bars.
     """
@@ -67,7 +65,6 @@ class DamageMeasures(Sequence):
     measures: tuple[str, ...]
     heights: np.ndarray
     height: float
-    park_ang: ParkAng | None
     yield_strain: float
 
     def __len__(self) -> int:
@@ -211,7 +208,6 @@ def damage_measures(
         tuple(structure),
         heights,
         float(column.height),
-        park_ang if "Park-Ang index" in chosen else None,
         float(column.steel.fy / column.steel.es),
     )
 

@@ -190,30 +190,13 @@ def fragility(
     return Fragility(intensities, found, failed, collapsed, curve)
 
 
-def fit_fragility(intensity: ArrayLike, exceedances: ArrayLike, trials: ArrayLike) -> FragilityCurve:
+def fit_fragility(intensity: np.ndarray, exceedances: np.ndarray, trials: np.ndarray) -> FragilityCurve:
     """Fit a lognormal curve to numbers (n,) of exceedances in trials by maximum likelihood (Baker 2015, binomial).
 
     The numbers need not be whole. ValueError if the points do not determine a rising curve: fewer than two intensities,
     none or all of the trials exceed, every intensity with an exceedance is above every one without, or the probability
     decreases with intensity.
-
-    Examples
-    --------
-    >>> from fe_likelihoods.prediction.fragility import fit_fragility
-    >>> curve = fit_fragility([1.0, 2.0, 4.0], [1, 10, 19], [20, 20, 20])  # 20 trials at each intensity
-    >>> round(float(curve.median), 2)
-    2.0
     """
-    intensity, exceedances, trials = (np.asarray(each, dtype=float) for each in (intensity, exceedances, trials))
-    if not intensity.shape == exceedances.shape == trials.shape or intensity.ndim != 1:
-        raise ValueError(
-            f"expected one number of exceedances and of trials for each intensity; got shapes {intensity.shape}, "
-            f"{exceedances.shape}, {trials.shape}"
-        )
-    if not (np.all(intensity > 0.0) and np.all((exceedances >= 0.0) & (exceedances <= trials + 1e-9))):
-        raise ValueError(
-            f"expected positive intensities and 0 <= exceedances <= trials; got {intensity}, {exceedances}, {trials}"
-        )
     some, not_all = intensity[exceedances > 0.0], intensity[exceedances < trials]
     if not some.size or not not_all.size:
         raise ValueError(f"{'all' if some.size else 'none'} of the trials exceed: use records of other intensities")
