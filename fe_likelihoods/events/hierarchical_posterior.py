@@ -230,19 +230,9 @@ class HierarchicalPosterior:
         return self.prior.rvs(n, rng)
 
     def population(self, x: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Population center and spread of the varying parameters, on their scales.
+        """Centers (n, n_varying + n_common) and standard deviations (n, n_varying) on the scales of the parameters.
 
-        Parameters
-        ----------
-        x : (n, ndim) float, or mapping
-            Hyper-parameters.
-
-        Returns
-        -------
-        center : (n, n_varying + n_common) float
-            Means of the varying parameters on their scales, then the common parameters.
-        sd : (n, n_varying) float
-            Standard deviations of the varying parameters on their scales.
+        Of hyper-parameters (n, ndim). The center of a common parameter is its value.
         """
         points, n = np.atleast_2d(as_points(x, self.prior.names)), len(self.varying)
         end = points.shape[1] - len(self.common)

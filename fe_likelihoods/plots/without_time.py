@@ -43,22 +43,9 @@ def plot_points(
 ) -> Figure:
     """Plot measured values over load cases, positions or other points, with computed values or a prediction.
 
-    Parameters
-    ----------
-    measurements : Measurements
-        With an axis other than time.
-    responses : mapping of str to (n_channels, n_points) ndarray, optional
-        Computed values by their titles [SI]. The last one is drawn as bars, or as a line over positions, others as
-        small marks.
-    deviations : (n_channels, n_points) ndarray, optional
-        Standard deviations of the measured values [SI], drawn as error bars.
-    prediction : Prediction, optional
-        Its mean, and its outermost quantiles as error bars, instead of `responses`.
-
-    Returns
-    -------
-    matplotlib Figure
-        With one axes for each unit, or for each channel where points are numbers or many.
+    Responses (n_channels, n_points) by their titles [SI]: the last one as bars, or as a line over positions, others as
+    small marks; or, instead of them, the mean of a prediction with its outermost quantiles. Deviations are standard
+    deviations of the measured values [SI]. One axes for each unit, or each channel where points are numbers or many.
     """
     drawn = dict(responses or {})
     reach = None
@@ -136,20 +123,8 @@ def plot_modes(
 ) -> Figure:
     """Plot measured and computed natural frequencies, and the mode shapes at the sensors.
 
-    Parameters
-    ----------
-    modes : PredictedModes
-        Modes at samples of the posterior (`ModalLikelihood.predict_modes`).
-    before : PredictedModes, optional
-        Modes at draws of the prior.
-    label : str
-        What `modes` are.
-
-    Returns
-    -------
-    matplotlib Figure
-        With axes for the frequencies, as multiples of the measured ones and with the errors of a frequency
-        (`PredictedModes.interval`), and for the shape of each mode.
+    `modes` are at samples of the posterior, or what `label` says, `before` at draws of the prior. Frequencies are
+    multiples of the measured ones, with the errors of a frequency (`PredictedModes.interval`).
     """
     import matplotlib.pyplot as plt
 
