@@ -57,6 +57,9 @@ _PATIENCE = 4  # iterations after which an ascent that is far below a known end 
 _LEFT = 6.0  # iterations like the last one that would be needed to reach the known end
 _ROUGH = 5.0  # gain that the quadratic approximation may promise where no step gains anything
 _STALLED = 0.1, 0.02  # gain in log-density below which a step counts as failed, and the same as a share of what is left
+# Share of the promised gain below which an ascent with derivatives of its own makes new differences. Without them,
+# searches need 10 to 30 % fewer simulations, but a column gets a false second mode with 1 of 5 seeds.
+_MISLED = 0.7
 _KEPT_PROMISE = 0.5  # share of the promised gain from which one damping is enough for the next step
 _HOPELESS = 200.0  # log-density below the best end at which another one is given up
 _SAME_MODE = 4.0  # squared distance per dimension, in units of the Laplace approximation
@@ -195,7 +198,7 @@ class _Climb:
         number: int,
         designed: bool = True,
     ) -> None:
-        self._number, self._designed = number, designed
+        self._number, self._shared, self._designed = number, np.isinf(apart), designed
         self._target, self._jacobians, self._centre, self._known = target, jacobians, centre, known
         self._apart = apart
         self.here: _Point
@@ -336,15 +339,18 @@ class _Climb:
             moves *= np.minimum(1.0, _LARGEST_STEP / np.abs(moves).max(axis=1, keepdims=True))
             points = self._target.moved(at.coords, moves)
             runs = yield points
-            higher = self.highest(points, runs, at.value)
+            higher, misled = self.highest(points, runs, at.value), False
             gain = 0.0 if higher is None else higher.value - at.value
             if higher is not None:
                 k = int(np.argmin(np.square(points - higher.coords).sum(axis=1)))
                 promised = float(at.gradient @ moves[k] - 0.5 * moves[k] @ at.hessian @ moves[k])
                 good, damping = gain > _KEPT_PROMISE * promised, float(np.clip(dampings[k], *_DAMPING_LIMITS))
+                misled = gain < _MISLED * promised
                 self.here = higher
             if gain > max(_STALLED[0], _STALLED[1] * at.gain_left):
                 failures = 0
+                if misled and not self._shared and not own:
+                    yield from self._own_differences(at, 1.0)
                 continue
             good, failures = False, failures + 1
             damping = max(damping, _FIRST_DAMPING)
