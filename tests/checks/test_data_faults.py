@@ -48,7 +48,7 @@ def test_units_of_all_and_of_one_channel_are_named(factor):
 @pytest.mark.parametrize(
     ("factor", "dimension", "unit", "expected"),
     [
-        (947.0, "displacement", "mm", "m and mm"),
+        (947.0, "displacement", "mm", "m and mm or mm and um"),
         (1.0 / 1020.0, "displacement", "", "m and mm"),
         (9.95, "acceleration", "g", "m/s2 and g"),
         (980.0, "acceleration", "g", "m/s2 and mm/s2 or g and cm/s2 or g and mg"),
