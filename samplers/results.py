@@ -186,7 +186,7 @@ class RunResults:
 
     @property
     def signed_sample(self) -> SignedSample | None:
-        """Expectations under the posterior, more accurate than chain averages; None if the guide knows no density.
+        """Expectations under the posterior; None if the guide knows no density, or the draws alone are more accurate.
 
         ``sampler.signed_sample.expectation(function)`` gives an expectation and its standard error
         (`samplers.estimates.control_variates`). Like `guide`, it belongs to the last annealing of this object.

@@ -38,6 +38,7 @@ from ..estimates.importance import (
     usable,
 )
 from ..estimates.pareto import LARGEST_SHAPE
+from ..estimates.weights import normalised_weights
 from ..judgement.rounds import (
     LIGHT_TAILS,
     RELIABLE_SHARE,
@@ -105,7 +106,7 @@ def lend(
 
 
 class RoundsOfGuide(NamedTuple):
-    """Result of `draw_rounds`: all draws `pooled`, their rounds, and the signed sample where it is more accurate.
+    """Result of `draw_rounds`: all draws `pooled`, their rounds, and the signed sample where its means are better.
 
     `reason` says why the draws cannot be used. `shortfall` says what was not reached although they can be used.
     `stopped`: the limit of simulations ended the rounds.
@@ -120,8 +121,9 @@ class RoundsOfGuide(NamedTuple):
 
     @property
     def evidence(self) -> tuple[float, float]:
-        """Log-evidence and its standard error, from the signed sample where there is one."""
-        found = self.pooled if self.signed is None else self.signed
+        """Log-evidence and its standard error: the more accurate one of the pooled draws and the signed sample."""
+        both = [each for each in (self.pooled, self.signed) if each is not None]
+        found = min(both, key=lambda each: each.log_evidence_error)
         return found.log_evidence, found.log_evidence_error
 
 
@@ -298,10 +300,14 @@ def draw_rounds(
 
 
 def _with_signed(outcome: RoundsOfGuide) -> RoundsOfGuide:
-    """With the signed sample of all rounds, if its evidence is more accurate."""
-    found = signed_sample(outcome.rounds)
-    better = found is not None and found.log_evidence_error < outcome.pooled.log_evidence_error
-    return outcome._replace(signed=found if better else None)
+    """With the signed sample of all rounds, if its means are more accurate than those of the pooled draws."""
+    found, pooled = signed_sample(outcome.rounds), outcome.pooled
+    if found is not None:
+        weights = normalised_weights(pooled.log_weights)
+        variance = weights @ np.square(pooled.coords - weights @ pooled.coords)
+        relative = np.square(found.expectation().error) / np.maximum(variance, np.finfo(float).tiny)
+        found = found if np.mean(relative) < 1.0 / pooled.effective_sample_size else None
+    return outcome._replace(signed=found)
 
 
 def _report(last: Round, pooled: PooledRounds) -> GuidedRound:
