@@ -144,9 +144,10 @@ def signed_sample(rounds: Sequence[Round]) -> SignedSample | None:
     if not used:
         return None
     found = [(rounds[k], *_differences(rounds[k])) for k in used]
-    log_evidence = pool_rounds(rounds).log_evidence
+    log_evidence, points = pool_rounds(rounds).log_evidence, np.concatenate([r.coords for r in rounds])
+    known_at = {k: rounds[k].known.log_density(points) for k in used}  # emulators take most of the time
     for _ in range(2):  # the evidence that the differences are taken with becomes more accurate
-        log_shares = np.log([len(r.coords) for r, *_ in found]) - _log_mean_squares(rounds, used, log_evidence)
+        log_shares = np.log([len(r.coords) for r, *_ in found]) - _log_mean_squares(rounds, known_at, log_evidence)
         shares = np.exp(log_shares - np.logaddexp.reduce(log_shares))
         log_evidence, error = _evidence(found, shares)
     coords, weights, numbers, known = [], [], [], {}
@@ -162,13 +163,15 @@ def signed_sample(rounds: Sequence[Round]) -> SignedSample | None:
     return SignedSample(np.concatenate(coords), np.concatenate(weights), np.concatenate(numbers), log_evidence, error)
 
 
-def _log_mean_squares(rounds: Sequence[Round], used: Sequence[int], log_evidence: float) -> np.ndarray:
-    """Logarithms (k,) of the mean squares of the differences that draws of some of the rounds have."""
-    coords, densities = (np.concatenate([getattr(r, name) for r in rounds]) for name in ("coords", "log_densities"))
+def _log_mean_squares(rounds: Sequence[Round], known_at: dict[int, np.ndarray], log_evidence: float) -> np.ndarray:
+    """Logarithms (k,) of the mean squares of the differences that draws of some of the rounds have.
+
+    `known_at` are the log-densities (n,) that these rounds, by their numbers, know at all draws.
+    """
+    densities = np.concatenate([r.log_densities for r in rounds])
     log_prob, mixture = mixture_at_draws(rounds)
     posterior, found = log_prob - log_evidence, []
-    for k in used:
-        known = rounds[k].known.log_density(coords)
+    for k, known in known_at.items():
         larger, smaller = np.maximum(posterior, known), np.minimum(posterior, known)
         some = larger > -np.inf
         larger, smaller = larger[some], smaller[some]
