@@ -19,12 +19,10 @@ from ..reports import Stage
 __all__ = [
     "check_annealing",
     "check_evidence",
-    "check_guide_against_recycling",
     "check_likelihood",
     "check_prior",
     "check_shares",
     "check_stages",
-    "describe_unused_guide",
     "find_unreached_part",
 ]
 
@@ -50,8 +48,6 @@ VOLUME_ERROR = 0.5
 # Smallest difference between two shares of a component that is reported if it is also significant.
 LARGE_SHARE_DIFFERENCE = 0.1
 DIFFERENT = "The two estimates of the evidence differ"
-# Differences of evidences are reported beyond this many standard errors.
-FAR = 3.0
 
 
 def check_likelihood(log_prob: np.ndarray, log_prior: np.ndarray) -> list[Finding]:
@@ -227,32 +223,6 @@ def check_shares(
     return [Finding("A mode may be lost", CARE, text, "Use more walkers or more moves, and compare two runs.")]
 
 
-def check_guide_against_recycling(
-    of_guide: float, error_of_guide: float, log_evidence: float, error: float
-) -> list[Finding]:
-    """A finding if the rounds of a guide and the recycling after them differ in the evidence: one has lost a part."""
-    if abs(of_guide - log_evidence) <= FAR * float(np.hypot(error_of_guide, error)):
-        return []
-    text = (
-        f"Recycling gives the log-evidence {log_evidence:.2f} +- {error:.2f}, the draws of the guide before it give "
-        f"{of_guide:.2f} +- {error_of_guide:.2f}: one of them has lost a part of the posterior."
-    )
-    return [Finding("A mode may be lost", WRONG, text, "Use a better guide, or more walkers without one.")]
-
-
 def find_unreached_part(text: str, severity: str) -> Finding:
     """A finding about draws of a guide that hardly reached a part of the posterior."""
     return Finding("The guide missed a part of the posterior", severity, f"{text[0].upper()}{text[1:]}.")
-
-
-def describe_unused_guide(reason: str, impossible: bool) -> str:
-    """The warning when the draws of a guide are not used; `impossible`: none has a finite log-probability."""
-    if impossible:
-        return (
-            f"the draws of the guide are impossible ({reason}), so the run goes on without them, by annealing from the "
-            "prior, which needs more simulations. Use a better guide, or none"
-        )
-    return (
-        f"the draws of the guide are not close enough to the posterior ({reason}), so the run goes on by recycling, "
-        "which starts from them and needs more simulations. Use a better guide, or none"
-    )

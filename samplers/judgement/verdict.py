@@ -19,7 +19,7 @@ from ..estimates.genealogy import standard_error_of_mean
 from ..estimates.importance import FIRST_ROUND_SHARE, USABLE_SHARE, fewest_points, usable
 from ..estimates.pareto import LARGEST_SHAPE
 from ..finding import CARE, NOTE, WRONG, Finding
-from ..reports import AnnealingResult, EarlyStop, GuidedRound
+from ..reports import AnnealingResult, EarlyStop, GuidedRound, GuidedStart
 from .checks import find_unreached_part
 from .clusters import Cluster, find_clusters
 from .failures import NearFailures, check_failed_region
@@ -162,9 +162,6 @@ class Verdict(_Stored):
         if check is not None:
             others = [("stages", result.log_evidence_ladder, result.ladder[-1].log_evidence_error, "")]
             others.append(("check", *check[:2], "" if check.reliable else ", uneven weights"))
-        if result.rounds and result.start is not None and not result.start.used:
-            last = result.rounds[-1]
-            others.append(("guide", last.log_evidence, last.log_evidence_error, ", uneven weights"))
         if others:
             stated += f" ({'; '.join(f'{name} {x:.2f} +- {error:.2g}{note}' for name, x, error, note in others)})"
         failed = f"{run.failure_count} of {run.evaluations} evaluations failed"
@@ -216,7 +213,7 @@ def judge(
     more: float | None = 0.0
     stop = result.early_stop
     if stop is not None and not stop.complete:
-        found += _of_early_stop(stop, stage.log_evidence_error, ndim)
+        found.append(_of_early_stop(stop, result.start, stage.log_evidence_error, ndim))
         more = _missing_draws(result.rounds, nwalkers) if stop.from_guide else None
     elif stop is not None:
         found.append(Finding(LIMIT, CARE, "The limit of simulations ended the run at beta = 1, before its last check."))
@@ -232,9 +229,6 @@ def judge(
             unsettled = result.start.shortfall == UNSETTLED
             found.append(find_unreached_part(result.start.shortfall, WRONG if unsettled else CARE))
         found += _of_signed_sample(result)
-    elif result.start is not None:
-        text = f"The draws of the guide were not used ({result.start.reason})."
-        found.append(Finding("The guide was not used", CARE, text))
     if result.start is not None or (stop is not None and stop.from_guide):
         if all(each.kind != UNSEEN for each in found):
             reasons.append(result.basis or "parts of the posterior in which the guide makes no draws are not seen")
@@ -285,8 +279,10 @@ def independent_points(result: AnnealingResult, coords: np.ndarray) -> float:
     return float(np.min((spread / error)[error > 0.0] ** 2, initial=len(coords)))
 
 
-def describe_early_stop(verdict: Verdict, limit: float, result: AnnealingResult, made: int, missing: int) -> str:
-    """The warning when the limit has ended a call: `made` steps at beta = 1 were made, `missing` steps were not."""
+def describe_early_stop(verdict: Verdict, limit: float | None, result: AnnealingResult, made: int, missing: int) -> str:
+    """The warning when a call ends early: `made` steps at beta = 1 were made, `missing` steps were not."""
+    if result.start is not None and not result.start.used:
+        return str(verdict)
     if result.early_stop is not None:
         ended = f"max_simulations={limit:g} ended the run"
     else:
@@ -301,17 +297,21 @@ def describe_early_stop(verdict: Verdict, limit: float, result: AnnealingResult,
     )
 
 
-def _of_early_stop(stop: EarlyStop, error: float, ndim: int) -> list[Finding]:
-    """Findings about a population that was made from the points known when the limit of simulations was reached."""
+def _of_early_stop(stop: EarlyStop, start: GuidedStart | None, error: float, ndim: int) -> Finding:
+    """What is found of a population that was made from the points known at the end: at the limit, or of a guide."""
+    kind, why, action = LIMIT, LIMIT, ""
+    if start is not None:
+        kind, why = "The draws of the guide are not usable", f"The rounds of the guide ended, because {start.reason},"
+        action = "Run again without a guide, which takes some thousand simulations, or use a better guide."
     where = f"at beta = {stop.beta:.3g} " if stop.beta < 1.0 else ""
     text = (
-        f"The limit of simulations ended the run {where}with {stop.points} weighted points, whose effective sample "
+        f"{why} {where}with {stop.points} weighted points, whose effective sample "
         f"size is {stop.effective_sample_size:.2g} and whose weights have a Pareto shape of {stop.pareto_shape:.2g}"
     )
     if usable(stop.effective_sample_size, stop.pareto_shape, error, ndim):
-        return [Finding(LIMIT, CARE, f"{text}.")]
+        return Finding(kind, CARE, f"{text}.", action)
     wanted = f"an effective sample size of {fewest_points(ndim):.0f} and a shape below {LARGEST_SHAPE:g} are needed"
-    return [Finding(LIMIT, WRONG, f"{text} ({wanted}).")]
+    return Finding(kind, WRONG, f"{text} ({wanted}).", action)
 
 
 def _of_signed_sample(result: AnnealingResult) -> list[Finding]:

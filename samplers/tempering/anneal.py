@@ -3,7 +3,8 @@
 There are three paths. All end with an estimate of the evidence from draws that were not used for the annealing.
 
 guided rounds (`samplers.tempering.guided`)
-    With a guide, its weighted draws replace the annealing. If they are not reliable, recycling starts from them.
+    With a guide, its weighted draws replace the annealing. If they are not usable, the run ends with a verdict that
+    says so: annealing from the prior takes ten times the simulations, which is for the user to decide.
 recycling (`samplers.tempering.recycling`)
     Adaptive importance sampling. Its weighted draws are resampled to as many points as there are walkers, which are
     moved only if they are not independent draws already. If the result is not reliable, moves start again from the
@@ -16,7 +17,7 @@ resampled (`StoppedEarly`).
 """
 
 import logging
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 
 import numpy as np
 
@@ -31,21 +32,18 @@ from ..estimates.weights import WHERE_TO_LOOK, coarse_weights, effective_sample_
 from ..finding import WRONG, Finding
 from ..judgement.checks import (
     check_annealing,
-    check_guide_against_recycling,
     check_shares,
-    describe_unused_guide,
     find_unreached_part,
 )
 from ..proposals.basins import find_basins, with_components
 from ..proposals.mixture import fit_mixture, log_density
 from ..proposals.transforms import find_support_bounds
-from ..reports import EarlyStop, GuidedStart, Report, Restart, Stage, warn
+from ..reports import EarlyStop, GuidedStart, Report, Restart, Stage
 from ..resampling import systematic
 from ..settings import Settings
 from .early_stop import StoppedEarly
-from .guided import FEWEST_DRAWS, Guidance, RoundsOfGuide, better_of, draw_rounds, start_from_guide, stopped_rounds
+from .guided import Guidance, draw_rounds, stopped_rounds
 from .mutation import MoveSchedule, Mutated, VisitedPoints, move_together
-from .pending_points import PendingPoints
 from .population import Density, Population
 from .recycling import Recycled, recycle, submit_start
 from .smc_moves import anneal_by_moves
@@ -70,17 +68,12 @@ def anneal(
     Yields the points as they are now with a report (`samplers.reports`), or with a function of a guide's search, whose
     result is to be sent back; in the last pair, they are at beta = 1 and equally weighted.
     """
-    size, rounds = len(population.coords), None
+    size = len(population.coords)
     try:
         if guidance is not None:
-            rounds = yield from _from_guide(population, density, random, schedule, settings, guidance)
-            if rounds is None:
-                return
-        if population.records is None:
-            start = submit_start(population.coords, density, whole=not settings.recycle)
-        else:
-            start = PendingPoints.known(population.coords, population.records)
-        recycled = None
+            yield from _from_guide(population, density, random, schedule, guidance)
+            return
+        start, recycled = submit_start(population.coords, density, whole=not settings.recycle), None
         if settings.recycle:
             steps = recycle(start, density, random)
             recycled = yield from _by_recycling(steps, population, size, density, random, schedule, settings)
@@ -92,8 +85,7 @@ def anneal(
             moved = yield from anneal_by_moves(population, density, random, schedule, settings, visited)
             yield from _check_moves(*moved, density, random, settings, visited)
     except StoppedEarly as stop:
-        searched = 0.0 if guidance is None else guidance.budget.of_guides
-        yield from _finish_early(stop if rounds is None else better_of(stop, rounds), size, random, searched)
+        yield from _finish_early(stop, size, random, 0.0 if guidance is None else guidance.budget.of_guides)
 
 
 def _check_moves(
@@ -150,12 +142,8 @@ def _by_recycling(
     random: np.random.RandomState,
     schedule: MoveSchedule,
     settings: Settings,
-    compare: Callable[[Recycled], Sequence[Finding]] = lambda found: (),
 ) -> Generator[tuple[Population, Report], None, Recycled]:
-    """Make the `steps` of `recycle`, then resample the weighted draws to `size` points and move them.
-
-    `population`: the starting points. `compare`: function that returns findings about a reliable result.
-    """
+    """Make the `steps` of `recycle`, then resample the weighted draws to `size` points and move them."""
     found = yield from steps
     if not found.reliable:
         logger.info("the result of recycling is not reliable, because %s", found.reason)
@@ -168,8 +156,6 @@ def _by_recycling(
     effective = population.effective_sample_size
     if settings.check_draws != 0:
         yield population, found.check
-    for each in compare(found):
-        yield population, each
     if found.independent:  # sweeps would cost evaluations and improve nothing
         for move in schedule.mixtures:
             move.expect_independence()
@@ -197,10 +183,9 @@ def _from_guide(
     density: Density,
     random: np.random.RandomState,
     schedule: MoveSchedule,
-    settings: Settings,
     guidance: Guidance,
-) -> Generator[tuple[Population, Report], None, RoundsOfGuide | None]:
-    """Draws of a guide, or recycling that starts from the draws; returns the draws if neither result is reliable."""
+) -> Steps:
+    """Rounds of a guide's draws. Raises StoppedEarly with all draws if they are not usable, or at the limit."""
     size = len(population.coords)
     found = yield from draw_rounds(population, density, random, guidance)
     if found.signed is not None:
@@ -210,51 +195,20 @@ def _from_guide(
             yield population, find_unreached_part(found.shortfall, WRONG)
         raise stopped_rounds(found)
     pooled = found.pooled
-    start = GuidedStart(found.reason, "" if found.reason else found.shortfall, pooled.pareto_shape)
-    if start.used:
-        resampled, distinct = _resampled(pooled.coords, pooled.records, pooled.log_weights, size, random)
-        schedule.calibrate(pooled.coords, coarse_weights(pooled.log_weights), density.inside)
-        yield resampled, start
-        ess, share = pooled.effective_sample_size, found.rounds[-1].effective_share
-        yield resampled, Stage(1.0, ess, share, 0, distinct, *found.evidence)
-        return None
-    impossible = pooled.log_evidence == -np.inf
-    if impossible:
-        _check_prior(found, population, density)
-    warn(describe_unused_guide(found.reason, impossible))
-    yield population, start
-    if impossible:
-        return found
-    try:
-        started, mixture = start_from_guide(found.rounds, population, density)
-    except BudgetExhausted:
-        raise stopped_rounds(found) from None
-
-    def compare(recycled: Recycled) -> list[Finding]:
-        value, error = recycled.log_evidence, recycled.log_evidence_error
-        return check_guide_against_recycling(pooled.log_evidence, pooled.log_evidence_error, value, error)
-
-    try:
-        points = PendingPoints.known(started.coords, started.records)
-        steps = recycle(points, density, random, mixture, size)
-        recycled = yield from _by_recycling(steps, started, size, density, random, schedule, settings, compare)
-    except StoppedEarly as stop:
-        raise better_of(stop, found) from None
-    return None if recycled.reliable else found
-
-
-def _check_prior(found: RoundsOfGuide, population: Population, density: Density) -> None:
-    """Raise ValueError if a few draws of the prior are impossible, like all draws of the guide."""
-    few = population.coords[:FEWEST_DRAWS]
-    try:
-        records = density.evaluate(few)
-    except BudgetExhausted:
-        raise stopped_rounds(found) from None
-    if np.max(records["log_prob"]) == -np.inf:
+    if pooled.log_evidence == -np.inf:
         raise ValueError(
-            f"none of {len(found.pooled.coords)} draws of the guide and of {len(few)} draws of the prior has a finite "
-            f"log-probability: {WHERE_TO_LOOK}"
+            f"none of {len(pooled.coords)} draws of the guide has a finite log-probability: {WHERE_TO_LOOK}, use a "
+            "better guide, or run without a guide"
         )
+    start = GuidedStart(found.reason, "" if found.reason else found.shortfall, pooled.pareto_shape)
+    if not start.used:
+        yield population, start
+        raise stopped_rounds(found)
+    resampled, distinct = _resampled(pooled.coords, pooled.records, pooled.log_weights, size, random)
+    schedule.calibrate(pooled.coords, coarse_weights(pooled.log_weights), density.inside)
+    yield resampled, start
+    ess, share = pooled.effective_sample_size, found.rounds[-1].effective_share
+    yield resampled, Stage(1.0, ess, share, 0, distinct, *found.evidence)
 
 
 def _finish_early(stop: StoppedEarly, size: int, random: np.random.RandomState, searched: float) -> Steps:

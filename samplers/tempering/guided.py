@@ -35,7 +35,6 @@ from ..estimates.importance import (
     log_mixture,
     pool_rounds,
     tails_are_light,
-    usable,
 )
 from ..estimates.pareto import LARGEST_SHAPE
 from ..estimates.weights import normalised_weights
@@ -56,16 +55,14 @@ from .early_stop import StoppedEarly
 from .guide import AdaptedGuide, GuideSession
 from .pending_points import PendingPoints
 from .population import Density, Population
-from .recycling import StartingDensity, most_running
+from .recycling import most_running
 
 __all__ = [
     "Batch",
     "Guidance",
     "RoundsOfGuide",
-    "better_of",
     "draw_rounds",
     "lend",
-    "start_from_guide",
     "stopped_rounds",
 ]
 
@@ -368,40 +365,8 @@ def _next_size(rounds: Sequence[Round], batches: Sequence[Batch], size: int) -> 
     return max(FEWEST_DRAWS, int(np.ceil(ROUND_SHARE * size)))
 
 
-def start_from_guide(
-    rounds: Sequence[Round], prior: Population, density: Density
-) -> tuple[Population, StartingDensity]:
-    """Points to start recycling from, and their density: the draws of all rounds, and a few draws of the prior."""
-    drawn = np.concatenate([r.coords for r in rounds])
-    few = prior.coords[: max(len(rounds[-1].coords), prior.coords.shape[1] + 2)]
-    coords = np.concatenate([drawn, few])
-    records = np.concatenate([*(r.records for r in rounds), density.evaluate(few)])
-    made = len(coords)
-    log_share, log_rest = np.log(len(drawn) / made), np.log(len(few) / made)
-
-    def log_density(points: np.ndarray, records: np.ndarray) -> np.ndarray:
-        return np.logaddexp(log_share + log_mixture(rounds, points), log_rest + records["log_prior"])
-
-    return Population(0.0, coords, records, float(made)), StartingDensity(made, log_density)
-
-
-def better_of(stop: StoppedEarly, found: RoundsOfGuide) -> StoppedEarly:
-    """The points known at a stop, or the guide's rounds before it, whichever have the larger effective sample size.
-
-    Usable rounds take precedence: each has an independent proposal, and no mode is lost between rounds.
-    """
-    rounds, pooled = stopped_rounds(found), found.pooled
-    rounds.log_evidence_of_stages = stop.log_evidence_of_stages
-    ndim, effective = pooled.coords.shape[1], pooled.effective_sample_size
-    if stop.complete:
-        return stop
-    if usable(effective, pooled.pareto_shape, pooled.log_evidence_error, ndim):
-        return rounds
-    return stop if stop.effective_sample_size >= effective else rounds
-
-
 def stopped_rounds(found: RoundsOfGuide) -> StoppedEarly:
-    """All rounds of a guide, as the points from which the limit of simulations makes a population."""
+    """All rounds of a guide that end without usable draws or at the limit, as points to make a population from."""
     if found.pooled is None:
         nothing = Population(1.0, np.empty((0, 0)), np.empty(0), 0.0, (), np.empty(0))
         return StoppedEarly(nothing, float("-inf"), float("inf"), 1.0, from_guide=True)

@@ -27,7 +27,7 @@ doi:10.1111/j.1467-9469.2011.00756.x
 Owen & Zhou (2000), JASA 95(449), doi:10.1080/01621459.2000.10473909 (deterministic mixture weights)
 """
 
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Generator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -50,7 +50,7 @@ from .next_beta import next_beta
 from .pending_points import PendingPoints
 from .population import Density, Population
 
-__all__ = ["Recycled", "StartingDensity", "most_running", "recycle", "search_draws", "smallest_target", "submit_start"]
+__all__ = ["Recycled", "most_running", "recycle", "search_draws", "smallest_target", "submit_start"]
 
 # Wanted effective sample size at each beta (the target), as a share of the number of starting points. A small target
 # allows large steps of beta; the fresh draws of a round then restore the effective sample size.
@@ -92,16 +92,6 @@ EXPECTED_GROWTH = 3.0
 LARGEST_SHARE_KEPT = 0.9
 
 
-class StartingDensity(NamedTuple):
-    """Density that the starting points were drawn from, with the number of draws `made`, also outside the support.
-
-    `log_density` is a function of points (n, ndim) and their records (n,) that returns (n,).
-    """
-
-    made: float
-    log_density: Callable[[np.ndarray, np.ndarray], np.ndarray]
-
-
 class Recycled(NamedTuple):
     """Result of recycling: the draws made at beta = 1 with those of the check, their records and log-weights (n,).
 
@@ -133,25 +123,18 @@ class Recycled(NamedTuple):
 
 
 def recycle(
-    pending: PendingPoints,
-    density: Density,
-    random: np.random.RandomState,
-    start: StartingDensity | None = None,
-    size: int | None = None,
+    pending: PendingPoints, density: Density, random: np.random.RandomState
 ) -> Generator[tuple[Population, Report], None, Recycled]:
-    """Anneal draws of the prior, or of another starting density, to beta = 1 by adaptive importance sampling.
+    """Anneal draws of the prior to beta = 1 by adaptive importance sampling.
 
-    The path is start^(1 - beta) posterior^beta. `size` is the wanted effective sample size at beta = 1 and the number
-    of draws for the check, by default the number of starting points. Yields all weighted points with a `Stage` for each
-    beta below 1 before its draws are made, then a `Sweep`. Raises StoppedEarly at the limit of simulations.
+    Their number is the wanted effective sample size at beta = 1 and the number of draws for the check. Yields all
+    weighted points with a `Stage` for each beta below 1 before its draws are made, then a `Sweep`. Raises StoppedEarly
+    at the limit of simulations.
     """
     n, ndim = pending.coords.shape
-    size = n if size is None else size
-    # another starting density was fitted by a separate search
-    search, basin_rounds = _Search(search_draws(n) if start is None else 0.0), 0
-    start = StartingDensity(n, lambda _, records: records["log_prior"]) if start is None else start
+    search, basin_rounds = _Search(search_draws(n)), 0
     target = least = smallest_target(n, ndim)
-    points, bounds = WeightedPoints(pending, start), find_support_bounds(density.inside, pending.coords)
+    points, bounds = WeightedPoints(pending), find_support_bounds(density.inside, pending.coords)
     beta, efficiencies, increments, checks, most = 0.0, [], [], 0, 1
     drawn: list[_Drawn] = []  # at the present beta
     if (alive := effective_sample_size(points.log_weights(0.0))) < target:
@@ -164,7 +147,7 @@ def recycle(
     while True:
         # choose beta
         points.update()
-        fresh = sum(effective_sample_size(draws.log_weights(start, beta)) for draws in drawn)
+        fresh = sum(effective_sample_size(draws.log_weights(beta)) for draws in drawn)
         log_weights, last_beta = points.log_weights(beta), beta
         effective = effective_sample_size(log_weights)
         if beta < 1.0 and effective >= target and (beta == 0.0 or fresh >= FRESH_SHARE * target):
@@ -198,7 +181,7 @@ def recycle(
         mixture = _with_even_share(mixture, EVEN_SHARE)
         most = max(most, len(mixture.weights))
         target = max(least, POINTS_PER_COMPONENT * (ndim + 1.0) * most) if most > 1 else least
-        finished, basins = beta == 1.0 and effective >= size, None
+        finished, basins = beta == 1.0 and effective >= n, None
         if not finished or basin_rounds < MOST_BASIN_ROUNDS:
             log_target = points.log_target(beta) - log_evidence
             least_mass = LEAST_MASS if finished and basin_rounds > 0 else 0.0
@@ -208,7 +191,7 @@ def recycle(
             wanted = DRAWS_PER_BASIN * len(basins.weights)
         else:
             mixture = with_components(mixture, basins)
-            wanted = size if finished else DRAWS_PER_TARGET * target
+            wanted = n if finished else DRAWS_PER_TARGET * target
         if last_beta < beta < 1.0:
             wanted = search.enlarge(wanted, beta)
 
@@ -227,7 +210,7 @@ def recycle(
             points.add(mixture, made, pending)
             continue
         drawn.append(draws := _Drawn(mixture, made, pending))
-        new_weights = draws.log_weights(start, beta)
+        new_weights = draws.log_weights(beta)
         efficiencies.append(effective_sample_size(new_weights) / max(len(new_weights), 1))
 
         # check
@@ -237,7 +220,7 @@ def recycle(
             log_evidence, error = _evidence(points.log_weights(beta), inherited)
         reason = doubt_recycling(check, log_evidence, beta, efficiencies)
         # draws that contradict a fit also improve it: check again, as long as that is cheap
-        independent = checking and not reason and _suffice(drawn, start, size)
+        independent = checking and not reason and _suffice(drawn, n)
         ends = independent or checks == MOST_CHECKS if checking else bool(reason)
         if ends:
             if not checking:
@@ -245,7 +228,7 @@ def recycle(
                 points.update()
                 log_evidence, error = _evidence(points.log_weights(beta), inherited)
             points.add(mixture, made, pending)
-            result = _result(drawn if beta == 1.0 else [draws], start, beta)
+            result = _result(drawn if beta == 1.0 else [draws], beta)
             return Recycled(reason, *result, log_evidence, error, check, points, sum(increments), independent)
         points.add(mixture, made, pending)
 
@@ -257,23 +240,20 @@ class WeightedPoints:
     the evidence. `proposals` are the mixtures in order, with the number of draws made from each.
     """
 
-    def __init__(self, pending: PendingPoints, start: StartingDensity):
-        self._batches, self._start = [pending], start
+    def __init__(self, pending: PendingPoints):
+        self._batches = [pending]
         self.proposals: list[tuple[int, Mixture]] = []
-        self._log_start_of_all = start.log_density(pending.coords, pending.base)
-        self._log_mixture_of_all = np.log(start.made) + self._log_start_of_all
+        self._log_mixture_of_all = np.log(len(pending.coords)) + pending.base["log_prior"]
         self.update()
 
     def add(self, mixture: Mixture, made: float, pending: PendingPoints) -> None:
         """Add the draws inside the support, of `made` draws from a mixture."""
         coords = pending.coords
-        log_start = self._start.log_density(coords, pending.base)
-        log_mixture = np.log(self._start.made) + log_start
+        log_mixture = np.log(len(self._batches[0].coords)) + pending.base["log_prior"]
         for count, earlier in self.proposals:
             log_mixture = np.logaddexp(log_mixture, np.log(count) + log_density(earlier, coords))
         self.proposals.append((made, mixture))
         self._batches.append(pending)
-        self._log_start_of_all = np.concatenate([self._log_start_of_all, log_start])
         coords_of_all = np.concatenate([pending.coords for pending in self._batches])
         self._log_mixture_of_all = np.logaddexp(
             np.concatenate([self._log_mixture_of_all, log_mixture]), np.log(made) + log_density(mixture, coords_of_all)
@@ -287,7 +267,7 @@ class WeightedPoints:
         self.coords = np.concatenate([coords for coords, _ in parts])
         self.records = np.concatenate([records for _, records in parts])
         arrived = np.concatenate([pending.arrived for pending in self._batches])
-        self._log_start, self._log_mixture = self._log_start_of_all[arrived], self._log_mixture_of_all[arrived]
+        self._log_mixture = self._log_mixture_of_all[arrived]
 
     def running(self, latest: bool = True) -> int:
         """Number of points that have not arrived; without the latest draws if not `latest`."""
@@ -296,13 +276,13 @@ class WeightedPoints:
 
     @property
     def log_ratio(self) -> np.ndarray:
-        """Logarithm of the posterior over the starting density; from the prior, the log-likelihood."""
-        return self.records["log_prob"] - self._log_start
+        """Log-likelihood (n,)."""
+        return self.records["log_prob"] - self.records["log_prior"]
 
     def log_target(self, beta: float) -> np.ndarray:
         """Logarithm (n,) of the tempered target, not normalised."""
         alive = self.records["log_prob"] > -np.inf
-        return np.where(alive, self._log_start + beta * np.where(alive, self.log_ratio, 0.0), -np.inf)
+        return np.where(alive, self.records["log_prior"] + beta * np.where(alive, self.log_ratio, 0.0), -np.inf)
 
     def log_weights(self, beta: float) -> np.ndarray:
         """Logarithm of the tempered target over the mixture, (n,); the sum of the weights estimates the evidence."""
@@ -316,28 +296,28 @@ class _Drawn(NamedTuple):
     made: int
     pending: PendingPoints
 
-    def log_weights(self, start: StartingDensity, beta: float) -> np.ndarray:
+    def log_weights(self, beta: float) -> np.ndarray:
         """Log-weights (m,) of the draws that have arrived, relative to the mixture that they were drawn from."""
         coords, records = self.pending.arrived_part()
         alive = records["log_prob"] > -np.inf
         log_prob = np.where(alive, records["log_prob"], 0.0)
-        tempered = (1.0 - beta) * start.log_density(coords, records) + beta * log_prob
+        tempered = (1.0 - beta) * records["log_prior"] + beta * log_prob
         return np.where(alive, tempered - log_density(self.mixture, coords), -np.inf)
 
 
-def _result(drawn: Sequence[_Drawn], start: StartingDensity, beta: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _result(drawn: Sequence[_Drawn], beta: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points, records and log-weights of complete rounds, as in `Recycled`."""
     parts = [draws.pending.arrived_part() for draws in drawn]
-    log_weights = [draws.log_weights(start, beta) for draws in drawn]
+    log_weights = [draws.log_weights(beta) for draws in drawn]
     sizes = [draws.made for draws in drawn]
     shares = round_shares(sizes, [effective_sample_size(w) / n for w, n in zip(log_weights, sizes, strict=True)])
     scaled = [w + np.log(share / n) for w, share, n in zip(log_weights, shares, sizes, strict=True)]
     return np.concatenate([c for c, _ in parts]), np.concatenate([r for _, r in parts]), np.concatenate(scaled)
 
 
-def _suffice(drawn: Sequence[_Drawn], start: StartingDensity, size: int) -> bool:
+def _suffice(drawn: Sequence[_Drawn], size: int) -> bool:
     """Whether `size` points resampled from the draws at beta = 1 are as good as independent draws of the posterior."""
-    weights = normalised_weights(_result(drawn, start, 1.0)[2])
+    weights = normalised_weights(_result(drawn, 1.0)[2])
     return bool(np.minimum(size * weights, 1.0).sum() >= ENOUGH_DISTINCT * size)
 
 
