@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fe_likelihoods import TruncatedNormal, Uniform
+from fe_likelihoods import Uniform
 
 from .problem import CRITICAL, PRIOR, make_posterior
 
@@ -58,10 +58,3 @@ def test_errors_of_wrong_shapes_name_the_parameters(posterior, density, shape):
 def test_points_outside_the_unit_cube_are_refused(posterior, u):
     with pytest.raises(ValueError, match=r"probabilities in \[0, 1\]"):
         posterior.prior_transform(np.array(u))
-
-
-def test_survival_quantiles_mirror_the_quantiles():
-    distribution = TruncatedNormal(2.2, 0.8, lower=0.7, upper=4.0)
-    q = np.array([0.0, 0.2, 1.0])
-    np.testing.assert_allclose(distribution.isf(q), distribution.ppf([1.0, 0.8, 0.0]))
-    assert distribution.isf(0.0) == 4.0

@@ -200,22 +200,6 @@ def test_another_function_on_a_backend_in_memory_is_refused(kind):
 # ---------------------------------------------------------------- the record makes the file again
 
 
-@pytest.mark.parametrize(("kind", "fingerprint"), covering(OURS, ["counted", None], strength=1))
-def test_a_deleted_file_is_made_again_from_the_record(kind, fingerprint, tmp_path, whole_run):
-    whole = whole_run(kind, 3)
-    path = tmp_path / "run.h5"
-    begin(make(kind, path, Counted(fingerprint)), 3)
-    path.unlink()
-    assert record_of(path).exists()
-    posterior = Counted(fingerprint)
-    again = make(kind, path, posterior, seed=8)
-    again.run_mcmc(None, 3)
-    assert same(again, whole)
-    assert len(posterior.evaluated) <= (2 if fingerprint is None else 0)  # a comparison replaces the fingerprint
-    again.run_mcmc(None, 2)
-    assert same(again, whole_run(kind, 3, 2))
-
-
 # ---------------------------------------------------------------- limits and interrupts
 
 

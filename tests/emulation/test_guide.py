@@ -24,7 +24,7 @@ from samplers.judgement.guides import check_excluded_runs
 from tests.faults import guided_run
 from tests.statistics.hard_posteriors import CASES
 
-from .problems import free_vibration, vibration
+from .problems import vibration
 
 
 def quadrature(posterior):
@@ -84,19 +84,6 @@ def test_densities_are_normalised_and_draws_are_inside_the_support():
     log_normal = -0.5 * np.square((coords - centre) / spread).sum(axis=1) - np.log(2.0 * np.pi * spread.prod())
     ratio = np.exp(log_normal - guide.log_density(coords))
     assert ratio.mean() == pytest.approx(1.0, abs=4.0 * ratio.std() / np.sqrt(4000))
-
-
-def test_a_model_whose_prior_median_fails():
-    def fails(theta):
-        if abs(theta[0] - 1.0) < 0.05:
-            raise RuntimeError("diverged")
-        return free_vibration(theta)
-
-    posterior = vibration(function=fails)
-    sampler = SMCSampler(100, 2, posterior, vectorize=True, seed=1, guide=posterior.guide(), max_simulations=600)
-    sampler.run_mcmc(None, 1)
-    assert sampler.verdict.status == "converged"
-    assert sampler.get_chain(flat=True).mean(axis=0) == pytest.approx([1.2, 0.8], abs=0.05)
 
 
 def test_impossible_guides_are_refused_before_any_simulation():

@@ -1,18 +1,23 @@
 """Asynchronous runs: killed anywhere, they go on; the record repeats them to the last bit without an evaluation."""
 
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 
 import emcee
 import numpy as np
 import pytest
 
-from samplers import SMCSampler
+from samplers import SMCSampler, TMCMCSampler
 from tests.contract.targets import Gaussian, WithBlobs
-from tests.faults.records import blocks, cut
-from tests.simulated_cluster import SimulatedCluster
+from tests.emulation.problems import symmetric
+from tests.faults.records import blocks, cut, points_of
+from tests.faults.resumable_run import outcome
+from tests.simulated_cluster import DelayedPool, SimulatedCluster
+from tests.tempering.guides import FixedGuide
 
-N, NDIM, STEPS = 40, 2, 2
+N, NDIM = 40, 2
 COMPARED = 2  # evaluations by which a new sampler compares the posterior with that of the file
+STEPS = {"recycling": 2, "guide": 1}
 
 pytestmark = pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
 
@@ -26,57 +31,72 @@ class Fragile(WithBlobs):
         return values
 
 
-def make(path, workers=5, order=0, **settings):
-    """A sampler with a file; `order` is the seed of the run lengths, and so of the order of arrival."""
-    lengths = np.random.default_rng(order)
-    cluster = SimulatedCluster(Fragile(ndim=NDIM, sd=0.05), workers, lambda x: lengths.exponential(size=len(x)))
-    backend = emcee.backends.HDFBackend(str(path))
-    settings = {"seed": 5, "recycle": True, "asynchronous": True, **settings}
-    return SMCSampler(N, NDIM, cluster, vectorize=True, backend=backend, **settings), cluster
+def finished(kind, path, order=0, **settings):
+    """A run on a file, and what it has evaluated; `order` is the seed of the run lengths, and so of the arrivals.
 
-
-def finished(path, **settings):
-    sampler, cluster = make(path, **settings)
-    sampler.run_mcmc(None, STEPS - sampler.iteration)
+    "recycling" is of points with blobs, of which some fail; "guide" of two modes, with searches on parts of the record.
+    """
+    settings = {"seed": 5, "asynchronous": True, "backend": emcee.backends.HDFBackend(str(path)), **settings}
+    if kind == "recycling":
+        lengths = np.random.default_rng(order)
+        posterior = SimulatedCluster(Fragile(ndim=NDIM, sd=0.05), 5, lambda x: lengths.exponential(size=len(x)))
+        settings["recycle"], context = True, nullcontext()
+    else:
+        posterior = symmetric()
+        likelihood = posterior.likelihood
+        likelihood.simulator.pool = pool = DelayedPool(12, order, likelihood.model.n_steps)
+        settings["guide"], context = posterior.guide(4), pool.pool
+    sampler = SMCSampler(N, NDIM, posterior, vectorize=True, **settings)
+    with context:
+        sampler.run_mcmc(None, STEPS[kind] - sampler.iteration)
     sampler._record.close()
-    return sampler, cluster
+    return sampler, posterior.evaluations if kind == "recycling" else pool.simulations
 
 
-def state_of(sampler):
-    """Everything that two runs are compared by."""
-    ladder = [stage._replace(seconds=0) for stage in sampler.ladder]
-    failures = sorted((failure["parameters"].tobytes(), failure["reason"]) for failure in sampler.failures)
-    blobs = sampler.get_blobs().tobytes()
-    return sampler.get_chain().tobytes(), blobs, ladder, sampler.log_evidence, sampler.evaluations, failures
+def repeated(kind, path, folder, order=99):
+    """The run of a record without its HDF5 file."""
+    cut(path, None, folder / "repeated.h5")
+    return finished(kind, folder / "repeated.h5", order)
 
 
-def repeated(path, folder, order):
-    """The run of a record without its HDF5 file, and the number of evaluations that it took."""
-    copy = folder / "repeated.h5"
-    cut(path, None, copy)
-    return finished(copy, order=order)
+@pytest.fixture(scope="module", params=["recycling", pytest.param("guide", marks=pytest.mark.slow)])
+def whole(request, tmp_path_factory):
+    path = tmp_path_factory.mktemp("whole") / "run.h5"
+    return request.param, path, *finished(request.param, path, order=1)
 
 
-def test_a_run_depends_on_the_order_of_arrival_and_on_nothing_else(tmp_path):
-    """The control: other lengths give another chain, so that a replay that ignored the order would be noticed."""
-    chains = [finished(tmp_path / f"{i}.h5", order=order)[0].get_chain() for i, order in enumerate((1, 1, 2))]
-    assert np.array_equal(chains[0], chains[1]) and not np.array_equal(chains[0], chains[2])
+def test_the_order_of_arrival_decides_and_the_record_repeats_it_without_an_evaluation(whole, tmp_path):
+    """The control: other lengths give another run, so that a replay that ignored the order would be noticed."""
+    kind, path, sampler, made = whole
+    assert made == pytest.approx(sampler.simulations) and (sampler.failures or kind == "guide")
+    assert outcome(finished(kind, tmp_path / "other.h5", order=2)[0]) != outcome(sampler)
+    again, nothing = repeated(kind, path, tmp_path)
+    assert outcome(again) == outcome(sampler) and nothing <= (COMPARED if kind == "recycling" else 0)
 
 
-@pytest.mark.parametrize("every", [65, pytest.param(13, marks=pytest.mark.slow)])
-def test_killed_anywhere_a_run_goes_on_and_its_record_repeats_it(every, tmp_path):
-    """Cut after some of the blocks, and continued with other lengths: nothing known is evaluated again."""
-    whole, cluster = finished(tmp_path / "whole.h5", order=1)
-    assert whole.failures and cluster.evaluations == whole.evaluations
-    places = [place for _, place in blocks(tmp_path / "whole.h5")][::every]
-    assert len(places) > 65 // every
-    for number, place in enumerate(places):
-        path = tmp_path / "killed.h5"
-        cut(tmp_path / "whole.h5", place, path)
-        resumed, cluster = finished(path, order=number)
-        again, nothing = repeated(path, tmp_path, order=99)
-        assert state_of(again) == state_of(resumed) and nothing.evaluations <= COMPARED
-    assert state_of(repeated(tmp_path / "whole.h5", tmp_path, order=98)[0]) == state_of(whole)
+@pytest.mark.parametrize(
+    "share", [0.5, *(pytest.param(share, marks=pytest.mark.slow) for share in (0.04, 0.25, 0.7, 0.97))]
+)
+def test_killed_anywhere_a_run_goes_on_and_its_record_repeats_it(whole, tmp_path, share):
+    """In the search and in the rounds; continued with other lengths, of which a later replay takes no account."""
+    kind, path, sampler, made = whole
+    places = [place for _, place in blocks(path)]
+    cut(path, places[int(share * len(places))], tmp_path / "killed.h5")
+    known = len(points_of(tmp_path / "killed.h5"))
+    resumed, rest = finished(kind, tmp_path / "killed.h5", order=4)
+    assert rest <= (resumed.evaluations - known + COMPARED if kind == "recycling" else (1.4 - share) * made + 12)
+    again, nothing = repeated(kind, tmp_path / "killed.h5", tmp_path)
+    assert outcome(again) == outcome(resumed) and nothing <= (COMPARED if kind == "recycling" else 0)
+
+
+@pytest.mark.parametrize(("kind", "limit"), [("recycling", 150), ("guide", 75)])
+def test_a_limit_counts_what_is_running(kind, limit, tmp_path):
+    """No more than the limit is submitted, all of that is used, and a larger limit goes on."""
+    sampler, made = finished(kind, tmp_path / "run.h5", order=1, max_simulations=limit)
+    assert limit - 1.0 < sampler.simulations <= limit and made == pytest.approx(sampler.simulations)
+    if kind == "recycling":
+        more, further = finished(kind, tmp_path / "run.h5", order=3, max_simulations=5000)
+        assert more.verdict.status != "not usable" and further <= COMPARED + more.evaluations - limit
 
 
 def test_threads_take_single_points():
@@ -90,21 +110,21 @@ def test_threads_take_single_points():
     assert np.all(np.abs(mean - posterior.mean) < 4 * sd)
 
 
-def test_a_limit_of_simulations_counts_points_that_are_running(tmp_path):
-    """No more than the limit is submitted, all of that is used, and a larger limit goes on."""
-    sampler, cluster = make(tmp_path / "run.h5", max_simulations=150)
-    sampler.run_mcmc(None, 1)
-    assert cluster.evaluations == 150 == sampler.simulations
-    more, further = make(tmp_path / "run.h5", max_simulations=5000, order=3)
-    more.run_mcmc(None, 1)
-    assert more.verdict.status != "not usable" and further.evaluations <= COMPARED + more.evaluations - 150
+POSTERIOR = Gaussian(NDIM)
+GUIDE = FixedGuide(POSTERIOR, POSTERIOR.mean, [np.diag(POSTERIOR.sd**2)])
 
 
-def test_what_cannot_be_asynchronous_is_refused():
-    posterior = Gaussian(NDIM)
-    with pytest.raises(ValueError, match="evaluation_queue"):
-        SMCSampler(300, NDIM, posterior, vectorize=True, asynchronous=True)
-    with pytest.raises(ValueError, match="moves wait"), ThreadPoolExecutor(1) as pool:
-        SMCSampler(N, NDIM, posterior, pool=pool, recycle=False, asynchronous=True)
-    with pytest.raises(ValueError, match="True or False"):
-        SMCSampler(300, NDIM, posterior, vectorize=True, asynchronous=1)
+@pytest.mark.parametrize(
+    ("Sampler", "settings", "error", "word"),
+    [
+        (SMCSampler, {"vectorize": True}, ValueError, "evaluation_queue"),
+        (SMCSampler, {"vectorize": True, "guide": GUIDE}, ValueError, "evaluation_queue"),
+        (SMCSampler, {"pool": 1, "recycle": False}, ValueError, "moves wait"),
+        (SMCSampler, {"vectorize": True, "asynchronous": 1}, ValueError, "True or False"),
+        (TMCMCSampler, {"pool": 1, "guide": GUIDE}, TypeError, "asynchronous"),
+    ],
+)
+def test_what_cannot_be_asynchronous_is_refused(Sampler, settings, error, word):
+    with pytest.raises(error, match=word), ThreadPoolExecutor(1) as pool:
+        given = {"asynchronous": True, **settings} | ({"pool": pool} if "pool" in settings else {})
+        Sampler(300, NDIM, POSTERIOR, **given)

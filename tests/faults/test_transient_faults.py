@@ -145,21 +145,6 @@ def test_a_failure_that_depends_on_the_measurements_is_not_used_for_others(tmp_p
 # time limits ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_simulation_stopped_at_a_time_limit_is_run_again(tmp_path):
-    path = tmp_path / "cache.sqlite"
-
-    def runs(model):
-        likelihood = likelihood_of(model, path)
-        failed = bool(np.isnan(likelihood.misfit(THETAS[1:2])).all())
-        assert likelihood.simulator.failures.count == likelihood.simulator.failures.transient == failed
-        return likelihood.simulations, failed
-
-    stopped = SimulationFailed(TransientReason("stopped at the time limit of 5 s"))
-    assert runs(Faulty(stopped, 5.0)) == runs(Faulty(stopped, 5.0)) == (1, True)
-    assert runs(Faulty(time_limit=5.0)) == (1, False)
-    assert runs(Faulty(stopped, 2.0)) == (0, False)
-
-
 # real faults ---------------------------------------------------------------------------------------------------------
 
 

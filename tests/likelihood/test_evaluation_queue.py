@@ -259,6 +259,31 @@ def test_a_closed_queue_cancels_what_waits_and_caches_what_runs(tmp_path, shared
         np.testing.assert_array_equal(posterior(SHORT), posterior_of(Treacherous())(SHORT))
 
 
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="NO fork ON THIS SYSTEM")
+def test_a_killed_queue_has_stored_what_has_ended(tmp_path):
+    """SIGKILL while one point runs: a later run simulates that point only."""
+    path, x = tmp_path / "cache.sqlite", np.concatenate([LONG[:1], SHORT])
+
+    def run():
+        with ThreadPoolExecutor(2) as pool:
+            queue = posterior_of(Gated(tmp_path), pool=pool, cache=path).evaluation_queue()
+            queue.submit(x)
+            while True:
+                queue.collect()
+
+    process = multiprocessing.get_context("fork").Process(target=run)
+    process.start()
+    again = posterior_of(Gated(tmp_path), cache=path)
+    stored, key = SimulationCache(path), again.likelihood.simulator.simulation_key
+    wait_until(lambda: stored.look_up(key, SHORT[:, :2], 1).known.all())
+    process.kill()
+    process.join(SECONDS)
+    assert process.exitcode == -signal.SIGKILL
+    (tmp_path / "go").touch()
+    np.testing.assert_array_equal(again(x), posterior_of(Treacherous())(x))
+    assert (again.likelihood.simulations, again.likelihood.simulator.disk_hits) == (1, len(SHORT))
+
+
 @pytest.mark.parametrize("asynchronous", [True, False], ids=["queue", "call"])
 def test_an_interrupt_loses_no_run_that_has_ended(asynchronous, tmp_path):
     path = tmp_path / "cache.sqlite"

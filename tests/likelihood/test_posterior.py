@@ -2,7 +2,6 @@
 
 import logging
 import math
-import time
 import warnings
 from multiprocessing.pool import ThreadPool
 
@@ -135,20 +134,6 @@ def test_equals_the_direct_formula(posterior, oscillator, measurements):
     assert posterior(x) == posterior.log_prob(x) == pytest.approx(log_likelihood + log_prior, rel=1e-12)
 
 
-def test_equals_the_conjugate_posterior_up_to_a_constant():
-    # a response linear in its parameter, normal prior, known noise: the posterior of the slope is normal
-    model = Polynomial()
-    posterior = polynomial_posterior(model)
-    basis = model.dt * np.arange(model.n_steps)
-    sigma = 0.7
-    precision = 1.0 + basis @ basis / sigma**2
-    mean = (0.2 + basis @ posterior.likelihood.measurements.values[1] / sigma**2) / precision
-    slopes = np.linspace(-3.0, 3.0, 25)
-    x = np.column_stack([np.full(25, 0.3), slopes, np.full(25, 1.1), np.full(25, sigma)])
-    difference = posterior(x) - stats.norm.logpdf(slopes, mean, precision**-0.5)
-    np.testing.assert_allclose(difference, difference[0], rtol=0, atol=1e-10)
-
-
 # shapes, names, orders ----------------------------------------------------------------------------------------------
 
 
@@ -257,25 +242,6 @@ def test_an_object_that_is_no_model_is_refused_with_the_missing_members(oscillat
         FELikelihood(Incomplete(), measurements)
     with pytest.raises(ValueError, match="function is not a model, because it has no parameter_names, channels, dt"):
         FELikelihood(lambda theta: theta, measurements)
-
-
-class SlowPolynomial(Polynomial):
-    """Takes so long that the model is compared after the first batch."""
-
-    def simulate(self, theta):
-        time.sleep(0.3)
-        return super().simulate(theta)
-
-
-def test_threads_share_a_model_that_counts_its_runs():
-    """Its list of runs grows in this process: no change of the model, since a repeated simulation agrees."""
-    expected = polynomial_posterior(Polynomial())
-    x = np.array([[0.3, 0.1, 0.5, 1.0], [0.4, 0.1, 0.5, 1.0]])
-    posterior = polynomial_posterior(SlowPolynomial())
-    with ThreadPool(2) as pool:
-        posterior.likelihood.simulator.pool = pool
-        assert np.array_equal(posterior(x), expected(x))
-    assert posterior.report()["simulations"] == 2
 
 
 @pytest.mark.parametrize("threads", [0, 2])

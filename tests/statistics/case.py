@@ -2,7 +2,7 @@
 
 Most responses are linear combinations of smooth shapes over time, with nonlinear functions of the parameters as
 coefficients (*features*). With n samples, noise sigma and shapes of mean square one, a feature has the standard
-deviation sigma / sqrt(n); n is the number of samples of its window where the shape has one.
+deviation sigma / sqrt(n).
 """
 
 from collections.abc import Callable, Mapping
@@ -49,20 +49,6 @@ class _OneRun:
         return response
 
 
-class _ShortenedModel(FunctionModel):
-    """A function that computes the whole response, as a model that can be shortened."""
-
-    def first(self, seconds: float) -> FunctionModel:
-        """The same model for the first part of its record, up to and including a time [s]."""
-        n_steps = round(seconds / self.dt) + 1
-
-        def first_samples(theta: np.ndarray) -> np.ndarray:
-            return self.function(theta)[:, :n_steps]
-
-        version = f"{self.version}, {n_steps} samples"
-        return FunctionModel(first_samples, self.parameter_names, self.channels, self.dt, n_steps, version=version)
-
-
 @dataclass(frozen=True)
 class HardPosterior:
     """A small posterior that is hard in one way."""
@@ -85,20 +71,13 @@ class HardPosterior:
     offset: float = 0.0  # constant in the responses and in the data [m]
     # whether the noise has no component along the shapes, so that it does not change the mode shares
     balanced: bool = False
-    # Start and end (k, 2) of each shape, as fractions of the record; by default all shapes cover the whole record. With
-    # windows, the model can be shortened.
-    windows: Any = None
 
     @property
     def shapes(self) -> np.ndarray:
-        """Shapes of the features over time (k, n_channels, n_steps), of mean square one in their windows."""
+        """Shapes of the features over time (k, n_channels, n_steps), of mean square one."""
         t = (np.arange(self.n_steps) + 0.5) / self.n_steps
         k, c = np.arange(len(self.target))[:, None, None], np.arange(self.n_channels)[:, None]
-        if self.windows is None:
-            return np.sqrt(2.0) * np.sin(np.pi * (k + 1 + c) * t)
-        start, end = np.array(self.windows).T[:, :, None, None]
-        waves = np.sin(np.pi * (k + 1 + c) * (t - start) / (end - start))
-        return np.sqrt(2.0) * np.where((t >= start) & (t < end), waves, 0.0)
+        return np.sqrt(2.0) * np.sin(np.pi * (k + 1 + c) * t)
 
     def responses(self, theta: np.ndarray) -> np.ndarray:
         """Responses of many parameter sets (n, d) at once: (n, n_channels, n_steps), NaN where a simulation fails."""
@@ -126,8 +105,7 @@ class HardPosterior:
     def posterior(self, seed: int, name: str = "hard") -> Posterior:
         """Posterior given the data of a seed, with a model that runs one simulation per call."""
         channels = tuple(Channel(f"c{i + 1}", "displacement", "m") for i in range(self.n_channels))
-        kind = FunctionModel if self.windows is None else _ShortenedModel
-        model = kind(_OneRun(self.responses), tuple(self.prior), channels, DT, self.n_steps, version=name)
+        model = FunctionModel(_OneRun(self.responses), tuple(self.prior), channels, DT, self.n_steps, version=name)
         measurements = Measurements(channels, DT, self.data(seed), f"SYNTHETIC, {name}, seed {seed}")
         prior = dict(self.prior) | {f"sigma_{channel.name}": HalfNormal(0.5) for channel in channels}
         if self.error_model == "autoregressive":

@@ -4,10 +4,11 @@ Every case is a cheap Python function behind a `FunctionModel` (see `HardPosteri
 `brute_force.reference` gives evidence, moments and mode shares of a case, with their errors.
 
 The cases are those in which a search from few starts, a smooth emulator or a Gaussian approximation goes wrong: several
-modes, bounds, failing simulations, likelihoods with jumps, curved and flat posteriors, few samples, noisy runs. The
-models of this module cannot be shortened (there is no method ``first``), and most have one channel. The cases of
-`late_posteriors`, whose models can be shortened, are added to `CASES`.
+modes, bounds, failing simulations, likelihoods with jumps, curved posteriors, few samples. The models cannot be
+shortened (there is no method ``first``), and most have one channel.
 """
+
+from functools import partial
 
 import numpy as np
 
@@ -15,7 +16,6 @@ from fe_likelihoods import LogNormal, TruncatedNormal, Uniform
 from fe_likelihoods.priors.distributions import Distribution
 
 from .case import HardPosterior
-from .late_posteriors import LATE_CASES
 
 __all__ = ["CASES", "hash_uniform"]
 
@@ -75,10 +75,6 @@ def _failing_scattered(x):
     return np.where((hash_uniform(x) < 0.2)[:, None], np.nan, _smooth(x))
 
 
-def _failing_mean(x):
-    return np.where((np.abs(x[:, :2] - 1.0) < 0.25).all(axis=1)[:, None], np.nan, _smooth(x))
-
-
 def _rough(size, x):
     cells = np.floor(x[:, :2] / np.array([0.004, 0.003]))
     jumps = np.stack([hash_uniform(cells, salt) - 0.5 for salt in (1, 2)], axis=1)
@@ -92,23 +88,9 @@ def _banana(thickness, x):
     return np.stack([(b - a**2) * 0.0035 / thickness, 0.02 * a, c], axis=1)
 
 
-def _unidentified(x):
-    return _smooth(x[:, :3])
-
-
 def _product(x):
     a, b, c = x.T
     return np.stack([a * b, c * np.sqrt(a * b)], axis=1)
-
-
-def _noisy_runs(x):
-    features = _smooth(x)
-    errors = np.stack([hash_uniform(x, salt) - 0.5 for salt in range(3)], axis=1)
-    return features * (1.0 + 2e-6 * errors)
-
-
-def _uninformative(x):
-    return 0.01 * _smooth(x)
 
 
 def _four(x):
@@ -116,24 +98,7 @@ def _four(x):
     return np.stack([a * b, b + 0.3 * c**2, c * d, np.sqrt(a) - 0.5 * d], axis=1)
 
 
-class _Partial:
-    """A function of features with its first arguments given; a plain object, so that it has a readable name."""
-
-    def __init__(self, function, *first):
-        self.function, self.first = function, first
-
-    def __call__(self, x):
-        return self.function(*self.first, x)
-
-
 # ------------------------------------------------------------------ responses over time
-
-
-def _pushover(x, n_steps=200):
-    """Force of a bilinear spring under a growing displacement up to one: the yield displacement may be beyond it."""
-    k, uy, hardening = x.T[:, :, None]
-    u = np.linspace(0.0, 1.0, n_steps)
-    return (k * (np.minimum(u, uy) + 0.1 * hardening * np.maximum(u - uy, 0.0)))[:, None]
 
 
 def _free_vibration(x, n_steps=400):
@@ -153,10 +118,6 @@ def _thirds(x):
 
 def _near_or_far(x):
     return np.searchsorted([1.5, 2.4], x[:, 0])
-
-
-def _spring_prior():
-    return {"k": TruncatedNormal(1.0, 0.3), "uy": LogNormal(1.5, 0.4), "hardening": TruncatedNormal(1.0, 0.5)}
 
 
 _WIDE = {"a": Uniform(0.0, 3.0), "b": TruncatedNormal(1.0, 0.3), "c": TruncatedNormal(1.0, 0.4)}
@@ -182,17 +143,8 @@ CASES = {
     "far": HardPosterior(
         "two narrow modes with half the mass, in a region that holds a tenth of the prior, far from the wide mode",
         _WIDE,
-        _Partial(_far, 0.15, 0.0063),
+        partial(_far, 0.15, 0.0063),
         [0.8, 1.0, 1.0, 0.0063],
-        label=_near_or_far,
-        n_modes=3,
-        balanced=True,
-    ),
-    "farther": HardPosterior(
-        "as the case far, in a region that holds three per cent of the prior: no start may find it",
-        _WIDE,
-        _Partial(_far, 0.045, 0.0083),
-        [0.8, 1.0, 1.0, 0.0083],
         label=_near_or_far,
         n_modes=3,
         balanced=True,
@@ -217,48 +169,19 @@ CASES = {
     "failing_scattered": HardPosterior(
         "one simulation in five fails, at points without any pattern", _three(), _failing_scattered, [0.9, 1.1, 0.7]
     ),
-    "failing_mean": HardPosterior(
-        "simulations fail around the mean of the prior", _three(), _failing_mean, [1.3, 0.7, 0.7]
-    ),
     "rough_mild": HardPosterior(
-        "a log-likelihood with jumps of up to one", _three(), _Partial(_rough, 0.5), [0.9, 1.1, 0.7]
+        "a log-likelihood with jumps of up to one", _three(), partial(_rough, 0.5), [0.9, 1.1, 0.7]
     ),
     "rough": HardPosterior(
-        "a log-likelihood with jumps of one to three", _three(), _Partial(_rough, 1.5), [0.9, 1.1, 0.7]
+        "a log-likelihood with jumps of one to three", _three(), partial(_rough, 1.5), [0.9, 1.1, 0.7]
     ),
     "banana": HardPosterior(
         "a curved posterior, bent by several times its thickness",
         {"a": TruncatedNormal(1.0, 0.5), "b": TruncatedNormal(1.0, 1.0), "c": TruncatedNormal(1.0, 0.4)},
-        _Partial(_banana, 0.02),
+        partial(_banana, 0.02),
         [0.0, 0.02, 1.0],
-    ),
-    "thin_banana": HardPosterior(
-        "a curved posterior, bent by thirty times its thickness",
-        {"a": TruncatedNormal(1.0, 0.5), "b": TruncatedNormal(1.0, 1.0), "c": TruncatedNormal(1.0, 0.4)},
-        _Partial(_banana, 0.0035),
-        [0.0, 0.02, 1.0],
-    ),
-    "unidentified": HardPosterior(
-        "a parameter without any effect",
-        _three() | {"d": LogNormal(1.0, 0.6)},
-        _unidentified,
-        [0.9, 1.1, 0.7],
     ),
     "product": HardPosterior("two parameters of which only the product has an effect", _three(), _product, [0.9, 0.95]),
-    "threshold": HardPosterior(
-        "two parameters that have no effect at the mean of the prior, where the bars do not yield",
-        _spring_prior(),
-        respond=_pushover,
-        truth=[1.1, 0.7, 1.4],
-        noise=0.02,
-    ),
-    "threshold_edge": HardPosterior(
-        "data that barely say whether the bars yield",
-        _spring_prior(),
-        respond=_pushover,
-        truth=[1.1, 0.9, 1.0],
-        noise=0.1,
-    ),
     "few_samples": HardPosterior(
         "30 samples for four parameters",
         _three() | {"d": TruncatedNormal(1.0, 0.4)},
@@ -266,13 +189,6 @@ CASES = {
         [1.0, 1.3, 1.0, 0.5],
         noise=0.3,
         n_steps=30,
-    ),
-    "noisy_runs": HardPosterior(
-        "runs with a relative noise of 1e-6, and a precise measurement",
-        _three(),
-        _noisy_runs,
-        [0.9, 1.1, 0.7],
-        noise=0.001,
     ),
     "side_lobes": HardPosterior(
         "a frequency: local maxima of the likelihood every few per cent, a model that cannot be shortened",
@@ -301,9 +217,5 @@ CASES = {
         [0.9, 1.1, 0.7],
         error_model="autoregressive",
     ),
-    "uninformative": HardPosterior(
-        "data that say almost nothing", _three(), _uninformative, [0.009, 0.011, 0.007], noise=0.1
-    ),
-    **LATE_CASES,
 }
 """All cases by name."""

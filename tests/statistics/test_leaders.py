@@ -2,23 +2,11 @@
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from samplers import TMCMCSampler
 from samplers.moves.population_moves import RandomWalkMove
-from tests.contract.targets import Box, Gaussian
-from tests.statistics.test_posteriors import deviations, evidence_deviation, runs, within
-
-
-def test_truncated_prior_edges(seed):
-    """The posterior is largest at two edges of the box, which cut it off."""
-    posterior = Box([0, 0], [1, 1], lambda x: -10.0 * x[..., 0] + 3.0 * x[..., 1])
-    samplers = runs(posterior, seed, count=12, nwalkers=100, nsteps=2, Sampler=TMCMCSampler)
-    falling = stats.truncexpon(b=10, scale=0.1).mean()
-    rising = 1.0 - stats.truncexpon(b=3, scale=1.0 / 3.0).mean()
-    assert within(deviations(samplers, [falling, rising]), samplers)
-    log_evidence = np.log((1.0 - np.exp(-10.0)) / 10.0) + np.log((np.exp(3.0) - 1.0) / 3.0)
-    assert within(evidence_deviation(samplers, log_evidence), samplers)
+from tests.contract.targets import Gaussian
+from tests.statistics.test_posteriors import deviations, runs, within
 
 
 @pytest.mark.slow

@@ -117,14 +117,14 @@ def test_two_modes(recycle, seed):
     assert within(evidence_deviation(samplers, -3 * np.log(3)), samplers)
 
 
-@pytest.mark.parametrize("recycle", [slow_recycling, moves])
-def test_edges_of_a_truncated_prior(recycle, seed):
+@pytest.mark.parametrize("mode", [pytest.param("default", marks=pytest.mark.slow), "moves", "tmcmc"])
+def test_edges_of_a_truncated_prior(mode, seed):
     """The posterior is a half-normal with its mode on the edge, times an exponential that piles up at another."""
 
     def log_likelihood(x):
         return -0.5 * (x[..., 0] / 0.05) ** 2 - 20.0 * x[..., 1]
 
-    samplers = runs(Box([0, 0], [1, 1], log_likelihood), seed, recycle=recycle)
+    samplers = runs(Box([0, 0], [1, 1], log_likelihood), seed, **MODES[mode])
     half_normal, exponential = stats.halfnorm(scale=0.05), stats.truncexpon(b=20, scale=1 / 20)
     assert within(deviations(samplers, [half_normal.mean(), exponential.mean()]), samplers)
     assert within(

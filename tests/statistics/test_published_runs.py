@@ -78,33 +78,3 @@ def test_published_tmcmc_fails_with_a_warning(targets, name, seed):
 
 
 # most evaluations, largest error of the mean in posterior sd (rms), of the mode's weight, of the log-evidence
-DEFAULTS = {
-    ("SMC", "T1"): (14e3, 0.07, 0.0, 0.15),
-    ("SMC", "T2"): (15e3, 0.08, 0.05, 0.25),
-    ("SMC", "T3"): (9e3, 0.08, 0.0, 0.15),
-    ("SMC", "T4"): (8e3, 0.06, 0.04, 0.1),
-    ("TMCMC", "T1"): (80e3, 0.08, 0.0, 0.2),
-    ("TMCMC", "T2"): (52e3, 0.1, 0.06, 0.25),  # bent: proposals for basins cost up to a fifth here, sweeps as much
-    ("TMCMC", "T4"): (15e3, 0.06, 0.04, 0.15),
-}
-
-
-@pytest.mark.slow
-@healthy
-@pytest.mark.parametrize("case", DEFAULTS, ids=" ".join)
-def test_defaults_on_the_targets(targets, case, seed):
-    """One run, 500 walkers; four standard errors of some 800 independent points."""
-    Sampler = {"SMC": SMCSampler, "TMCMC": TMCMCSampler}[case[0]]
-    target = targets[case[1]]
-    sampler = Sampler(500, target.ndim, target, vectorize=True, seed=seed)
-    sampler.run_mcmc(None, 6)
-    most, z_bound, weight_bound, evidence_bound = DEFAULTS[case]
-    assert sampler.evaluations < most
-    chain = sampler.get_chain(flat=True)
-    z = (chain.mean(axis=0) - target.mean) / target.sd
-    assert np.sqrt(np.mean(z**2)) < z_bound
-    assert np.sqrt(np.mean((chain.std(axis=0) / target.sd - 1) ** 2)) < 0.1
-    if target.mode is not None:
-        indicator, weight = target.mode
-        assert abs(indicator(chain).mean() - weight) < weight_bound
-    assert abs(sampler.log_evidence - target.log_evidence) < evidence_bound

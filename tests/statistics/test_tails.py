@@ -7,7 +7,6 @@ from scipy import integrate, stats
 from samplers import SMCSampler
 from samplers.moves.population_moves import MixtureMove
 from samplers.proposals import mixture
-from tests.contract.targets import Gaussian
 
 SCALE = 0.5
 
@@ -72,25 +71,3 @@ def test_light_proposals_that_are_fitted_to_their_points_cut_heavy_tails(seed, m
     error = squares.std(ddof=1) / np.sqrt(len(squares))
     print(squares.mean(), error)
     assert squares.mean() < 1.0 - 4.0 * error
-
-
-class Jumps(Gaussian):
-    """A Gaussian whose log-likelihood has jumps of standard deviation 1 between cells much smaller than itself."""
-
-    def log_likelihood(self, x):
-        cells = np.floor(np.sum(x * np.arange(1, self.ndim + 1) * 400.0, axis=-1)).astype(np.int64)
-        return super().log_likelihood(x) + np.random.RandomState(1).standard_normal(4096)[cells * 2654435761 % 4096]
-
-
-def verdicts(posterior, seeds):
-    """Verdicts of runs with recycling."""
-    found = []
-    for seed in seeds:
-        sampler = SMCSampler(250, posterior.ndim, posterior, vectorize=True, seed=seed)
-        sampler.run_mcmc(None, 0)
-        found.append(sampler.verdict)
-    return found
-
-
-def test_control_jumps_in_ten_dimensions_are_no_doubt():
-    assert [verdict.status for verdict in verdicts(Jumps(10, sd=0.05), range(3))] == ["converged"] * 3
