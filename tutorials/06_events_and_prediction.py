@@ -104,7 +104,7 @@ population = HierarchicalPosterior(
 sampler = SMCSampler(300, population.ndim, population, vectorize=True, seed=1)
 sampler.run_mcmc(None, 2)
 hierarchy = Hierarchy(population, sampler.get_chain(flat=True))
-print(hierarchy.spread)
+print(hierarchy)
 ratios = event_ratios(hierarchy, posteriors, peak("displacement"))
 print(ratios)
 

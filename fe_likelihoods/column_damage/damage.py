@@ -334,7 +334,7 @@ def _extent(
             for event in range(found.shape[1]):
                 largest = found[:, event].reshape(len(found), -1).max(axis=1)  # all places of an event share its error
                 factor = np.ones(len(found))
-                factor[largest > 0.0] = errors[name].draw(largest[largest > 0.0], rng)
+                factor[largest > 0.0] = errors[name].quantile(rng.random(np.sum(largest > 0.0)), largest[largest > 0.0])
                 found[:, event] *= factor.reshape(-1, *(1,) * (found.ndim - 2))
         quantiles[name] = np.quantile(found, probabilities, axis=0)
     return quantiles

@@ -16,7 +16,8 @@ the expectation over the posterior of test k, with its prior density :math:`p_k`
 import copy
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -48,6 +49,9 @@ class Varying:
         parameter, in its unit (scale "linear").
     scale : {"log", "linear"}
         Whether the logarithm of the parameter or the parameter itself has a normal distribution.
+    slopes : mapping of str to Distribution
+        Prior of the change of the center, on this scale, per unit of a covariate that all tests state
+        (`StoredPosterior.covariates`): a temperature, or the logarithm of an amplitude.
 
     Raises
     ------
@@ -64,12 +68,14 @@ class Varying:
     location: Distribution
     sd: Distribution
     scale: str = "log"
+    slopes: Mapping[str, Distribution] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.scale not in SCALES:
             raise ValueError(f"Varying: scale must be one of {', '.join(map(repr, SCALES))}; got {self.scale!r}")
         for name in ("location", "sd"):
             object.__setattr__(self, name, as_distribution(name, getattr(self, name)))
+        object.__setattr__(self, "slopes", {name: as_distribution(name, each) for name, each in self.slopes.items()})
         if self.sd.bounds[0] < 0.0:
             raise ValueError(
                 f"Varying: sd must have a prior of positive values, such as HalfNormal(0.3); got {self.sd}"
@@ -107,17 +113,19 @@ class HierarchicalPosterior:
         Scales of the varying and the common parameters.
     described : dict of str to DescribedPosterior
         The samples of each test as they are used.
+    covariates : dict of str to float
+        Mean of each covariate over the tests, at which the medians and means of the population hold.
 
     Raises
     ------
     ValueError
-        If a test lacks a parameter, a parameter is both varying and common, the prior of a test joins one of these
-        parameters with others, or an argument is out of range.
+        If a test lacks a parameter or a covariate, a parameter is both varying and common, the prior of a test joins
+        one of these parameters with others, or an argument is out of range.
 
     Notes
     -----
     The hyper-parameters are ``median_NAME`` and ``sd_log_NAME`` (scale "log"), or ``mean_NAME`` and ``sd_NAME`` (scale
-    "linear"), then the names of the common parameters.
+    "linear"), then ``slope_COVARIATE_NAME``, then the names of the common parameters.
 
     The likelihood is taken as zero outside the prior bounds of a test.
 
@@ -147,7 +155,14 @@ class HierarchicalPosterior:
         for name, each in varying.items():
             location, sd = _HYPER_NAMES[each.scale]
             distributions |= {f"{location}_{name}": each.location, f"{sd}_{name}": each.sd}
+        slopes = [(k, *each) for k, (_, of) in enumerate(varying.items()) for each in of.slopes.items()]
+        self._slopes = [(k, covariate) for k, covariate, _ in slopes]
+        distributions |= {f"slope_{covariate}_{[*varying][k]}": each for k, covariate, each in slopes}
         self.prior = Prior(distributions | dict(common))
+        self.covariates = {
+            name: float(np.mean([test.covariates[name] for test in tests.values()]))
+            for name in dict.fromkeys(covariate for _, covariate in self._slopes)
+        }
         self.scales = Scales(np.array([each.scale == "log" for each in varying.values()] + [False] * len(common)))
         self.described = {}
         for name, test in self.tests.items():
@@ -190,6 +205,7 @@ class HierarchicalPosterior:
         state.update(complete_repr(self.prior).encode())
         for name, each in self.described.items():
             state.update(f"{name} {self.tests[name].log_evidence} {complete_repr(each.prior)}".encode())
+            state.update(repr([self.tests[name].covariates[covariate] for covariate in self.covariates]).encode())
             for array in (each.log_shares, each.means, each.covariances):
                 state.update(np.ascontiguousarray(array).tobytes())
         return state.hexdigest()
@@ -213,11 +229,10 @@ class HierarchicalPosterior:
         total = np.full(len(rows), -np.inf)
         inside = np.atleast_1d(self.prior.logpdf(rows)) > -np.inf
         if inside.any():
-            population = self.population(rows[inside])
-            of_tests = [
-                population_marginal(each, *population) + (self.tests[name].log_evidence or 0.0)
-                for name, each in self.described.items()
-            ]
+            of_tests = []
+            for name, each in self.described.items():
+                population = self.population(rows[inside], self.tests[name].covariates)
+                of_tests.append(population_marginal(each, *population) + (self.tests[name].log_evidence or 0.0))
             total[inside] = np.stack(of_tests, axis=1).sum(axis=1)
         return total if points.ndim == 2 else float(total[0])
 
@@ -229,17 +244,37 @@ class HierarchicalPosterior:
         """Draws (n, ndim) of the prior; arguments as for `Posterior.sample_prior`."""
         return self.prior.rvs(n, rng)
 
-    def population(self, x: Any) -> tuple[np.ndarray, np.ndarray]:
+    def population(self, x: Any, covariates: Mapping[str, float] | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Centers (n, n_varying + n_common) and standard deviations (n, n_varying) on the scales of the parameters.
 
-        Of hyper-parameters (n, ndim). The center of a common parameter is its value.
+        Of hyper-parameters (n, ndim), for a test with these covariates (default: their means over the tests). The
+        center of a common parameter is its value. ValueError for a covariate without a finite number.
         """
         points, n = np.atleast_2d(as_points(x, self.prior.names)), len(self.varying)
         end = points.shape[1] - len(self.common)
         center = np.concatenate([points[:, 0 : 2 * n : 2], points[:, end:]], axis=1)
         center = self.scales.to_scale(center)
+        for column, (k, name) in enumerate(self._slopes, start=2 * n):
+            center[:, k] += points[:, column] * self._beyond(name, covariates)
         deviations = np.clip(points[:, 1 : 2 * n : 2], 1.0 / _LARGEST, _LARGEST)
         return np.clip(center, -_LARGEST, _LARGEST), deviations
+
+    def slope_spread(self, x: Any, covariates: Mapping[str, float]) -> dict[str, float]:
+        """Standard deviations of the centers at these covariates, of hyper-parameters (n, ndim), by their slopes."""
+        points, n, found = np.atleast_2d(as_points(x, self.prior.names)), len(self.varying), {}
+        for column, (k, name) in enumerate(self._slopes, start=2 * n):
+            found[k] = found.get(k, 0.0) + points[:, column] * self._beyond(name, covariates)
+        return {[*self.varying][k]: float(np.std(each)) for k, each in found.items()}
+
+    def _beyond(self, name: str, covariates: Mapping[str, float] | None) -> float:
+        """A covariate less its mean over the tests."""
+        value = (self.covariates if covariates is None else covariates).get(name)
+        if not isinstance(value, Real) or not np.isfinite(value):
+            raise ValueError(
+                f"the population depends on {', '.join(self.covariates)}: expected a number for each of them, such as "
+                f"covariates={self.covariates}; got {dict(covariates or {})}"
+            )
+        return float(value) - self.covariates[name]
 
 
 def _check(tests: Any, varying: Any, common: Any) -> None:
@@ -255,5 +290,11 @@ def _check(tests: Any, varying: Any, common: Any) -> None:
             )
     if not isinstance(common, Mapping):
         raise ValueError(f"HierarchicalPosterior: common must be a mapping of names to distributions; got {common!r}")
+    for name in dict.fromkeys(covariate for each in varying.values() for covariate in each.slopes):
+        if missing := [test for test, each in tests.items() if name not in each.covariates]:
+            raise ValueError(
+                f"HierarchicalPosterior: expected the covariate {name} in every test, StoredPosterior(..., covariates="
+                f'{{"{name}": 12.0}}); {", ".join(map(repr, missing))} lack it'
+            )
     if both := sorted(set(varying) & set(common)):
         raise ValueError(f"HierarchicalPosterior: {', '.join(both)} cannot be both varying and common")

@@ -4,7 +4,7 @@
 checks where the stored posteriors do not suffice, and draws the parameters of a further test.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,8 +18,6 @@ from .hierarchical_posterior import HierarchicalPosterior
 from .reweighting import check_hierarchy
 
 __all__ = ["Hierarchy"]
-
-_MOSTLY_PRIOR = 0.7  # posterior to prior standard deviation of a spread, above which the data say little
 
 
 class Hierarchy:
@@ -61,7 +59,7 @@ class Hierarchy:
     median_stiffness ...
     sd_log_stiffness ...
     damping ...
-    The tests differ in stiffness by ...
+    Predictions for a further test carry ...
     """
 
     def __init__(self, posterior: HierarchicalPosterior, samples: Any, seed: int = 0) -> None:
@@ -84,58 +82,34 @@ class Hierarchy:
         return f"<Hierarchy: {len(self.samples)} samples of {self.posterior!r}>"
 
     def __str__(self) -> str:
-        rows = [("hyper-parameter", "mean", "sd", "5 %", "95 %")]
+        rows = [("hyper-parameter", "mean", "sd", "5 %", "95 %", "error of one test")]
         columns = [
             self.samples.mean(axis=0),
             self.samples.std(axis=0),
             *np.quantile(self.samples, [0.05, 0.95], axis=0),
         ]
-        for name, *each in zip(self.posterior.parameter_names, *columns, strict=True):
-            rows.append((name, *map(number, each)))
+        errors = [""] * self.posterior.ndim
+        errors[1 : 2 * len(self.posterior.varying) : 2] = [number(each, 2) for each in self._errors()]
+        for name, *each, error in zip(self.posterior.parameter_names, *columns, errors, strict=True):
+            rows.append((name, *map(number, each), error))
         first = f"Population of {len(self.posterior.tests)} tests, {len(self.samples)} samples"
         return "\n".join(
             [
                 f"{first}: {', '.join(self.posterior.tests)}",
                 text_table(rows),
-                self.spread,
+                "Predictions for a further test carry the spread between the tests (predict_new_event). "
+                "It contains what posteriors lack that are too narrow (residual_checks).",
                 *labelled(self.checks.findings),
             ]
         )
 
-    @property
-    def spread(self) -> str:
-        """How much the tests differ in each varying parameter, and what follows for predictions, in one sentence.
-
-        The standard deviation between the tests, with its interval of 90 %, beside the error of a single test (the
-        median of their posterior standard deviations).
-        """
-        found, known = [], False
-        for k, (name, varying) in enumerate(self.posterior.varying.items()):
-            low, middle, high = np.quantile(self.samples[:, 2 * k + 1], [0.05, 0.5, 0.95])
-            errors = []
-            for each in self.posterior.described.values():
-                weights, values = np.exp(each.log_weights), each.points[:, k]
-                errors.append(np.sqrt(weights @ np.square(values - weights @ values) / weights.sum()))
-            error = np.median(errors)
-            unit = {"log": " %", "linear": ""}[varying.scale]
-            factor = 100.0 if varying.scale == "log" else 1.0
-            ends = f"{number(factor * low, 2)} to {number(factor * high, 2)}{unit}"
-            prior = np.std(varying.sd.rvs(2000, random_state=0))
-            by_prior = ", mostly by its prior" if np.std(self.samples[:, 2 * k + 1]) > _MOSTLY_PRIOR * prior else ""
-            if low > error:
-                known = True
-                times = f"{middle / error:.{0 if middle > 9.95 * error else 1}f} times the error of one test"
-                found.append(f"{name} by {number(factor * middle, 2)}{unit} ({ends}{by_prior}), {times}")
-            else:
-                found.append(f"{name} by no more than the error of one test shows ({ends}{by_prior})")
-        what = "must carry" if known else "carry"
-        return (
-            f"The tests differ in {', '.join(found)}: predictions for a further one {what} this spread "
-            "(predict_new_event). Posteriors under white noise are too narrow where residuals are correlated "
-            "(residual_checks); the spread then contains what they lack."
-        )
-
-    def new_test(self, n: int, names: Sequence[str] | None = None, rng: RandomState = None) -> dict[str, np.ndarray]:
+    def new_test(
+        self,
+        n: int,
+        names: Sequence[str] | None = None,
+        rng: RandomState = None,
+        covariates: Mapping[str, float] | None = None,
+    ) -> dict[str, np.ndarray]:
         """Draw the parameters of a further test: the predictive density of the population.
 
         The draws contain the uncertainty of the hyper-parameters and the spread between tests.
@@ -149,6 +123,8 @@ class Hierarchy:
             ones. Others are drawn from their prior, which must be the same in all tests.
         rng : int, numpy.random.Generator, numpy.random.RandomState or None
             As for `Posterior.sample_prior`.
+        covariates : mapping of str to float, optional
+            Conditions of the test, for parameters with `Varying.slopes`. Default: their means over the tests.
 
         Returns
         -------
@@ -158,7 +134,7 @@ class Hierarchy:
         Raises
         ------
         ValueError
-            If a name is unknown, or the priors of a parameter differ between the tests.
+            If a name is unknown, the priors of a parameter differ between the tests, or a covariate is missing.
 
         Warns
         -----
@@ -174,7 +150,7 @@ class Hierarchy:
             raise ValueError(f"new_test: n must be a whole number, 1 or more; got {n!r}")
         generator, posterior = as_generator(rng), self.posterior
         rows = generator.permutation(np.resize(generator.permutation(len(self.samples)), n))
-        center, sd = posterior.population(self.samples[rows])
+        center, sd = posterior.population(self.samples[rows], covariates)
         varying = len(posterior.varying)
         center[:, :varying] += sd * generator.standard_normal((n, varying))
         draws = posterior.scales.from_scale(center)
@@ -190,8 +166,13 @@ class Hierarchy:
             found[name] = self._prior_draws(name, n, generator)
         return found if names is None else {name: found[name] for name in names}
 
-    def median_test(self) -> dict[str, float]:
+    def median_test(self, covariates: Mapping[str, float] | None = None) -> dict[str, float]:
         """Parameters in the middle of the population: medians of the varying parameters, and the common ones.
+
+        Parameters
+        ----------
+        covariates : mapping of str to float, optional
+            As for `new_test`.
 
         Returns
         -------
@@ -199,9 +180,17 @@ class Hierarchy:
             Population centers, averaged over the hyper-samples on the scales of the populations: the geometric mean of
             medians for the scale "log".
         """
-        center, _ = self.posterior.population(self.samples)
+        center, _ = self.posterior.population(self.samples, covariates)
         names = [*self.posterior.varying, *self.posterior.common]
         return dict(zip(names, self.posterior.scales.from_scale(center.mean(axis=0)).tolist(), strict=True))
+
+    def _errors(self) -> np.ndarray:
+        """Median over the tests of the posterior standard deviations (n_varying,), on the scales of the population."""
+        errors = []
+        for each in self.posterior.described.values():
+            weights = np.exp(each.log_weights) / np.exp(each.log_weights).sum()
+            errors.append(np.sqrt(weights @ np.square(each.points - weights @ each.points)))
+        return np.median(errors, axis=0)[: len(self.posterior.varying)]
 
     def _prior_draws(self, name: str, n: int, rng: np.random.Generator) -> np.ndarray:
         """Prior draws of a parameter that belongs to each test alone."""

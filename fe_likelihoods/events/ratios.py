@@ -232,11 +232,6 @@ class EventRatios:
         center, scale = self._center_and_scale(np.log(predicted))
         return np.exp(center + scale * special.stdtrit(self.degrees_of_freedom, probability))
 
-    def draw(self, predicted: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Draw a ratio of a new event for each predicted value (n, ...), which is positive; all are independent."""
-        center, scale = self._center_and_scale(np.log(predicted))
-        return np.exp(center + scale * rng.standard_t(self.degrees_of_freedom, np.shape(predicted)))
-
     def probability_above(self, ratio: np.ndarray, log_predicted: np.ndarray) -> np.ndarray:
         """Probability that the ratio of a new event exceeds `ratio`, at logarithms of predicted values."""
         center, scale = self._center_and_scale(log_predicted)

@@ -59,9 +59,9 @@ def check_hierarchy(posterior: "HierarchicalPosterior", samples: np.ndarray, see
     """Check the stored samples of every test at 100 evenly spaced samples of the hyper-parameters (n, ndim)."""
     rng = np.random.default_rng(seed)
     used = samples[np.linspace(0, len(samples) - 1, min(len(samples), _HYPER_SAMPLES)).astype(int)]
-    center, sd = posterior.population(used)
     found, changes = {}, []
     for name, described in posterior.described.items():
+        center, sd = posterior.population(used, posterior.tests[name].covariates)
         change = np.empty((_RESAMPLINGS, len(used)))
         for row in change:
             row[:] = population_marginal(resampled_description(described, rng), center, sd)

@@ -7,8 +7,8 @@ enumerated. The equations are on the page ``docs/stiffness_loss.rst``.
 """
 
 import itertools
-import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -102,6 +102,7 @@ def stiffness_loss(
     damaged: LogNormal = LogNormal(0.75, 0.25),  # noqa: B008 - frozen
     spread: Distribution | float = HalfNormal(0.02),  # noqa: B008
     common: float = 0.05,
+    slopes: Mapping[str, Distribution] = MappingProxyType({}),
     error: Distribution | float = LogNormal(1.5, 0.7),  # noqa: B008
     most: int = 3,
     n_draws: int = 10_000,
@@ -125,6 +126,9 @@ def stiffness_loss(
         its prior, or a known value.
     common : float
         Prior standard deviation of the logarithm of the factor that all stiffnesses share.
+    slopes : mapping of str to Distribution
+        Prior of the change of this logarithm per unit of a covariate that both calibrations state, such as a
+        temperature: ``StoredPosterior(..., covariates={"temperature": 2.0})`` and a prior of -0.002 to 0 per degree.
     error : Distribution or float
         Factor by which the errors of both calibrations exceed the stated ones: its prior, or a known value. 1 where the
         model is right.
@@ -144,7 +148,7 @@ def stiffness_loss(
     ------
     ValueError
         If a stiffness is unknown, not positive or constant, has a joint prior with other parameters, an argument is out
-        of range, or there are fewer than five effective samples per stiffness.
+        of range, a covariate is missing, or there are fewer than five effective samples per stiffness.
 
     Examples
     --------
@@ -155,34 +159,56 @@ def stiffness_loss(
     >>> found.probability(0.1).round(1)  # of a loss of 10 % or more, in each storey
     array([0.9, 0. ])
     """
-    names = tuple(names)
-    _check(names, presence, damaged, common, most, n_draws)
-    states = [_state(stored, names) for stored in (before, after)]
-    sets, log_prior = _sets(len(names), min(most, len(names)), presence)
+    names, d = tuple(names), len(tuple(names))
+    for good, text in (
+        (d > 1 and len(set(names)) == d, f"the names of two or more different stiffnesses; got {names}"),
+        (0.0 < presence < 1.0, f"presence between 0 and 1; got {presence}"),
+        (isinstance(damaged, LogNormal), f"damaged as a LogNormal distribution of the ratio; got {damaged!r}"),
+        (0.0 < common < np.inf, f"common as a positive standard deviation; got {common}"),
+        (isinstance(most, int) and most >= 1, f"most of at least 1; got {most}"),
+        (isinstance(n_draws, int) and n_draws >= 100, f"n_draws of at least 100; got {n_draws}"),
+        (
+            all(name in state.covariates for name in slopes for state in (before, after)),
+            f"the covariates {', '.join(slopes)} in both calibrations; got {before.covariates} and {after.covariates}",
+        ),
+    ):
+        if not good:
+            raise ValueError(f"stiffness_loss: expected {text}")
+    first, second = states = [_state(stored, names) for stored in (before, after)]
+    warmer = {name: after.covariates[name] - before.covariates[name] for name in slopes}
+    shift = sum(warmer[name] * each.moments[0] for name, each in slopes.items())
+    second = second._replace(peak=second.peak - shift)
+    common = float(np.hypot(common, np.linalg.norm([warmer[name] * each.moments[1] for name, each in slopes.items()])))
+    sets = [np.array([*itertools.combinations(range(d), m)], dtype=int) for m in range(min(most, d) + 1)]
+    damage = np.concatenate([(each[:, :, None] == np.arange(d)).any(axis=1) for each in sets])
+    share = 1.0 - (1.0 - presence) ** (1.0 / d)  # of each stiffness, independent
+    log_prior = damage.sum(axis=1) * np.log(share / (1.0 - share))
+    log_prior += np.log(presence) - np.logaddexp.reduce(log_prior[1:])
+    log_prior[0] = np.log(1.0 - presence)
     nodes = [
-        _Node(factor, scatter, common, damaged, *_change(*states, factor))
+        _Node(*_change(first, second, factor), scatter, common, damaged, factor)
         for factor in _nodes(error, _NODES[1], "error")
         for scatter in _nodes(spread, _NODES[0], "spread")
     ]
-    evidence = np.array([log_prior + _log_evidence(node, sets) for node in nodes])
+    evidence = np.array([log_prior + node.log_evidences(sets) for node in nodes])
     rng = np.random.default_rng(seed)
     cumulative = np.cumsum(np.exp(evidence - evidence.max()))
     chosen = np.searchsorted(cumulative / cumulative[-1], (np.arange(n_draws) + rng.random()) / n_draws)
     of_node, of_set = np.unravel_index(np.minimum(chosen, evidence.size - 1), evidence.shape)
-    damage, block = _masks(sets, of_set, len(names)), 1 + _NUMBERS // (len(names) + 1) ** 2
-    change = np.empty((n_draws, len(names) + 1))
+    damage, change = damage[of_set], np.empty((n_draws, d + 1))
     for k in np.unique(of_node):
         rows = np.flatnonzero(of_node == k)
-        for part in np.array_split(rows, 1 + len(rows) // block):
-            change[part] = _draw(nodes[k], damage[part], rng)
+        for part in np.array_split(rows, 1 + len(rows) * (d + 1) ** 2 // _NUMBERS):
+            change[part] = nodes[k].draw(damage[part], rng)
     findings = [
         each._replace(text=f"In the calibration {when}: {each.text}")
         for when, state in zip(("before", "after"), states, strict=True)
         for each in state.findings
     ]
     count, factors = damage.sum(axis=1), np.array([node.error for node in nodes])[of_node]
-    findings += check_most(count, most, len(names))
-    return StiffnessLoss(names, -np.expm1(change[:, :-1]), np.exp(change[:, -1]), count, factors, tuple(findings))
+    findings += check_most(count, most, d)
+    common_factor = np.exp(change[:, -1] + shift)
+    return StiffnessLoss(names, -np.expm1(change[:, :-1]), common_factor, count, factors, tuple(findings))
 
 
 class _State(NamedTuple):
@@ -231,15 +257,45 @@ def _state(stored: StoredPosterior, names: tuple[str, ...]) -> _State:
 
 
 class _Node(NamedTuple):
-    """Likelihood exp(log_evidence + vector' T - T' matrix T / 2) of the change T (d,), and the parts of the change."""
+    """Likelihood exp(evidence + vector' T - T' matrix T / 2) of the change T (d,), and the parts of the change."""
 
-    error: float
+    matrix: np.ndarray
+    vector: np.ndarray
+    evidence: float
     scatter: float
     common: float
     damaged: LogNormal
-    matrix: np.ndarray
-    vector: np.ndarray
-    log_evidence: float
+    error: float
+
+    def log_evidences(self, sets: list[np.ndarray]) -> np.ndarray:
+        """Of all sets of damaged stiffnesses; scatter and common factor are integrated out."""
+        d, mean, variance = len(self.vector), np.log(self.damaged.median), self.damaged.log_sd**2
+        both = np.eye(d) + self.matrix @ (other := self.scatter**2 * np.eye(d) + self.common**2)
+        vector = np.linalg.solve(both, self.vector)
+        matrix = _symmetric(np.linalg.solve(both, self.matrix))
+        none = self.evidence + 0.5 * self.vector @ other @ vector - 0.5 * np.linalg.slogdet(both)[1]
+        found = []
+        for members in sets:
+            m = members.shape[1]
+            for part in np.array_split(members, 1 + members.size * m // _NUMBERS):
+                precision = matrix[part[:, :, None], part[:, None, :]] + np.eye(m) / variance
+                of_part = vector[part] + mean / variance
+                gain = (of_part * np.linalg.solve(precision, of_part[:, :, None])[:, :, 0]).sum(axis=1)
+                found.append(none + 0.5 * (gain - np.linalg.slogdet(precision)[1]))
+                found[-1] -= 0.5 * m * (np.log(variance) + mean**2 / variance)
+        return np.concatenate(found)
+
+    def draw(self, damage: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Changes (n, d + 1) of the stiffnesses without the common one, and the common one; damage where (n, d)."""
+        n, d = damage.shape
+        parts = np.column_stack([np.eye(d), np.ones(d)])
+        mean = np.column_stack([np.log(self.damaged.median) * damage, np.zeros(n)])
+        own = self.scatter**2 + self.damaged.log_sd**2 * damage
+        weights = 1.0 / np.column_stack([own, np.full(n, self.common**2)])
+        precision = parts.T @ self.matrix @ parts + weights[:, :, None] * np.eye(d + 1)
+        vector = self.vector @ parts + weights * mean
+        noise = np.linalg.cholesky(precision) @ rng.standard_normal((n, d + 1, 1))  # its covariance is the precision
+        return np.linalg.solve(precision, vector[:, :, None] + noise)[:, :, 0]
 
 
 def _change(before: _State, after: _State, factor: float) -> tuple[np.ndarray, np.ndarray, float]:
@@ -271,70 +327,3 @@ def _nodes(value: Distribution | float, n: int, name: str) -> np.ndarray:
             f"stiffness_loss: expected {name} as a positive number, or a distribution of one; got {value!r}"
         )
     return nodes
-
-
-def _sets(d: int, most: int, presence: float) -> tuple[list[np.ndarray], np.ndarray]:
-    """Sets of m stiffnesses (n, m) for each m, and the logarithms (n_sets,) of the prior probabilities of all."""
-    sets = [
-        np.array(list(itertools.combinations(range(d), m)), dtype=int).reshape(math.comb(d, m), m)
-        for m in range(most + 1)
-    ]
-    share = 1.0 - (1.0 - presence) ** (1.0 / d)  # of each stiffness, independent
-    odds = np.repeat(np.arange(most + 1) * np.log(share / (1.0 - share)), [len(each) for each in sets])
-    some = np.log(presence) - np.logaddexp.reduce(odds[1:])
-    return sets, np.concatenate([[np.log(1.0 - presence)], odds[1:] + some])
-
-
-def _masks(sets: list[np.ndarray], numbers: np.ndarray, d: int) -> np.ndarray:
-    """Which stiffnesses (n, d) the sets of these numbers (n,) contain."""
-    first, masks = 0, np.zeros((len(numbers), d), dtype=bool)
-    for members in sets:
-        rows = np.flatnonzero((numbers >= first) & (numbers < first + len(members)))
-        masks[rows[:, None], members[numbers[rows] - first]] = True
-        first += len(members)
-    return masks
-
-
-def _log_evidence(node: _Node, sets: list[np.ndarray]) -> np.ndarray:
-    """Log-evidence (n_sets,) of all sets of damaged stiffnesses; scatter and common factor are integrated out."""
-    d, mean, variance = len(node.vector), np.log(node.damaged.median), node.damaged.log_sd**2
-    both = np.eye(d) + node.matrix @ (other := node.scatter**2 * np.eye(d) + node.common**2)
-    vector = np.linalg.solve(both, node.vector)
-    matrix = _symmetric(np.linalg.solve(both, node.matrix))
-    none = node.log_evidence + 0.5 * node.vector @ other @ vector - 0.5 * np.linalg.slogdet(both)[1]
-    found = []
-    for members in sets:
-        m = members.shape[1]
-        for part in np.array_split(members, 1 + members.size * m // _NUMBERS):
-            precision = matrix[part[:, :, None], part[:, None, :]] + np.eye(m) / variance
-            of_part = vector[part] + mean / variance
-            gain = (of_part * np.linalg.solve(precision, of_part[:, :, None])[:, :, 0]).sum(axis=1)
-            found.append(none + 0.5 * (gain - np.linalg.slogdet(precision)[1]))
-            found[-1] -= 0.5 * m * (np.log(variance) + mean**2 / variance)
-    return np.concatenate(found)
-
-
-def _draw(node: _Node, damage: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Changes (n, d + 1) of the stiffnesses without the common one, and the common one, with damage where (n, d)."""
-    n, d = damage.shape
-    parts = np.column_stack([np.eye(d), np.ones(d)])
-    mean = np.column_stack([np.log(node.damaged.median) * damage, np.zeros(n)])
-    own = node.scatter**2 + node.damaged.log_sd**2 * damage
-    weights = 1.0 / np.column_stack([own, np.full(n, node.common**2)])
-    precision = parts.T @ node.matrix @ parts + weights[:, :, None] * np.eye(d + 1)
-    vector = node.vector @ parts + weights * mean
-    noise = np.linalg.cholesky(precision) @ rng.standard_normal((n, d + 1, 1))  # whose covariance is the precision
-    return np.linalg.solve(precision, vector[:, :, None] + noise)[:, :, 0]
-
-
-def _check(names: tuple[str, ...], presence: float, damaged: LogNormal, common: float, most: int, n: int) -> None:
-    if len(names) < 2 or len(set(names)) != len(names):
-        raise ValueError(f"stiffness_loss: expected the names of two or more different stiffnesses; got {names}")
-    if not 0.0 < presence < 1.0:
-        raise ValueError(f"stiffness_loss: presence must be a probability between 0 and 1; got {presence}")
-    if not isinstance(damaged, LogNormal):
-        raise ValueError(f"stiffness_loss: damaged must be a LogNormal distribution of the ratio; got {damaged!r}")
-    if not 0.0 < common < np.inf:
-        raise ValueError(f"stiffness_loss: common must be a positive standard deviation; got {common}")
-    if not (isinstance(most, int) and most >= 1 and isinstance(n, int) and n >= 100):
-        raise ValueError(f"stiffness_loss: expected most of at least 1 and n_draws of at least 100; got {most}, {n}")

@@ -5,8 +5,8 @@
 the population, the prior density at them, and a mixture of normal distributions fitted to them.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -62,6 +62,9 @@ class StoredPosterior:
         or for weighted samples the effective sample size of the weights.
     findings : sequence of Finding
         What speaks against the samples, which `stiffness_loss` passes on.
+    covariates : mapping of str to float
+        Conditions of the test on which parameters depend, such as ``{"temperature": 12.0}`` [°C] or the logarithm of
+        an amplitude (`Varying.slopes`, `stiffness_loss`).
 
     Raises
     ------
@@ -83,9 +86,10 @@ class StoredPosterior:
     log_evidence_error: float = 0.0
     effective_sample_size: float | None = None
     findings: Sequence[Finding] = ()
+    covariates: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
-    def from_run(cls, sampler: Any, posterior: Any) -> "StoredPosterior":
+    def from_run(cls, sampler: Any, posterior: Any, covariates: Mapping[str, float] | None = None) -> "StoredPosterior":
         """Posterior of a finished run of `samplers.SMCSampler` or `samplers.TMCMCSampler`, with its evidence.
 
         After a run with a guide that has an emulator, the samples are the many draws of the emulated posterior, whose
@@ -96,6 +100,8 @@ class StoredPosterior:
         sampler : SMCSampler or TMCMCSampler
         posterior : Posterior
             The sampled posterior.
+        covariates : mapping of str to float, optional
+            As above.
 
         Returns
         -------
@@ -116,10 +122,17 @@ class StoredPosterior:
             known = (signed.rounds == 0) & (signed.weights > 0.0)
             samples, weights = signed.coords[known], np.log(signed.weights[known])
             size = None
-        return cls(samples, posterior.prior, weights, *evidence, size, findings=findings)
+        return cls(samples, posterior.prior, weights, *evidence, size, findings, covariates or {})
 
     @classmethod
-    def from_search(cls, search: "ModeSearch", posterior: Any, n: int = 5000, seed: int = 0) -> "StoredPosterior":
+    def from_search(
+        cls,
+        search: "ModeSearch",
+        posterior: Any,
+        n: int = 5000,
+        seed: int = 0,
+        covariates: Mapping[str, float] | None = None,
+    ) -> "StoredPosterior":
         """Draws of the Laplace approximation at the highest mode of a search: few simulations, and no check of it.
 
         Variances along a curved ridge are too small, and nothing in the search shows it (``docs/stiffness_loss.rst``).
@@ -132,6 +145,8 @@ class StoredPosterior:
             The posterior that was searched.
         n, seed : int
             Number of draws, and their seed.
+        covariates : mapping of str to float, optional
+            As above.
 
         Returns
         -------
@@ -146,7 +161,8 @@ class StoredPosterior:
             raise ValueError("the search found no mode: use more starts, or a larger limit of simulations")
         mode = search.modes[0]
         coords = np.random.default_rng(seed).multivariate_normal(mode.coords, mode.covariance, n, method="cholesky")
-        return cls(posterior.prior.from_normal(coords), posterior.prior, findings=check_laplace(search))
+        samples, findings = posterior.prior.from_normal(coords), check_laplace(search)
+        return cls(samples, posterior.prior, findings=findings, covariates=covariates or {})
 
     def __post_init__(self) -> None:
         if not isinstance(self.prior, Prior):
@@ -187,6 +203,7 @@ class StoredPosterior:
             ("log_weights", weights),
             ("effective_sample_size", float(effective)),
             ("findings", tuple(self.findings)),
+            ("covariates", {name: float(each) for name, each in self.covariates.items()}),
         ):
             object.__setattr__(self, name, value)
 

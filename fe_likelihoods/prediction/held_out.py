@@ -66,7 +66,9 @@ class HeldOutScores(NamedResults):
 
 
 class LeftOutTests(dict[str, Hierarchy]):
-    """The population without each test, by its name."""
+    """The population without each test, by its name; `covariates` are those of the test that is left out."""
+
+    covariates: dict[str, Mapping[str, float]]
 
     def scores(
         self,
@@ -104,6 +106,7 @@ class LeftOutTests(dict[str, Hierarchy]):
         found = HeldOutScores()
         for (name, each), own_seed in zip(self.items(), np.random.SeedSequence(seed).spawn(len(self)), strict=True):
             given = {"model": posteriors[name], "quantity": quantity, "seed": int(own_seed.generate_state(1)[0])}
+            given["covariates"] = self.covariates.get(name)
             prediction = predict_new_event(each, posteriors, None, **given, **options)
             scores = prediction.score(posteriors[name].likelihood.measurements)
             found[name] = HeldOutScore(scores, prediction)
@@ -145,6 +148,7 @@ def leave_one_out(hierarchy: Hierarchy, *, seed: int = 0) -> LeftOutTests:
     if len(tests := hierarchy.posterior.tests) < 2:
         raise ValueError(f"leave_one_out needs two tests or more; got {', '.join(map(repr, tests))}")
     rng, found = np.random.default_rng(seed), LeftOutTests()
+    found.covariates = {name: each.covariates for name, each in tests.items()}
     for name in tests:
         rest = hierarchy.posterior.without(name)
         samples = _sample(rest, int(rng.integers(2**31)))

@@ -98,13 +98,14 @@ def event_ratios(
         raise ValueError(f"the posteriors of {', '.join(map(repr, missing))} are missing")
     at, found = hierarchy.median_test() if of_population else dict(hierarchy), []
     for name in names:
+        own = hierarchy.median_test(hierarchy.posterior.tests[name].covariates) if of_population else at
         source = read_source(posteriors[name])
         if source.likelihood is None:
             raise ValueError(
                 f"event {name!r} needs a posterior or a likelihood with measurements; got {source.model!r}"
             )
         try:
-            found.append(_event(source.likelihood, at, quantity, spread))
+            found.append(_event(source.likelihood, own, quantity, spread))
         except ValueError as error:
             raise ValueError(f"event {name!r}: {error}") from None
     values, levels, of_parameters, of_remainder = (np.array(each) for each in zip(*found, strict=True))
@@ -122,6 +123,7 @@ def predict_new_event(
     quantity: Quantity | Mapping[str, Quantity] = None,
     spread: Mapping[str, float] | None = None,
     prior_events: float = PRIOR_EVENTS,
+    covariates: Mapping[str, float] | None = None,
     noise: bool | str = False,
     n: int = 500,
     seed: int | None = None,
@@ -147,6 +149,9 @@ def predict_new_event(
     spread, prior_events
         Of the ratio of measured values to the values at the median parameters, see `event_ratios`. The printed
         prediction says how much of the width is due to the scatter that is expected before the events.
+    covariates : mapping of str to float, optional
+        Conditions of the new event for a population with `Varying.slopes`, such as ``{"temperature": -5.0}``. Default:
+        their means over the events. Beyond those of the events, intervals grow with the uncertainty of the slopes.
     noise : bool or str
         Whether histories are predicted with noise, as for `propagate`. The noise parameters must be varying, common, or
         have the same prior in all events. Shares of the response (`GaussianNoise`)
@@ -201,7 +206,8 @@ def predict_new_event(
             f"predict_new_event: expected the posteriors of the events by name, {{name: posterior}}; got {posteriors!r}"
         )
     if isinstance(quantity, Mapping):
-        given = {"model": model, "spread": spread, "prior_events": prior_events, "n": n, "seed": seed}
+        given = {"model": model, "spread": spread, "prior_events": prior_events, "covariates": covariates}
+        given |= {"n": n, "seed": seed}
         return {
             name: predict_new_event(
                 hierarchy, posteriors, record, quantity=each, noise=noise and not _is_number(each), **given, **options
@@ -219,6 +225,12 @@ def predict_new_event(
         if noise:
             raise ValueError("predict_new_event: numbers contain the errors of measurements already; noise=False")
         ratios = event_ratios(hierarchy, posteriors, quantity, spread=spread, prior_events=prior_events)
+        if covariates is not None:
+            wider = dict(ratios.spread)
+            for name, sd in hierarchy.posterior.slope_spread(hierarchy.samples, covariates).items():
+                kind = next((each for each in wider if name.startswith(each)), name)
+                wider[kind] = float(np.hypot(wider.get(kind, 0.0), sd))
+            ratios = replace(ratios, at=hierarchy.median_test(covariates), spread=wider)
         probabilities = settings.pop("quantiles", (0.05, 0.5, 0.95))
         prediction, values, ratios = _under_motion(predictor, ratios, record, quantity, **settings)
         if 0 in prediction.collapsed:  # as it would in every draw
@@ -246,7 +258,7 @@ def predict_new_event(
             raise ValueError("predict_new_event: noise=True needs a posterior; got a model")
         names += source.noise.parameter_names
     parameters, errors = np.random.SeedSequence(seed).spawn(2)
-    draws = hierarchy.new_test(n, names, np.random.default_rng(parameters))
+    draws = hierarchy.new_test(n, names, np.random.default_rng(parameters), covariates)
     if noise:
         draws = _possible(draws, source.noise)
     own_seed = int(errors.generate_state(1)[0])

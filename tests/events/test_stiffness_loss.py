@@ -311,9 +311,9 @@ def test_joint_priors_of_the_stiffnesses():
     [
         ({"names": ["k_1"]}, "two or more"),
         ({"names": ["k_1", "none"]}, "no parameters none"),
-        ({"presence": 1.0}, "presence must be"),
-        ({"damaged": HalfNormal(1.0)}, "must be a LogNormal"),
-        ({"common": 0.0}, "common must be"),
+        ({"presence": 1.0}, "presence between"),
+        ({"damaged": HalfNormal(1.0)}, "damaged as a LogNormal"),
+        ({"common": 0.0}, "common as a positive"),
         ({"most": 0}, "most of at least 1"),
         ({"spread": -1.0}, "spread as a positive number"),
         ({"error": 0.0}, "error as a positive number"),
