@@ -1,46 +1,13 @@
-"""Repeated simulations, and how much two simulations with the same parameters may differ."""
+"""How much two simulations with the same parameters may differ."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
-from ..noise.statistics import Statistic, needs_response
-from ..signals.comparison import Comparison
-from ..simulation.files import Opened, observing
-from ..simulation.label import ModelLabel
-from ..simulation.model import Model, misfit_of_responses, most_responses, simulate_batch
-
-__all__ = [
-    "Simulated",
-    "VerifyingRun",
-    "difference_in_words",
-    "largest_difference",
-    "observed",
-    "simulate_again",
-]
+__all__ = ["Simulated", "difference_in_words", "largest_difference"]
 
 ROUNDING = 1e-13  # relative error of a sum of squares, since processors add the terms in different orders
-
-
-@dataclass(eq=False)
-class VerifyingRun:
-    """What the simulations of one request need; the model has one `fingerprint` for all of them."""
-
-    model: Model
-    pool: Any  # where the simulations of the likelihood run
-    measured: np.ndarray | Comparison  # response (n_channels, n_steps) [SI]
-    statistic: Statistic | None  # that is stored; None: sums of squares
-    n_numbers: int  # length of the statistic
-    tolerance: float  # as for `SimulationCache`
-
-    @cached_property
-    def fingerprint(self) -> str:
-        """Declared identity of the model, when it was first asked for."""
-        return self.model.fingerprint
 
 
 class Simulated(NamedTuple):
@@ -51,47 +18,20 @@ class Simulated(NamedTuple):
     norm: np.ndarray  # (n_channels,) of the response [SI]
 
 
-# new simulations ------------------------------------------------------------------------------------------------------
+def difference_in_words(
+    earlier: np.ndarray, reason: str, new: Simulated, names: Sequence[str], tolerance: float, of_response: bool
+) -> tuple[str, float]:
+    """How a simulation differs from an earlier one, in words and relative to the response norm; empty if it agrees.
 
-
-@contextmanager
-def observed(label: ModelLabel, pool: Any) -> Iterator[None]:
-    """Add what the simulations in a ``with`` block open to the label, if it observes simulations."""
-    if not label.observes:
-        yield
-        return
-    with observing() as observer:
-        yield
-    label.add(observer.result(label.opened) if pool is None else Opened(observer.noted))
-
-
-def simulate_again(run: VerifyingRun, thetas: np.ndarray, label: ModelLabel) -> list[Simulated]:
-    """New simulations; what they open is added to the model's label."""
-    rows = []
-    size = most_responses(run.model)
-    for start in range(0, len(thetas), size):
-        with observed(label, run.pool):
-            batch = simulate_batch(run.model, thetas[start : start + size], run.pool)
-        misfit, reasons = misfit_of_responses(run.model, batch, run.measured, run.statistic)
-        with np.errstate(over="ignore", invalid="ignore"):
-            norms = np.linalg.norm(batch.response, axis=2)
-        rows += map(Simulated, misfit, reasons, norms)
-    return rows
-
-
-# differences ----------------------------------------------------------------------------------------------------------
-
-
-def difference_in_words(earlier: np.ndarray, reason: str, new: Simulated, run: VerifyingRun) -> tuple[str, float]:
-    """How a simulation differs from an earlier one, in words and relative to the response norm; empty if it agrees."""
+    `names` are those of the channels, the other arguments as for `largest_difference`.
+    """
     if reason or new.reason:
         was, now = (f"failed ({text})" if text else "succeeded" for text in (reason, new.reason))
         return ("" if reason and new.reason else f"it {was}; simulated again, it {now}"), 0.0
-    found = largest_difference(earlier, new.misfit, new.norm, run.tolerance, needs_response(run.statistic))
+    found = largest_difference(earlier, new.misfit, new.norm, tolerance, of_response)
     if found is None:
         return "", 0.0
     index, change = found
-    names = [channel.name for channel in run.model.channels]
     what = "sum of squared residuals" if index < len(names) else f"statistic {index}"
     values = f"stored {earlier[index]:.17g}, simulated again {new.misfit[index]:.17g}"
     return f"channel {names[index % len(names)]!r}, {what}: {values}", change

@@ -1,4 +1,4 @@
-"""Caches of recent statistics and responses in memory.
+"""Outcomes of simulations in memory: statistics, and responses.
 
 Residual statistics do not depend on the noise parameters. They are reused when only noise parameters change, when a
 sampler returns to a point, and when a chain is evaluated again. Responses depend neither on the noise nor on the
@@ -7,7 +7,7 @@ measurements. They are reused when a mode search is repeated, and by other likel
 
 import threading
 from collections import OrderedDict
-from collections.abc import Iterable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -31,7 +31,7 @@ def thetas_of(keys: Sequence[bytes], n_structural: int) -> np.ndarray:
 
 
 class _Memory:
-    """Outcomes by key, the oldest first, of at most `most` in size. Threads may share it.
+    """Outcomes by key, the least recently used first, of at most `most` in size. Threads may share it.
 
     An outcome is a value, or a text: the reason of a failure. It is empty after unpickling, because its contents would
     dominate the size of the pickle. ValueError if `most` is not a whole number of 0 or more.
@@ -53,16 +53,11 @@ class _Memory:
 
     def clear(self) -> None:
         """Drop all outcomes."""
-        self._outcomes: OrderedDict[Any, Any] = OrderedDict()
+        self._outcomes: OrderedDict[Hashable, Any] = OrderedDict()
+        self._bytes = 0  # of responses
 
-
-class MemoryCache(_Memory):
-    """Least-recently-used cache of statistics of at most `most` simulations, by the bytes of structural parameters."""
-
-    _what = "memory_rows must be the number of simulations to cache in memory"
-
-    def look_up(self, keys: Sequence[bytes], width: int) -> tuple[np.ndarray, list[bool]]:
-        """Cached statistics (n, width) of n distinct keys, NaN if failed or not cached, and whether each is cached."""
+    def outcomes(self, keys: Iterable[Hashable]) -> list[Any]:
+        """Outcomes of keys; None where nothing is stored."""
         found = []
         with self._lock:
             for key in keys:
@@ -70,7 +65,17 @@ class MemoryCache(_Memory):
                 if outcome is not None:
                     self._outcomes.move_to_end(key)
                 found.append(outcome)
-        unknown = _NAN * width
+        return found
+
+
+class MemoryCache(_Memory):
+    """Statistics of at most `most` simulations, by the bytes of structural parameters."""
+
+    _what = "memory_rows must be the number of simulations to cache in memory"
+
+    def look_up(self, keys: Sequence[bytes], width: int) -> tuple[np.ndarray, list[bool]]:
+        """Cached statistics (n, width) of n distinct keys, NaN if failed or not cached, and whether each is cached."""
+        found, unknown = self.outcomes(keys), _NAN * width
         # a bytearray makes a writable array
         filled = bytearray().join([each if isinstance(each, bytes) else unknown for each in found])
         return np.frombuffer(filled, dtype=float).reshape(len(keys), width), [each is not None for each in found]
@@ -91,45 +96,26 @@ class MemoryCache(_Memory):
 
     def reason(self, key: bytes) -> str:
         """Reason of a cached failure; empty for others."""
-        outcome = self._outcomes.get(key)
+        (outcome,) = self.outcomes([key])
         return outcome if isinstance(outcome, str) else ""
 
 
 class ResponseMemory(_Memory):
-    """The most recently stored responses in double precision, and reasons of failures, in at most `most` bytes.
+    """Responses (n_channels, n_steps) [SI], not to be changed, in at most `most` bytes, by fingerprint and parameters.
 
-    Likelihoods with the same model or shortened versions of it share one. The oldest are dropped.
+    Likelihoods with the same model or shortened versions of it share one.
     """
 
     _what = "memory_bytes must be the size of the responses to keep in memory [bytes]"
 
-    def look_up(self, fingerprint: str, keys: Sequence[bytes]) -> list[np.ndarray | str | None]:
-        """Stored outcomes for a model's fingerprint and keys from `distinct_keys`; None where nothing is stored.
-
-        An outcome is the response (n_channels, n_steps) [SI], not to be changed, or the reason of a failure.
-        """
-        with self._lock:
-            return [self._outcomes.get((fingerprint, key)) for key in keys]
-
-    def responses(self, fingerprint: str) -> dict[bytes, np.ndarray]:
-        """Responses of a model's simulations that did not fail, by their keys, the oldest first; not to be changed."""
-        with self._lock:
-            found = {key: outcome for (model, key), outcome in self._outcomes.items() if model == fingerprint}
-        return {key: outcome for key, outcome in found.items() if not isinstance(outcome, str)}
-
-    def store(self, fingerprint: str, keys: Sequence[bytes], outcomes: Iterable[np.ndarray | str]) -> None:
-        """Store copies of responses, and reasons of failures; drops the oldest outcomes beyond the limit."""
+    def store(self, keys: Sequence[Hashable], outcomes: Iterable[np.ndarray | str]) -> None:
+        """Store copies of responses, and reasons of failures."""
         with self._lock:
             for key, outcome in zip(keys, outcomes, strict=True) if self.most else ():
-                self._bytes += _size(outcome) - _size(self._outcomes.pop((fingerprint, key), None))
-                self._outcomes[fingerprint, key] = outcome if isinstance(outcome, str) else np.array(outcome)
+                self._bytes += _size(outcome) - _size(self._outcomes.pop(key, None))
+                self._outcomes[key] = outcome if isinstance(outcome, str) else np.array(outcome)
                 while self._bytes > self.most:
                     self._bytes -= _size(self._outcomes.popitem(last=False)[1])
-
-    def clear(self) -> None:
-        """Drop all outcomes."""
-        super().clear()
-        self._bytes = 0
 
 
 def _size(outcome: np.ndarray | str | None) -> int:

@@ -12,6 +12,7 @@ aside, and while the file cannot be written, rows wait in memory.
 
 import logging
 import os
+import secrets
 import sqlite3
 from collections.abc import Collection, Sequence
 from pathlib import Path
@@ -138,6 +139,7 @@ class SimulationCache:
     def _begin(self, file: CacheFile) -> None:
         self.file = file
         self.damaged = 0
+        self.name = secrets.token_hex(8)  # of this object
         self._waiting: list[Row] = []
         self._remark = ""  # that was stored last
 

@@ -1,8 +1,9 @@
-"""Which stored simulations are those of a model: some are run again and compared before the others are used.
+"""A model with simulations in a cache: whether it is still the same, and which stored simulations are its own.
 
 Code and files cannot prove that the model with a declared identity still computes the same results. The model's label
-(`fe_likelihoods.simulation.label`) decides how many rows are compared; numbers and powers: ``docs/parallel.rst``. Rows
-belong to a generation, the simulations of one state of a model; the file says to which generation a label belongs.
+(`fe_likelihoods.simulation.label`) decides how many stored rows are simulated again before others are used; numbers and
+powers: ``docs/parallel.rst``. Rows belong to a generation, the simulations of one state of a model; the file says to
+which generation a label belongs.
 
 * The label is known: the row stored last and a random one before the first row is used in a process, and a random one
   of every 100 rows used. A difference is an error, `StaleCache`.
@@ -11,6 +12,11 @@ belong to a generation, the simulations of one state of a model; the file says t
   begins: the earlier rows stay in the file and are not used.
 
 Failures are compared only if there is no successful simulation, since a changed model often fails at the same points.
+
+Results from two states of a model must not be mixed either, as when a value is set between two batches. So fingerprint,
+code, values and opened files are compared after simulations, in about 1 % of the time. User code may change values
+itself, such as a counter: the first and the latest simulation are repeated then, and the model counts as unchanged if
+the results are the same.
 """
 
 import json
@@ -20,18 +26,22 @@ import secrets
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from hashlib import blake2b
 from itertools import islice
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..simulation.faults import TransientReason
-from ..simulation.files import Opened
+from ..noise.statistics import Statistic, needs_response, statistic_width
+from ..signals.comparison import Comparison
+from ..simulation.by_value import is_arriving
+from ..simulation.faults import ChangedModel, TransientReason
+from ..simulation.files import Opened, observing
 from ..simulation.label import ModelLabel
-from ..simulation.model import SimulationBatch, misfit_of_responses
-from .comparison import Simulated, VerifyingRun, difference_in_words, simulate_again
+from ..simulation.model import Model, SimulationBatch, misfit_of_responses, most_responses, simulate_batch
+from .comparison import Simulated, difference_in_words
 from .rows import (
     LABEL_COLUMNS,
     STORE_LABEL,
@@ -43,9 +53,9 @@ from .rows import (
     reason_of,
     source_number,
 )
-from .simulation_cache import SimulationCache
+from .simulation_cache import TOLERANCE, SimulationCache
 
-__all__ = ["ROWS", "StaleCache", "Trust", "VerifiedCache", "choose_rows"]
+__all__ = ["ROWS", "StaleCache", "Trust", "VerifiedModel", "choose_rows"]
 
 logger = logging.getLogger(__name__)
 
@@ -56,6 +66,11 @@ FIRST_COMPARED = 3  # rows in the first batch of a comparison; each further batc
 MAX_ATTEMPTS = 4  # simulations that may fail for other reasons than the model
 LARGEST_ROUNDING = 1e-4  # largest relative response difference that may come from rounding and iterations
 MAX_TRUSTS = 32
+SHARE_OF_TIME = 0.01  # for comparisons of the model
+NO_TIME = 5e-5  # [s]; a comparison that takes less is always made, since storing a row takes longer
+ROWS_PER_REPETITION = 100  # simulations between two repetitions if only items have changed that simulations change
+FINGERPRINT = "its fingerprint"
+OF_A_PROCESS = ("environment ", "library", "package ", "python")  # label items that may differ between processes
 DIFFER = "stored simulations of this %s differ from new ones; they stay in the file and are not used"
 CHANGED = (
     "Something has changed that neither its declared identity nor its label contains, or the model does not repeat its "
@@ -83,10 +98,10 @@ class StaleCache(ValueError):
 
 
 class Trust:
-    """The label of a model, and which rows of a file this process trusts; a likelihood and its copies share one `key`.
+    """The label of a model, and which rows of a file this process trusts; likelihoods with one `key` share it.
 
     `generations` and `written` labels are by the source number of the model; `left` has the rows that may be used until
-    the next verification, by fingerprint and whether any row is a success; `used` counts rows. Rows with the number of
+    the next verification, by identity and whether any row is a success; `used` counts rows. Rows with the number of
     the `session` were stored here and need no verification. `stale` is the error of a row that differed; `is_blocked`
     says that rows could not be compared, since no simulation ended.
     """
@@ -144,51 +159,200 @@ class _Comparison(NamedTuple):
     new: Simulated | None = None
 
 
-class VerifiedCache:
-    """A `SimulationCache` whose rows are verified before they are used.
+class VerifiedModel:
+    """A model compared with measurements, whose simulations may be stored in a `SimulationCache`.
 
-    The `label` is that of the model when the likelihood was made. Counted are rows that were `compared`, `unverified`
-    ones whose new simulation was stopped (not by the model), and the wall time, `seconds`. Derived likelihoods and
-    copies verify rows once in a process; another process verifies them again.
+    `measured` are values (n_channels, n_steps) or a `Comparison`, `_key` is the identity of stored statistics. `label`
+    is that of the model when it was first simulated, with the statistic's code. Derived likelihoods and copies share
+    its `Trust`, and so do likelihoods of one cache object whose models run no user code. `verifications` counts
+    simulations that were made again, `unverified` rows whose new simulation was stopped (not by the model), `seconds`
+    is the wall time of simulations [s]; `has_results` says whether results are known in this process. Methods take the
+    model's `fingerprint`, which is one for a request.
     """
 
-    def __init__(self, cache: SimulationCache, label: ModelLabel) -> None:
-        self._set_up(cache, Trust.of(label, secrets.token_hex(16)))
+    _key: str
 
-    def _set_up(self, cache: SimulationCache, trust: Trust) -> None:
-        self.cache, self._trust = cache, trust
-        self.compared, self.unverified, self.seconds = 0, 0, 0.0
+    def __init__(
+        self,
+        model: Model,
+        measured: np.ndarray | Comparison,
+        statistic: Statistic | None,
+        pool: Any,
+        cache: SimulationCache | str | os.PathLike | None,
+    ) -> None:
+        self.model, self.measured, self.statistic, self.pool = model, measured, statistic, pool
+        self.n_numbers = statistic_width(measured, statistic)
+        self.cache = cache if cache is None or isinstance(cache, SimulationCache) else SimulationCache(cache)
+        self.verifications = self.unverified = 0
+        self.seconds = 0.0
+        self._label_model()
+
+    def _label_model(self) -> None:
+        label, key = ModelLabel(self.model, self.statistic), secrets.token_hex(16)
+        if self.cache is not None and not label.observes:  # user code may depend on what no label contains
+            key = f"{self.cache.name} {label.code}"
+        self._trust = Trust.of(label, key)
+        self._known: dict[str, str | None] = label.items | {FINGERPRINT: self.model.fingerprint}
+        self._begin()
+
+    def _begin(self) -> None:
+        self.has_results = self._was_sent = False  # from another process, by a pool whose workers import the code
+        self._points: list[tuple[np.ndarray, np.ndarray]] = []  # first and latest success: parameters, statistics
+        self._unchecked: list[np.ndarray] = []  # parameters (n, n_structural) simulated since the last comparison
+        self._not_before = 0.0  # time of the next comparison [s]
         self._random = np.random.default_rng()  # separate, so that the user's random numbers do not change
 
-    def __getstate__(self) -> tuple:
-        return self.cache, self._trust
+    def __getstate__(self) -> dict:
+        return self.__dict__ | {
+            "pool": None,
+            "_was_sent": os.getpid(),
+            "_points": [],
+            "_unchecked": [],
+            "_random": None,
+        }
 
-    def __setstate__(self, state: tuple) -> None:
-        self._set_up(*state)
+    def __setstate__(self, state: dict) -> None:
+        vars(self).update(state)
+        self._begin()
+        self._was_sent = state["_was_sent"] != os.getpid() and not is_arriving()  # by value
 
     @property
     def label(self) -> ModelLabel:
         """Label of the model."""
         return self._trust.label
 
-    def share_trust(self, other: "VerifiedCache") -> None:
+    def share_trust(self, other: "VerifiedModel") -> None:
         """Trust rows that another object has verified or stored, if its model has the same code."""
-        if other.label.code == self.label.code:
+        if self.cache is not None and other.cache is not None and other.label.code == self.label.code:
             self._trust = other._trust
 
-    # storing ----------------------------------------------------------------------------------------------------------
+    # new simulations ----------------------------------------------------------------------------------------------
 
-    def store(
+    @contextmanager
+    def _observed(self) -> Iterator[None]:
+        """Add what the simulations in a ``with`` block open to the label, if it observes simulations."""
+        if not self.label.observes:
+            yield
+            return
+        with observing() as observer:
+            yield
+        self.label.add(observer.result(self.label.opened) if self.pool is None else Opened(observer.noted))
+
+    def _simulate_again(self, thetas: np.ndarray) -> list[Simulated]:
+        start, rows, size = time.perf_counter(), [], most_responses(self.model)
+        for first in range(0, len(thetas), size):
+            with self._observed():
+                batch = simulate_batch(self.model, thetas[first : first + size], self.pool)
+            misfit, reasons = misfit_of_responses(self.model, batch, self.measured, self.statistic)
+            with np.errstate(over="ignore", invalid="ignore"):
+                norms = np.linalg.norm(batch.response, axis=2)
+            rows += map(Simulated, misfit, reasons, norms)
+        self.seconds += time.perf_counter() - start
+        self.verifications += len(thetas)
+        return rows
+
+    def _difference(self, earlier: np.ndarray, reason: str, new: Simulated) -> tuple[str, float]:
+        """How a simulation differs from an earlier one, see `difference_in_words`."""
+        names = [channel.name for channel in self.model.channels]
+        tolerance = TOLERANCE if self.cache is None else self.cache.tolerance
+        return difference_in_words(earlier, reason, new, names, tolerance, needs_response(self.statistic))
+
+    # changes of the model -----------------------------------------------------------------------------------------
+
+    def _check_before(self) -> None:
+        """Label the model as it is now, if nothing was simulated or used yet.
+
+        Raises `ChangedModel` if this object was pickled in another process, where the code has other values.
+        """
+        if self._points or self.has_results:
+            return
+        changed = self._changes() - self.label.changing
+        found = sorted(name for name in changed if not name.startswith(OF_A_PROCESS))
+        if self._was_sent and found:
+            raise ChangedModel(
+                f"the {type(self.model).__name__} in this process is not the one that was sent ({', '.join(found[:3])} "
+                "differ): a module that is imported here has other contents or values than where the likelihood was "
+                "made. Give the pool to the likelihood, FELikelihood(..., pool=...), which sends code and values, or "
+                "make a new likelihood"
+            )
+        if changed:
+            self._label_model()
+
+    def _check_after(
         self,
-        fingerprint: str,
+        thetas: np.ndarray,
+        misfit: np.ndarray,
+        reasons: list[str],
+        earlier: Callable[[], list[tuple[np.ndarray, np.ndarray]]],
+    ) -> None:
+        """Compare the model after simulations, unless the last comparison was too recent.
+
+        `earlier` returns parameters and statistics of a known simulation, to repeat if none was seen here. Raises
+        `ChangedModel`; the simulations at `_unchecked` may be from before or after the change.
+        """
+        self._unchecked.append(thetas)
+        succeeded = [row for row, reason in enumerate(reasons) if not reason]
+        points = [(thetas[row].copy(), misfit[row].copy()) for row in succeeded[:1] + succeeded[-1:]]
+        known = self._points or earlier()
+        self._points = (known or points)[:1] + points[-1:]
+        if self._points and (start := time.monotonic()) >= self._not_before:
+            self._require_same(is_first=not known and self.pool is None)
+            now = time.monotonic()
+            self._not_before = now + max(0.0, now - start - NO_TIME) / SHARE_OF_TIME
+
+    def _changes(self) -> set[str]:
+        """Names of what has changed; a file counts from when a simulation opened it."""
+        known = self.label.opened.items() | self._known
+        now = self.label.present(self.model) | {FINGERPRINT: self.model.fingerprint}
+        return {name for name in known.keys() | now.keys() if known.get(name) != now.get(name)}
+
+    def _require_same(self, is_first: bool) -> None:
+        """Raise `ChangedModel` if the model has changed, except for values that it changes itself, as the first may."""
+        if changed := self._changes():
+            if changed <= self.label.changing and sum(map(len, self._unchecked)) < ROWS_PER_REPETITION:
+                return
+            is_other = FINGERPRINT in changed
+            if is_other or not (is_first or self._repeats()):
+                why = f"different: {', '.join(sorted(changed)[:3])}"
+                why += "" if is_other else ", and an earlier simulation gives another result"
+                raise ChangedModel(
+                    f"the {type(self.model).__name__} has changed since the likelihood was made ({why}): "
+                    "a value or file that it uses was changed, or another model was set. Its simulations cannot be "
+                    "stored with the earlier ones. Make a new model and a new likelihood; what varies during a run has "
+                    "to be a parameter"
+                )
+            self.label.has_changed_itself(changed)
+            now = self.label.present(self.model)
+            # the same objects where nothing has changed, so that pickles stay small
+            self._known |= {name: now.get(name) for name in changed}
+        self._unchecked.clear()
+
+    def _repeats(self) -> bool:
+        """Whether the repeated simulations give the earlier results, or the model is not repeatable."""
+        thetas, earlier = np.array([theta for theta, _ in self._points]), [misfit for _, misfit in self._points]
+        for is_original in (True, False):
+            new = self._simulate_again(thetas)
+            differ = any(
+                not isinstance(each.reason, TransientReason) and self._difference(before, "", each)[0]
+                for before, each in zip(earlier, new, strict=True)
+            )
+            if not differ:
+                return is_original
+            earlier = [each.misfit for each in new]
+        return True
+
+    # stored rows --------------------------------------------------------------------------------------------------
+
+    def _store(
+        self,
         thetas: np.ndarray,
         misfit: np.ndarray | None,
         reasons: list[str],
         responses: np.ndarray | None,
-        run: VerifyingRun,
+        fingerprint: str,
     ) -> None:
         """Store simulations under the model's label: statistics and responses, if given, and failures of the model."""
-        trust, source = self._trust, source_number(run.fingerprint)
+        trust, source = self._trust, source_number(fingerprint)
         with trust.lock:
             is_blocked = trust.is_blocked
             trust.is_blocked = is_blocked and all(isinstance(reason, TransientReason) for reason in reasons)
@@ -198,81 +362,78 @@ class VerifiedCache:
             generation = self._use(source, generation or self._new_generation([]))
         rows = []
         if misfit is not None:
-            rows += pack_rows(fingerprint, thetas, misfit, reasons, generation, trust.session)
+            rows += pack_rows(self._key, thetas, misfit, reasons, generation, trust.session)
         if responses is not None or any(reasons):
             finite = np.zeros(len(thetas), bool) if responses is None else np.isfinite(responses).all(axis=(1, 2))
             values = np.zeros((len(thetas), 0)) if responses is None else responses
             chosen = [row for row, reason in enumerate(reasons) if reason or finite[row]]
             why = ["" if finite[row] else reasons[row] for row in chosen]
-            rows += pack_rows(run.fingerprint, thetas[chosen], values[chosen], why, generation, trust.session, True)
+            rows += pack_rows(fingerprint, thetas[chosen], values[chosen], why, generation, trust.session, True)
         self.cache.write(rows)
 
-    def discard(self, thetas: np.ndarray, *fingerprints: str) -> None:
-        """Delete rows that were stored here."""
-        for generation in set(self._trust.generations.values()):
-            self.cache.discard(thetas, *fingerprints, generation=generation)
+    def _discard_unchecked(self, fingerprint: str) -> None:
+        """Delete rows that were stored here since the last comparison of the model."""
+        if self.cache is not None and self._unchecked:
+            thetas = np.concatenate(self._unchecked)
+            for generation in set(self._trust.generations.values()):
+                self.cache.discard(thetas, self._key, fingerprint, generation=generation)
 
-    # look-ups ---------------------------------------------------------------------------------------------------------
-
-    def look_up(self, fingerprint: str, thetas: np.ndarray, run: VerifyingRun) -> CachedRows:
+    def _stored_statistics(self, thetas: np.ndarray, fingerprint: str) -> CachedRows:
         """Statistics that are stored, some verified; `StaleCache` if one differs although the label is known."""
-        return self._look_up(fingerprint, thetas, run, run.n_numbers)
+        return self._look_up_rows(self._key, thetas, fingerprint, self.n_numbers)
 
-    def look_up_responses(self, thetas: np.ndarray, run: VerifyingRun) -> list[np.ndarray | str | None]:
+    def _stored_responses(self, thetas: np.ndarray, fingerprint: str) -> list[np.ndarray | str | None]:
         """Responses (n_channels, n_steps) [SI], or reasons of failures for any measurements; None if not stored.
 
-        Some are verified by their statistics, as in `look_up`.
+        Some are verified by their statistics, as in `_stored_statistics`.
         """
-        shape = len(run.model.channels), run.model.n_steps
-        rows = self._look_up(run.fingerprint, thetas, run, shape[0] * shape[1]).rows
+        shape = len(self.model.channels), self.model.n_steps
+        rows = self._look_up_rows(fingerprint, thetas, fingerprint, shape[0] * shape[1]).rows
         return [
             row and (reason_of(row) if row.reason else np.frombuffer(row.value, dtype="<f8").reshape(shape))
             for row in rows
         ]
 
-    def _look_up(self, fingerprint: str, thetas: np.ndarray, run: VerifyingRun, width: int) -> CachedRows:
-        trust, source = self._trust, source_number(run.fingerprint)
+    def _look_up_rows(self, identity: str, thetas: np.ndarray, fingerprint: str, width: int) -> CachedRows:
+        trust, source = self._trust, source_number(fingerprint)
         while True:
             with trust.lock:
-                generation = trust.generations.get(source) or self._find(source, fingerprint, run, width)
+                generation = trust.generations.get(source) or self._find_generation(source, identity, width)
             if generation is None:
                 return CachedRows([None] * len(thetas), width)
-            rows = self.cache.look_up(fingerprint, thetas, width, generation)
-            if not self.cache.verify or self._verify(fingerprint, rows.rows, generation, run, width):
+            rows = self.cache.look_up(identity, thetas, width, generation)
+            if not self.cache.verify or self._verify(identity, rows.rows, generation, source, width):
                 return rows
 
-    # generations ------------------------------------------------------------------------------------------------------
+    # generations --------------------------------------------------------------------------------------------------
 
-    def _find(self, source: int, fingerprint: str, run: VerifyingRun, width: int) -> int | None:
+    def _find_generation(self, source: int, identity: str, width: int) -> int | None:
         """The generation of a known label, or one that new simulations agree with, or a new one; None: cannot tell."""
         trust, cache = self._trust, self.cache
         generation = self._known_generation(source) or next(iter(trust.generations.values()), None)
-        if generation is None and not trust.is_blocked and (stored := cache.generations_of(fingerprint)):
-            generation = self._adopted(stored, fingerprint, run, width) if cache.verify else stored[0]
+        if generation is None and not trust.is_blocked and (stored := cache.generations_of(identity)):
+            generation = self._adopted(stored, identity, width) if cache.verify else stored[0]
         return generation and self._use(source, generation)
 
-    def _adopted(self, stored: list[int], fingerprint: str, run: VerifyingRun, width: int) -> int | None:
+    def _adopted(self, stored: list[int], identity: str, width: int) -> int | None:
         """The generation that new simulations agree with, else a new one; None if no simulation ends."""
-        cache, name = self.cache, type(run.model).__name__
-        candidates = {generation: cache.candidates(fingerprint, generation, width) for generation in stored}
+        cache, name = self.cache, type(self.model).__name__
+        candidates = {generation: cache.candidates(identity, generation, width) for generation in stored}
         candidates = {generation: rows for generation, rows in candidates.items() if len(rows) >= ROWS}
+        what = "%d of them are simulated again, to see whether they can be used"
         self._say(
             "the code, a file, a package or the machine of this %s is not that of its stored simulations; "
-            + (
-                "%d of them are simulated again, to see whether they can be used"
-                if candidates
-                else "they are fewer than %d, stay in the file, and are not used"
-            ),
+            + (what if candidates else "they are fewer than %d, stay in the file, and are not used"),
             *(name, ROWS),
         )
         for generation, rows in candidates.items():
-            found = self._compare(cache.rows_of(choose_rows(rows, ROWS, self._random)), ROWS, run)
+            found = self._compare(cache.rows_of(choose_rows(rows, ROWS, self._random)), ROWS)
             if found.row is not None:
                 continue
             if found.compared < ROWS / 2:
                 self._trust.is_blocked = True
                 return None
-            self._trust.left[fingerprint, True] = ROWS_PER_VERIFICATION * found.compared
+            self._trust.left[identity, True] = ROWS_PER_VERIFICATION * found.compared
             self._say("%d stored simulations of this %s agree with new ones: all are used", found.compared, name)
             return generation
         if candidates:
@@ -284,12 +445,11 @@ class VerifiedCache:
 
         Files that belong to other labels of the model count from now on.
         """
-        label = self.label
+        label, known = self.label, None
         rows = self.cache.file.select(f"SELECT {LABEL_COLUMNS} FROM labels WHERE source = ? ORDER BY rowid", (source,))
         rows = list(filter(is_undamaged_label, rows))
         for row in rows:
             label.add(Opened(json.loads(row[2])).read_again())
-        known = None
         for row in rows:
             files = json.loads(row[2])
             if row[1] == label.code.encode() and Opened(files).read_again().files == files:
@@ -315,9 +475,9 @@ class VerifiedCache:
     def _say(self, text: str, *values: Any) -> None:
         logger.warning(f"%s: {text}", self.cache.path, *values)
 
-    # comparisons ------------------------------------------------------------------------------------------------------
+    # comparisons of rows ------------------------------------------------------------------------------------------
 
-    def _verify(self, fingerprint: str, rows: list[Row | None], generation: int, run: VerifyingRun, width: int) -> bool:
+    def _verify(self, identity: str, rows: list[Row | None], generation: int, source: int, width: int) -> bool:
         """Verify some of the rows that were found; False if the look-up must be repeated in a new generation."""
         trust = self._trust
         with trust.lock:
@@ -329,15 +489,14 @@ class VerifiedCache:
             if trust.is_blocked:
                 return True
             succeeded, latest = [row for row in others if not row.reason], None
-            if (fingerprint, True) not in trust.left or not succeeded:
-                latest = self.cache.latest_success(fingerprint, generation, width)
+            if (identity, True) not in trust.left or not succeeded:
+                latest = self.cache.latest_success(identity, generation, width)
                 latest = None if latest is None or latest.session == trust.session else latest
             # failures alone do not verify successful rows, which may be used later
-            used, kind = trust.used, (fingerprint, bool(latest or succeeded))
-            due = trust.due(kind, len(others))
-            found = self._compare(self._in_order(latest, others), due, run)
+            used, kind = trust.used, (identity, bool(latest or succeeded))
+            found = self._compare(self._in_order(latest, others), trust.due(kind, len(others)))
             if found.row is not None:
-                return self._use_no_rows(found.row, found.new, used, generation, run)
+                return self._use_no_rows(found.row, found.new, used, generation, source)
             if found.stopped:
                 if not found.compared:
                     trust.is_blocked = True
@@ -355,63 +514,59 @@ class VerifiedCache:
         shuffled = [rows[place] for place in self._random.permutation(len(rows))]
         yield from (row for row in sorted(shuffled, key=lambda row: bool(row.reason)) if row != latest)
 
-    def _compare(self, rows: Iterable[Row], n: int, run: VerifyingRun) -> _Comparison:
+    def _compare(self, rows: Iterable[Row], n: int) -> _Comparison:
         """Simulate rows again, in growing batches, until n are compared, one differs, or too many stop."""
         rows, compared, stopped = iter(rows), 0, []
         while compared < n and len(stopped) < max(MAX_ATTEMPTS, compared):
             chosen = list(islice(rows, min(max(FIRST_COMPARED, 3 * compared), n - compared)))
             if not chosen:
                 break
-            thetas = np.array([np.frombuffer(row.theta, dtype="<f8") for row in chosen])
-            start = time.perf_counter()
-            new = simulate_again(run, thetas, self.label)
-            if run.pool is None and self.label.observes:
-                self.label.has_changed_itself(self.label.changed(run.model))
-            self.seconds += time.perf_counter() - start
-            self.compared += len(new)
+            new = self._simulate_again(np.array([np.frombuffer(row.theta, dtype="<f8") for row in chosen]))
+            if self.pool is None and self.label.observes:
+                self.label.has_changed_itself(self.label.changed(self.model))
             for row, each in zip(chosen, new, strict=True):
                 if isinstance(each.reason, TransientReason):
                     stopped.append(each.reason)
-                    self.compared, self.unverified = self.compared - 1, self.unverified + 1
-                elif self._difference(row, each, run)[0]:
+                    self.verifications, self.unverified = self.verifications - 1, self.unverified + 1
+                elif self._row_difference(row, each)[0]:
                     return _Comparison(compared, stopped, row, each)
                 else:
                     compared += 1
         return _Comparison(compared, stopped)
 
-    def _difference(self, row: Row, new: Simulated, run: VerifyingRun) -> tuple[str, float]:
-        """How a simulation differs from a stored one, as `difference_in_words`."""
+    def _row_difference(self, row: Row, new: Simulated) -> tuple[str, float]:
+        """How a simulation differs from a stored one, as `_difference`."""
         misfit, reason = np.frombuffer(row.value, dtype="<f8"), reason_of(row)
         if not reason and row.size is not None:  # a response
-            batch = SimulationBatch(misfit.reshape(1, len(run.model.channels), -1), [""])
-            (misfit,), (reason,) = misfit_of_responses(run.model, batch, run.measured, run.statistic)
-        return difference_in_words(misfit, reason, new, run)
+            batch = SimulationBatch(misfit.reshape(1, len(self.model.channels), -1), [""])
+            (misfit,), (reason,) = misfit_of_responses(self.model, batch, self.measured, self.statistic)
+        return self._difference(misfit, reason, new)
 
-    def _use_no_rows(self, row: Row, new: Simulated, used: int, generation: int, run: VerifyingRun) -> bool:
+    def _use_no_rows(self, row: Row, new: Simulated, used: int, generation: int, source: int) -> bool:
         """Begin a new generation, if the label was adopted and no row was used; False. `StaleCache` otherwise."""
         trust, theta = self._trust, np.frombuffer(row.theta, dtype="<f8")
         trust.start_again()
         query = "SELECT count(*) FROM labels WHERE source = ? AND generation = ?"
-        source, difference = source_number(run.fingerprint), self._difference(row, new, run)
         if self.cache.file.select(query, (source, generation)) > [(1,)]:
             # the model has changed in a part of the space where no row was compared, or by what no label contains
             new_generation = self._new_generation([generation])
             for each in {source, *trust.generations}:
                 self._use(each, new_generation)
-            self._say(DIFFER, type(run.model).__name__)
+            self._say(DIFFER, type(self.model).__name__)
             if not used:
                 return False
-        point = ", ".join(f"{n} = {value:.17g}" for n, value in zip(run.model.parameter_names, theta, strict=True))
-        text = f"{self.cache.path}: a stored simulation is not that of this {type(run.model).__name__}. At {point}: "
-        text += f"{difference[0]}. {CHANGED}"
+        difference, change = self._row_difference(row, new)
+        point = ", ".join(f"{n} = {value:.17g}" for n, value in zip(self.model.parameter_names, theta, strict=True))
+        text = f"{self.cache.path}: a stored simulation is not that of this {type(self.model).__name__}. At {point}: "
+        text += f"{difference}. {CHANGED}"
         if used:
             text += f", and discard this run, which has used {used} rows"
         if row.reason:
             text += ". Also do so if failures depend on anything but the parameters, such as a licence"
-        if 0.0 < difference[1] < LARGEST_ROUNDING:
+        if 0.0 < change < LARGEST_ROUNDING:
             text += (
                 ". If such a difference comes from rounding, for example on another machine, accept differences of "
-                f"this size, with SimulationCache(path, tolerance={2.0 * difference[1]:.1e})"
+                f"this size, with SimulationCache(path, tolerance={2.0 * change:.1e})"
             )
         trust.stale = StaleCache(text, theta)
         raise trust.stale

@@ -48,7 +48,7 @@ def evaluation_queue(posterior: Any, responses: bool = False) -> PointQueue:
         if not streams and len(rows):
             with suppress(Exception):  # raised by `collect`
                 evaluate(rows)  # together, which is faster; their simulations are known then
-        return [threads.submit(evaluate, row[None]) for row in rows]
+        return list(threads.submit_all(evaluate, [row[None] for row in rows]))
 
     def give_up(futures: list[Future]) -> None:
         for future in futures:
@@ -58,7 +58,7 @@ def evaluation_queue(posterior: Any, responses: bool = False) -> PointQueue:
 
     threads = Threads(lambda: (size() or _MOST_THREADS) if streams else 0)
     for part in parts if streams else ():  # failures may end sooner: points that wait may be successes
-        part.simulator.pending = lambda: threads.pending
+        part.simulator.pending = lambda: len(threads.pending)
     return PointQueue(start, size, give_up)
 
 

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError, Future
 from contextlib import suppress
+from functools import cached_property
 from queue import Empty, SimpleQueue
 from typing import Any
 
@@ -21,11 +22,10 @@ import numpy as np
 
 from samplers.interrupts import interrupts_end_the_run
 
-from ..cache.comparison import VerifyingRun, observed
 from ..cache.memory import MemoryCache, ResponseMemory, distinct_keys, thetas_of
-from ..cache.simulation_cache import TOLERANCE, SimulationCache
-from ..cache.verification import StaleCache
-from ..noise.statistics import Statistic, statistic_width
+from ..cache.simulation_cache import SimulationCache
+from ..cache.verification import StaleCache, VerifiedModel
+from ..noise.statistics import Statistic
 from ..priors.points import as_rows
 from ..signals.channels import Measurements
 from ..signals.comparison import Comparison, compare_with
@@ -34,6 +34,7 @@ from ..simulation.faults import ChangedModel
 from ..simulation.folder import Observed, unpack
 from ..simulation.local_pool import value_of
 from ..simulation.model import (
+    MisfitBatch,
     Model,
     SimulationBatch,
     has_batch_method,
@@ -44,7 +45,6 @@ from ..simulation.model import (
     sent_simulation,
     simulate_batch,
 )
-from .checked_model import CheckedModel
 from .failure_log import FailureLog
 from .inputs import check_statistic, name_of_statistic
 
@@ -59,19 +59,26 @@ class _Request:
 
     For n `keys` (see `distinct_keys`): `thetas` (n, n_structural), `statistics` (n, n_numbers), NaN where not known,
     `reasons` of failures, `responses` (n, n_channels, n_steps) if requested, and whether the statistics are `known`,
-    and nothing is to be simulated (`done`).
+    and nothing is to be simulated (`done`). The model has one `fingerprint` for all of them.
     """
 
-    def __init__(self, keys: list[bytes], full: bool, run: VerifyingRun, statistics: np.ndarray, known: Any) -> None:
-        self.keys, self.run, self.statistics = keys, run, statistics
-        self.thetas = thetas_of(keys, len(run.model.parameter_names))
+    def __init__(self, keys: list[bytes], full: bool, model: Model, statistics: np.ndarray, known: Any) -> None:
+        self.keys, self.model, self.statistics = keys, model, statistics
+        self.thetas = thetas_of(keys, len(model.parameter_names))
         self.finite = np.isfinite(self.thetas).all(axis=1)
         self.reasons = ["" if fine else "the parameters are not finite" for fine in self.finite]
         self.known = np.array(known, dtype=bool) | ~self.finite
         self.done = self.known & ~np.isfinite(statistics).all(axis=1) if full else self.known.copy()
-        self.responses = None
-        if full:
-            self.responses = np.full((len(keys), len(run.model.channels), run.model.n_steps), np.nan)
+        self.responses = np.full((len(keys), len(model.channels), model.n_steps), np.nan) if full else None
+
+    @cached_property
+    def fingerprint(self) -> str:
+        return self.model.fingerprint
+
+    @property
+    def left(self) -> np.ndarray:
+        """Rows that are to be simulated."""
+        return (~self.done).nonzero()[0]
 
 
 class _Running:
@@ -83,7 +90,7 @@ class _Running:
         self.counted_until = 0.0  # time of the last arrival [s]
 
 
-class Simulator:
+class Simulator(VerifiedModel):
     """A model's simulations, compared with measurements in the order of the model's channels; each is run once.
 
     Options are those of `FELikelihood`; the statistic is the sums of squares by default. `measured` are values
@@ -108,44 +115,23 @@ class Simulator:
         responses_only: bool = False,
     ) -> None:
         self.failures = FailureLog(model.parameter_names, max_failure_share)
-        self._responses_only = responses_only
-        self.model, self.measurements, self.statistic = model, measurements, statistic
-        self.measured = compare_with(measurements, model.dt, model.n_steps)
-        check_statistic(statistic, self.measured)
-        self.n_structural = len(model.parameter_names)
-        self.n_numbers = statistic_width(self.measured, statistic)
-        self.pool = as_executor(pool, model)
-        self.cache = cache if cache is None or isinstance(cache, SimulationCache) else SimulationCache(cache)
         self.memory_cache, self.response_memory = MemoryCache(memory_rows), ResponseMemory(memory_bytes)
-        self._checked = CheckedModel(model, statistic, self.cache)
-        self._key = self.simulation_key
+        self.measurements, self._responses_only = measurements, responses_only
+        measured = compare_with(measurements, model.dt, model.n_steps)
+        check_statistic(statistic, measured)
+        super().__init__(model, measured, statistic, as_executor(pool, model), cache)
+        self._key, self.n_structural = self.simulation_key, len(model.parameter_names)
         self.chunk_size = 1
         self.simulations = self.cache_hits = self.disk_hits = 0
-        self._seconds, self._recalled = 0.0, set[bytes]()
+        self._recalled: set[bytes] = set()
         self.when_simulated: Callable[[int], None] | None = None
         self._in_pool: _Running | None = None
         self.pending: Callable[[], int] | None = None  # number of points of a queue that have not ended
 
     def __getstate__(self) -> dict:
-        return self.__dict__ | {"pool": None, "when_simulated": None, "_in_pool": None, "pending": None}
+        return super().__getstate__() | {"when_simulated": None, "_in_pool": None, "pending": None}
 
     # counts and identity ------------------------------------------------------------------------------------------
-
-    @property
-    def seconds(self) -> float:
-        """Wall time of the simulations [s], including verification."""
-        rows = self._checked.rows
-        return self._seconds + (0.0 if rows is None else rows.seconds)
-
-    @property
-    def verifications(self) -> int:
-        """Number of earlier simulations that were compared with a new one, besides `simulations`."""
-        return self._checked.compared
-
-    @property
-    def unverified(self) -> int:
-        """Number of rows that could not be compared, because the new simulation was stopped (`TransientReason`)."""
-        return 0 if self._checked.rows is None else self._checked.rows.unverified
 
     def report(self) -> dict:
         """Summary of the simulations that were requested in this process, see `Posterior.report`."""
@@ -161,7 +147,7 @@ class Simulator:
     @property
     def fingerprint(self) -> str:
         """Hex digest of all that the statistics depend on: `simulation_key`, and the code when this object was made."""
-        text = f"{self.simulation_key} {self._checked.label.identity}"
+        text = f"{self.simulation_key} {self.label.identity}"
         return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
     @property
@@ -180,7 +166,7 @@ class Simulator:
     def share(self, other: "Simulator") -> None:
         """Use the responses in memory of another simulator, and trust the rows that it has verified."""
         self.response_memory = other.response_memory
-        self._checked.share_trust(other._checked)
+        self.share_trust(other)
 
     # requests -----------------------------------------------------------------------------------------------------
 
@@ -215,11 +201,11 @@ class Simulator:
                 statistics[wanted] = self.run(thetas[wanted])
             return statistics
         request = self._run_in_pool(keys, which, full) if self.streams else self._look_up(keys, which, full)
-        left = (~request.done).nonzero()[0]
+        left = request.left
         while len(left):
-            self._check_before(request.run)
+            self._check_model()
             some, start = left[: self._chunk(len(left), full)], time.perf_counter()
-            with observed(self._checked.label, self.pool):
+            with self._observed():
                 if self.pool is None or self._returns_responses(full):
                     values, reasons = simulate_batch(self.model, request.thetas[some], self.pool)
                 else:
@@ -260,11 +246,11 @@ class Simulator:
     def _look_up(self, keys: list[bytes], which: Sequence[int], full: bool) -> _Request:
         """What is known of distinct keys, which is counted; `which` has the key of every requested row."""
         with self._running.lock:
-            request = _Request(keys, full, self._run, *self.memory_cache.look_up(keys, self.n_numbers))
+            request = _Request(keys, full, self.model, *self.memory_cache.look_up(keys, self.n_numbers))
             for row in (request.done & request.finite).nonzero()[0] if full else ():
                 request.reasons[row] = self.memory_cache.reason(keys[row]) or "the simulation failed before"
             try:
-                on_disk = self._fill_from_disk(request) + self._fill_from_responses(request)
+                on_disk = self._take_statistics(request) + self._take_responses(request)
             except StaleCache:  # results in memory may belong to another model
                 self._clear()
                 raise
@@ -273,54 +259,56 @@ class Simulator:
             self.disk_hits += int(counts[on_disk].sum())
         return request
 
-    def _fill_from_disk(self, request: _Request) -> list[int]:
+    def _take_statistics(self, request: _Request) -> list[int]:
         """Fill in stored statistics, unless responses are wanted, and return their rows; some are verified by runs."""
-        stored, new = self._checked.rows, (~request.done).nonzero()[0]
-        if stored is None or not len(new) or request.responses is not None or self._responses_only:
+        new = request.left
+        if self.cache is None or not len(new) or request.responses is not None or self._responses_only:
             return []
-        rows = stored.look_up(self._key, request.thetas[new], request.run)
+        rows = self._stored_statistics(request.thetas[new], request.fingerprint)
         found, reasons = rows.known.nonzero()[0], rows.reasons
         if len(found):
             self._enter_known(request, new[found], rows.values[found], [reasons[place] for place in found])
         return new[found].tolist()
 
-    def _fill_from_responses(self, request: _Request) -> list[int]:
+    def _take_responses(self, request: _Request) -> list[int]:
         """Fill in rows whose responses are cached, and statistics that are not known; returns rows from the disk."""
-        stored, full, on_disk = self._checked.rows, request.responses is not None, []
-        if stored is None and not len(self.response_memory):
+        memory, full, on_disk = self.response_memory, request.responses is not None, []
+        if self.cache is None and not len(memory):
             return []
-        left, size = (~request.done).nonzero()[0].tolist(), most_responses(self.model)
+        left, size = request.left.tolist(), most_responses(self.model)
         for start in range(0, len(left), size):
-            rows, fingerprint = left[start : start + size], request.run.fingerprint
-            outcomes = self.response_memory.look_up(fingerprint, [request.keys[row] for row in rows])
-            outcomes = {row: outcome for row, outcome in zip(rows, outcomes, strict=True) if outcome is not None}
-            missing = [row for row in rows if row not in outcomes]
-            if stored is not None and missing:
-                read = zip(missing, stored.look_up_responses(request.thetas[missing], request.run), strict=True)
-                read = {row: outcome for row, outcome in read if outcome is not None}
-                on_disk += list(read)
-                outcomes |= read
-                if full and read:
-                    self.response_memory.store(fingerprint, [request.keys[row] for row in read], list(read.values()))
-            if full:
-                for row, outcome in outcomes.items():
-                    request.responses[row] = np.nan if isinstance(outcome, str) else outcome
-            request.done[list(outcomes)] = True
-            if new := [row for row in outcomes if not request.known[row]]:
+            rows, fingerprint = left[start : start + size], request.fingerprint
+            known = dict(zip(rows, memory.outcomes([(fingerprint, request.keys[row]) for row in rows]), strict=True))
+            missing = [row for row in rows if known[row] is None]
+            if self.cache is not None and missing:
+                read = dict(zip(missing, self._stored_responses(request.thetas[missing], fingerprint), strict=True))
+                known |= read
+                new = [row for row in missing if read[row] is not None]
+                on_disk += new
+                if full:
+                    memory.store([(fingerprint, request.keys[row]) for row in new], [read[row] for row in new])
+            known = {row: outcome for row, outcome in known.items() if outcome is not None}
+            for row, outcome in known.items() if full else ():
+                request.responses[row] = np.nan if isinstance(outcome, str) else outcome
+            request.done[list(known)] = True
+            if new := [row for row in known if not request.known[row]]:
                 nothing = np.full((len(self.model.channels), self.model.n_steps), np.nan)
-                failed = [outcomes[row] if isinstance(outcomes[row], str) else "" for row in new]
-                responses = [nothing if reason else outcomes[row] for row, reason in zip(new, failed, strict=True)]
-                batch = SimulationBatch(np.array(responses), failed)
-                statistics, reasons = misfit_of_responses(self.model, batch, self.measured, self.statistic)
+                failed = [known[row] if isinstance(known[row], str) else "" for row in new]
+                responses = [nothing if reason else known[row] for row, reason in zip(new, failed, strict=True)]
+                statistics, reasons = self._statistics_of(np.array(responses), failed)
                 self._enter_known(request, new, statistics, reasons)
-                if stored is not None and not self._responses_only:
-                    stored.store(self._key, request.thetas[new], statistics, reasons, None, request.run)
+                if self.cache is not None and not self._responses_only:
+                    self._store(request.thetas[new], statistics, reasons, None, fingerprint)
         return on_disk
+
+    def _statistics_of(self, responses: np.ndarray, reasons: list[str]) -> MisfitBatch:
+        """Statistics of responses (n, n_channels, n_steps) and reasons of failures."""
+        return misfit_of_responses(self.model, SimulationBatch(responses, reasons), self.measured, self.statistic)
 
     def _enter_known(self, request: _Request, rows: Sequence[int], statistics: np.ndarray, reasons: list[str]) -> None:
         """Enter known statistics, and log the remark that is stored with them."""
         if self.cache is not None:
-            self.cache.repeat_remark(self.model, request.run.fingerprint)
+            self.cache.repeat_remark(self.model, request.fingerprint)
         self.failures.count_outcomes(request.thetas[rows], reasons)
         self._enter(request, rows, statistics, reasons)
 
@@ -332,7 +320,7 @@ class Simulator:
             if reason and request.responses is not None:
                 request.responses[row] = np.nan
         self.memory_cache.store([request.keys[row] for row in rows], statistics, reasons)
-        self._checked.has_results = True
+        self.has_results = True
 
     def _clear(self) -> None:
         self.memory_cache.clear()
@@ -371,7 +359,7 @@ class Simulator:
         with running.lock:  # so that nothing arrives between the two
             running.lock.wait_for(lambda: running.keys.isdisjoint(keys))
             request = self._look_up(keys, which, full)
-            left = self._send(request, (~request.done).nonzero()[0].tolist(), arrived)
+            left = self._send(request, request.left.tolist(), arrived)
         try:
             while left:
                 self._receive(request, left, take_all(arrived))
@@ -392,7 +380,7 @@ class Simulator:
         """Submit rows of a request to the pool; their futures will come through a queue."""
         if not rows:
             return {}
-        self._check_before(request.run)
+        self._check_model()
         running = self._running
         if not running.keys:
             running.counted_until = time.perf_counter()
@@ -416,7 +404,7 @@ class Simulator:
                 self._running.keys.discard(request.keys[row])
                 try:
                     (result, reason), opened = unpack(value_of(future.result()), self.pool)
-                    self._checked.label.add(opened)
+                    self.label.add(opened)
                     rows, results, reasons = [*rows, row], [*results, result], [*reasons, reason]
                 except CancelledError:
                     error = error or RuntimeError("the pool was closed before a simulation had finished")
@@ -445,44 +433,38 @@ class Simulator:
         if they are stored on disk.
         """
         thetas, full = request.thetas[rows], request.responses is not None
+        # the model may have been replaced
+        fingerprint = request.fingerprint if request.model is self.model else self.model.fingerprint
         responses, statistics, why = None, values, reasons
         if values.ndim == 3:
             responses = values
-            statistics, why = misfit_of_responses(
-                self.model, SimulationBatch(values, reasons), self.measured, self.statistic
-            )
+            statistics, why = self._statistics_of(values, reasons)
         with self._running.lock:
-            self._seconds += seconds
+            self.seconds += seconds
             self.simulations += len(thetas)
             self.failures.count_outcomes(thetas, why)
             if self.when_simulated is not None:
                 self.when_simulated(len(thetas))
-            run = request.run if request.run.model is self.model else self._run  # the model may have been replaced
-            self._drop_if_changed(self._checked.after, run, thetas, statistics, why, self._earlier_point)
+            self._drop_if_changed(self._check_after, thetas, statistics, why, self._earlier_point)
             if full:
                 request.responses[rows] = responses
             self._enter(request, rows, statistics, why)
             if full or has_jacobian(self.model):
                 outcomes = [reason or response for reason, response in zip(reasons, responses, strict=True)]
-                self.response_memory.store(run.fingerprint, [request.keys[row] for row in rows], outcomes)
+                self.response_memory.store([(fingerprint, request.keys[row]) for row in rows], outcomes)
             if self.cache is not None:
                 kept = None if self._responses_only else statistics
                 stored = responses if full or self.cache.responses else None
-                self._checked.rows.store(self._key, thetas, kept, why, stored, run)
+                self._store(thetas, kept, why, stored, fingerprint)
                 self.cache.store_remark(self.model)
 
     # the model ----------------------------------------------------------------------------------------------------
 
-    @property
-    def _run(self) -> VerifyingRun:
-        tolerance = TOLERANCE if self.cache is None else self.cache.tolerance
-        return VerifyingRun(self.model, self.pool, self.measured, self.statistic, self.n_numbers, tolerance)
-
-    def _check_before(self, run: VerifyingRun) -> None:
+    def _check_model(self) -> None:
         """Check failures and the model before simulations, not after them, so that finished simulations are stored."""
         with self._running.lock:
             self._check_failures()
-            self._drop_if_changed(self._checked.before, run)
+            self._drop_if_changed(self._check_before)
 
     def _earlier_point(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Parameters and statistics of a successful simulation in memory, if there is one, to be run again."""
@@ -490,15 +472,13 @@ class Simulator:
         statistics, _ = self.memory_cache.look_up([each.tobytes() for each in thetas], self.n_numbers)
         return list(zip(thetas, statistics, strict=True))
 
-    def _drop_if_changed(self, compare: Callable[..., Any], run: VerifyingRun, *arguments: Any) -> None:
+    def _drop_if_changed(self, compare: Callable[..., None], *arguments: Any) -> None:
         """Compare the model; if it has changed, drop what was simulated since the last comparison, on either side."""
         try:
-            compare(run, *arguments)
+            compare(*arguments)
         except ChangedModel:
             self._clear()
-            if self.cache is not None and self._checked.unchecked:
-                unchecked = np.concatenate(self._checked.unchecked)
-                self._checked.rows.discard(unchecked, self._key, run.fingerprint)
+            self._discard_unchecked(self.model.fingerprint)
             raise
 
 

@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, CancelledError, Future
 from concurrent.futures import wait as wait_for
+from itertools import repeat
 from numbers import Integral
 from typing import Any
 
@@ -44,8 +45,9 @@ class Submitting:
         """
         futures = self.submit_all(function, list(items), **self._of_map)
         try:
-            for future in wait_for(futures, return_when=FIRST_EXCEPTION).done:
-                value_of(future.result())
+            done, left = wait_for(futures, return_when=FIRST_EXCEPTION)
+            for future in done if left else ():
+                future.result()
             return [value_of(future.result()) for future in futures]
         except BaseException:
             self.give_up(futures)
@@ -69,31 +71,42 @@ def value_of(result: Any) -> Any:
 class Threads:
     """Daemon threads that call functions, at most ``most()`` at once; Python does not wait for them at its end.
 
-    With 0 threads, a function is called at once. `pending` counts the functions that have not ended.
+    With 0 threads, functions are called at once.
     """
 
     def __init__(self, most: Callable[[], int]) -> None:
         self._most, self._changed = most, threading.Condition()
         self._waiting: deque[tuple[Future, Callable, Any]] = deque()
+        self._running: set[Future] = set()
         self._threads: set[threading.Thread] = set()
-        self._n_idle = self.pending = 0
+        self._n_idle = 0
 
-    def submit(
-        self, function: Callable[[Any], Any], item: Any, future: Future | None = None, first: bool = False
-    ) -> Future:
-        """Future of a function of an item, which `cancel` prevents until a thread takes it; `first`: before others."""
-        future, most = Future() if future is None else future, self._most()
+    @property
+    def pending(self) -> list[Future]:
+        """Futures of calls that have not ended."""
         with self._changed:
-            self.pending += 1
-            (self._waiting.appendleft if first else self._waiting.append)((future, function, item))
-            self._changed.notify()
-            if len(self._threads) < most and self._n_idle < len(self._waiting):
+            return [*self._running, *(future for future, *_ in self._waiting)]
+
+    def submit_all(
+        self,
+        function: Callable[[Any], Any],
+        items: Sequence[Any],
+        futures: Sequence[Future] | None = None,
+        first: bool = False,
+    ) -> Sequence[Future]:
+        """A future for each item, which `cancel` prevents until a thread takes it; with `first`, before others."""
+        futures, most = [Future() for _ in items] if futures is None else futures, self._most()
+        calls = list(zip(futures, repeat(function), items))  # noqa: B905
+        with self._changed:
+            self._waiting.extendleft(calls[::-1]) if first else self._waiting.extend(calls)
+            self._changed.notify(len(calls))
+            for _ in range(min(most - len(self._threads), len(self._waiting) - self._n_idle)):
                 thread = threading.Thread(target=self._work, args=(_LINGER,), name="fe_likelihoods", daemon=True)
                 self._threads.add(thread)
                 thread.start()
         if not most:
             self._work(0.0)
-        return future
+        return futures
 
     def has_this_one(self) -> bool:
         """Whether the present thread is one of them."""
@@ -101,26 +114,27 @@ class Threads:
 
     def _work(self, linger: float) -> None:
         """Call functions one after the other, until none has been waiting for a time [s]."""
+        future = None
         while True:
             with self._changed:
-                self._n_idle += 1
-                self._changed.wait_for(lambda: self._waiting, linger)
-                self._n_idle -= 1
+                self._running.discard(future)
+                if not self._waiting:
+                    future = None
+                    self._n_idle += 1
+                    self._changed.wait_for(lambda: self._waiting, linger)
+                    self._n_idle -= 1
                 if not self._waiting:
                     self._threads.discard(threading.current_thread())
                     return
                 future, function, item = self._waiting.popleft()
+                self._running.add(future)
             if future.set_running_or_notify_cancel():
                 try:
-                    result, error = function(item), None
-                except BaseException as raised:
-                    result, error = None, raised
-                if error is None:
-                    future.set_result(result)
-                else:
+                    result = function(item)
+                except BaseException as error:
                     future.set_exception(error)
-            with self._changed:
-                self.pending -= 1
+                else:
+                    future.set_result(result)
 
 
 class _Job(Future):
@@ -131,6 +145,12 @@ class _Job(Future):
         self.function, self.item = function, item
         self.worker: Worker | None = None
         self.given_up = False
+
+    def held_by(self, worker: Worker | None) -> None:
+        """A process has the item; CancelledError if it was given up."""
+        self.worker = worker
+        if self.given_up:
+            raise CancelledError
 
 
 class LocalPool(Submitting):
@@ -170,8 +190,7 @@ class LocalPool(Submitting):
         self._set_up()
 
     def _set_up(self) -> None:
-        self._owner, self._lock = os.getpid(), threading.Lock()
-        self._jobs: set[_Job] = set()  # that have not ended
+        self._owner = os.getpid()
         self._threads = Threads(lambda most=self.workers: most)
         self._workers = Workers(environment=self._environment)
 
@@ -192,7 +211,7 @@ class LocalPool(Submitting):
     def close(self) -> None:
         """Give up all items and end the processes; a later item starts new processes."""
         self._notice_fork()
-        self.give_up(list(self._jobs))
+        self.give_up(self._threads.pending)
         self._workers.close()
 
     def submit_all(self, function: Callable[[Any], Any], items: Sequence[Any], first: bool = False) -> list[Future]:
@@ -200,20 +219,15 @@ class LocalPool(Submitting):
         self._notice_fork()
         pickled = Pickled.of(function)  # each time: the values that it uses may have changed
         jobs = [_Job(pickled, item) for item in items]
-        self._jobs.update(jobs)
-        for job in reversed(jobs) if first else jobs:
-            job.add_done_callback(self._jobs.discard)
-            self._threads.submit(self._result, job, job, first)
-        return jobs
+        return list(self._threads.submit_all(self._result, jobs, jobs, first))
 
     def give_up(self, futures: Sequence[Future], running: bool = True) -> None:
         """Cancel items; with `running`, also kill the processes that run them. Items with results keep them."""
         self._notice_fork()
         started = [job for job in futures if not job.cancel() and running and not job.done()]
         for job in started:
-            with self._lock:
-                job.given_up, worker = True, job.worker
-            if worker is not None:
+            job.given_up = True  # before the question for its process: one of the two threads sees what the other did
+            if (worker := job.worker) is not None:
                 worker.kill()
         if not self._threads.has_this_one():
             wait_for(started)
@@ -225,17 +239,10 @@ class LocalPool(Submitting):
 
     def _result(self, job: _Job) -> Any:
         """Result of an item, from another process if its process dies."""
-
-        def watch(worker: Worker | None) -> None:
-            with self._lock:
-                job.worker = worker
-            if job.given_up:
-                raise CancelledError
-
         deaths = loads = 0
         while not job.given_up:
             try:
-                answer = self._workers.run(job.function, job.item, watch=watch)
+                answer = self._workers.run(job.function, job.item, watch=job.held_by)
             except LoadingFailed as error:
                 loads += 1
                 if loads == MAX_ATTEMPTS:

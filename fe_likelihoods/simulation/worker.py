@@ -114,7 +114,7 @@ class Worker:
         LoadingFailed if the process dies or does not answer within `seconds`.
         """
         self._key = function.key
-        if function.key in self.keys:
+        if self.keys.use(function.key):
             return None
         try:
             slow = "the worker process did not start within {:g} s"
@@ -132,7 +132,6 @@ class Worker:
         RunFailed if the process dies, prints too much or does not answer within `seconds`.
         """
         self.calls += 1
-        self.keys.use(self._key)
         if self._output is not None:
             os.ftruncate(self._output.fileno(), 0)
             os.lseek(self._output.fileno(), 0, os.SEEK_SET)
@@ -143,8 +142,10 @@ class Worker:
         """Answer to a message; without one, the process is killed, and its simulation's folder may be kept."""
         start = time.monotonic()
         try:
-            with suppress(OSError):  # `_receive` notices that the process has died
+            try:
                 self._connection.send_bytes(message)
+            except OSError:  # `_receive` notices that the process has died
+                pass
             if (answer := self._receive(start + seconds)) is not None:
                 return answer
             reason = TransientReason(slow.format(seconds))
@@ -227,11 +228,13 @@ class Workers:
 
     def _take(self, key: bytes) -> Worker:
         """A process, preferably one that has loaded the function with a key."""
-        for worker in sorted(self._idle.copy(), key=lambda worker: key not in worker.keys):
-            with suppress(ValueError):  # another thread has taken it
+        for worker in sorted(self._idle, key=lambda worker: key not in worker.keys):
+            try:
                 self._idle.remove(worker)
-                if worker.alive:
-                    return worker
+            except ValueError:  # another thread has taken it
+                continue
+            if worker.alive:
+                return worker
         return Worker(**self._options)
 
     def close(self) -> None:
@@ -281,9 +284,10 @@ def _ended(process: subprocess.Popen) -> bool:
         return True
     if not hasattr(os, "waitid"):  # macOS before Python 3.13
         return process.poll() is not None
-    with suppress(ChildProcessError):
+    try:
         return os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
-    return True
+    except ChildProcessError:
+        return True
 
 
 def _kill(process: subprocess.Popen, owner: int) -> None:

@@ -199,7 +199,7 @@ def test_what_a_simulation_opens_belongs_to_the_label(workshop, what, isolated):
     (workshop.folder / name).write_text(before)
     points = POINTS[:20]
     first = workshop.run(points=points, isolated=isolated)
-    assert list(first.simulator._checked.label.opened.items()) == [f"opened {name}"]
+    assert list(first.simulator.label.opened.items()) == [f"opened {name}"]
     same = workshop.run(points=points, isolated=isolated)
     assert (same.simulations, same.simulator.verifications) == (0, 2)
     (workshop.folder / name).write_text(after)
@@ -215,7 +215,7 @@ def test_workers_of_a_pool_tell_what_they_open(workshop):
     (workshop.folder / "k.txt").write_text("2.5")
     likelihood = workshop.run(pool=2)
     likelihood.simulator.pool.close()
-    assert list(likelihood.simulator._checked.label.opened.items()) == ["opened k.txt"]
+    assert list(likelihood.simulator.label.opened.items()) == ["opened k.txt"]
     alone = workshop.run()
     assert (alone.simulations, alone.simulator.verifications) == (0, USUAL)
 
@@ -279,7 +279,7 @@ def test_changes_of_5_percent_are_found(ndim, rng):
 
 
 def test_a_value_that_is_set_between_two_batches_is_an_error(workshop, monkeypatch):
-    monkeypatch.setattr("fe_likelihoods.likelihood.checked_model._NO_TIME", np.inf)
+    monkeypatch.setattr("fe_likelihoods.cache.verification.NO_TIME", np.inf)
     likelihood = workshop.run(points=POINTS[:10])
     sys.modules["helper"].E = 3.0
     with pytest.raises(ChangedModel, match=r"helper.E, and an earlier simulation gives another result"):
@@ -306,7 +306,7 @@ COUNTERS = {
 
 @pytest.mark.parametrize("helper", COUNTERS.values(), ids=COUNTERS)
 def test_a_model_may_change_its_own_values(workshop, helper, monkeypatch):
-    monkeypatch.setattr("fe_likelihoods.likelihood.checked_model._NO_TIME", np.inf)
+    monkeypatch.setattr("fe_likelihoods.cache.verification.NO_TIME", np.inf)
     workshop.write(helper=helper)
     likelihood = workshop.run(points=POINTS[:10])
     for start in range(10, 300, 10):
@@ -320,10 +320,10 @@ def test_a_model_may_change_its_own_values(workshop, helper, monkeypatch):
 def test_values_that_a_model_changes_itself_are_known_of_one_import(workshop):
     workshop.write(helper=COUNTERS["counter"])
     first = workshop.run(points=POINTS[:10])
-    assert label.ModelLabel(first.model).code == first.simulator._checked.label.code
+    assert label.ModelLabel(first.model).code == first.simulator.label.code
     again = workshop.run(points=POINTS[:0])
     sys.modules["helper"].calls = 5  # by a script
-    assert label.ModelLabel(again.model).code != first.simulator._checked.label.code
+    assert label.ModelLabel(again.model).code != first.simulator.label.code
 
 
 # labels ---------------------------------------------------------------------------------------------------------------

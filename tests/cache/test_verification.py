@@ -338,7 +338,7 @@ def test_a_process_verifies_once_for_all_copies_of_a_likelihood(filled, thetas, 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="NO fork ON THIS SYSTEM")
 def test_a_fork_while_another_thread_verifies_does_not_block(filled, thetas):
     likelihood = likelihood_of(Scaled(), filled)
-    with likelihood.simulator._checked.rows._trust.lock:
+    with likelihood.simulator._trust.lock:
         child = os.fork()
         if not child:
             likelihood.misfit(thetas)

@@ -227,7 +227,7 @@ class Changing(Treacherous):
 
 
 def test_a_model_that_has_changed_ends_the_run(monkeypatch):
-    monkeypatch.setattr("fe_likelihoods.likelihood.checked_model._NO_TIME", np.inf)  # compared before every batch
+    monkeypatch.setattr("fe_likelihoods.cache.verification.NO_TIME", np.inf)  # compared before every batch
     with ThreadPoolExecutor(2) as pool:
         posterior = posterior_of(Changing(), pool=pool)
         with posterior.evaluation_queue() as queue:
