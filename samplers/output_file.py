@@ -13,7 +13,6 @@ import os
 import time
 import uuid
 import zlib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +21,7 @@ import numpy as np
 from emcee.backends import Backend, HDFBackend
 
 from .interrupts import deferred_interrupts
-
-try:
-    from fcntl import LOCK_EX, flock
-except ImportError:  # Windows has no such locks
-    flock = None
+from .locks import locked_folder
 
 __all__ = ["DAMAGED", "WholeFile", "run_of_file", "whole_file"]
 
@@ -185,7 +180,7 @@ def _replace_group(backend: HDFBackend, ours: h5py.File, anew: bool) -> None:
     """
     path, name = Path(backend.filename).resolve(), backend.name
     new = path.with_name(f"{path.name}.{uuid.uuid4().hex[:8]}.new")
-    with _locked(path.parent), contextlib.ExitStack() as stack:
+    with locked_folder(path.parent), contextlib.ExitStack() as stack:
         stack.callback(new.unlink, missing_ok=True)
 
         def write(others: h5py.File | None) -> None:
@@ -208,18 +203,3 @@ def _replace_group(backend: HDFBackend, ours: h5py.File, anew: bool) -> None:
                 raise
             write(None)
         os.replace(new, path)
-
-
-@contextlib.contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Context in which no other sampler replaces a file in a folder."""
-    if flock is None:
-        yield
-        return
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        with contextlib.suppress(OSError):  # a file system without locks
-            flock(descriptor, LOCK_EX)
-        yield
-    finally:
-        os.close(descriptor)

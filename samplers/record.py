@@ -39,11 +39,7 @@ import numpy as np
 
 from .blobs import joined
 from .interrupts import deferred_interrupts
-
-try:
-    from fcntl import LOCK_EX, LOCK_NB, flock
-except ImportError:  # Windows has no such locks: two runs on one file are not detected there
-    flock = None
+from .locks import lock_now
 
 __all__ = ["EvaluatedBatch", "Incomplete", "Record", "Remember", "RunStart", "free_name", "merge_batches"]
 
@@ -299,8 +295,7 @@ class Record:
 
     def _lock(self, file: Any) -> None:
         try:
-            if flock is not None:
-                flock(file, LOCK_EX | LOCK_NB)
+            lock_now(file)
         except BlockingIOError:
             raise ValueError(f"another run is writing to {self.path}: wait for its end, or use another file") from None
         except OSError as error:

@@ -21,11 +21,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-try:
-    from fcntl import LOCK_EX, LOCK_NB
-    from fcntl import flock as lock_file
-except ImportError:  # without file locks, two programs must not move the same damaged file aside at the same time
-    lock_file = None
+from samplers.locks import locked_folder
 
 from .rows import COLUMNS, LABEL_COLUMNS, LAYOUT, STORE, STORE_LABEL, is_undamaged, is_undamaged_label, transaction
 
@@ -239,33 +235,13 @@ class CacheFile:
             return None
         return status.st_dev, status.st_ino
 
-    @contextlib.contextmanager
-    def _exclusive(self) -> Iterator[None]:
+    def _exclusive(self) -> contextlib.AbstractContextManager:
         """Lock the folder, so that no other process opens the file or moves it aside meanwhile.
 
         SQLite finds the log by its name: a process that opens a damaged file while it is renamed would write to the
         new file's log. The file itself cannot be locked instead, because closing it releases SQLite's locks.
         """
-        try:
-            folder = None if lock_file is None else os.open(self.path.parent, os.O_RDONLY)
-        except OSError:  # a folder with search permission only
-            folder = None
-        if folder is None:
-            yield
-            return
-        try:
-            give_up = time.monotonic() + self.timeout
-            while True:
-                try:
-                    lock_file(folder, LOCK_EX | LOCK_NB)
-                    break
-                except OSError as error:  # continue without a lock if the file system has none
-                    if not isinstance(error, BlockingIOError) or time.monotonic() > give_up:
-                        break
-                time.sleep(0.002)
-            yield
-        finally:
-            os.close(folder)
+        return locked_folder(self.path.parent, self.timeout)
 
     def _open(self) -> sqlite3.Connection:
         uri = f"{self.path.as_uri()}?mode=rwc"

@@ -99,6 +99,9 @@ class Recent(OrderedDict):
             del self._sizes[self.popitem(last=False)[0]]
 
 
+loaded_functions = Recent()  # `Arrived` by key, in a worker of a pool
+
+
 class CannotLoad(ValueError):
     """A function that cannot be unpickled in a worker process."""
 
@@ -124,6 +127,15 @@ class Pickled(NamedTuple):
                 f"{without_addresses(str(error))}). Objects that it uses must not contain open files and connections: "
                 "make them inside the function"
             ) from error
+
+    def __call__(self, item: Any) -> Any:
+        """The result for an item in another process, which loads the function once."""
+        with _lock:
+            function = loaded_functions.use(self.key)
+            if function is None:
+                function = self.load()
+                loaded_functions.keep(self.key, function, len(self.payload))
+        return function(item)
 
     def load(self) -> "Arrived":
         """The function, in a worker.

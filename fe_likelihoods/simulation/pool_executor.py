@@ -1,16 +1,15 @@
 """Executor for other pools: concurrent.futures, multiprocessing, MPI, and any object with ``map``."""
 
-import threading
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from functools import cached_property, partial
+from functools import cached_property
 from multiprocessing.pool import Pool, ThreadPool
 from typing import Any
 
 from samplers.evaluation.point_queue import workers_of
 from samplers.interrupts import SentFunction
 
-from .by_value import Pickled, Recent
+from .by_value import Pickled
 from .local_pool import Outcome, Submitting, value_of
 
 __all__ = ["PoolExecutor"]
@@ -89,18 +88,4 @@ class _ByValue:
         return self._function(item)
 
     def __reduce__(self) -> tuple:
-        return partial, (_call, self.pickled)
-
-
-loaded_functions = Recent()  # `Arrived` by key, in a worker process
-_loading = threading.Lock()
-
-
-def _call(pickled: Pickled, item: Any) -> Any:
-    """Result of a sent function, which each process loads once."""
-    with _loading:
-        function = loaded_functions.use(pickled.key)
-        if function is None:
-            function = pickled.load()
-            loaded_functions.keep(pickled.key, function, len(pickled.payload))
-    return function(item)
+        return Pickled, tuple(self.pickled)

@@ -1,6 +1,5 @@
 """Workers compute with the code and the values of the process that sends them, whatever its files say."""
 
-import functools
 import sys
 import threading
 import types
@@ -128,71 +127,6 @@ def test_a_worker_has_the_values_of_the_parent_also_after_they_change(user, pool
         assert [pool.submit(user.late, 1.0).result(), pool.submit(user.deep, 1.0).result()] == [k, k]
     user.law.get = lambda: 10.0  # another function of the same name
     assert pool.map(user.late_module, [1.0]) == [10.0]
-
-
-CHANGES = {
-    "value": "law.K = {}",
-    "element of a list": "law.TABLE[0][0] = {}",
-    "another list": "law.TABLE[0] = [{}]",
-    "array": "law.ARRAY[0] = {}",
-    "view of an array": "law.ARRAY[:1][...] = {}",
-    "attribute": "law.STEEL.k = {}",
-    "attribute of a class": "law.Steel.factor = {}",
-    "method": "law.Steel.force = lambda self: {}",
-    "code": "law.one.__code__ = (lambda: {}).__code__",
-    "default": "law.default.__defaults__ = ({},)",
-    "keyword": "law.default.__kwdefaults__['more'] = {}",
-    "attribute of a function": "law.one.factor = {}",
-    "closure": "law.closure.__closure__[0].cell_contents = {}",
-    "function in a list": "law.FUNCTIONS[0] = lambda: {}",
-    "partial": "law.PARTIAL = functools.partial(law.default, {})",
-    "another module": "law.other.K = {}",
-    "module in place of another": "law.other = types.SimpleNamespace(K={})",
-}
-CHANGING = """
-import functools
-import numpy as np
-import user as other
-other.K = 0.0
-K, TABLE, ARRAY = 0.0, [[0.0]], np.zeros(1)
-class Steel:
-    factor = 0.0
-    def __init__(self): self.k = 0.0
-    def force(self): return 0.0
-STEEL = Steel()
-def one(): return 0.0
-one.factor = 0.0
-def default(value=0.0, *, more=0.0): return value + more
-def outer():
-    value = 0.0
-    def inner(): return value
-    return inner
-closure = outer()
-FUNCTIONS = [lambda: 0.0]
-PARTIAL = functools.partial(default)
-def total(item):
-    parts = K, TABLE[0][0], ARRAY[0], STEEL.k, Steel.factor, STEEL.force(), one(), default(), one.factor, closure()
-    return float(sum(parts) + FUNCTIONS[0]() + PARTIAL() + other.K)
-"""
-
-
-@pytest.mark.parametrize("how", CHANGES)
-def test_every_change_reaches_a_worker_that_has_loaded_the_function(how, user, pool, tmp_path):
-    """The pickle of an earlier call is not used; changes alternate, so that each comes after calls without one."""
-    (tmp_path / "changing.py").write_text(CHANGING)
-    import changing as law
-
-    names = {"law": law, "functools": functools, "types": types}
-    try:
-        for value in (1.0, 2.0, 1.0, 0.0):
-            for _ in range(3):
-                assert pool.map(law.total, [0]) == [law.total(0)]
-            before = law.total(0)
-            exec(CHANGES[how].format(value), names)
-            assert law.total(0) != before
-            assert pool.map(law.total, [0]) == [law.total(0)]
-    finally:
-        del sys.modules["changing"]
 
 
 def test_a_global_that_is_not_defined_yet_is_not_none(pool):

@@ -15,7 +15,7 @@ import pytest
 
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.signals.records import Record
-from fe_likelihoods.simulation import pool_executor
+from fe_likelihoods.simulation import by_value
 from fe_likelihoods.simulation.executors import LocalPool, as_executor
 from fe_likelihoods.simulation.model import misfit_batch, sent_simulation, simulate_batch
 from tests.faults import treacherous
@@ -36,7 +36,7 @@ class Recorder:
 
 @pytest.fixture(autouse=True)
 def nothing_known():
-    pool_executor.loaded_functions.clear()
+    by_value.loaded_functions.clear()
 
 
 @pytest.fixture
