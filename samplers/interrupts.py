@@ -1,7 +1,7 @@
 """Ctrl-C and SystemExit end a run, and no point that they have interrupted is stored."""
 
 import contextlib
-import functools
+import logging
 import multiprocessing
 import os
 import signal
@@ -17,9 +17,19 @@ __all__ = [
     "interrupts",
     "interrupts_end_the_run",
     "is_worker",
+    "process_name",
     "raise_if_interrupted",
     "raise_if_it_ends_the_run",
 ]
+
+logger = logging.getLogger(__name__)
+
+_EXIT = (
+    "SystemExit ends the run, and nothing is stored for this evaluation. If a function or model calls sys.exit where "
+    "it fails, raise an exception there instead (SimulationFailed), or run it in other processes (pool=2, or "
+    "isolated=True for a model): there SystemExit is a failure"
+)
+_names: dict[int, bytes] = {}
 
 
 class _RaisesKeyboardInterrupt:
@@ -93,15 +103,21 @@ def deferred_interrupts() -> Iterator[None]:
 
 
 def raise_if_it_ends_the_run(error: BaseException, before: BaseException | None = None) -> None:
-    """Raise KeyboardInterrupt or SystemExit if a function has raised it, even as the cause or context of `error`.
+    """Raise what must not become a failed evaluation, even if it is the cause or context of `error`.
 
-    In a worker process, SystemExit is a failed evaluation. `before` is ``sys.exception()`` at the call of the function:
-    what is handled there is the context of its errors, but no cause of them.
+    That is KeyboardInterrupt, SystemExit (in a worker process it is a failed evaluation), and an error whose attribute
+    ``ends_run`` is true. `before` is ``sys.exception()`` at the call of the function: what is handled there is the
+    context of its errors, but no cause of them.
     """
+    if getattr(error, "ends_run", False):
+        raise error
     causes = _causes(error, before)
     for kind in (KeyboardInterrupt,) if is_worker() else (KeyboardInterrupt, SystemExit):
         for cause in causes:
             if isinstance(cause, kind):
+                if isinstance(cause, SystemExit) and _EXIT not in getattr(cause, "__notes__", ()):
+                    cause.add_note(_EXIT)
+                    logger.warning(_EXIT)
                 raise cause
 
 
@@ -134,10 +150,9 @@ def is_worker() -> bool:
     return _is_worker or multiprocessing.parent_process() is not None
 
 
-@functools.cache
-def _this_process(pid: int) -> bytes:
+def process_name() -> bytes:
     """Random name of this process; a forked process has a different name."""
-    return os.urandom(16)
+    return _names.setdefault(os.getpid(), os.urandom(16))
 
 
 class Ended(NamedTuple):
@@ -154,10 +169,10 @@ class SentFunction:
     """
 
     def __init__(self, function: Callable[[Any], Any]) -> None:
-        self.function, self.sender = function, _this_process(os.getpid())
+        self.function, self.sender = function, process_name()
 
     def __call__(self, item: Any) -> Any:
-        if self.sender != _this_process(os.getpid()):
+        if self.sender != process_name():
             become_worker()
         try:
             with interrupts_end_the_run():

@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from samplers.interrupts import raise_if_it_ends_the_run
+
 from ..priors.points import as_points
 from ..simulation.faults import reason_of
-from ..simulation.interrupts import raise_if_it_ends_the_run
 from ..simulation.label import items_of
 from .failure_log import FailureLog
 from .parameters import Parameter

@@ -19,13 +19,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from samplers.interrupts import raise_if_it_ends_the_run
+
 from ..signals.channels import Channel
 from ..signals.records import Record
 from ..signals.sampling import rest_samples
 from ..simulation.by_value import is_arriving
 from ..simulation.faults import ChangedModel, reason_of, reworded
 from ..simulation.files import file_digest
-from ..simulation.interrupts import raise_if_it_ends_the_run
 from ..simulation.label import value_digest
 from ..simulation.model import SimulationFailed, real_response
 from .base import StructuralModel, digest

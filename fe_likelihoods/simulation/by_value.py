@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 
 import cloudpickle
 
-from samplers.interrupts import become_worker
+from samplers.interrupts import become_worker, process_name
 
 from .faults import ChangedModel
 from .user_code import SCRIPTS, is_of_user, sources_digest
@@ -43,7 +43,6 @@ __all__ = [
     "dumps",
     "is_arriving",
     "names_in",
-    "process_name",
     "without_addresses",
 ]
 
@@ -54,7 +53,6 @@ _OF_THE_IMPORT = {"__builtins__", "__loader__", "__spec__", "__cached__"}
 _COMPILED = tuple(importlib.machinery.EXTENSION_SUFFIXES)
 _lock = threading.RLock()
 _arriving: dict[str, types.ModuleType] | None = None  # modules of the function that is being loaded
-_names: dict[int, bytes] = {}
 _present: dict[str, types.ModuleType] = {}  # modules of the function that ran last in this process
 
 
@@ -163,11 +161,6 @@ class Pickled(NamedTuple):
                 raise CannotLoad(f"a function cannot be loaded in a worker process: {text}") from error
             finally:
                 _arriving = None
-
-
-def process_name() -> bytes:
-    """Random name of this process; a forked process has a different name."""
-    return _names.setdefault(os.getpid(), os.urandom(16))
 
 
 class Arrived:

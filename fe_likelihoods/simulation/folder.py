@@ -24,7 +24,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from .by_value import process_name
+from samplers.interrupts import process_name
+
 from .faults import RunFailed, TransientReason, UnusableModel, reason_of, reworded
 from .files import Opened, RunningSimulation, observing, of_this_library, refuse_shared, running_simulation
 

@@ -18,7 +18,13 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from samplers.interrupts import interrupts, interrupts_end_the_run, is_worker, raise_if_interrupted
+from samplers.interrupts import (
+    interrupts,
+    interrupts_end_the_run,
+    is_worker,
+    raise_if_interrupted,
+    raise_if_it_ends_the_run,
+)
 
 from ..noise.statistics import Statistic, reduce_response, statistic_width, sums_of_squares
 from ..signals.channels import Channel
@@ -26,7 +32,6 @@ from ..signals.comparison import Comparison
 from .faults import FailedRun, MisfitReason, is_transient, reason_of, shortened
 from .files import note, refuse_shared
 from .folder import Observed, Sender, run_in_folder, unpack
-from .interrupts import raise_if_it_ends_the_run
 
 __all__ = [
     "MisfitBatch",

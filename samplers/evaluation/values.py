@@ -57,8 +57,6 @@ class Caught:
         except (Exception, SystemExit) as error:
             raise_if_it_ends_the_run(error, before)
             raise_if_interrupted(known)
-            if getattr(error, "ends_run", False):
-                raise
             if not self.vectorize:
                 return Failed(error)
             if len(points) == 1:

@@ -124,6 +124,21 @@ def test_other_code_of_the_library_is_verified_and_adopted(path, monkeypatch, rn
     assert (same.simulations, same.simulator.disk_hits, same.simulator.verifications) == (0, 80, 59)
 
 
+def test_built_in_models_are_verified_once_for_a_cache(path, rng):
+    """User code may depend on what no label contains: there, every likelihood verifies."""
+    thetas = rng.uniform(0.5, 1.5, size=(20, 2)) * [1.0, 0.5]
+    for make in (oscillator, lambda cache: likelihood_of(Line(), cache)):
+        make(path).misfit(thetas)
+        cache = SimulationCache(path)
+        verified = []
+        for _ in range(3):
+            likelihood = make(cache)
+            likelihood.misfit(thetas)
+            verified.append(likelihood.simulator.verifications)
+            assert likelihood.simulations == 0
+        assert verified == ([2, 0, 0] if make is oscillator else [2, 2, 2])
+
+
 def test_noise_prior_and_display_units_change_nothing(path):
     x = np.array([[1.1, 0.9, 0.2, 0.005], [0.8, 1.3, 0.1, 0.001]])
     names = ("stiffness", "damping", "sigma_acceleration", "sigma_displacement")
