@@ -31,7 +31,7 @@ def thetas_of(keys: Sequence[bytes], n_structural: int) -> np.ndarray:
 
 
 class _Memory:
-    """Outcomes by key, the least recently used first, of at most `most` in size. Threads may share it.
+    """Outcomes by key, the oldest first, of at most `most` in size. Threads may share it.
 
     An outcome is a value, or a text: the reason of a failure. It is empty after unpickling, because its contents would
     dominate the size of the pickle. ValueError if `most` is not a whole number of 0 or more.
@@ -56,26 +56,21 @@ class _Memory:
         self._outcomes: OrderedDict[Hashable, Any] = OrderedDict()
         self._bytes = 0  # of responses
 
-    def outcomes(self, keys: Iterable[Hashable]) -> list[Any]:
-        """Outcomes of keys; None where nothing is stored."""
-        found = []
+
+class MemoryCache(_Memory):
+    """The most recently used statistics of at most `most` simulations, by the bytes of structural parameters."""
+
+    _what = "memory_rows must be the number of simulations to cache in memory"
+
+    def look_up(self, keys: Sequence[bytes], width: int) -> tuple[np.ndarray, list[bool]]:
+        """Cached statistics (n, width) of n distinct keys, NaN if failed or not cached, and whether each is cached."""
+        found, unknown = [], _NAN * width
         with self._lock:
             for key in keys:
                 outcome = self._outcomes.get(key)
                 if outcome is not None:
                     self._outcomes.move_to_end(key)
                 found.append(outcome)
-        return found
-
-
-class MemoryCache(_Memory):
-    """Statistics of at most `most` simulations, by the bytes of structural parameters."""
-
-    _what = "memory_rows must be the number of simulations to cache in memory"
-
-    def look_up(self, keys: Sequence[bytes], width: int) -> tuple[np.ndarray, list[bool]]:
-        """Cached statistics (n, width) of n distinct keys, NaN if failed or not cached, and whether each is cached."""
-        found, unknown = self.outcomes(keys), _NAN * width
         # a bytearray makes a writable array
         filled = bytearray().join([each if isinstance(each, bytes) else unknown for each in found])
         return np.frombuffer(filled, dtype=float).reshape(len(keys), width), [each is not None for each in found]
@@ -96,7 +91,7 @@ class MemoryCache(_Memory):
 
     def reason(self, key: bytes) -> str:
         """Reason of a cached failure; empty for others."""
-        (outcome,) = self.outcomes([key])
+        outcome = self._outcomes.get(key)
         return outcome if isinstance(outcome, str) else ""
 
 
@@ -107,6 +102,11 @@ class ResponseMemory(_Memory):
     """
 
     _what = "memory_bytes must be the size of the responses to keep in memory [bytes]"
+
+    def look_up(self, keys: Iterable[Hashable]) -> list[np.ndarray | str | None]:
+        """Outcomes of keys; None where nothing is stored."""
+        with self._lock:
+            return [self._outcomes.get(key) for key in keys]
 
     def store(self, keys: Sequence[Hashable], outcomes: Iterable[np.ndarray | str]) -> None:
         """Store copies of responses, and reasons of failures."""

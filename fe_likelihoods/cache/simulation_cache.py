@@ -139,9 +139,12 @@ class SimulationCache:
     def _begin(self, file: CacheFile) -> None:
         self.file = file
         self.damaged = 0
-        self.name = secrets.token_hex(8)  # of this object
+        self._rename()
         self._waiting: list[Row] = []
         self._remark = ""  # that was stored last
+
+    def _rename(self) -> None:
+        self.name = secrets.token_hex(8)  # of the object, under which likelihoods share what they have verified
 
     def __getstate__(self) -> tuple:
         settings = ("max_response_bytes", "responses", "verify", "tolerance")
@@ -319,6 +322,7 @@ class SimulationCache:
         with self.file.lock:
             self._waiting = [row for row in self._waiting if row.source not in sources]
             self._remark = ""
+            self._rename()
             delete, rows = "DELETE FROM rows WHERE source = ?", [(source,) for source in sources]
             return self.file.insist(lambda connection: connection.executemany(delete, rows).rowcount)
 

@@ -261,8 +261,9 @@ class Simulator(VerifiedModel):
 
     def _take_statistics(self, request: _Request) -> list[int]:
         """Fill in stored statistics, unless responses are wanted, and return their rows; some are verified by runs."""
-        new = request.left
-        if self.cache is None or not len(new) or request.responses is not None or self._responses_only:
+        if self.cache is None or request.responses is not None or self._responses_only:
+            return []
+        if not len(new := request.left):
             return []
         rows = self._stored_statistics(request.thetas[new], request.fingerprint)
         found, reasons = rows.known.nonzero()[0], rows.reasons
@@ -278,7 +279,7 @@ class Simulator(VerifiedModel):
         left, size = request.left.tolist(), most_responses(self.model)
         for start in range(0, len(left), size):
             rows, fingerprint = left[start : start + size], request.fingerprint
-            known = dict(zip(rows, memory.outcomes([(fingerprint, request.keys[row]) for row in rows]), strict=True))
+            known = dict(zip(rows, memory.look_up([(fingerprint, request.keys[row]) for row in rows]), strict=True))
             missing = [row for row in rows if known[row] is None]
             if self.cache is not None and missing:
                 read = dict(zip(missing, self._stored_responses(request.thetas[missing], fingerprint), strict=True))
@@ -433,8 +434,6 @@ class Simulator(VerifiedModel):
         if they are stored on disk.
         """
         thetas, full = request.thetas[rows], request.responses is not None
-        # the model may have been replaced
-        fingerprint = request.fingerprint if request.model is self.model else self.model.fingerprint
         responses, statistics, why = None, values, reasons
         if values.ndim == 3:
             responses = values
@@ -449,6 +448,8 @@ class Simulator(VerifiedModel):
             if full:
                 request.responses[rows] = responses
             self._enter(request, rows, statistics, why)
+            if full or has_jacobian(self.model) or self.cache is not None:  # the model may have been replaced
+                fingerprint = request.fingerprint if request.model is self.model else self.model.fingerprint
             if full or has_jacobian(self.model):
                 outcomes = [reason or response for reason, response in zip(reasons, responses, strict=True)]
                 self.response_memory.store([(fingerprint, request.keys[row]) for row in rows], outcomes)

@@ -112,11 +112,6 @@ class ModelLabel:
         """The items of a model in its present state, and of the files that simulations opened."""
         return self._present(model) | self.opened.read_again().items()
 
-    def changed(self, model: Any) -> set[str]:
-        """Names of the items that differ from the label."""
-        known, now = self.items | self.opened.items(), self.present(model)
-        return {name for name in known.keys() | now.keys() if known.get(name) != now.get(name)}
-
     def has_changed_itself(self, names: Iterable[str]) -> None:
         """Record that simulations change some items; later labels of the same import keep their first digests."""
         for name in self.items.keys() & set(names) - _PARTS - self.changing:
