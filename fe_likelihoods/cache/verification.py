@@ -40,7 +40,14 @@ from ..simulation.by_value import is_arriving
 from ..simulation.faults import ChangedModel, TransientReason
 from ..simulation.files import Opened, observing
 from ..simulation.label import ModelLabel
-from ..simulation.model import Model, SimulationBatch, misfit_of_responses, most_responses, simulate_batch
+from ..simulation.model import (
+    MisfitBatch,
+    Model,
+    SimulationBatch,
+    misfit_of_responses,
+    most_responses,
+    simulate_batch,
+)
 from .comparison import Simulated, difference_in_words
 from .rows import (
     LABEL_COLUMNS,
@@ -226,6 +233,10 @@ class VerifiedModel:
         if self.cache is not None and other.cache is not None and other.label.code == self.label.code:
             self._trust = other._trust
 
+    def statistics_of(self, responses: np.ndarray, reasons: list[str]) -> MisfitBatch:
+        """Statistics (n, n_numbers) of responses (n, n_channels, n_steps) [SI], and reasons of failures."""
+        return misfit_of_responses(self.model, SimulationBatch(responses, reasons), self.measured, self.statistic)
+
     # new simulations ----------------------------------------------------------------------------------------------
 
     @contextmanager
@@ -243,7 +254,7 @@ class VerifiedModel:
         for first in range(0, len(thetas), size):
             with self._observed():
                 batch = simulate_batch(self.model, thetas[first : first + size], self.pool)
-            misfit, reasons = misfit_of_responses(self.model, batch, self.measured, self.statistic)
+            misfit, reasons = self.statistics_of(*batch)
             with np.errstate(over="ignore", invalid="ignore"):
                 norms = np.linalg.norm(batch.response, axis=2)
             rows += map(Simulated, misfit, reasons, norms)
@@ -538,8 +549,7 @@ class VerifiedModel:
         """How a simulation differs from a stored one, as `_difference`."""
         misfit, reason = np.frombuffer(row.value, dtype="<f8"), reason_of(row)
         if not reason and row.size is not None:  # a response
-            batch = SimulationBatch(misfit.reshape(1, len(self.model.channels), -1), [""])
-            (misfit,), (reason,) = misfit_of_responses(self.model, batch, self.measured, self.statistic)
+            (misfit,), (reason,) = self.statistics_of(misfit.reshape(1, len(self.model.channels), -1), [""])
         return self._difference(misfit, reason, new)
 
     def _use_no_rows(self, row: Row, new: Simulated, used: int, generation: int, source: int) -> bool:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ..simulation.model import SimulationBatch, derivatives_batch, misfit_of_responses
+from ..simulation.model import derivatives_batch
 
 __all__ = ["likelihood_gradient", "slopes_along"]
 
@@ -77,7 +77,7 @@ def _of_part(part: Any, rows: np.ndarray, sd: np.ndarray, bounds: np.ndarray) ->
         noise, response = rows[k, d:], batch.response[k]
         slopes[k, :d] = _along_responses(part, response, along, noise)
         if d < rows.shape[1]:
-            here = _statistics(part, response[None])
+            here = part.simulator.statistics_of(response[None], [""]).misfit
 
             def of_noise(values: np.ndarray, here: np.ndarray = here) -> np.ndarray:
                 return part.noise.log_likelihood(np.repeat(here, len(values), 0), part.n_samples, values)
@@ -97,13 +97,8 @@ def _along_responses(part: Any, response: np.ndarray, along: np.ndarray, noise: 
     offsets, weights = _CENTRAL
     slopes = np.empty(len(along))
     for j, (step, direction) in enumerate(zip(steps, along, strict=True)):
-        statistics = _statistics(part, response + step * offsets[:, None, None] * direction)
+        moved = response + step * offsets[:, None, None] * direction
+        statistics = part.simulator.statistics_of(moved, [""] * len(moved)).misfit
         values = part.noise.log_likelihood(statistics, part.n_samples, np.repeat(noise[None], len(offsets), 0))
         slopes[j] = weights @ values / step
     return slopes
-
-
-def _statistics(part: Any, responses: np.ndarray) -> np.ndarray:
-    """Statistics (n, n_numbers) of responses (n, c, n_steps)."""
-    batch = SimulationBatch(responses, [""] * len(responses))
-    return misfit_of_responses(part.model, batch, part.measured, part.simulator.statistic).misfit

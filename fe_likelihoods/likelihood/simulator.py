@@ -34,13 +34,11 @@ from ..simulation.faults import ChangedModel
 from ..simulation.folder import Observed, unpack
 from ..simulation.local_pool import value_of
 from ..simulation.model import (
-    MisfitBatch,
     Model,
     SimulationBatch,
     has_batch_method,
     has_jacobian,
     misfit_batch,
-    misfit_of_responses,
     most_responses,
     sent_simulation,
     simulate_batch,
@@ -296,15 +294,11 @@ class Simulator(VerifiedModel):
                 nothing = np.full((len(self.model.channels), self.model.n_steps), np.nan)
                 failed = [known[row] if isinstance(known[row], str) else "" for row in new]
                 responses = [nothing if reason else known[row] for row, reason in zip(new, failed, strict=True)]
-                statistics, reasons = self._statistics_of(np.array(responses), failed)
+                statistics, reasons = self.statistics_of(np.array(responses), failed)
                 self._enter_known(request, new, statistics, reasons)
                 if self.cache is not None and not self._responses_only:
                     self._store(request.thetas[new], statistics, reasons, None, fingerprint)
         return on_disk
-
-    def _statistics_of(self, responses: np.ndarray, reasons: list[str]) -> MisfitBatch:
-        """Statistics of responses (n, n_channels, n_steps) and reasons of failures."""
-        return misfit_of_responses(self.model, SimulationBatch(responses, reasons), self.measured, self.statistic)
 
     def _enter_known(self, request: _Request, rows: Sequence[int], statistics: np.ndarray, reasons: list[str]) -> None:
         """Enter known statistics, and log the remark that is stored with them."""
@@ -437,7 +431,7 @@ class Simulator(VerifiedModel):
         responses, statistics, why = None, values, reasons
         if values.ndim == 3:
             responses = values
-            statistics, why = self._statistics_of(values, reasons)
+            statistics, why = self.statistics_of(values, reasons)
         with self._running.lock:
             self.seconds += seconds
             self.simulations += len(thetas)
