@@ -1,4 +1,4 @@
-"""The figure of scores shows what the scores say: histogram, band of chance, intervals and shares."""
+"""The figure of scores shows what the scores say: intervals, shares, and the band of chance."""
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -18,40 +18,30 @@ def numbers(measured, rng, factor=1.0, center=None):
     return score_values([c.name for c in CHANNELS], [c.unit for c in CHANNELS], values, measured, 0.9)
 
 
-def bars(axes):
-    return np.array([patch.get_height() for patch in axes.patches])
-
-
-def chance(axes):
-    """Ends of the shaded band."""
-    heights = axes.collections[0].get_paths()[0].vertices[:, 1]
-    return heights.min(), heights.max()
-
-
 @pytest.mark.parametrize(("factor", "calibrated"), [(1.0, True), (0.3, False)])
-def test_histogram_is_within_the_band_of_chance_for_calibrated_predictions_alone(factor, calibrated, rng):
+def test_shares_are_within_the_band_of_chance_for_calibrated_predictions_alone(factor, calibrated, rng):
     measured = np.exp(0.2 * rng.normal(size=(60, 2)))
-    axes = plot_scores({f"EQ{k}": numbers(each, rng, factor, np.ones(2)) for k, each in enumerate(measured)}).axes[0]
-    low, high = chance(axes)
-    assert low < 0.1 < high
-    assert (np.mean((bars(axes) >= low) & (bars(axes) <= high)) >= 0.7) == calibrated
-    assert (bars(axes)[[0, -1]].min() > high) != calibrated
+    axes = plot_scores({f"EQ{k}": numbers(each, rng, factor, np.ones(2)) for k, each in enumerate(measured)}).axes[1]
+    bands = [each.get_paths()[0].vertices[:, 1] for each in axes.collections[::2]]
+    within = [line.get_ydata()[0] for line in axes.lines]
+    for share, band in zip(within, bands, strict=True):
+        assert (band.min() <= share <= band.max()) == calibrated
     plt.close("all")
 
 
 def test_intervals_of_numbers_are_drawn_relative_to_the_measured_values_in_the_order_of_events(rng):
     events = {name: numbers(np.array(values), rng) for name, values in {"B": (2.0, 0.01), "A": (0.5, 0.03)}.items()}
     figure = plot_scores(events)
-    labels = [text.get_text() for text in figure.axes[1].get_yticklabels()]
+    labels = [text.get_text() for text in figure.axes[0].get_yticklabels()]
     assert [each.split(":")[0] for each in labels] == ["B, deck", "B, drift", "A, deck", "A, drift"]
     assert labels[1] == "B, drift: 10 mm"
-    outer, inner = (each.get_segments() for each in figure.axes[1].collections[:2])
+    outer, inner = (each.get_segments() for each in figure.axes[0].collections[:2])
     np.testing.assert_allclose(
         [segment[:, 0] for segment in outer[2:]],
         np.stack([events["A"].lower, events["A"].upper], axis=1) / events["A"].measured[:, None],
     )
     assert all(o[0, 0] < i[0, 0] < i[1, 0] < o[1, 0] for o, i in zip(outer, inner, strict=True))
-    shares = [line.get_ydata()[0] for line in figure.axes[2].lines]
+    shares = [line.get_ydata()[0] for line in figure.axes[1].lines]
     pit = np.concatenate([each.pit for each in events.values()])
     assert shares == [np.mean(np.abs(pit - 0.5) <= 0.25), np.mean(np.abs(pit - 0.5) <= 0.45)]
     plt.close("all")
@@ -77,14 +67,12 @@ def overlaps(found):
 
 
 @pytest.mark.parametrize("n", [3, 40])
-def test_legends_cover_no_bar_and_labels_of_axes_do_not_overlap(rng, n):
+def test_labels_of_axes_do_not_overlap(rng, n):
     figure = plot_scores({f"EQ{k}": numbers(np.exp(rng.normal(size=2)), rng) for k in range(n)})
     figure.canvas.draw()
-    legend = figure.axes[0].get_legend().get_window_extent()
-    assert not any(legend.overlaps(bar.get_window_extent()) for bar in figure.axes[0].patches)
     labels = [axes.xaxis.label for axes in figure.axes] + [axes.yaxis.label for axes in figure.axes]
-    labels += figure.axes[1].get_yticklabels() + figure.axes[1].get_xticklabels()
+    labels += figure.axes[0].get_yticklabels() + figure.axes[0].get_xticklabels()
     labels += [axes.title for axes in figure.axes]
     assert not overlaps(boxes(figure, labels))
-    assert figure.get_figheight() < 15.0 and figure.axes[0].get_window_extent().height > 100.0
+    assert figure.get_figheight() < 15.0 and figure.axes[1].get_window_extent().height > 100.0
     plt.close(figure)
