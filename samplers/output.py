@@ -90,6 +90,7 @@ class Output:
             "ladder": result.ladder,
             "check": result.check,
             "founders": None if result.founders is None else np.asarray(result.founders).tolist(),
+            "parents": None if result.parents is None else np.asarray(result.parents).tolist(),
             "verdict": self.verdict,
             "provisional": self.provisional,
         }
@@ -166,11 +167,12 @@ def _read(backend: Backend) -> dict[str, Any]:
 
 
 def _parsed(stored: dict[str, Any]) -> tuple[AnnealingResult, Verdict | None]:
-    check, founders, verdict = (stored.get(name) for name in ("check", "founders", "verdict"))
+    check, founders, parents, verdict = (stored.get(name) for name in ("check", "founders", "parents", "verdict"))
     result = AnnealingResult(
         tuple(Stage(*values) for values in stored.get("ladder", ())),
         None if check is None else EvidenceCheck(*check),
         None if founders is None else np.array(founders),
+        None if parents is None else np.array(parents),
     )
     if verdict is None:
         return result, None

@@ -178,6 +178,7 @@ class AnnealingResult(NamedTuple):
     ladder: tuple[Stage, ...] = ()
     check: EvidenceCheck | None = None  # independent estimate of the evidence
     founders: np.ndarray | None = None  # (nwalkers,) int, see `samplers.estimates.genealogy`; None if unknown
+    parents: np.ndarray | None = None  # (nwalkers,) int, founders by the last resampling alone; None if unknown
     rounds: tuple[GuidedRound, ...] = ()
     start: GuidedStart | None = None  # result of the rounds; None without a guide
     signed: SignedSample | None = None  # known and evaluated points of the rounds; None if the guide knows no density

@@ -10,7 +10,7 @@ from .estimates.genealogy import standard_error_of_mean, student_factor
 from .estimates.importance import EvidenceCheck
 from .evaluation.evaluator import Evaluator
 from .evaluation.user_target import Target
-from .judgement.clusters import error_between_modes, find_members
+from .judgement.clusters import error_between_modes
 from .judgement.failures import NearFailures
 from .judgement.verdict import Verdict
 from .record import Record
@@ -118,6 +118,12 @@ class RunResults:
         return np.arange(self.nwalkers) if founders is None else founders
 
     @property
+    def _parents(self) -> np.ndarray:
+        """Founders (nwalkers,) by the last resampling alone; all different if they are not known."""
+        parents = self._result.parents
+        return np.arange(self.nwalkers) if parents is None else parents
+
+    @property
     def prior_draws(self) -> np.ndarray | None:
         """Draws of the prior (nwalkers, ndim) from which the run was annealed; None without a record of it."""
         return None if self._record.start is None else self._record.start.coords
@@ -171,8 +177,8 @@ class RunResults:
             errors = errors * student_factor(1.0 / np.sum(shares**2) - 1.0)
         if not self._result.finished:  # a chain that was not annealed
             return errors
-        flat, error = values.reshape(-1, values.shape[2]), self.ladder[-1].log_evidence_error
-        return np.hypot(errors, error_between_modes(find_members(chain), flat, error))
+        error = self.ladder[-1].log_evidence_error
+        return np.hypot(errors, error_between_modes(chain, values, self._parents, error))
 
     @property
     def guide(self) -> Guide | None:

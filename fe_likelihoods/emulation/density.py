@@ -1,11 +1,12 @@
 """The emulated posterior: its density, its evidence and independent draws, without simulations.
 
 Each mode has a region with an emulator of its own. A point belongs to the region whose centre is nearest, in the
-whitened coordinates of the region; the density there is the prior times the likelihood of the emulated statistics, and
-zero beyond the reach of the emulator. A t distribution per region is fitted to this density by adaptive importance
-sampling in memory (Cornuet, Marin, Mira & Robert, 2012, Scand. J. Stat. 39(4), doi:10.1111/j.1467-9469.2011.00756.x),
-and a mixture by expectation-maximisation where these do not cover it; a large sample of weighted points (the pool)
-gives the evidence of the emulated posterior, and draws after a few independence Metropolis steps.
+whitened coordinates of the region; the density there is the prior times the likelihood of the emulated statistics, also
+far from all simulations: a density that ends near them would grow along a ridge by a part in each round. A t
+distribution per region is fitted to this density by adaptive importance sampling in memory (Cornuet, Marin, Mira &
+Robert, 2012, Scand. J. Stat. 39(4), doi:10.1111/j.1467-9469.2011.00756.x), and a mixture by expectation-maximisation
+where these do not cover it; a large sample of weighted points (the pool) gives the evidence of the emulated posterior,
+and draws after a few independence Metropolis steps.
 """
 
 from collections.abc import Sequence
@@ -100,10 +101,9 @@ class EmulatedPosterior:
         return self._log_likelihood(self._target.scaled(coords)) + self._target.log_prior(coords)
 
     def _log_likelihood(self, scaled: np.ndarray) -> np.ndarray:
-        nearest, squared = self._nearest(scaled)
-        result = np.full(len(scaled), -np.inf)
+        nearest, result = self._nearest(scaled), np.full(len(scaled), -np.inf)
         for k, region in enumerate(self._regions):
-            rows = np.flatnonzero((nearest == k) & (squared[k] <= region.emulator.reach))
+            rows = np.flatnonzero(nearest == k)
             if len(rows):
                 result[rows] = region.emulator.log_likelihood(scaled[rows])
         return np.where(np.isnan(result), -np.inf, result)
@@ -118,10 +118,9 @@ class EmulatedPosterior:
         """Normalised log-density (n,) of parameters (n, ndim)."""
         return self._target.density_of_parameters(self.log_density, parameters) - self.log_evidence
 
-    def _nearest(self, scaled: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Region (n,) that scaled parameters belong to, and squared distances (n_regions, n) from all of them."""
-        squared = np.stack([region.emulator.squared_distance(scaled) for region in self._regions])
-        return np.argmin(squared, axis=0), squared
+    def _nearest(self, scaled: np.ndarray) -> np.ndarray:
+        """Region (n,) that scaled parameters belong to."""
+        return np.argmin([region.emulator.squared_distance(scaled) for region in self._regions], axis=0)
 
     def draw(self, n: int, random: np.random.RandomState) -> np.ndarray:
         """Draws (n, ndim) of the emulated posterior that are practically independent."""
@@ -153,7 +152,7 @@ class EmulatedPosterior:
 
     def _moments(self) -> list[Region]:
         """The regions with the mean, covariance and evidence that the pool gives them, where it suffices."""
-        (nearest, _), updated = self._nearest(self._scaled), []
+        nearest, updated = self._nearest(self._scaled), []
         for k, region in enumerate(self._regions):
             rows = nearest == k
             share = self._weights[rows].sum()
@@ -186,7 +185,7 @@ class EmulatedPosterior:
         enough = _ENOUGH_PER_DIMENSION * self._target.ndim
         for _ in range(_ROUNDS):
             scaled, _, log_weights = self._propose([(mixture, 1.0)], _DRAWS, random)
-            nearest, _ = self._nearest(scaled)
+            nearest = self._nearest(scaled)
             for k, region in enumerate(regions):
                 rows = np.flatnonzero((nearest == k) & (log_weights > -np.inf))
                 if len(rows) <= enough:
@@ -215,7 +214,7 @@ class EmulatedPosterior:
         structural, ndim = self._target.archive.coords, self._target.ndim
         noise = np.array([region.centre[structural.shape[1] :] for region in self._regions])
         scaled = self._target.scaled(np.column_stack([structural, np.zeros((len(structural), noise.shape[1]))]))
-        scaled[:, structural.shape[1] :] = noise[self._nearest(scaled)[0]]
+        scaled[:, structural.shape[1] :] = noise[self._nearest(scaled)]
         density = self._log_likelihood(scaled) + self._target.log_prior(structural)
         simulated = self._target.log_likelihood(self._target.archive.statistics, scaled[:, structural.shape[1] :])
         self.of_runs = simulated + self._target.log_prior(structural), density
@@ -232,7 +231,7 @@ class EmulatedPosterior:
         size = min(_POOL, _NUMBERS // self._target.ndim)
         self._scaled, self._pool, self._log_weights = self._propose(parts, size, random)
         if not np.any(self._log_weights > -np.inf):
-            raise np.linalg.LinAlgError("none is inside the support of the prior and within reach of an emulator")
+            raise np.linalg.LinAlgError("none is inside the support of the prior")
         # outside the support of the prior, coordinates are infinite
         self._pool[self._log_weights == -np.inf] = 0.0
         self._weights = normalised_weights(self._log_weights)

@@ -46,7 +46,6 @@ __all__ = ["ResponseEmulator", "TrainingSet", "fit_emulator"]
 _MAX_COMPONENTS = 60
 _NEGLIGIBLE_VARIANCE = 1e-3  # of the left-out components together, per run, in units of the noise variance
 _SMALLEST_SHARE = 1e-10  # of the leading component
-_REACH = 2.5  # squared distance up to which the emulator is used, as a multiple of the training points' largest one
 _TINY = 1e-300
 _WIDEST = 9.0  # factor by which variances are widened at most
 # In log-likelihood, at most. Without it, draws for a cyclic test had promised 20 to 130 more than at the mean, and
@@ -72,9 +71,9 @@ class _Forms(NamedTuple):
 class ResponseEmulator:
     """Predicts statistics of responses near the runs that it was fitted to; made by `fit_emulator`.
 
-    `reach` is the largest `squared_distance` at which it is used, and `left_out` (m, k) are the errors of each training
-    run's coefficients, predicted from the other runs. Rows of `histories` (1 + k, n) are the mean residual and the
-    components, as weights of runs.
+    `target` has the scale of its inputs; `left_out` (m, k) are the errors of each training run's coefficients as
+    predicted from the other runs. Rows of `histories` (1 + k, n) are the mean residual and the components, as weights
+    of runs.
     """
 
     def __init__(
@@ -87,8 +86,7 @@ class ResponseEmulator:
         coefficients: np.ndarray,
         slopes: np.ndarray,
     ) -> None:
-        self._target, self._centre, self._whitening, self.process = target, centre, whitening, process
-        self.reach = _REACH * float(np.square(process.inputs).sum(axis=1).max())
+        self.target, self._centre, self._whitening, self.process = target, centre, whitening, process
         self.left_out, variances = left_out_errors(process)
         largest = (np.square(self.left_out) / np.maximum(variances, _TINY)).max(axis=0)
         self._widening = np.clip(largest / (2.0 * np.log(len(variances))), 1.0, _WIDEST)
@@ -99,7 +97,7 @@ class ResponseEmulator:
         self._hessian = 2.0 * self._forms.quadratic @ slopes
 
     def _inputs(self, scaled: np.ndarray) -> np.ndarray:
-        return (scaled[:, : self._target.n_structural] - self._centre) @ self._whitening
+        return (scaled[:, : self.target.n_structural] - self._centre) @ self._whitening
 
     def squared_distance(self, scaled: np.ndarray) -> np.ndarray:
         """Squared distance (n,) of scaled parameters (n, >= n_structural) from the centre, in whitened parameters."""
@@ -110,13 +108,13 @@ class ResponseEmulator:
 
         The columns are those of `ResponseTarget.scaled`.
         """
-        noise = scaled[:, self._target.n_structural :]
+        noise = scaled[:, self.target.n_structural :]
         mean, variance = predict(self.process, self._inputs(scaled))
         variance = variance * self._widening
         curved = 1.0 + variance * np.maximum(-np.diagonal(self._hessian), 0.0)
         gradient = self._gradient + mean @ self._hessian
         gain = 0.5 * (variance * np.square(gradient) / curved - np.log(curved)).sum(axis=1)
-        return self._target.log_likelihood(self._at(mean), noise) + np.minimum(gain, _LARGEST_GAIN)
+        return self.target.log_likelihood(self._at(mean), noise) + np.minimum(gain, _LARGEST_GAIN)
 
     def _at(self, mean: np.ndarray) -> np.ndarray:
         """Statistics (n, n_numbers) at coefficients (n, k)."""

@@ -9,6 +9,7 @@ these coordinates is
 with the response R at the structural parameters, the statistics S of the residuals, and the noise parameters eta.
 """
 
+import copy
 import hashlib
 import json
 from collections.abc import Callable, Generator, Sequence
@@ -117,7 +118,7 @@ class ResponseTarget:
             self._median_volume = float(np.squeeze(self._noise_prior.logpdf(at)) - self.log_prior(zero)[0])
         elif self.n_noise:  # the volume of structural parameters alone is not known
             self._scales = dict.fromkeys(self._scales, (nothing, nothing))
-        self.take_scale("logarithms")
+        self._logarithmic, self._reciprocal = self._columns("logarithms")
         self.archive = Archive(self.statistic, self.measured.shape)
         self._simulated: set[bytes] = set()
         self.differentiable, self.kinds = self._data.differentiable, self._data.kinds
@@ -221,13 +222,19 @@ class ResponseTarget:
         full[:, : self.n_structural] = thetas
         return _finite(self._prior.to_normal(full)[:, : self.n_structural])
 
-    def take_scale(self, name: str) -> None:
-        """Let scaled parameters be one of `SCALES` where the prior keeps parameters away from zero.
+    def in_scale(self, name: str) -> "ResponseTarget":
+        """The same target and archive, with scaled parameters that are one of `SCALES` where the prior is off zero.
 
         Other parameters are not transformed, except that those with a lognormal prior are logarithms.
         """
-        logarithmic, reciprocal = (each[: self.n_structural] for each in self._scales[name])
-        self._logarithmic, self._reciprocal = np.flatnonzero(logarithmic), np.flatnonzero(reciprocal)
+        other = copy.copy(self)
+        other._logarithmic, other._reciprocal = self._columns(name)
+        return other
+
+    def _columns(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Columns of structural parameters whose logarithms and reciprocals a scale takes."""
+        logarithmic, reciprocal = (np.flatnonzero(each[: self.n_structural]) for each in self._scales[name])
+        return logarithmic, reciprocal
 
     def scaled_parameters(self, coords: np.ndarray) -> np.ndarray:
         """Structural parameters (n, n_structural), or a function of those that the prior keeps away from zero.

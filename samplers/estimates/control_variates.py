@@ -32,7 +32,7 @@ import numpy as np
 
 from ..resampling import systematic
 from .genealogy import student_factor
-from .importance import KnownDensity, Round, mixture_at_draws, pool_rounds
+from .importance import KnownDensity, PooledRounds, Round, mixture_at_draws
 
 __all__ = ["Expectation", "SignedSample", "signed_sample", "unreached_share"]
 
@@ -132,8 +132,8 @@ class SignedSample(NamedTuple):
         return Expectation(value, error * np.diff(ends)[:, 0] / (high - low))
 
 
-def signed_sample(rounds: Sequence[Round]) -> SignedSample | None:
-    """The signed sample of all rounds with a known density; None if there is none.
+def signed_sample(rounds: Sequence[Round], pooled: PooledRounds) -> SignedSample | None:
+    """The signed sample of all rounds with a known density, from all draws `pooled`; None if there is none.
 
     Rounds, as `add_round` returns them, are independent estimates. Each counts with the inverse of the mean square of
     its differences, an expectation that the draws of all rounds give: few draws may have small differences by chance,
@@ -144,8 +144,8 @@ def signed_sample(rounds: Sequence[Round]) -> SignedSample | None:
     if not used:
         return None
     found = [(rounds[k], *_differences(rounds[k])) for k in used]
-    log_evidence, points = pool_rounds(rounds).log_evidence, np.concatenate([r.coords for r in rounds])
-    known_at = {k: rounds[k].known.log_density(points) for k in used}  # emulators take most of the time
+    log_evidence = pooled.log_evidence
+    known_at = {k: rounds[k].known.log_density(pooled.coords) for k in used}  # emulators take most of the time
     for _ in range(2):  # the evidence that the differences are taken with becomes more accurate
         log_shares = np.log([len(r.coords) for r, *_ in found]) - _log_mean_squares(rounds, known_at, log_evidence)
         shares = np.exp(log_shares - np.logaddexp.reduce(log_shares))

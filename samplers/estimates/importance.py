@@ -30,7 +30,6 @@ __all__ = [
     "log_mixture",
     "mixture_at_draws",
     "pool_rounds",
-    "recent_share",
     "round_shares",
     "tail_growth",
     "tail_shape",
@@ -172,7 +171,7 @@ class Round(NamedTuple):
     known: KnownDensity | None = None  # close to the posterior, fixed before the draws were made
     log_known: np.ndarray | None = None  # (n,), log-density of `known` minus log-density of the proposal
     log_density: Callable[[np.ndarray], np.ndarray] | None = None  # (m,) of the proposal at points (m, ndim)
-    log_densities: np.ndarray | None = None  # (n, n_rounds), of the proposals of all rounds at these draws
+    log_densities: np.ndarray | None = None  # (n, n_rounds) at these draws: of the own proposal, by `add_round` of all
 
     @property
     def effective_sample_size(self) -> float:
@@ -280,18 +279,13 @@ def tail_variance(log_weights: np.ndarray) -> float:
     return (largest * max(shape, 0.0) / (1.0 - shape)) ** 2
 
 
-def recent_share(rounds: Sequence[Round]) -> float:
-    """Mean effective share of the last three rounds."""
-    return max(float(np.mean([r.effective_share for r in rounds[-3:]])), np.finfo(float).tiny)
-
-
 def add_round(rounds: Sequence[Round], latest: Round) -> list[Round]:
     """Rounds and a further one, each with the densities of all of them at its draws."""
     earlier = [
         each._replace(log_densities=np.column_stack([each.log_densities, latest.log_density(each.coords)]))
         for each in rounds
     ]
-    densities = [each.log_density(latest.coords) for each in (*rounds, latest)]
+    densities = [*(each.log_density(latest.coords) for each in rounds), latest.log_densities]
     return [*earlier, latest._replace(log_densities=np.column_stack(densities))]
 
 

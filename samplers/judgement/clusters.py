@@ -5,11 +5,12 @@ line between their means does not fall below a fifth of its lower end value, whi
 a distance of about 4 standard deviations; components in between connect other components. The share of a mode is the
 probability that a point belongs to one of its components, averaged over the chain. A mode without points is not found.
 
-Moves cross between modes rarely, so the shares keep the errors of all resamplings, which founders of the last few do
+Where moves rarely cross between modes, the shares keep the errors of all resamplings, which founders of the last few do
 not show. If no point crosses, n weights of the stages give the log-evidence the variance S / n, a mode with the share p
 S / (p n), and the share itself p (1 - p) S / n: sqrt(p (1 - p)) times the error of the log-evidence, at most 1. In 245
 runs of SMC with several modes the shares were off by .22 (root mean square), which this states as .19 and the founders
-as .05; in 134 of TMCMC by .10, stated as .13 and .03.
+as .05; in 134 of TMCMC by .10, stated as .13 and .03. Where points cross in the moves after the last resampling, their
+part of this error is the correlation of memberships before and after these moves.
 """
 
 from typing import NamedTuple
@@ -46,17 +47,18 @@ class Cluster(NamedTuple):
     sd: np.ndarray
 
 
-def find_clusters(chain: np.ndarray, founders: np.ndarray, error: float) -> tuple[Cluster, ...]:
+def find_clusters(chain: np.ndarray, founders: np.ndarray, parents: np.ndarray, error: float) -> tuple[Cluster, ...]:
     """Modes of a chain (nsteps, nwalkers, ndim), the largest first, with shares whose sum is 1.
 
-    `founders` (nwalkers,) are the founder of each walker (`samplers.estimates.genealogy`); `error` is the standard
-    error of the log-evidence of the stages, from which the shares have theirs.
+    `founders` (nwalkers,) are the founder of each walker (`samplers.estimates.genealogy`), and `parents` those by the
+    last resampling alone; `error` is the standard error of the log-evidence of the stages.
     """
     flat = chain.reshape(-1, chain.shape[2])
     belongs = find_members(chain)
     shares = belongs.mean(axis=0)
-    errors = standard_error_of_mean(belongs.reshape(*chain.shape[:2], -1), founders)
-    errors = np.hypot(np.where(shares < 1.0, errors, 0.0), min(error, 1.0) * np.sqrt(shares * (1.0 - shares)))
+    along = belongs.reshape(*chain.shape[:2], -1)
+    errors = np.where(shares < 1.0, standard_error_of_mean(along, founders), 0.0)
+    errors = np.hypot(errors, _kept(along, parents) * min(error, 1.0) * np.sqrt(shares * (1.0 - shares)))
     modes = []
     for weights, share, share_error in zip(belongs.T, shares, errors, strict=True):
         mean = weights @ flat / weights.sum()
@@ -79,10 +81,32 @@ def find_members(chain: np.ndarray) -> np.ndarray:
     return belongs
 
 
-def error_between_modes(belongs: np.ndarray, values: np.ndarray, error: float) -> np.ndarray:
-    """Standard error (k,) of the mean of values (n, k) by the shares of modes, whose members `find_members` gives."""
-    apart = (belongs.T @ values) / belongs.sum(axis=0)[:, None] - values.mean(axis=0)
-    return min(error, 1.0) * np.sqrt(belongs.mean(axis=0) @ np.square(apart))
+def error_between_modes(chain: np.ndarray, values: np.ndarray, parents: np.ndarray, error: float) -> np.ndarray:
+    """Standard error (k,) of the mean of values (nsteps, nwalkers, k) at the points of a chain by the shares of modes.
+
+    `parents` and `error` are as for `find_clusters`.
+    """
+    belongs, flat = find_members(chain), values.reshape(-1, values.shape[2])
+    kept = _kept(belongs.reshape(*chain.shape[:2], -1), parents)
+    apart = (belongs.T @ flat) / belongs.sum(axis=0)[:, None] - flat.mean(axis=0)
+    return min(error, 1.0) * np.sqrt((np.square(kept) * belongs.mean(axis=0)) @ np.square(apart))
+
+
+def _kept(belongs: np.ndarray, parents: np.ndarray) -> np.ndarray:
+    """Correlation (k,) of memberships (nsteps, nwalkers, k) along the chain with those of the `parents` of the walkers.
+
+    Its square is the correlation between walkers with one parent. 1 where each walker has a parent of its own.
+    """
+    _, group, sizes = np.unique(parents, return_inverse=True, return_counts=True)
+    apart, shares = belongs.mean(axis=0), belongs.mean(axis=(0, 1))
+    apart = apart - shares
+    sums = np.zeros((len(sizes), len(shares)))
+    np.add.at(sums, group, apart)
+    pairs, variances = np.sum(sizes * (sizes - 1)), shares * (1.0 - shares)
+    if pairs == 0:
+        return np.ones(len(shares))
+    together = (np.square(sums).sum(axis=0) - np.square(apart).sum(axis=0)) / pairs
+    return np.sqrt(np.clip(together / np.where(variances > 0.0, variances, 1.0), 0.0, 1.0))
 
 
 def _groups(mixture: Mixture) -> np.ndarray:

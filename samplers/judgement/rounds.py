@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ..estimates.control_variates import unreached_share
-from ..estimates.importance import EvidenceCheck, KnownDensity, PooledRounds, Round, recent_share
+from ..estimates.importance import EvidenceCheck, KnownDensity, PooledRounds, Round
 from ..estimates.pareto import LARGEST_SHAPE
 
 __all__ = [
@@ -82,7 +82,7 @@ def is_reliable(rounds: Sequence[Round]) -> bool:
     """Whether fresh rounds show that the guide describes the posterior."""
     latest = rounds[-1]
     share = latest.effective_share
-    if min(share, recent_share(rounds)) < RELIABLE_SHARE:
+    if min(share, np.mean([each.effective_share for each in rounds[-3:]])) < RELIABLE_SHARE:
         return False
     few = len(latest.log_weights) < FEW_DRAWS
     return latest.pareto_shape < LARGEST_RELIABLE_SHAPE or (few and share >= SHORT_TAIL_SHARE)

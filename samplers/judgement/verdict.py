@@ -143,7 +143,7 @@ class Verdict(_Stored):
         stages = run._result.require_finished()
         if run.iteration == 0:
             raise ValueError("modes are found in a chain, which is empty: call run_mcmc with one step or more")
-        return find_clusters(run.get_chain(), run.founders, stages[-1].log_evidence_error)
+        return find_clusters(run.get_chain(), run.founders, run._parents, stages[-1].log_evidence_error)
 
     @property
     def summary(self) -> str:

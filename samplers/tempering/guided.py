@@ -155,7 +155,7 @@ class Batch:
         log_density = self._log_density[self.pending.arrived]
         log_weights = np.where(alive, np.where(alive, log_prob, 0.0) - log_density, -np.inf)
         known = None if self._known is None else self._known.log_density(coords) - log_density
-        return Round(coords, records, log_weights, self._known, known, self._function)
+        return Round(coords, records, log_weights, self._known, known, self._function, log_density[:, None])
 
     def take_observable(self) -> np.ndarray:
         """Draws (m, ndim) that have arrived since the last call or the submission."""
@@ -298,7 +298,7 @@ def draw_rounds(
 
 def _with_signed(outcome: RoundsOfGuide) -> RoundsOfGuide:
     """With the signed sample of all rounds, if its means are more accurate than those of the pooled draws."""
-    found, pooled = signed_sample(outcome.rounds), outcome.pooled
+    found, pooled = signed_sample(outcome.rounds, outcome.pooled), outcome.pooled
     if found is not None:
         weights = normalised_weights(pooled.log_weights)
         variance = weights @ np.square(pooled.coords - weights @ pooled.coords)

@@ -44,7 +44,7 @@ class Recording:
         elif kind in COLLECTED:
             result = result._replace(**{COLLECTED[kind]: (*getattr(result, COLLECTED[kind]), report)})
         if result.finished and population.founders:
-            result = result._replace(founders=population.founders[0])
+            result = result._replace(founders=population.founders[0], parents=population.founders[-1])
         self.result = result
         return result
 
@@ -54,10 +54,11 @@ def check_end(result: AnnealingResult, coords: np.ndarray) -> list[Finding]:
     stop = result.early_stop
     if stop is not None and not stop.complete:
         return []  # its points are judged by their weights
-    founders = np.arange(len(coords)) if result.founders is None else result.founders
+    each = np.arange(len(coords))
+    founders, parents = (each if known is None else known for known in (result.founders, result.parents))
     error = result.ladder[-1].log_evidence_error
 
     def share_error() -> float:
-        return max(mode.share_error for mode in find_clusters(coords[None], founders, error))
+        return max(mode.share_error for mode in find_clusters(coords[None], founders, parents, error))
 
     return check_evidence(result.log_evidence_ladder, error, result.check, share_error)

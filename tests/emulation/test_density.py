@@ -8,7 +8,7 @@ from scipy.integrate import quad
 
 from fe_likelihoods.emulation.density import EmulatedPosterior, Region
 
-RADIUS, THICKNESS, REACH = 1.0, 0.01, 100.0
+RADIUS, THICKNESS = 1.0, 0.01
 
 
 class Target:
@@ -45,7 +45,7 @@ def emulated(arc, runs):
         return np.where(np.abs(angle) < arc, -0.5 * np.square((radius - RADIUS) / THICKNESS), -np.inf)
 
     emulator = SimpleNamespace(
-        log_likelihood=log_likelihood, reach=REACH, squared_distance=lambda coords: np.square(coords).sum(axis=1)
+        log_likelihood=log_likelihood, squared_distance=lambda coords: np.square(coords).sum(axis=1)
     )
     region = Region(np.array([RADIUS, 0.0]), np.diag([THICKNESS**2, 1.0]), emulator, 0.0)
     return EmulatedPosterior(Target(runs), [region], np.random.RandomState(1))
@@ -67,7 +67,6 @@ def test_a_gaussian():
     target = Target(0.0, runs=1)
     emulator = SimpleNamespace(
         log_likelihood=lambda coords: -0.5 * (np.square(coords) / [0.01, 1e-4]).sum(axis=1),
-        reach=REACH,
         squared_distance=lambda coords: np.square(coords).sum(axis=1),
     )
     found = EmulatedPosterior(

@@ -50,14 +50,12 @@ def test_near_a_bound_the_emulator_follows_the_response(prior):
     coords = target.structural_coordinates(np.array([[1.2, 1e-2], [1.2, 1e-3], [1.203, 1e-6], [1.198, 1e-9]]))
     emulated = emulator.log_likelihood(target.scaled(coords))
     true = target.log_likelihood(at_once(target.run(coords)).statistics, np.zeros((4, 0)))
-    assert (emulator.squared_distance(target.scaled(coords)) < emulator.reach).all()
     assert np.abs(emulated - true).max() < 0.3
 
 
 @pytest.mark.parametrize("scale", SCALES)
 def test_scaled_parameters_can_be_undone_and_their_volume_is_known(scale):
-    target = ResponseTarget(vibration(damping=LogNormal(0.8, 0.3)))
-    target.take_scale(scale)
+    target = ResponseTarget(vibration(damping=LogNormal(0.8, 0.3))).in_scale(scale)
     coords = np.random.default_rng(1).standard_normal((50, target.ndim))
     scaled = target.scaled(coords)
     back, log_volume = target.unscaled(scaled)

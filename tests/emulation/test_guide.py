@@ -210,7 +210,7 @@ def test_a_banana_is_right_or_has_a_concern(n):
     ("simulated", "emulated", "refused"),
     [
         ([0.0, -1.0, -20.0], [0.1, -1.5, -np.inf], False),  # improbable runs need not be emulated
-        ([0.0, -1.0, -2.0], [0.0, -1.0, -np.inf], True),  # beyond the reach of the emulator
+        ([0.0, -1.0, -2.0], [0.0, -1.0, -np.inf], True),
         ([0.0, -1.0, -2.0], [0.0, -1.0, -6.5], True),
         ([0.0, -1.0, -2.0], [0.0, -1.0, np.nan], True),
         ([0.0, -1.0, -2.0], [-3.0, -4.0, -5.0], False),  # an uncertain emulator

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from samplers import SMCSampler, compare_models, ladder_table
-from samplers.judgement.clusters import error_between_modes, find_clusters, find_members
+from samplers.judgement.clusters import error_between_modes, find_clusters
 from tests.statistics import analytic_posteriors as analytic
 
 
@@ -78,17 +78,24 @@ def test_modes_need_a_chain(two_modes):
         sampler.verdict.modes  # noqa: B018
 
 
-def test_errors_of_shares_are_those_of_the_stages_and_at_most_one(rng):
+@pytest.mark.parametrize("crossed", [0.0, 1.0])
+def test_errors_of_shares_are_those_of_the_stages_until_moves_cross(crossed, rng):
     """Two modes 20 apart with shares .25 and .75: a share has sqrt(.1875) of the error, and the mean 20 times this."""
-    first = np.arange(400) < 100
+    parents = np.repeat(np.arange(200), 2)
+    first = np.where(rng.random(400) < crossed, rng.permutation(400) < 100, parents < 50)
     chain = (rng.standard_normal((400, 2)) + np.where(first, 20.0, 0.0)[:, None])[None]
     for stated, used in ((0.2, 0.2), (np.inf, 1.0)):
-        (large, small) = find_clusters(chain, np.arange(400), stated)
-        assert small.share == pytest.approx(0.25, rel=1e-3) and large.share > 0.7
-        expected = np.hypot(np.sqrt(0.1875 / 399), used * np.sqrt(0.1875))
-        assert small.share_error == pytest.approx(expected, rel=1e-3)
-        found = error_between_modes(find_members(chain), chain[0], stated)
-        assert found == pytest.approx(used * np.sqrt(0.1875) * (small.mean - large.mean), rel=1e-3)
-    one = chain[:, 100:]
-    assert find_clusters(one, np.arange(300), np.inf)[0].share_error == 0.0
-    assert np.all(error_between_modes(find_members(one), one[0], np.inf) < 1e-12)
+        (_, small) = find_clusters(chain, np.arange(400), parents, stated)
+        alone = np.sqrt(small.share * (1.0 - small.share))
+        (between,) = error_between_modes(chain, chain[:, :, :1], parents, stated)
+        if crossed:
+            assert (
+                small.share_error < np.hypot(alone / 20.0, 0.4 * used * alone) and between < 20.0 * 0.4 * used * alone
+            )
+        else:
+            assert small.share_error == pytest.approx(np.hypot(alone / np.sqrt(399), used * alone), rel=1e-2)
+            assert between == pytest.approx(20.0 * used * alone, rel=0.02)
+    one = chain[:, ~first]
+    each = np.arange(one.shape[1])
+    assert find_clusters(one, each, each, np.inf)[0].share_error == 0.0
+    assert np.all(error_between_modes(one, one, each, np.inf) < 1e-12)

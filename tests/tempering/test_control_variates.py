@@ -31,9 +31,16 @@ def rounds_of(rng, n, number, shift=0.1, scale=1.1, posterior=POSTERIOR):
         known = KnownDensity(normal.logpdf, normal.rvs(POOL, random_state=rng), np.full(POOL, 1.0 / POOL), 0.0)
         records = np.zeros(n, dtype=[("log_prob", float)])
         records["log_prob"] = log_p
-        latest = Round(coords, records, log_p - log_q, known, known.log_density(coords) - log_q, density)
+        latest = Round(
+            coords, records, log_p - log_q, known, known.log_density(coords) - log_q, density, log_q[:, None]
+        )
         made = add_round(made, latest)
     return made
+
+
+def signed_of(rounds):
+    """The signed sample of rounds."""
+    return signed_sample(rounds, pool_rounds(rounds))
 
 
 @pytest.mark.slow
@@ -41,7 +48,7 @@ def rounds_of(rng, n, number, shift=0.1, scale=1.1, posterior=POSTERIOR):
 def test_errors_cover(n, number, shift, scale, rng):
     scores = {name: [] for name in ("mean", "sd", "low", "median", "high", "log Z")}
     for _ in range(150):
-        sample = signed_sample(rounds_of(rng, n, number, shift, scale))
+        sample = signed_of(rounds_of(rng, n, number, shift, scale))
         for name, found, truth in (
             ("mean", sample.expectation(), 0.0),
             ("sd", sample.standard_deviation(), 1.0),
@@ -72,7 +79,7 @@ def test_a_round_without_failures_does_not_count_more(rng):
 
     scores, values = [], []
     for _ in range(200):
-        sample = signed_sample(rounds_of(rng, 12, 4, 0.0, 1.0, Fails()))
+        sample = signed_of(rounds_of(rng, 12, 4, 0.0, 1.0, Fails()))
         values.append(np.exp(sample.log_evidence - LOG_EVIDENCE) - 5.0 / 6.0)
         scores.append((sample.log_evidence - LOG_EVIDENCE - np.log(5.0 / 6.0)) / sample.log_evidence_error)
     assert abs(np.mean(values)) < 4.0 * np.std(values) / np.sqrt(len(values))
@@ -81,7 +88,7 @@ def test_a_round_without_failures_does_not_count_more(rng):
 
 def test_few_draws_are_worth_many(rng):
     """30 draws with a known density that is off by 5 %: means as accurate as from several hundred independent draws."""
-    errors = [signed_sample(rounds_of(rng, 30, 1, 0.05, 1.0)).expectation().value for _ in range(100)]
+    errors = [signed_of(rounds_of(rng, 30, 1, 0.05, 1.0)).expectation().value for _ in range(100)]
     assert np.sqrt(np.mean(np.square(errors))) < 1.0 / np.sqrt(300.0)
     # the chain of the same draws
     plain = [pool_rounds(rounds_of(rng, 30, 1, 0.05, 1.0)) for _ in range(100)]
@@ -92,12 +99,12 @@ def test_few_draws_are_worth_many(rng):
 def test_control_a_known_density_that_is_not_the_density_of_its_points(rng):
     """Negative control: points that are not from the known density make the estimate wrong by many errors."""
     made = [r._replace(known=r.known._replace(coords=r.known.coords + 0.5)) for r in rounds_of(rng, 100, 1, scale=1.0)]
-    found = signed_sample(made).expectation()
+    found = signed_of(made).expectation()
     assert np.all(np.abs(found.value) > 5.0 * found.error)
 
 
 def test_exact_knowledge_leaves_the_error_of_its_points(rng):
-    sample = signed_sample(rounds_of(rng, 30, 1, 0.0, 1.0))
+    sample = signed_of(rounds_of(rng, 30, 1, 0.0, 1.0))
     assert sample.weights.sum() == pytest.approx(1.0)
     assert np.allclose(sample.weights[sample.rounds > 0], 0.0, atol=1e-15)
     assert sample.log_evidence == pytest.approx(LOG_EVIDENCE, abs=1e-12)
@@ -107,16 +114,16 @@ def test_exact_knowledge_leaves_the_error_of_its_points(rng):
 def test_rounds_without_knowledge_are_left_out(rng):
     made = rounds_of(rng, 30, 2)
     without = [r._replace(known=None, log_known=None) for r in made]
-    assert signed_sample(without) is None
+    assert signed_of(without) is None
     elsewhere = made[0]._replace(log_known=np.full(30, -np.inf))
     impossible = made[0]._replace(log_weights=np.full(30, -np.inf))
-    alone = signed_sample(add_round([], made[1]))
+    alone = signed_of([made[1]._replace(log_densities=made[1].log_densities[:, 1:])])
     for other in (without[0], elsewhere, impossible):
-        assert np.array_equal(signed_sample([other, made[1]]).weights, alone.weights)
+        assert np.array_equal(signed_of([other, made[1]]).weights, alone.weights)
 
 
 def test_wrong_arguments(rng):
-    sample = signed_sample(rounds_of(rng, 30, 1))
+    sample = signed_of(rounds_of(rng, 30, 1))
     with pytest.raises(ValueError, match="between 0 and 1; got 1.5"):
         sample.quantile(1.5)
     with pytest.raises(ValueError, match="one number between 0 and 1"):
@@ -131,7 +138,7 @@ def test_wrong_arguments(rng):
 
 def test_a_variance_below_its_error_is_no_standard_deviation(rng):
     """Weights of both signs can make a variance negative: no number is stated then, and the verdict says so."""
-    sample = signed_sample(rounds_of(rng, 30, 1))
+    sample = signed_of(rounds_of(rng, 30, 1))
     far = sample.coords.copy()
     # a draw in a tail that the known density does not have: the largest weights make the variance positive
     for row in (np.argmin(sample.weights), np.argmax(np.where(sample.rounds > 0, sample.weights, -1.0))):

@@ -214,8 +214,9 @@ def _rounds(rng, spreads, ndim=3):
         coords = proposal.rvs(n, random_state=rng).reshape(n, ndim)
         records = np.zeros(n, dtype=[("log_prob", float)])
         records["log_prob"] = stats.multivariate_normal(np.zeros(ndim)).logpdf(coords)
-        log_weights = records["log_prob"] - proposal.logpdf(coords)
-        rounds = add_round(rounds, Round(coords, records, log_weights, log_density=proposal.logpdf))
+        own = proposal.logpdf(coords)
+        log_weights = records["log_prob"] - own
+        rounds = add_round(rounds, Round(coords, records, log_weights, None, None, proposal.logpdf, own[:, None]))
     return rounds
 
 
@@ -229,7 +230,8 @@ def test_rounds_that_each_miss_a_part_have_a_large_error(rng):
 
         coords = rng.uniform(missed, missed + parts - 1, (50, 1))
         records = np.zeros(50, dtype=[("log_prob", float)])
-        rounds = add_round(rounds, Round(coords, records, -log_density(coords), log_density=log_density))
+        own = log_density(coords)
+        rounds = add_round(rounds, Round(coords, records, -own, None, None, log_density, own[:, None]))
     pooled = pool_rounds(rounds)
     assert abs(pooled.log_evidence - np.log(parts)) < 2.0 * pooled.log_evidence_error < 1.0
 
