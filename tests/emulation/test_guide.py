@@ -17,6 +17,7 @@ from fe_likelihoods import (
     Measurements,
     Posterior,
     TruncatedNormal,
+    Uniform,
 )
 from fe_likelihoods.emulation.guide import ResponseGuide
 from samplers import SMCSampler, TMCMCSampler
@@ -204,6 +205,33 @@ def test_a_banana_is_right_or_has_a_concern(n):
     sd = np.sqrt((weights * x**2).sum() / weights.sum())
     right = abs(sampler.get_chain(flat=True)[:, 0].std() / sd - 1.0) < 0.25  # 3.5 standard errors of 100 draws
     assert right if n == 8 else sampler.verdict.status == "usable"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [12, 18])
+def test_a_long_ridge_is_followed_to_the_bounds_of_its_prior(seed):
+    """E h^3 alone is identified. In parameters, in which few runs are emulated as well, the ridge is curved."""
+    time, channels = 0.02 * np.arange(300), [Channel("tip", "displacement", "mm")]
+
+    def of_stiffness(k):
+        omega = 2.0 * np.pi * np.sqrt(k)
+        return (0.01 * np.exp(-0.03 * omega * time) * np.cos(omega * time))[None]
+
+    model = FunctionModel(lambda x: of_stiffness(x[0] * x[1] ** 3), ("E", "h"), channels, 0.02, 300, version="ridge")
+    values = of_stiffness(0.95) + 1e-3 * np.random.default_rng(seed).standard_normal((1, 300))
+    prior = {"E": Uniform(0.1, 5.0), "h": Uniform(0.3, 2.0), "sigma_tip": HalfNormal(0.003)}
+    posterior = Posterior(FELikelihood(model, Measurements(channels, 0.02, values)), prior).marginal()
+    sampler = SMCSampler(100, 2, posterior, vectorize=True, seed=seed, guide=posterior.guide(), max_simulations=800)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        sampler.run_mcmc(None, 1)
+    k, h = np.linspace(0.85, 1.05, 801), np.linspace(0.3, 2.0, 2001)
+    inside = (k[:, None] / h**3 > 0.1) & (k[:, None] / h**3 < 5.0)
+    of_k = np.where(inside, h**-3.0 / 4.9 / 1.7, 0.0).sum(axis=1) * (h[1] - h[0])
+    log_likelihood = posterior.log_likelihood(np.column_stack([k, np.ones_like(k)]))
+    truth = np.log(np.sum(np.exp(log_likelihood - log_likelihood.max()) * of_k) * (k[1] - k[0])) + log_likelihood.max()
+    assert sampler.verdict.status == "usable"  # few starts lead to the one mode
+    assert abs(sampler.log_evidence - truth) < 4.0 * sampler.log_evidence_error < 0.3
 
 
 @pytest.mark.parametrize(
