@@ -28,7 +28,7 @@ FEWEST_ADJOINING = 5
 LEAST_ADJOINING = 0.08  # of the failures in the ellipsoid, relative to the share of all points there
 LARGE_SHARE_NEAR = 0.02  # of the evaluated points among the samples
 NEIGHBOURS = 5  # evaluated points about a failure, which tell scattered failures from those that fill a region
-UNLIKELY = 1e-4  # probability that so many of them fail by chance
+UNLIKELY = 1e-4  # probability that so many of them, or of the points among the samples, fail by chance
 INSIDE = 0.99  # share of the samples inside the ellipsoid that counts as their region
 KEPT_POINTS = 20_000  # the latest points are those near the posterior
 
@@ -66,13 +66,15 @@ class NearFailures(NamedTuple):
 
         "away" from the samples: fewer than 5 failures adjoin the samples, or failures are scattered among successful
         points and at most 2 % of the points in the ellipsoid. "scattered": the same with more than 2 %. "border": more
-        than 2 % failed, and enough failures adjoin the samples to end the posterior. "edge": other adjoining failures.
+        than 2 % failed, and not by chance, and enough failures adjoin the samples to end the posterior. "edge": other
+        adjoining failures.
         """
         if self.adjoining < FEWEST_ADJOINING:
             return "away"
-        is_large = self.failed > LARGE_SHARE_NEAR * self.evaluated
         if self.scattered:
-            return "scattered" if is_large else "away"
+            return "scattered" if self.failed > LARGE_SHARE_NEAR * self.evaluated else "away"
+        # of 200 points of a guided run, 1 to 7 fail beyond 2 standard deviations, and 16 to 33 beyond 1
+        is_large = binom.sf(self.failed - 1, self.evaluated, LARGE_SHARE_NEAR) < UNLIKELY
         # of failures beside a bent posterior, far fewer adjoin the samples than of the other points in the ellipsoid
         adjoin = self.adjoining * self.evaluated > LEAST_ADJOINING * self.failed * self.nearest
         return "border" if is_large and adjoin else "edge"

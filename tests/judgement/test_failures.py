@@ -199,6 +199,14 @@ def test_the_place_of_the_failures(log_likelihood, fails, place, status, seed):
     assert [each for each in words if words[each] in str(sampler.verdict)] == [place] * (place in words)
 
 
+@pytest.mark.parametrize(
+    ("failed", "evaluated", "place"), [(7, 221, "edge"), (16, 200, "border"), (20, 995, "edge"), (42, 1020, "border")]
+)
+def test_a_few_failures_more_than_the_limit_are_chance(failed, evaluated, place):
+    """Counts of runs, guided and plain, whose failures begin at 2 standard deviations (right), and at 1 and 1.5."""
+    assert NearFailures(failed, evaluated, True, 10, False, evaluated).place == place
+
+
 def test_walkers_in_one_place_have_no_region(rng):
     """As where a limit ended the run after a collapse; the smallest number of points that span a region has one."""
     failed, succeeded = rng.normal(0.0, 1.0, (40, 2)), rng.normal(0.0, 1.0, (40, 2))
