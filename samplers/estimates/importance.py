@@ -149,7 +149,8 @@ SMALLEST_EXCESS = 0.05
 LARGE_GROWTH = {0.5: 0.1, 0.25: 0.3, 0.125: 0.3}
 SIGNIFICANT = 4.0  # in errors
 FEWEST_FOR_GROWTH = 8
-SMALLEST_LOG_DENSITY = -1e5  # instead of -inf: rounds of which each misses a draw of another still have shares
+# Instead of -inf: rounds of which each misses a draw of another still have shares; from -1e2 to -1e9 they are the same.
+SMALLEST_LOG_DENSITY = -1e5
 
 
 class KnownDensity(NamedTuple):

@@ -28,7 +28,7 @@ FEWEST_ADJOINING = 5
 LEAST_ADJOINING = 0.08  # of the failures in the ellipsoid, relative to the share of all points there
 LARGE_SHARE_NEAR = 0.02  # of the evaluated points among the samples
 # Probability of so many failures with this share, below which there are more. Cut off 1 to 1.6 standard deviations
-# beside the mode, 20 of 22 runs are then refused, whose means are off by 2 to 5 errors; at 2, 2 of 17, which are right
+# beside the mode, 24 of 26 runs are then refused, whose means are off by 2 to 5 errors; at 2, 2 of 21, which are right
 # (5 with the share alone).
 CHANCE = 0.05
 NEIGHBOURS = 5  # evaluated points about a failure, which tell scattered failures from those that fill a region
