@@ -21,9 +21,8 @@ import numpy as np
 
 from ..signals.channels import Channel
 from ..signals.records import Record
-from ..simulation.faults import RunFailed, TransientReason, reason_of
+from ..simulation.faults import SimulationFailed, TransientReason, reason_of
 from ..simulation.folder import KEEP, keep_folder
-from ..simulation.model import SimulationFailed
 from ..simulation.programs import run_program
 from ..simulation.worker import describe_exit, last_lines
 from ..units import find_unit
@@ -250,7 +249,7 @@ class ExecutableModel(UserModel):
                 self._keep(place, values, reason, seconds)
                 if not isinstance(reason, TransientReason) and shutil.disk_usage(place).free < _FREE_BYTES:
                     text = f"{reason} (the disk of the temporary folder {place.parent} is full)"
-                    raise RunFailed(TransientReason(text), seconds) from error
+                    raise SimulationFailed(TransientReason(text), seconds) from error
                 raise
 
     def _write(self, folder: Path, values: dict[str, str]) -> None:
@@ -269,15 +268,17 @@ class ExecutableModel(UserModel):
             path.write_text("".join(f"{value!r}\n" for value in self.record.acceleration.tolist()))
 
     def _execute(self, place: Path, arguments: list[str]) -> None:
-        """Run the program in the folder ``run`` of `place`; raise RunFailed unless it succeeds."""
+        """Run the program in the folder ``run`` of `place`; raise SimulationFailed unless it succeeds."""
         start = time.monotonic()
 
         def watch(seconds: float) -> float:
             if seconds > self.time_limit:
                 text = f"stopped at the time limit of {self.time_limit:g} s"
-                raise RunFailed(TransientReason(text), seconds)
+                raise SimulationFailed(TransientReason(text), seconds)
             if _size(place) > self.max_output:
-                raise RunFailed(TransientReason(f"stopped because it wrote more than {self.max_output} bytes"), seconds)
+                raise SimulationFailed(
+                    TransientReason(f"stopped because it wrote more than {self.max_output} bytes"), seconds
+                )
             return min(_WATCH_INTERVAL, self.time_limit - seconds + 1e-3)
 
         outputs = place / "stdout.txt", place / "stderr.txt"
@@ -288,9 +289,9 @@ class ExecutableModel(UserModel):
                 reason = ": ".join(filter(None, [describe_exit(exit_code, "the program"), last_lines(stderr, 3)]))
             reason += self._missing(place / "run")
             killed = exit_code < 0 or exit_code in _EXIT_CODES_OF_SHELLS
-            raise RunFailed(TransientReason(reason) if killed else reason, seconds)
+            raise SimulationFailed(TransientReason(reason) if killed else reason, seconds)
         if _size(place) > self.max_output:
-            raise RunFailed(TransientReason(f"the program wrote more than {self.max_output} bytes"), seconds)
+            raise SimulationFailed(TransientReason(f"the program wrote more than {self.max_output} bytes"), seconds)
 
     def _missing(self, folder: Path) -> str:
         """What a failed program may have looked for in the folder of the run, where it is not."""

@@ -12,9 +12,8 @@ from concurrent.futures import BrokenExecutor
 
 __all__ = [
     "ChangedModel",
-    "FailedRun",
     "MisfitReason",
-    "RunFailed",
+    "SimulationFailed",
     "TransientReason",
     "UnusableModel",
     "is_transient",
@@ -27,21 +26,28 @@ _FAULTS = (OSError, MemoryError, ImportError, BrokenExecutor, subprocess.Timeout
 _LONGEST_REASON = 2000  # characters
 
 
-class FailedRun(RuntimeError):
-    """Base of exceptions that say in words, their `reason`, why a run failed; a `TransientReason` keeps its kind."""
+class SimulationFailed(RuntimeError):
+    """A simulation that failed.
 
-    reason: str
+    `reason` says why, in words; a `TransientReason` if the process was stopped, was killed or crashed. `seconds` [s] is
+    the duration of a run in another process, where that is known; a reason may also end with it, as in "crashed after
+    12.3 s". A reason that begins with "collapse" says that the structure has collapsed: this is a result, which
+    `fe_likelihoods.prediction.fragility.fragility` counts as an exceedance.
 
-
-class RunFailed(FailedRun):
-    """A failed run in another process: its duration `seconds` [s] or None, and its `reason`.
-
-    The reason is a `TransientReason` if the process was stopped, was killed or crashed.
+    Examples
+    --------
+    >>> def displacement(theta):
+    ...     if theta[0] < 0.5:
+    ...         raise SimulationFailed("collapse: the stiffness is below a half")
+    ...     return model.simulate([theta[0], 1.0])[1:]
+    >>> function = FunctionModel(displacement, ["stiffness"], model.channels[1:], dt=0.05, n_steps=200)
+    >>> FELikelihood(function, measurements.select(["displacement"])).log_likelihood([0.4, 0.02])
+    -inf
     """
 
     def __init__(self, reason: str, seconds: float | None = None) -> None:
-        super().__init__(reason, seconds)
-        self.reason = reason
+        super().__init__(reason)
+        self.reason = (reason if isinstance(reason, str) else str(reason)) or "no reason given"
         self.seconds = seconds
 
 
@@ -72,7 +78,7 @@ def is_transient(error: BaseException) -> bool:
 
 def reason_of(error: BaseException) -> str:
     """Reason of a simulation that raised an exception; a `TransientReason` for faults of the infrastructure."""
-    if isinstance(error, FailedRun):
+    if isinstance(error, SimulationFailed):
         return shortened(error.reason)
     text = shortened(f"{type(error).__name__}: {error}")
     return TransientReason(text) if is_transient(error) else text

@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 
 from samplers.interrupts import process_name
 
-from .faults import RunFailed, TransientReason, UnusableModel, reason_of, reworded
+from .faults import SimulationFailed, TransientReason, UnusableModel, reason_of, reworded
 from .files import Opened, RunningSimulation, observing, of_this_library, refuse_shared, running_simulation
 
 __all__ = [
@@ -135,7 +135,7 @@ def run_in_folder(function: Callable[[Any], Any], item: Any, sender: Sender | No
         result, error, shared = _run_in_mirror(_mirror_for(sender), function, item, sender, thread)
     except OSError as failure:
         text = f"the working folder of a simulation could not be made: {failure}"
-        raise RunFailed(TransientReason(text)) from failure
+        raise SimulationFailed(TransientReason(text)) from failure
     if error is not None:
         raise error
     return result, shared
@@ -191,7 +191,7 @@ def _run_in_mirror(
     mirror.is_new = kept is None and not simulation.has_programs  # which may still write
     if kept is not None and not isinstance(error, UnusableModel | KeyboardInterrupt):
         reason = reworded(reason, f"{reason} (its folder is {kept})")
-        error, result = (None, (None, reason)) if error is None else (RunFailed(reason), None)
+        error, result = (None, (None, reason)) if error is None else (SimulationFailed(reason), None)
     return result, error, simulation.shared
 
 

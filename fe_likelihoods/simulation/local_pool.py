@@ -18,7 +18,7 @@ from typing import Any
 from samplers.interrupts import Ended
 
 from .by_value import Pickled
-from .faults import RunFailed
+from .faults import SimulationFailed
 from .worker import LoadingFailed, Worker, Workers
 
 __all__ = ["LocalPool", "Outcome", "Submitting", "Threads", "value_of"]
@@ -247,7 +247,7 @@ class LocalPool(Submitting):
                 loads += 1
                 if loads == MAX_ATTEMPTS:
                     raise RuntimeError(f"{error.reason} while loading the model; see its output on stderr") from None
-            except RunFailed as error:
+            except SimulationFailed as error:
                 deaths, loads = deaths + 1, 0
                 if deaths == MAX_ATTEMPTS:
                     return None, error.reason

@@ -29,7 +29,7 @@ from samplers.interrupts import (
 from ..noise.statistics import Statistic, reduce_response, statistic_width, sums_of_squares
 from ..signals.channels import Channel
 from ..signals.comparison import Comparison
-from .faults import FailedRun, MisfitReason, is_transient, reason_of, shortened
+from .faults import MisfitReason, SimulationFailed, is_transient, reason_of, shortened
 from .files import note, refuse_shared
 from .folder import Observed, Sender, run_in_folder, unpack
 
@@ -56,29 +56,6 @@ __all__ = [
 logger = logging.getLogger(__name__)
 
 _RESPONSE_VALUES = 2**23  # largest number of response values in memory at once: 64 MiB
-
-
-class SimulationFailed(FailedRun):
-    """A simulation that failed.
-
-    `reason` says why, in words. It may end with the duration of the run, as in "crashed after 12.3 s"
-    (`split_seconds`). A reason that begins with "collapse" says that the structure has collapsed (`is_collapse`): this
-    is a result, which `fe_likelihoods.prediction.fragility.fragility` counts as an exceedance.
-
-    Examples
-    --------
-    >>> def displacement(theta):
-    ...     if theta[0] < 0.5:
-    ...         raise SimulationFailed("collapse: the stiffness is below a half")
-    ...     return model.simulate([theta[0], 1.0])[1:]
-    >>> function = FunctionModel(displacement, ["stiffness"], model.channels[1:], dt=0.05, n_steps=200)
-    >>> FELikelihood(function, measurements.select(["displacement"])).log_likelihood([0.4, 0.02])
-    -inf
-    """
-
-    def __init__(self, reason: str) -> None:
-        super().__init__(reason)
-        self.reason = (reason if isinstance(reason, str) else str(reason)) or "no reason given"
 
 
 def is_collapse(reason: str) -> bool:

@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 from samplers.interrupts import become_worker
 
 from .by_value import CannotLoad, Pickled, Recent, without_addresses
-from .faults import RunFailed, TransientReason, is_transient, reworded
+from .faults import SimulationFailed, TransientReason, is_transient, reworded
 from .files import of_this_library
 from .folder import discard, working_folder
 
@@ -48,7 +48,7 @@ _START_LIMIT = 120.0  # [s] for starting the process of an isolated function and
 _MOST_OUTPUT = 2**24  # [bytes] that a call of an isolated function may print
 
 
-class LoadingFailed(RunFailed):
+class LoadingFailed(SimulationFailed):
     """A worker process that died, or took too long, before it was given an item."""
 
 
@@ -119,7 +119,7 @@ class Worker:
         try:
             slow = "the worker process did not start within {:g} s"
             answer = self._ask(_LOAD + pickle.dumps(function, protocol=5), seconds, slow)
-        except RunFailed as error:
+        except SimulationFailed as error:
             raise LoadingFailed(error.reason) from None
         if answer.error is not None:
             return answer
@@ -129,7 +129,7 @@ class Worker:
     def call(self, item: Any, seconds: float) -> "Answer":
         """The answer of the function that was loaded last, for an item.
 
-        RunFailed if the process dies, prints too much or does not answer within `seconds`.
+        SimulationFailed if the process dies, prints too much or does not answer within `seconds`.
         """
         self.calls += 1
         if self._output is not None:
@@ -149,9 +149,9 @@ class Worker:
             if (answer := self._receive(start + seconds)) is not None:
                 return answer
             reason = TransientReason(slow.format(seconds))
-        except RunFailed as error:
+        except SimulationFailed as error:
             reason = error.reason
-        raise RunFailed(reworded(reason, reason + self.kill(reason)), time.monotonic() - start)
+        raise SimulationFailed(reworded(reason, reason + self.kill(reason)), time.monotonic() - start)
 
     def _receive(self, stop: float) -> "Answer | None":
         """The answer; None if there is none until the time `stop`."""
@@ -165,7 +165,7 @@ class Worker:
                 if _ended(self._process) and not self._poll(0):
                     raise EOFError
                 if self._output is not None and os.fstat(self._output.fileno()).st_size > self._most:
-                    raise RunFailed(TransientReason(f"stopped because it printed more than {self._most} bytes"))
+                    raise SimulationFailed(TransientReason(f"stopped because it printed more than {self._most} bytes"))
                 if time.monotonic() >= stop:
                     return None
         except (EOFError, OSError):
@@ -175,7 +175,7 @@ class Worker:
             self._end()
             said = "" if self._output is None else last_lines(self._output, 1)
             reason = "; ".join(filter(None, [describe_exit(self._process.wait(), "the worker process"), said]))
-            raise RunFailed(TransientReason(reason)) from None
+            raise SimulationFailed(TransientReason(reason)) from None
 
     def kill(self, reason: str = "") -> str:
         """Kill the process and its session; with the `reason` of a failure, returns what to add to it."""
@@ -208,7 +208,7 @@ class Workers:
         seconds: float = math.inf,
         watch: Callable[[Worker | None], None] = lambda worker: None,
     ) -> Answer:
-        """Answer of a function for an item, or of a process that cannot load it; RunFailed without an answer.
+        """Answer of a function for an item, or of a process that cannot load it; SimulationFailed without an answer.
 
         `watch` is called with the process, and with None when it is idle again.
         """
@@ -268,11 +268,11 @@ class Sandbox:
         return Sandbox, self._arguments
 
     def __call__(self, item: Any) -> Any:
-        """Result of the function for one item, or its exception; RunFailed if the process died or passed a limit."""
+        """Result of the function for an item, or its exception; SimulationFailed if the process died or was stopped."""
         function, limit, *_ = self._arguments
         answer = self._workers.run(Pickled.of(function), item, math.inf if limit is None else limit)
         if isinstance(answer.error, CannotLoad):
-            raise RunFailed(TransientReason(str(answer.error))) from answer.error
+            raise SimulationFailed(TransientReason(str(answer.error))) from answer.error
         if answer.error is not None:
             raise answer.error
         return answer.value
@@ -368,7 +368,7 @@ def _end_with(parent: int) -> None:
 
 
 def _packed(value: Any, error: BaseException | None = None) -> bytes:
-    """Pickled `Answer`; if it cannot be pickled, a `RunFailed` with the text of `error` or of the pickling error."""
+    """Pickled `Answer`; a `SimulationFailed` with the text of `error`, or why it cannot be pickled, if it cannot be."""
     try:
         data = pickle.dumps((value, error), protocol=5)
         if error is not None:
@@ -378,4 +378,4 @@ def _packed(value: Any, error: BaseException | None = None) -> bytes:
     except Exception as failure:
         error = error or failure
     text = without_addresses(f"{type(error).__name__}: {error}")
-    return pickle.dumps((None, RunFailed(TransientReason(text) if is_transient(error) else text)), protocol=5)
+    return pickle.dumps((None, SimulationFailed(TransientReason(text) if is_transient(error) else text)), protocol=5)

@@ -90,7 +90,7 @@ def test_report_makes_events_again_without_simulations(finished, monkeypatch):
     first = (finished / "r" / "events.csv").read_text()
     simulated, one = [], linear_oscillator.respond
     monkeypatch.setattr(linear_oscillator, "respond", lambda *args: simulated.append(args) or one(*args))
-    for most in (19, 3):  # at first more rows of the file are verified; samples that were in memory alone are stored
+    for most in (19, 7):  # at first more rows of the file are verified; samples that were in memory alone are stored
         simulated.clear()
         (finished / "r" / "events.csv").unlink()
         said = call("report", "r")
