@@ -1,9 +1,8 @@
 """Results as text: aligned tables for ``print``, numbers, lists in sentences."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
-__all__ = ["NamedResults", "listed", "number", "text_table"]
+__all__ = ["listed", "number", "text_table"]
 
 
 def text_table(rows: Sequence[Sequence[str]]) -> str:
@@ -32,16 +31,3 @@ def number(value: float, digits: int = 3) -> str:
 def listed(texts: Sequence[str]) -> str:
     """Texts as a list in a sentence: "a, b and c"."""
     return texts[0] if len(texts) == 1 else f"{', '.join(texts[:-1])} and {texts[-1]}"
-
-
-class NamedResults(dict[str, Any]):
-    """Results by name, a dict; ``print`` gives one table with a row per name.
-
-    Each value has a property `cells`: texts by the headings of their columns, the same for all values.
-    """
-
-    def __str__(self) -> str:
-        rows: list[Mapping[str, str]] = [value.cells for value in self.values()]
-        head = list(dict.fromkeys(heading for row in rows for heading in row))
-        named = zip(self, rows, strict=True)
-        return text_table([["event", *head], *([name, *(row.get(h, "-") for h in head)] for name, row in named)])

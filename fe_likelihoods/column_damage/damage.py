@@ -121,11 +121,12 @@ class Damage(NamedTuple):
     def table(self) -> str:
         """Return the probabilities of the limit states and the quantiles of the measures after each event as text.
 
-        A probability of 0 or 1 is given with the bound of its interval, others with their Monte Carlo error. Strains
-        are given for the place with the largest quantile.
+        Probabilities have their intervals. Strains are given for the place with the largest quantile.
         """
         rows = [("probability of", *self.events)]
-        rows += [(name, *(_stated(*v) for v in zip(*each[1:5], strict=True))) for name, each in self.presence.items()]
+        for name, each in self.presence.items():
+            cells = zip(each.probability, each.lower, each.upper, strict=True)
+            rows.append((name, *(f"{p:.3g} ({low:.2g} to {high:.2g})" for p, low, high in cells)))
         lines = [text_table(rows)]
         if self.extent:
             rows = [("quantiles " + ", ".join(f"{p:g}" for p in self.prediction.probabilities), *self.events)]
@@ -231,7 +232,7 @@ def damage(
     >>> predicted = propagate(complete, np.ones((3, 5)), quantity=damage_measures(complete))
     >>> print(damage(predicted, noise=False))
     probability of                          shaking, rest
-    bar yield                                 1 (> 0.292)
+    bar yield                             1 (0.29 to 1)
     ...
     peak drift                       0.0091 0.0091 0.0091
     ...
@@ -247,9 +248,8 @@ def damage(
             "the noise of sensors does no damage, and errors that are drawn do work and leave residual values: "
             "propagate the measures with noise=False, and give ratios= for the error of the model"
         )
-    listed = not isinstance(limits, str | LimitState) and np.iterable(limits)
-    states = limit_states(measures) if limits is None else tuple(limits) if listed else ()
-    if limits is not None and not (listed and all(isinstance(state, LimitState) for state in states)):
+    states = limit_states(measures) if limits is None else tuple(limits) if np.iterable(limits) else (limits,)
+    if isinstance(limits, LimitState) or not all(isinstance(state, LimitState) for state in states):
         raise ValueError(
             'limits must be a sequence of LimitState, such as [LimitState("cracks", "bar tension", 0.015)]; got '
             f"{limits!r}"
@@ -279,20 +279,15 @@ def damage(
     if without and noise is None:
         guess = "state a guess, such as EventRatios([1.0], prior_sd=0.3, prior_events=10)"
         warn_of_missing_error(f"damage ({', '.join(without)})", guess)
-    rng, probabilities = np.random.default_rng(seed), prediction.probabilities
-    quantiles = (
-        _extent(measures.split(prediction.values), probabilities, errors, rng)
-        if probabilities and prediction.n_samples
-        else {}
-    )
-    return Damage(states, presence, location, quantiles, _contents(states, errors), prediction)
-
-
-def _stated(probability: float, error: float, lower: float, upper: float) -> str:
-    """Probability with its error, or with the bound of its interval if none or all of the samples exceed."""
-    if probability in (0.0, 1.0):
-        return f"{probability:.0f} (< {upper:.3f})" if probability == 0.0 else f"{probability:.0f} (> {lower:.3f})"
-    return f"{probability:.3f} +- {error:.3f}"
+    rng, extent = np.random.default_rng(seed), {}
+    for name, found in measures.split(prediction.values).items() if prediction.n_samples else ():
+        if name in errors:
+            largest = found.reshape(*found.shape[:2], -1).max(axis=2)  # all places of an event share its error
+            factor = errors[name].quantile(rng.random(largest.shape), np.maximum(largest, np.finfo(float).tiny))
+            found = found * factor.reshape(*factor.shape, *(1,) * (found.ndim - 2))
+        if prediction.probabilities:
+            extent[name] = np.quantile(found, prediction.probabilities, axis=0)
+    return Damage(states, presence, location, extent, _contents(states, errors), prediction)
 
 
 def _limits(state: LimitState, n: int, rng: np.random.Generator) -> np.ndarray:
@@ -318,26 +313,6 @@ def _ratios_of_measures(ratios: Any, measures: tuple[str, ...]) -> dict[str, Eve
         if not isinstance(each, EventRatios) or each.shape:
             raise ValueError(f"the ratios of {name!r} must be EventRatios of one quantity; got {each!r}")
     return found
-
-
-def _extent(
-    values: dict[str, np.ndarray],
-    probabilities: Sequence[float],
-    errors: Mapping[str, EventRatios],
-    rng: np.random.Generator,
-) -> dict[str, np.ndarray]:
-    """Quantiles of the measures, multiplied by draws of their ratios."""
-    quantiles = {}
-    for name, found in values.items():
-        if name in errors:
-            found = found.copy()
-            for event in range(found.shape[1]):
-                largest = found[:, event].reshape(len(found), -1).max(axis=1)  # all places of an event share its error
-                factor = np.ones(len(found))
-                factor[largest > 0.0] = errors[name].quantile(rng.random(np.sum(largest > 0.0)), largest[largest > 0.0])
-                found[:, event] *= factor.reshape(-1, *(1,) * (found.ndim - 2))
-        quantiles[name] = np.quantile(found, probabilities, axis=0)
-    return quantiles
 
 
 def _contents(states: Sequence[LimitState], errors: Mapping[str, EventRatios]) -> str:

@@ -22,12 +22,14 @@ from typing import Any
 
 import numpy as np
 
-from ..priors.distributions import Distribution, RandomState
+from ..likelihood.function_likelihood import FunctionLikelihood
+from ..likelihood.posterior import Posterior
+from ..priors.distributions import Distribution
 from ..priors.multivariate import as_distribution
 from ..priors.points import as_points, complete_repr
 from ..priors.priors import Prior
 from .population_marginal import population_marginal
-from .scales import SCALES, Scales
+from .scales import Scales
 from .stored_posterior import StoredPosterior, describe
 
 __all__ = ["HierarchicalPosterior", "Varying"]
@@ -71,8 +73,8 @@ class Varying:
     slopes: Mapping[str, Distribution] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.scale not in SCALES:
-            raise ValueError(f"Varying: scale must be one of {', '.join(map(repr, SCALES))}; got {self.scale!r}")
+        if self.scale not in _HYPER_NAMES:
+            raise ValueError(f"Varying: scale must be one of {', '.join(map(repr, _HYPER_NAMES))}; got {self.scale!r}")
         for name in ("location", "sd"):
             object.__setattr__(self, name, as_distribution(name, getattr(self, name)))
         object.__setattr__(self, "slopes", {name: as_distribution(name, each) for name, each in self.slopes.items()})
@@ -87,11 +89,8 @@ class Varying:
             )
 
 
-class HierarchicalPosterior:
-    """Posterior density of the hyper-parameters, given several tests.
-
-    It has the interface of `Posterior`: every density takes one point (ndim,) and returns a float, or n points
-    (n, ndim) and returns (n,). No simulation is run.
+class HierarchicalPosterior(Posterior):
+    """Posterior density of the hyper-parameters, given several tests: a `Posterior` that runs no simulation.
 
     Parameters
     ----------
@@ -158,7 +157,8 @@ class HierarchicalPosterior:
         slopes = [(k, *each) for k, (_, of) in enumerate(varying.items()) for each in of.slopes.items()]
         self._slopes = [(k, covariate) for k, covariate, _ in slopes]
         distributions |= {f"slope_{covariate}_{[*varying][k]}": each for k, covariate, each in slopes}
-        self.prior = Prior(distributions | dict(common))
+        names = [*distributions, *common]
+        super().__init__(FunctionLikelihood(self.marginal_likelihood, names, True), Prior(distributions | dict(common)))
         self.covariates = {
             name: float(np.mean([test.covariates[name] for test in tests.values()]))
             for name in dict.fromkeys(covariate for _, covariate in self._slopes)
@@ -171,31 +171,15 @@ class HierarchicalPosterior:
             except ValueError as error:
                 raise ValueError(f"test {name!r}: {error}") from None
 
-    def __repr__(self) -> str:
-        common = f"common {', '.join(self.common)}, " if self.common else ""
-        return (
-            f"<HierarchicalPosterior: {len(self.tests)} tests, varying {', '.join(self.varying)}, {common}{self.ndim} "
-            "hyper-parameters>"
-        )
-
     def without(self, test: str) -> "HierarchicalPosterior":
         """The same posterior density without the data of one test; ValueError for the only test, or an unknown one."""
         if test not in self.tests or len(self.tests) < 2:
             raise ValueError(f"expected one of two tests or more, {', '.join(map(repr, self.tests))}; got {test!r}")
         other = copy.copy(self)
+        other.likelihood = FunctionLikelihood(other.marginal_likelihood, self.parameter_names, True)
         other.tests = {name: each for name, each in self.tests.items() if name != test}
         other.described = {name: each for name, each in self.described.items() if name != test}
         return other
-
-    @property
-    def ndim(self) -> int:
-        """Number of hyper-parameters."""
-        return self.prior.dim
-
-    @property
-    def parameter_names(self) -> list[str]:
-        """Names of the hyper-parameters."""
-        return list(self.prior.names)
 
     @property
     def fingerprint(self) -> str:
@@ -210,39 +194,13 @@ class HierarchicalPosterior:
                 state.update(np.ascontiguousarray(array).tobytes())
         return state.hexdigest()
 
-    def __call__(self, x: Any) -> np.ndarray | float:
-        """Same as `log_prob`."""
-        return self.log_prob(x)
-
-    def log_prob(self, x: Any) -> np.ndarray | float:
-        """Log-prior plus log-likelihood of hyper-parameters."""
-        return self.log_prior(x) + self.log_likelihood(x)
-
-    def log_prior(self, x: Any) -> np.ndarray | float:
-        """Normalised log prior density of the hyper-parameters."""
-        return self.prior.logpdf(as_points(x, self.prior.names))
-
-    def log_likelihood(self, x: Any) -> np.ndarray | float:
-        """Logarithm of the marginal likelihood of all tests; -inf outside the support of the prior."""
-        points = as_points(x, self.prior.names)
-        rows = np.atleast_2d(points)
-        total = np.full(len(rows), -np.inf)
-        inside = np.atleast_1d(self.prior.logpdf(rows)) > -np.inf
-        if inside.any():
-            of_tests = []
-            for name, each in self.described.items():
-                population = self.population(rows[inside], self.tests[name].covariates)
-                of_tests.append(population_marginal(each, *population) + (self.tests[name].log_evidence or 0.0))
-            total[inside] = np.stack(of_tests, axis=1).sum(axis=1)
-        return total if points.ndim == 2 else float(total[0])
-
-    def prior_transform(self, u: np.ndarray) -> np.ndarray:
-        """Map from the unit cube to the hyper-parameters, for nested samplers."""
-        return self.prior.transform(u)
-
-    def sample_prior(self, n: int, rng: RandomState = None) -> np.ndarray:
-        """Draws (n, ndim) of the prior; arguments as for `Posterior.sample_prior`."""
-        return self.prior.rvs(n, rng)
+    def marginal_likelihood(self, points: np.ndarray) -> np.ndarray:
+        """Logarithm (n,) of the marginal likelihood of all tests at hyper-parameters (n, ndim) inside their prior."""
+        total = np.zeros(len(points))
+        for name, each in self.described.items():
+            population = self.population(points, self.tests[name].covariates)
+            total += population_marginal(each, *population) + (self.tests[name].log_evidence or 0.0)
+        return total
 
     def population(self, x: Any, covariates: Mapping[str, float] | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Centers (n, n_varying + n_common) and standard deviations (n, n_varying) on the scales of the parameters.

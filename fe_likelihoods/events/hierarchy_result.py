@@ -78,9 +78,6 @@ class Hierarchy:
         self.checks = check_hierarchy(posterior, points, seed)
         warn(self.checks.findings)
 
-    def __repr__(self) -> str:
-        return f"<Hierarchy: {len(self.samples)} samples of {self.posterior!r}>"
-
     def __str__(self) -> str:
         rows = [("hyper-parameter", "mean", "sd", "5 %", "95 %", "error of one test")]
         columns = [
@@ -102,6 +99,8 @@ class Hierarchy:
                 *labelled(self.checks.findings),
             ]
         )
+
+    __repr__ = __str__
 
     def new_test(
         self,

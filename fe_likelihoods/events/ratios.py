@@ -11,7 +11,7 @@ logarithm of a new ratio has Student's t distribution. The equations are on the 
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -32,17 +32,17 @@ _SHOWN = 0.9  # probability of printed intervals
 
 
 class RatioPopulations(NamedTuple):
-    """Posterior draws (n,) of the ratio distribution of one quantity."""
+    """Posterior draws (n,) or (n, n_quantities) of the ratio distribution."""
 
     center: np.ndarray  # mean log ratio at the mean log level of the events
     slope: np.ndarray  # change of the mean log ratio per unit of the log level
     sd: np.ndarray  # of log ratios between events
-    log_level: float  # mean logarithm of the predicted values of the events
+    log_level: np.ndarray  # mean logarithm of the predicted values of the events
 
     def probability_above(self, ratio: np.ndarray, log_predicted: np.ndarray) -> np.ndarray:
         """Probability that a ratio from each population exceeds `ratio` (n, ...), at logarithms of predicted values."""
-        rows = (-1, *(1,) * (log_predicted.ndim - 1))
-        center, slope, sd = (each.reshape(rows) for each in (self.center, self.slope, self.sd))
+        rows = (..., *(None,) * (log_predicted.ndim - self.center.ndim))
+        center, slope, sd = self.center[rows], self.slope[rows], self.sd[rows]
         center = center + slope * (log_predicted - self.log_level)
         return special.ndtr((center - np.log(ratio)) / sd)
 
@@ -187,17 +187,6 @@ class EventRatios:
         """Shape of the quantity that the ratios are for."""
         return self.values.shape[1:]
 
-    def of_quantity(self, k: int) -> "EventRatios":
-        """Ratios for quantity `k` of several."""
-        return replace(
-            self,
-            values=self.values[:, k],
-            levels=None if self.levels is None else np.asarray(self.levels)[:, k],
-            prior_sd=np.broadcast_to(self.prior_sd, self.values.shape)[:, k],
-            new_sd=np.broadcast_to(self.new_sd, self.shape)[k],
-            remainder=np.broadcast_to(self.remainder, self.shape)[k],
-        )
-
     def quantile(self, probability: ArrayLike, predicted: ArrayLike = 1.0) -> np.ndarray:
         """Quantile of the ratio in a new event.
 
@@ -238,13 +227,14 @@ class EventRatios:
         return special.stdtr(self.degrees_of_freedom, (center - np.log(ratio)) / scale)
 
     def draw_populations(self, n: int, rng: np.random.Generator) -> RatioPopulations:
-        """Draw the line and the standard deviation of log ratios from their posterior; ValueError for quantities."""
-        if self.shape:
-            raise ValueError(f"expected the ratios of one quantity, (n_events,); got {self.values.shape}")
-        factor = self.sd / self.new_sd * np.sqrt(self.degrees_of_freedom / rng.chisquare(self.degrees_of_freedom, n))
-        center = self._mean + factor / np.sqrt(self._total) * rng.standard_normal(n)
-        slope = self._slope + factor * np.sqrt(self._gain) * rng.standard_normal(n)
-        return RatioPopulations(center, slope, factor * self.new_sd, float(self._log_level))
+        """Draw the line and the standard deviation of log ratios from their posterior."""
+        shape = (n, *self.shape)
+        factor = (
+            self.sd / self.new_sd * np.sqrt(self.degrees_of_freedom / rng.chisquare(self.degrees_of_freedom, shape))
+        )
+        center = self._mean + factor / np.sqrt(self._total) * rng.standard_normal(shape)
+        slope = self._slope + factor * np.sqrt(self._gain) * rng.standard_normal(shape)
+        return RatioPopulations(center, slope, factor * self.new_sd, self._log_level)
 
     def _center_and_scale(self, log_predicted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Center and scale of the t distribution of a new log ratio at log predicted values (...)."""

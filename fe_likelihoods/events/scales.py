@@ -4,9 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["SCALES", "Scales"]
-
-SCALES = ("log", "linear")
+__all__ = ["Scales"]
 
 
 class Scales(NamedTuple):

@@ -20,7 +20,6 @@ from ..priors.distributions import TruncatedNormal
 from ..priors.mixture_prior import MixtureDistribution, fit_mixture
 from ..priors.points import as_points
 from ..priors.priors import Prior
-from ..text_tables import number, text_table
 from .scales import Scales
 
 if TYPE_CHECKING:
@@ -210,16 +209,6 @@ class StoredPosterior:
     def __repr__(self) -> str:
         n, names = len(self.samples), ", ".join(self.prior.names)
         return f"<StoredPosterior: {n} samples of {names}; effective sample size {self.effective_sample_size:.0f}>"
-
-    def __str__(self) -> str:
-        weights = np.exp(self.log_weights)
-        means = weights @ self.samples
-        deviations = np.sqrt(weights @ np.square(self.samples - means))
-        rows = [("parameter", "mean", "sd")]
-        rows += [(name, *map(number, each)) for name, *each in zip(self.prior.names, means, deviations, strict=True)]
-        first = f"{len(self.samples)} samples of one test, effective sample size {self.effective_sample_size:.0f}"
-        evidence = "" if self.log_evidence is None else f"; log-evidence {self.log_evidence:.2f}"
-        return f"{first}{evidence}\n{text_table(rows)}"
 
 
 class DescribedPosterior(NamedTuple):

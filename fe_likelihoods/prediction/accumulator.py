@@ -1,9 +1,7 @@
 """Mean, variance and quantiles of a quantity over samples, from responses that arrive in batches.
 
-Mean and variance need one pass. They are combined over batches by the update of T. F. Chan, G. H. Golub and R. J.
-LeVeque (1983), The American Statistician 37(3), 242-247, doi:10.1080/00031305.1983.10483115, which avoids the
-cancellation in "mean square minus squared mean". Quantiles need the values themselves. See
-``docs/theory/prediction.rst``.
+Mean and variance need one pass, over differences to the first response: "mean square minus squared mean" of the values
+themselves loses digits. Quantiles need the values. See ``docs/theory/prediction.rst``.
 """
 
 from collections import Counter
@@ -27,31 +25,28 @@ class RunningMoments:
     """Running mean (None before the first sample) and variance of `count` equally shaped arrays."""
 
     def __init__(self) -> None:
-        self.count = 0.0
-        self.mean: np.ndarray | None = None
-        self._squares: np.ndarray | None = None
+        self.count, self._first, self._sum, self._squares = 0.0, None, 0.0, 0.0
 
     def add(self, values: np.ndarray, counts: np.ndarray) -> None:
         """Add results `values` (m, ...) that stand for `counts` (m,) samples each."""
-        total = float(counts.sum())
-        mean = np.tensordot(counts / total, values, axes=1)
-        deviations = values - mean
+        self._first = values[0].copy() if self._first is None else self._first
+        self.count += float(counts.sum())
         with np.errstate(over="ignore"):  # unstable responses may have an infinite variance
-            squares = np.tensordot(counts, np.square(deviations, out=deviations), axes=1)
-        if self.mean is None:
-            self.count, self.mean, self._squares = total, mean, squares
-            return
-        joint = self.count + total
-        shift = mean - self.mean
-        self.mean = self.mean + shift * (total / joint)
-        with np.errstate(over="ignore"):
-            self._squares = self._squares + squares + shift**2 * (self.count * total / joint)
-        self.count = joint
+            shifted = values - self._first
+            self._sum = self._sum + np.tensordot(counts, shifted, axes=1)
+            self._squares = self._squares + np.tensordot(counts, np.square(shifted, out=shifted), axes=1)
+
+    @property
+    def mean(self) -> np.ndarray | None:
+        """Mean, shape (...)."""
+        return None if self._first is None else self._first + self._sum / self.count
 
     @property
     def variance(self) -> np.ndarray:
         """Mean squared deviation from the mean, shape (...)."""
-        return self._squares / self.count
+        with np.errstate(over="ignore", invalid="ignore"):
+            variance = np.maximum(self._squares / self.count - np.square(self._sum / self.count), 0.0)
+        return np.where(np.isfinite(self._squares), variance, np.inf)
 
 
 class Accumulator:
@@ -183,16 +178,9 @@ class Accumulator:
     def quantiles(self, samples: np.ndarray, probabilities: Sequence[float]) -> np.ndarray:
         """Quantiles (n_probabilities, ...) over samples that did not fail."""
         kept = self._kept.reshape(len(self._kept), -1)
-        results, size = self.result_of_sample[samples], kept.shape[1]
-        n, out = len(results), np.empty((len(probabilities), size))
-        columns = max(1, _CHUNK // n)
-        for start in range(0, size, columns):
+        results, out = self.result_of_sample[samples], np.empty((len(probabilities), kept.shape[1]))
+        columns = max(1, _CHUNK // len(results))
+        for start in range(0, kept.shape[1], columns):
             part = slice(start, start + columns)
-            ascending = np.sort(kept[results, part].astype(float), axis=0)
-            for k, p in enumerate(probabilities):
-                low = int((n - 1) * p)
-                share = (n - 1) * p - low
-                out[k, part] = ascending[low]
-                if share:
-                    out[k, part] += share * (ascending[low + 1] - ascending[low])
+            out[:, part] = np.quantile(kept[results, part].astype(float), probabilities, axis=0)
         return out.reshape(len(probabilities), *self.shape)

@@ -8,8 +8,6 @@ import numpy as np
 
 from ..events.hierarchical_posterior import HierarchicalPosterior
 from ..events.hierarchy_result import Hierarchy
-from ..text_tables import NamedResults, number
-from ..units import from_si
 from .new_event import predict_new_event
 from .prediction import Prediction
 from .quantities import Quantity
@@ -26,35 +24,15 @@ class HeldOutScore(NamedTuple):
     scores: HistoryScores | QuantityScores  # against the event's measurements
     prediction: Prediction
 
-    @property
-    def cells(self) -> dict[str, str]:
-        """The scores as texts by headings: per number, or per channel for histories."""
-        scores, found = self.scores, {}
-        if isinstance(scores, QuantityScores):
-            for k, (name, unit) in enumerate(zip(scores.names, scores.units, strict=True)):
-                ends = scores.lower[k], scores.upper[k]
-                shown = [each if unit == "SI" else from_si(each, unit) for each in (scores.measured[k], *ends)]
-                measured, lower, upper = map(number, shown)
-                found |= {f"{name} [{unit}]": measured, f"{scores.level:.0%} interval of {name}": f"{lower} to {upper}"}
-                found[f"PIT of {name}"] = number(scores.pit[k], 2)
-        else:
-            for k, channel in enumerate(scores.channels):
-                found |= {f"RRMSE of {channel.name}": f"{scores.rrmse[k]:.1%}"}
-                found[f"interval score of {channel.name} [{channel.unit}]"] = number(
-                    from_si(scores.interval_score[k], channel.unit)
-                )
-                found[f"{channel.name} in band"] = f"{scores.coverage[k]:.1%}"
-        return found
-
     def __str__(self) -> str:
         return str(self.scores)
 
 
-class HeldOutScores(NamedResults):
-    """Scores by event; ``print`` gives a row per event, and how many numbers are within their intervals."""
+class HeldOutScores(dict[str, HeldOutScore]):
+    """Scores by event; ``print`` shows the table of each, and how many numbers are within their intervals."""
 
     def __str__(self) -> str:
-        lines = [super().__str__()]
+        lines = [f"{name}\n{each}" for name, each in self.items()]
         of_numbers = [each.scores for each in self.values() if isinstance(each.scores, QuantityScores)]
         for k, name in enumerate(of_numbers[0].names if of_numbers else ()):
             pit = [each.pit[k] for each in of_numbers]
@@ -140,10 +118,11 @@ def leave_one_out(hierarchy: Hierarchy, *, seed: int = 0) -> LeftOutTests:
     --------
     >>> left_out = leave_one_out(hierarchy, seed=1)
     >>> print(left_out.scores(posteriors, quantity=peak("displacement")))
-    event   displacement [cm]  90% interval of displacement  PIT of displacement
-    north ...
-    middle ...
-    south ...
+    north
+    quantity      unit  measured  median  90% interval ...
+    displacement    cm ...
+    middle
+    ...
     """
     if len(tests := hierarchy.posterior.tests) < 2:
         raise ValueError(f"leave_one_out needs two tests or more; got {', '.join(map(repr, tests))}")

@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..cache.memory import distinct_keys
 from ..likelihood.joint import JointLikelihood
 from ..likelihood.likelihood import FELikelihood
 from ..noise.draws import SampleNoise, sample_noise
@@ -24,7 +23,6 @@ __all__ = [
     "distinct_rows",
     "part_of",
     "read_source",
-    "samples_of_rows",
     "split_samples",
 ]
 
@@ -123,16 +121,10 @@ def split_samples(
     return thetas, model_error(noise_model, parameters, model.dt) if noise == "model" else whole
 
 
-def distinct_rows(thetas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distinct rows in the order of first appearance, and for each row its index among them."""
-    keys, row_of_sample = distinct_keys(thetas)
-    return np.frombuffer(b"".join(keys), dtype=float).reshape(len(keys), -1).copy(), np.array(row_of_sample)
-
-
-def samples_of_rows(row_of_sample: np.ndarray, n_rows: int) -> list[np.ndarray]:
-    """Return the indices of the samples that each distinct row stands for, the inverse of `distinct_rows`."""
-    order = np.argsort(row_of_sample, kind="stable")
-    return np.split(order, np.cumsum(np.bincount(row_of_sample, minlength=n_rows))[:-1])
+def distinct_rows(thetas: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+    """The distinct rows, and the indices of the samples that each of them stands for."""
+    distinct, row_of_sample, counts = np.unique(thetas, axis=0, return_inverse=True, return_counts=True)
+    return distinct, np.split(np.argsort(row_of_sample.ravel(), kind="stable"), np.cumsum(counts)[:-1])
 
 
 def _noise_of_events(

@@ -120,7 +120,7 @@ def predict_new_event(
     record: Record | Any,
     *,
     model: Any = None,
-    quantity: Quantity | Mapping[str, Quantity] = None,
+    quantity: Quantity = None,
     spread: Mapping[str, float] | None = None,
     prior_events: float = PRIOR_EVENTS,
     covariates: Mapping[str, float] | None = None,
@@ -128,7 +128,7 @@ def predict_new_event(
     n: int = 500,
     seed: int | None = None,
     **options: Any,
-) -> Prediction | dict[str, Prediction]:
+) -> Prediction:
     """Predict an event that is not among the events of a hierarchical model.
 
     Parameters
@@ -144,8 +144,8 @@ def predict_new_event(
         What predicts. Default: the posterior of the first event.
     quantity : optional
         Numbers such as ``peak("deck")``, one or a list of them: the *measured* values of the new event are predicted.
-        Histories, as for `propagate`: the response, or the measurements with ``noise=True``. Several of these by name.
-        Default: the histories of all channels.
+        Histories, as for `propagate`: the response, or the measurements with ``noise=True``. Default: those of all
+        channels.
     spread, prior_events
         Of the ratio of measured values to the values at the median parameters, see `event_ratios`. The printed
         prediction says how much of the width is due to the scatter that is expected before the events.
@@ -167,7 +167,7 @@ def predict_new_event(
 
     Returns
     -------
-    Prediction, or dict of str to Prediction
+    Prediction
         For numbers, mean, variance and standard error are NaN: the exponential of Student's t has no mean; use
         quantiles. The intervals that `exceedance` derives from it contain the uncertainty of the ratio.
 
@@ -205,15 +205,6 @@ def predict_new_event(
         raise ValueError(
             f"predict_new_event: expected the posteriors of the events by name, {{name: posterior}}; got {posteriors!r}"
         )
-    if isinstance(quantity, Mapping):
-        given = {"model": model, "spread": spread, "prior_events": prior_events, "covariates": covariates}
-        given |= {"n": n, "seed": seed}
-        return {
-            name: predict_new_event(
-                hierarchy, posteriors, record, quantity=each, noise=noise and not _is_number(each), **given, **options
-            )
-            for name, each in quantity.items()
-        }
     predictor = next(iter(posteriors.values())) if model is None else model
     known = [read_source(posteriors[name]).likelihood for name in hierarchy.posterior.tests if name in posteriors]
     settings = {

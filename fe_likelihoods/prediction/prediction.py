@@ -132,12 +132,7 @@ class Prediction:
             )
         return self.quantiles[self.probabilities.index(probability)]
 
-    def score(
-        self,
-        measured: Measurements | ArrayLike,
-        level: float = 0.9,
-        part: slice = slice(None),
-    ) -> HistoryScores | QuantityScores:
+    def score(self, measured: Measurements | ArrayLike, level: float = 0.9) -> HistoryScores | QuantityScores:
         """Compute proper scores, coverage and sharpness; ``print(prediction.score(measurements))`` is a table.
 
         Parameters
@@ -150,8 +145,6 @@ class Prediction:
         level : float
             Probability of the scored intervals, between 0 and 1. For histories, the prediction must have the quantiles
             with the probabilities (1 - level) / 2 and (1 + level) / 2, which a default prediction has for 0.9.
-        part : slice
-            The samples of the histories to score. Default: all.
 
         Returns
         -------
@@ -162,7 +155,7 @@ class Prediction:
         ------
         ValueError
             If the measurements lack a channel or have samples outside the histories, a measured channel is zero or has
-            no sample in the part, or the histories are from one sample or have no such quantiles. For other quantities:
+            no sample, or the histories are from one sample or have no such quantiles. For other quantities:
             if the measured values have another shape, samples of the channel are missing, or measurements are given
             for a function of the whole response. If less than one sample is expected on each side of the intervals (20
             samples for 0.9).
@@ -188,13 +181,14 @@ class Prediction:
         if not isinstance(measured, Measurements):
             raise ValueError(f"score: a prediction of histories needs Measurements; got {type(measured).__name__}")
         compared = self._compared(measured)
-        values = _values_of(compared)
-        mean, sd = (_at_samples(compared, each) for each in (self.mean, self.sd))
+        own_times = isinstance(compared, Comparison)
+        values, at = (compared.values, compared.at_samples) if own_times else (compared, np.asarray)
         ends = (self._near_quantile(0.5 - 0.5 * level), self._near_quantile(0.5 + 0.5 * level))
-        lower, upper = _band_at_samples(compared, *ends)
-        values, mean, sd, lower, upper = (each[:, part] for each in (values, mean, sd, lower, upper))
+        # Interpolated ends of a narrow band may cross: their order is nearer to the true quantiles (Chernozhukov,
+        # Fernandez-Val and Galichon, 2010, doi:10.3982/ECTA7880).
+        lower, upper = np.sort([at(each) for each in ends], axis=0)
         _check_number(self.n_samples, 2, level)
-        return score_histories(self.channels, values, (mean, sd), (lower, upper), level)
+        return score_histories(self.channels, values, (at(self.mean), at(self.sd)), (lower, upper), level)
 
     def _score_values(self, measured: Measurements | ArrayLike, level: float) -> QuantityScores:
         """Scores of numbers against the same numbers of measurements."""
@@ -310,20 +304,3 @@ def _check_number(n_samples: int, least: int, level: float) -> None:
     least = max(least, math.ceil(2.0 / (1.0 - level) - 1e-9))
     if n_samples < least:
         raise ValueError(f"score: expected {least} samples or more for intervals of {level:g}; got {n_samples}")
-
-
-def _values_of(compared: np.ndarray | Comparison) -> np.ndarray:
-    return compared.values if isinstance(compared, Comparison) else compared
-
-
-def _band_at_samples(compared: np.ndarray | Comparison, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """The ends of a band (2, n_channels, n_samples) at the times of the samples, in ascending order.
-
-    Interpolated ends of a narrow band of few draws may cross. Their order is then changed, which brings them nearer to
-    the true quantiles (Chernozhukov, Fernandez-Val and Galichon, 2010, doi:10.3982/ECTA7880).
-    """
-    return np.sort([_at_samples(compared, each) for each in (lower, upper)], axis=0)
-
-
-def _at_samples(compared: np.ndarray | Comparison, histories: np.ndarray) -> np.ndarray:
-    return compared.at_samples(histories) if isinstance(compared, Comparison) else histories

@@ -17,7 +17,7 @@ import logging
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
@@ -37,13 +37,7 @@ from ..simulation.model import Model, SimulationFailed
 from .accumulator import Accumulator
 from .calibrated_range import Ends, Peaks, bandwidth, calibration_of, difference_of_responses
 from .excitation import chosen_state, excite, under_record
-from .inputs import (
-    distinct_rows,
-    part_of,
-    read_source,
-    samples_of_rows,
-    split_samples,
-)
+from .inputs import distinct_rows, part_of, read_source, split_samples
 from .other_channels import predict_channels_of
 from .prediction import Prediction
 from .quantities import Quantity, evaluator
@@ -55,16 +49,6 @@ logger = logging.getLogger(__name__)
 _BATCH_VALUES = 2**22  # response values in one batch: 32 MiB
 _LARGEST_BATCH = 256
 _LARGEST_SERIAL_BATCH = 16  # small, so that the progress bar moves often when simulations run one by one
-
-
-@overload
-def propagate(
-    posterior_or_model: Any, samples: Any, *, quantity: Mapping[str, Quantity], **options: Any
-) -> dict[str, Prediction]: ...
-
-
-@overload
-def propagate(posterior_or_model: Any, samples: Any, *, quantity: Quantity = ..., **options: Any) -> Prediction: ...
 
 
 def propagate(
@@ -205,8 +189,7 @@ def propagate(
         raise ValueError("quantity: expected at least one quantity by name; got none")
     evaluators = {name: evaluator(each, model.channels, model.dt, n_steps) for name, each in wanted.items()}
 
-    distinct, row_of_sample = distinct_rows(thetas)
-    members = samples_of_rows(row_of_sample, len(distinct))
+    distinct, members = distinct_rows(thetas)
     try:
         entropy = np.random.SeedSequence(seed).entropy
     except (TypeError, ValueError) as error:

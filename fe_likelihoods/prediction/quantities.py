@@ -7,8 +7,9 @@ displacement.
 .. math:: I_A = \frac{\pi}{2 g} \int a^2\, dt, \qquad W = \int F\, du.
 """
 
+import functools
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -161,9 +162,8 @@ def arias_intensity(channel: str, part: slice = slice(None)) -> ChannelQuantity:
     value                            unit  mean  MC error     sd   5 %  50 %  95 %
     Arias intensity of acceleration   m/s  4.32   0.00701  0.121  4.13  4.31  4.52
     """
-    return ChannelQuantity(
-        channel, _arias_intensity, part, timed=True, describe=_of_acceleration, name="Arias intensity"
-    )
+    describe = functools.partial(_describe, "Arias intensity", {"acceleration": ("velocity", "m/s")})
+    return ChannelQuantity(channel, _arias_intensity, part, timed=True, describe=describe, name="Arias intensity")
 
 
 def dissipated_energy(force: str, displacement: str | ArrayLike, part: slice = slice(None)) -> ChannelQuantity:
@@ -201,7 +201,8 @@ def dissipated_energy(force: str, displacement: str | ArrayLike, part: slice = s
     energy of base_shear    kJ  7.81         0   0  7.81  7.81  7.81
     """
     displacement = _displacement(displacement, "dissipated_energy")
-    return ChannelQuantity(force, _work, part, (displacement,), describe=_of_force, name="energy")
+    describe = functools.partial(_describe, "energy", _WORK)
+    return ChannelQuantity(force, _work, part, (displacement,), describe=describe, name="energy")
 
 
 def displacement_before_failure(force: str, displacement: str | ArrayLike) -> ChannelQuantity:
@@ -239,7 +240,8 @@ def displacement_before_failure(force: str, displacement: str | ArrayLike) -> Ch
     displacement before failure of force    mm   287         0   0  287   287   287
     """
     displacement = _displacement(displacement, "displacement_before_failure")
-    return ChannelQuantity(force, _before_failure, others=(displacement,), describe=_of_failure, name="failure")
+    describe = functools.partial(_describe, "displacement before failure", {"force": ("displacement", "mm")})
+    return ChannelQuantity(force, _before_failure, others=(displacement,), describe=describe, name="failure")
 
 
 def final_value(channel: str, samples: int = 1) -> ChannelQuantity:
@@ -361,24 +363,13 @@ def _displacement(displacement: str | ArrayLike, of: str) -> str | np.ndarray:
     return values
 
 
-def _of_acceleration(channel: Channel) -> Channel:
-    if channel.dimension != "acceleration":
-        raise ValueError(f"arias_intensity needs an acceleration; channel {channel.name!r} is {channel.quantity!r}")
-    return Channel(f"Arias intensity of {channel.name}", "velocity", "m/s")
-
-
-def _of_force(channel: Channel) -> Channel:
-    if channel.dimension not in _WORK:
+def _describe(name: str, known: Mapping[str, tuple[str, str]], channel: Channel) -> Channel:
+    """The number of a channel, whose dimension and unit are `known` by the dimension of the channel."""
+    if channel.dimension not in known:
         raise ValueError(
-            f"dissipated_energy needs a channel of {', '.join(_WORK)}; channel {channel.name!r} is {channel.quantity!r}"
+            f"{name} needs a channel of {', '.join(known)}; channel {channel.name!r} is {channel.quantity!r}"
         )
-    return Channel(f"energy of {channel.name}", *_WORK[channel.dimension])
-
-
-def _of_failure(channel: Channel) -> Channel:
-    if channel.dimension != "force":
-        raise ValueError(f"displacement_before_failure needs a force; channel {channel.name!r} is {channel.quantity!r}")
-    return Channel(f"displacement before failure of {channel.name}", "displacement", "mm")
+    return Channel(f"{name} of {channel.name}", *known[channel.dimension])
 
 
 def evaluator(quantity: Quantity, channels: Sequence[Channel], dt: float, n_steps: int | None = None) -> Evaluator:

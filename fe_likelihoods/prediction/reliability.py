@@ -38,7 +38,6 @@ __all__ = [
 ]
 
 _DRAWS = 1000  # of the population of ratios
-_ARRAYS = ("probability", "standard_error", "lower", "upper")  # of an `Exceedance`
 
 
 class Exceedance(NamedTuple):
@@ -161,15 +160,7 @@ def exceedance(
         )
     if values.ndim == 1 and limits.ndim:
         values = values.reshape(-1, *(1,) * limits.ndim)
-    settings = known.effective, check_level(level), seed
-    if ratios is None or not ratios.shape:
-        found = estimate(values, limits, ratios, *settings).exceedance
-    else:  # each quantity has ratios of its own
-        rows = np.broadcast_to(limits, values.shape[1:])
-        columns = [
-            estimate(values[:, k], row, ratios.of_quantity(k), *settings).exceedance for k, row in enumerate(rows)
-        ]
-        found = columns[0]._replace(**{name: np.array([getattr(each, name) for each in columns]) for name in _ARRAYS})
+    found = estimate(values, limits, ratios, known.effective, check_level(level), seed).exceedance
     return found._replace(threshold=limits, uncertainty=known.contents, unit=known.unit)
 
 

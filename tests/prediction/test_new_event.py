@@ -191,14 +191,6 @@ def test_draws_of_impossible_shares_are_left_out(hierarchy, posterior):
     assert abs(prediction.n_samples - expected) < 4.0 * np.sqrt(2000 * 0.15 * 0.85)
 
 
-def test_several_quantities_by_name(events):
-    hierarchy, posteriors = events
-    wanted = {"histories": None, "peak": peak("top"), "numbers": [peak("top"), rms("top")]}
-    found = predict_new_event(hierarchy, posteriors, 1.0, quantity=wanted, n=50, seed=1)
-    assert found["histories"].dt == 0.02 and found["peak"].values.shape == (50,)
-    assert found["numbers"].values.shape == (50, 2)
-
-
 def test_what_cannot_be_predicted_is_refused(events, hierarchy, posterior):
     population_of_four, posteriors = events
     options = {"quantity": peak("top")}

@@ -106,7 +106,7 @@ def test_samples_may_be_missing_outside_of_the_part_only():
 @pytest.mark.parametrize(
     ("quantity", "match"),
     (
-        (arias_intensity("force"), "needs an acceleration; channel 'force' is 'lateral force'"),
+        (arias_intensity("force"), "needs a channel of acceleration; channel 'force' is 'lateral force'"),
         (dissipated_energy("deck", "drift"), "needs a channel of force, moment, stress"),
         (dissipated_energy("force", "roof"), "no channel 'roof'"),
         (dissipated_energy("force", TIME[:-1]), "has 401 samples, the array that belongs to it 400"),
@@ -152,7 +152,7 @@ def test_the_displacement_before_failure_is_the_largest_one_with_80_percent_of_t
         assert find_failure(force, displacement) <= len(force)
     measured = Measurements([Channel("f", "lateral force", "kN")], 1.0, [force])
     assert measured_quantity(displacement_before_failure("f", displacement), measured) == pytest.approx(3.0)
-    with pytest.raises(ValueError, match="needs a force; channel 'f' is 'displacement'"):
+    with pytest.raises(ValueError, match="needs a channel of force; channel 'f' is 'displacement'"):
         shown = Measurements([Channel("f", "displacement", "mm")], 1.0, [force])
         measured_quantity(displacement_before_failure("f", displacement), shown)
     with pytest.raises(ValueError, match="displacement_before_failure: expected the name of a channel, or finite"):
