@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -46,7 +47,7 @@ class HeldOutScores(dict[str, HeldOutScore]):
 class LeftOutTests(dict[str, Hierarchy]):
     """The population without each test, by its name; `covariates` are those of the test that is left out."""
 
-    covariates: dict[str, Mapping[str, float]]
+    covariates: Mapping[str, Mapping[str, float]] = MappingProxyType({})
 
     def scores(
         self,

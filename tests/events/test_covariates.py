@@ -121,7 +121,13 @@ def test_numbers_of_a_new_event_follow_the_slope_and_widen_beyond_the_events():
     assert far[2] - far[0] > 1.1 * (near[2] - near[0])
     default = predict_new_event(hierarchy, posteriors, 1.0, **options)
     np.testing.assert_allclose(default.quantiles, found[12.5].quantiles, rtol=1e-6)
-    scores = leave_one_out(hierarchy).scores(posteriors, quantity=peak("top"), spread=options["spread"])
+    assert default.ratios.sd < 0.1  # each event beside its own median; they are 0.25 apart by their temperatures
+
+
+@pytest.mark.slow
+def test_each_event_is_predicted_at_its_own_temperature():
+    hierarchy, posteriors = events(0.02, np.array([-5.0, 2.0, 9.0, 16.0, 23.0, 30.0]))
+    scores = leave_one_out(hierarchy).scores(posteriors, quantity=peak("top"), spread={"gain": 0.04})
     measured = [float(each.scores.measured[0]) for each in scores.values()]
     medians = [float(each.prediction.quantiles[1]) for each in scores.values()]
     np.testing.assert_allclose(np.log(medians), np.log(measured), atol=0.2)  # 0.7 apart by their temperatures
