@@ -58,6 +58,7 @@ def test_warning_of_another_process_is_repeated_once(drift, expected, path, capl
         assert "exceeds the ultimate strain of the steel" in caplog.text and "{'fy': " in caplog.text
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
 @pytest.mark.parametrize("drift", [0.2, 0.05])
 def test_a_stored_remark_is_a_finding_of_the_result(drift, path):

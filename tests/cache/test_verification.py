@@ -12,7 +12,6 @@ import pytest
 
 from fe_likelihoods import AutoregressiveNoise, FELikelihood, Measurements, SimulationCache
 from fe_likelihoods.cache import verification
-from fe_likelihoods.cache.comparison import largest_difference
 from fe_likelihoods.cache.verification import StaleCache
 from fe_likelihoods.simulation.faults import ChangedModel, TransientReason
 from fe_likelihoods.simulation.model import SimulationFailed
@@ -235,28 +234,6 @@ def test_small_differences_are_accepted_up_to_the_tolerance_of_the_message(fille
     stated = float(str(caught.value).rpartition("tolerance=")[2].rstrip(")"))
     assert 1e-9 < stated < 1e-6
     likelihood_of(Scaled(1.0 + 1e-7), SimulationCache(filled, tolerance=stated)).misfit(thetas)
-
-
-def test_differences_of_statistics_are_changes_of_the_response(rng):
-    """A change of the response of relative norm t is found for a tolerance below it, and accepted well above it."""
-    for scale in (1e-3, 1.0):  # of the residual: a good fit and a bad one
-        response = rng.normal(size=(2, 1000))
-        measured = response + scale * rng.normal(size=response.shape)
-        direction = (response - measured) / np.linalg.norm(response - measured, axis=1, keepdims=True)
-        other = response + 1e-6 * np.linalg.norm(response, axis=1, keepdims=True) * direction
-
-        def statistics(values, measured=measured):
-            residuals = values - measured
-            return np.concatenate([(residuals**2).sum(axis=1), (residuals[:, 1:] * residuals[:, :-1]).sum(axis=1)])
-
-        old, new, norm = statistics(response), statistics(other), np.linalg.norm(response, axis=1)
-        assert largest_difference(old, old, norm, 0.0) is None
-        index, change = largest_difference(old, new, norm, 2e-7)
-        assert index < 2 and 0.99e-6 < change <= 1.01e-6
-        assert largest_difference(old, new, norm, 1.01e-6) is None
-    perfect = np.zeros(2)
-    assert largest_difference(perfect, perfect + 1e-30, norm, 1e-9) is None
-    assert largest_difference(perfect, np.array([0.0, np.nan]), norm, 1e-9)[0] == 1
 
 
 # when -----------------------------------------------------------------------------------------------------------------

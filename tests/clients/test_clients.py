@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy import optimize
 
 from fe_likelihoods import TruncatedNormal
 
@@ -45,19 +44,3 @@ def test_evidence_without_the_failed_runs_is_detected(answer):
     with pytest.raises(AssertionError, match="evidence"):
         check(without_failures, answer)
     check(without_failures._replace(log_evidence=answer.log_evidence), answer)
-
-
-def test_scipy_finds_the_mode():
-    posterior = make_posterior()
-    start, options = posterior.sample_start(1, 3)[0], {"bounds": posterior.prior.bounds, "options": {"maxiter": 2000}}
-    reference = optimize.differential_evolution(
-        lambda x: min(-reference_log_prob(x), 1e100),
-        [(0.4, 2.4), (0.7, 2.0), (0.2, 3.0), (0.005, 0.03)],
-        seed=1,
-        tol=1e-8,
-        maxiter=60,
-        popsize=8,
-    )
-    for method in ("Nelder-Mead", "Powell", "L-BFGS-B"):
-        found = optimize.minimize(posterior.negative_log_prob, start, method=method, **options)
-        assert found.fun == pytest.approx(reference.fun, abs=1e-3), method

@@ -45,7 +45,7 @@ def is_right(samplers):
 @pytest.mark.parametrize(
     ("name", "Sampler"),
     [
-        pytest.param(n, s, marks=pytest.mark.slow if n == "WalkMove" or (s is TMCMCSampler and n != "all") else ())
+        pytest.param(n, s, marks=() if n == "all" or (n, s) == ("MHMove", SMCSampler) else pytest.mark.slow)
         for n in MOVES
         for s in (SMCSampler, TMCMCSampler)
     ],

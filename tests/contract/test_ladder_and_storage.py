@@ -11,7 +11,6 @@ from samplers import SamplingWarning, SMCSampler, TMCMCSampler
 from samplers.moves.population_moves import RandomWalkMove
 from samplers.presets import CHING_CHEN_2007, RAMANCHA_2022_CONSTANT, RAMANCHA_2022_LITERAL
 from samplers.reporting.summary import summary
-from samplers.reports import AnnealingResult
 from tests.contract.targets import Box, Gaussian
 
 N = 40
@@ -59,19 +58,6 @@ def test_recycling_accounts_for_everything():
     assert abs(sampler.log_evidence_ladder - posterior.log_evidence) < 4 * sampler.ladder[-1].log_evidence_error
     assert sampler.log_evidence in (check.log_evidence, sampler.log_evidence_ladder)
     assert sampler.evaluations < annealed(Gaussian(sd=0.02), nsteps=0, recycle=False).evaluations
-
-
-def test_two_estimates_that_disagree_widen_the_error_unless_the_higher_one_is_trusted():
-    sampler = annealed()
-    check = sampler.log_evidence_check
-    check = check._replace(log_evidence=check.log_evidence - 10.0, error=0.01, pareto_shape=0.1)
-    log_evidence, error = AnnealingResult(sampler.ladder, check).evidence
-    assert log_evidence == check.log_evidence
-    assert error == pytest.approx(5.0, abs=1.0)
-    higher = check._replace(log_evidence=check.log_evidence + 20.0, error=0.3)
-    assert AnnealingResult(sampler.ladder, higher).evidence == (higher.log_evidence, 0.3)
-    unreliable = AnnealingResult(sampler.ladder, check._replace(pareto_shape=0.9))
-    assert unreliable.evidence[0] == sampler.log_evidence_ladder
 
 
 def test_recycling_that_fails_falls_back_to_moves(caplog):

@@ -1,13 +1,9 @@
 """Guides of several data sets with parameters in common."""
 
 import warnings
-from collections import Counter
-from concurrent.futures import ThreadPoolExecutor
 
-import emcee
 import numpy as np
 import pytest
-from scipy import stats
 
 from fe_likelihoods import (
     AutoregressiveNoise,
@@ -187,19 +183,6 @@ def test_two_events_take_hundreds_of_simulations():
     assert samples.std(axis=0) == pytest.approx(sd, rel=4.0 * np.sqrt(variance / 2.0))
 
 
-@pytest.mark.slow
-def test_an_asynchronous_run_gives_the_result_of_quadrature():
-    log_evidence, mean, sd = exact(joint())
-    with ThreadPoolExecutor(2) as pool:
-        posterior = joint(pool=pool)
-        sampler = guided(posterior, limit=3000, asynchronous=True)
-    assert sampler.verdict.status == "converged" and sampler.simulations <= 700
-    assert posterior.likelihood.simulations <= 2 * sampler.simulations
-    assert abs(sampler.log_evidence - log_evidence) < 4.0 * sampler.log_evidence_error < 0.4
-    n = 1.0 / sampler.verdict.effective_sample_size + 1.0 / N
-    assert np.all(np.abs(sampler.get_chain(flat=True).mean(axis=0) - mean) < 4.0 * sd * np.sqrt(n))
-
-
 def test_control_one_event_alone_has_another_posterior():
     """The second event has a part in the result: without it, the standard deviations are larger."""
     _, _, sd = exact(joint())
@@ -207,19 +190,6 @@ def test_control_one_event_alone_has_another_posterior():
     prior = {name: TruncatedNormal(1.0, 0.3) for name in names} | {"sigma_top": HalfNormal(0.01)}
     _, _, alone = exact(Posterior(likelihoods()["first"], prior).marginal())
     assert np.all(alone > 1.05 * sd)
-
-
-@pytest.mark.slow
-def test_a_run_that_goes_on_is_the_long_run(tmp_path):
-    whole = guided(joint())
-    path = str(tmp_path / "run.h5")
-    limit = int(0.95 * whole.simulations)  # a smaller one would keep the search from further starts
-    guided(joint(), limit=limit, backend=emcee.backends.HDFBackend(path))
-    again = joint()
-    sampler = guided(again, backend=emcee.backends.HDFBackend(path))
-    assert np.array_equal(sampler.get_chain(), whole.get_chain())
-    assert sampler.log_evidence == whole.log_evidence and sampler.simulations == whole.simulations
-    assert again.likelihood.simulations < 2 * whole.simulations - 1.4 * limit
 
 
 @pytest.mark.slow
@@ -246,26 +216,3 @@ def test_a_limit_that_ends_the_search_repeats_no_simulation(monkeypatch):
     distinct = len(calls) - posterior.report()["verifications"]
     assert len(set(calls)) == distinct == 2 * sampler.simulations == posterior.likelihood.simulations
     assert whole.simulations < sampler.simulations < whole.simulations + 50
-
-
-@pytest.mark.slow
-def test_ranks_of_the_truth_are_uniform(seed):
-    """Simulation-based calibration: the truth is a draw of the prior, and so is the noise of each event."""
-    ranks, simulations, inside, scores, statuses = [], [], [], [], []
-    for number in range(20):
-        truth = joint(marginal=False).sample_prior(1, np.random.default_rng(1000 * seed + number))[0]
-        posterior = joint(marginal=False, truth=truth[:2], sd=truth[2:], seed=1000 * seed + number)
-        sampler = guided(posterior, limit=800, seed=number)
-        samples = sampler.get_chain(flat=True)
-        ranks.append(np.mean(samples < truth, axis=0))
-        low, high = np.quantile(samples, [0.05, 0.95], axis=0)
-        inside.append((low <= truth) & (truth <= high))
-        beyond = np.maximum(low - truth, 0.0) + np.maximum(truth - high, 0.0)
-        scores.append((high - low + 2.0 / 0.1 * beyond) / samples.std(axis=0))
-        statuses.append(sampler.verdict.status)
-        simulations.append(sampler.simulations)
-    print("simulations:", np.mean(simulations), min(simulations), max(simulations), Counter(statuses))
-    print("90 % intervals:", np.mean(inside, axis=0), "interval scores [sd]:", np.mean(scores, axis=0))
-    for rank in np.transpose(ranks):
-        print("p:", stats.kstest(rank, "uniform").pvalue)
-        assert stats.kstest(rank, "uniform").pvalue > 0.001

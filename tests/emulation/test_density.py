@@ -61,15 +61,3 @@ def log_evidence(arc):
 def test_a_thin_arc_is_covered_where_runs_were_made(arc):
     found = emulated(arc, arc)
     assert abs(found.log_evidence - log_evidence(arc)) < 4.0 * found.log_evidence_error < 0.15
-
-
-def test_a_gaussian():
-    target = Target(0.0, runs=1)
-    emulator = SimpleNamespace(
-        log_likelihood=lambda coords: -0.5 * (np.square(coords) / [0.01, 1e-4]).sum(axis=1),
-        squared_distance=lambda coords: np.square(coords).sum(axis=1),
-    )
-    found = EmulatedPosterior(
-        target, [Region(np.zeros(2), np.diag([0.01, 1e-4]), emulator, 0.0)], np.random.RandomState(2)
-    )
-    assert found.log_evidence == pytest.approx(-0.5 * np.log(101.0 * 10001.0), abs=0.03)

@@ -267,24 +267,6 @@ def test_wrong_derivatives_are_refused(factors):
         )
 
 
-def test_a_comparison_that_fails_is_made_up_for():
-    calls = []
-
-    def fails_once(theta):
-        calls.append(theta)
-        if len(calls) == 3:  # after both starts
-            raise RuntimeError("diverged")
-        return free_vibration(theta)
-
-    model = FunctionModel(fails_once, NAMES, CHANNELS, DT, N_STEPS, jacobian=lambda theta: 2.0 * slopes(theta))
-    prior = {"stiffness": TruncatedNormal(1.0, 0.3), "damping": TruncatedNormal(1.0, 0.3)}
-    sigmas = {"sigma_top": HalfNormal(0.01), "sigma_base": HalfNormal(20.0)}
-    measured = noisy(FunctionModel(free_vibration, NAMES, CHANNELS, DT, N_STEPS))
-    with pytest.raises(ValueError, match="differ from a difference of two simulations by 50 %"):
-        find_modes(Posterior(FELikelihood(model, measured).marginal(sigmas), prior), starts=2, seed=1)
-    assert len(calls) > 4
-
-
 @pytest.mark.parametrize("prior", [0.3, 1e-4, 0.9])
 def test_right_derivatives_are_accepted_for_any_width_of_the_prior(prior):
     """With a wide prior, a step of a share of its width is no small one for a vibration of many cycles."""

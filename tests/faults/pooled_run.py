@@ -3,10 +3,8 @@
 Each process that runs a simulation writes a file named by its process id in FOLDER. The simulations take an hour.
 """
 
-import multiprocessing
 import sys
 import time
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -41,18 +39,6 @@ def _dask():
     return Client(LocalCluster(n_workers=WORKERS, threads_per_worker=1, processes=True, dashboard_address=None))
 
 
-def _loky():
-    from joblib.externals.loky import get_reusable_executor
-
-    return get_reusable_executor(WORKERS)
-
-
-def _mpi():
-    from mpi4py.futures import MPIPoolExecutor
-
-    return MPIPoolExecutor(WORKERS)
-
-
 def _isolated() -> FunctionModel:
     return FunctionModel(treacherous, NAMES, CHANNELS, DT, N_STEPS, time_limit=3600.0)
 
@@ -63,20 +49,14 @@ def _program() -> ExecutableModel:
     return ExecutableModel(command, {}, "out.txt", NAMES, CHANNELS, DT, N_STEPS, time_limit=3600.0)
 
 
-POOLS = {
-    "local": lambda: LocalPool(WORKERS),
-    "executor": lambda: ProcessPoolExecutor(WORKERS, mp_context=multiprocessing.get_context("spawn")),
-    "multiprocessing": lambda: multiprocessing.get_context("spawn").Pool(WORKERS),
-    "loky": _loky,
-    "dask": _dask,
-    "mpi": _mpi,
-}
 # model, pool, and way of hanging
-CASES = {name: (Treacherous, pool, HANGS) for name, pool in POOLS.items()} | {
-    "deaf": (Treacherous, POOLS["local"], HANGS_HARD),
-    "nested": (_isolated, POOLS["local"], HANGS_HARD),
+CASES = {
+    "local": (Treacherous, lambda: LocalPool(WORKERS), HANGS),
+    "dask": (Treacherous, _dask, HANGS),
+    "deaf": (Treacherous, lambda: LocalPool(WORKERS), HANGS_HARD),
+    "nested": (_isolated, lambda: LocalPool(WORKERS), HANGS_HARD),
     "isolated": (_isolated, lambda: None, HANGS_HARD),
-    "program": (_program, POOLS["local"], HANGS),
+    "program": (_program, lambda: LocalPool(WORKERS), HANGS),
 }
 
 

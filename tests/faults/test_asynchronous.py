@@ -110,6 +110,47 @@ def test_threads_take_single_points():
     assert np.all(np.abs(mean - posterior.mean) < 4 * sd)
 
 
+class Ends(Gaussian):
+    """Raises an exception at one of its evaluations; notes the points."""
+
+    fingerprint = "of this target"  # a run that is continued need not compare values
+
+    def __init__(self, kind=None):
+        super().__init__(NDIM, sd=0.05)
+        self.kind, self.evaluated = kind, []
+
+    def __call__(self, x):
+        if self.kind is not None and len(self.evaluated) == 2 * N:
+            error = self.kind("changed")
+            error.ends_run = True
+            raise error
+        value = super().__call__(x)
+        self.evaluated.append(np.asarray(x).tobytes())
+        return value
+
+
+@pytest.mark.parametrize("kind", [KeyboardInterrupt, SystemExit, RuntimeError])
+def test_points_beside_one_that_ends_the_run_are_kept(kind, tmp_path):
+    """A worker that raises what is no failure of a point ends the run; all others that have ended are not repeated."""
+    path, posterior, again = tmp_path / "run.h5", Ends(kind), Ends()
+
+    def run(posterior):
+        backend = emcee.backends.HDFBackend(str(path))
+        with ThreadPoolExecutor(3) as pool:
+            settings = {"pool": pool, "backend": backend, "seed": 5, "recycle": True, "asynchronous": True}
+            sampler = SMCSampler(N, NDIM, posterior, **settings)
+            sampler.run_mcmc(None, 1)
+        return sampler
+
+    with pytest.raises(kind, match="changed"):
+        run(posterior)
+    known = points_of(path)
+    assert 2 * N - 3 <= len(known) and set(known) <= set(posterior.evaluated)
+    sampler = run(again)
+    assert not set(again.evaluated) & set(known)
+    assert abs(sampler.log_evidence - posterior.log_evidence) < 4 * sampler.log_evidence_error
+
+
 POSTERIOR = Gaussian(NDIM)
 GUIDE = FixedGuide(POSTERIOR, POSTERIOR.mean, [np.diag(POSTERIOR.sd**2)])
 

@@ -148,7 +148,9 @@ def test_a_failure_that_depends_on_the_measurements_is_not_used_for_others(tmp_p
 # real faults ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("what", "pool"), [("CRASHES", None), ("LEAVES", 1)], ids=["isolated", "pool"])
+@pytest.mark.parametrize(
+    ("what", "pool"), [("CRASHES", None), pytest.param("LEAVES", 1, marks=pytest.mark.slow)], ids=["isolated", "pool"]
+)
 def test_a_worker_that_dies_is_not_an_answer(what, pool, tmp_path):
     model = (
         FunctionModel(bad.treacherous, NAMES, CHANNELS, DT, N_STEPS, isolated=True) if pool is None else Treacherous()

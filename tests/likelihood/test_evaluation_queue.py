@@ -113,39 +113,6 @@ def test_values_are_those_of_single_points_on_every_pool(make, tmp_path):
             break
 
 
-@pytest.mark.parametrize("asynchronous", [True, False], ids=["queue", "call"])
-def test_short_runs_are_stored_before_a_long_one_ends(asynchronous, tmp_path, shared_pool):
-    """Two workers, of which one runs the first point for as long as the test wants."""
-    path = tmp_path / "cache.sqlite"
-    x = np.concatenate([LONG[:1], SHORT])
-    expected = posterior_of(Treacherous())(x)
-    with shared_pool(2) as pool:
-        posterior = posterior_of(Gated(tmp_path), pool=pool, cache=path)
-        thetas, key = x[:, :2], posterior.likelihood.simulator.simulation_key
-        stored = SimulationCache(path)
-        if asynchronous:
-            with posterior.evaluation_queue() as queue:
-                tickets, first = queue.submit(x), []
-                while len(first) < len(SHORT):
-                    first += queue.collect()
-                assert {ticket for ticket, _ in first} == set(tickets[1:])
-                # also where nobody calls the queue any more
-                wait_until(lambda: stored.look_up(key, thetas, 1).known.tolist() == [False] + [True] * len(SHORT))
-                (tmp_path / "go").touch()
-                values = dict(first + queue.collect())
-                assert [values[ticket] for ticket in tickets] == expected.tolist()
-        else:
-            results = []
-            thread = threading.Thread(target=lambda: results.append(posterior(x)))
-            thread.start()
-            wait_until(lambda: stored.look_up(key, thetas, 1).known.tolist() == [False] + [True] * len(SHORT))
-            assert not results
-            (tmp_path / "go").touch()
-            thread.join(SECONDS)
-            np.testing.assert_array_equal(results[0], expected)
-        assert stored.look_up(key, thetas, 1).known.all()
-
-
 def test_points_come_back_while_others_are_submitted(tmp_path, shared_pool):
     """New points go to the free worker, and duplicates of a running point are simulated once."""
     with shared_pool(2) as pool:

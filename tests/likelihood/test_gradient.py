@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy import optimize
 
 from fe_likelihoods import (
     AutoregressiveNoise,
@@ -192,19 +191,3 @@ def test_a_model_without_derivatives_is_refused(rng):
     with pytest.raises(ValueError, match="needs models with a method jacobian"):
         posterior.grad_log_prob(posterior.prior.mean())
     assert posterior.report()["simulations"] == 0
-
-
-def test_a_minimiser_with_gradients_finds_the_mode_of_one_without(rng):
-    posterior = gaussian(rng)
-    start, bounds = posterior.sample_start(1, 1)[0], posterior.prior.bounds
-    scales = np.array([0.2, 0.3, 0.5, 0.02])
-
-    def objective(z):
-        return posterior.negative_log_prob(z * scales), -posterior.grad_log_prob(z * scales) * scales
-
-    options = {"method": "L-BFGS-B", "bounds": bounds / scales[:, None]}
-    fast = optimize.minimize(objective, start / scales, jac=True, **options)
-    slow = optimize.minimize(
-        posterior.negative_log_prob, fast.x * scales, method="Nelder-Mead", options={"maxiter": 4000}
-    )
-    assert fast.fun <= slow.fun + 1e-4 and fast.nfev < 100

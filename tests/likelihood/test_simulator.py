@@ -240,16 +240,3 @@ def test_known_statistics_are_recalled_without_a_simulation(thetas):
     second.simulator.recall(thetas, np.zeros_like(statistics), batch.reasons)  # cached rows are not changed
     np.testing.assert_array_equal(second.simulator.statistics(thetas), statistics)
     assert second.simulator.failures.count == first.simulator.failures.count
-
-
-def test_one_point_has_the_value_of_a_batch(thetas):
-    likelihood = likelihood_of(Line())
-    points = np.hstack([thetas, np.full((len(thetas), 2), 0.3)])
-    points[:3, 2] = -1.0, np.nan, 0.0  # impossible noise parameters
-    batch = likelihood(points)
-    single = [likelihood(point) for point in points]
-    np.testing.assert_array_equal(single, batch)
-    assert np.isneginf(batch[:3]).all() and np.isneginf(batch[thetas[:, 1] > 1.0]).all()
-    known = likelihood.simulator.cache_hits
-    assert [likelihood(point) for point in points] == single
-    assert likelihood.simulator.cache_hits - known == len(points) - 3 and likelihood.simulations <= len(thetas)

@@ -61,25 +61,31 @@ def statistics_of(noise, residuals):
 # the closed form ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("rho", [0.0, -0.7, 0.5, 0.98, 0.9999])
-def test_autoregressive_noise_bridges_gaps_exactly(rng, rho):
-    noise, there = AutoregressiveNoise(CHANNELS, sensor={"top": 0.3}), with_gaps(rng)
-    residuals = np.where(there, rng.normal(size=(2, 60)) * [[1.0], [0.02]], np.nan)
+@pytest.mark.parametrize("n", [1, 2, 60, "gaps"])
+@pytest.mark.parametrize("rho", [-0.999, -0.7, 0.0, 0.5, 0.98, 0.9999])
+def test_autoregressive_noise_is_the_normal_density_and_bridges_gaps_exactly(rng, rho, n):
+    noise = AutoregressiveNoise(CHANNELS, sensor={"top": 0.3})
+    assert noise.parameter_names == ("sigma_top", "sigma_drift", "rho_top", "rho_drift")
+    there = with_gaps(rng) if n == "gaps" else np.ones((2, n), dtype=bool)
+    residuals = np.where(there, rng.normal(size=there.shape) * [[1.0], [0.02]], np.nan)
     parameters = np.array([[0.7, 0.03, rho, -0.5 * rho]])
     expected = sum(
-        stats.multivariate_normal.logpdf(r[one], cov=s**2 * linalg.toeplitz(q ** np.arange(60.0))[np.ix_(one, one)])
+        stats.multivariate_normal.logpdf(
+            r[one], cov=s**2 * linalg.toeplitz(q ** np.arange(1.0 * len(r)))[np.ix_(one, one)]
+        )
         for r, one, s, q in zip(residuals, there, (math.hypot(0.7, 0.3), 0.03), (rho, -0.5 * rho), strict=True)
     )
     got = noise.log_likelihood(statistics_of(noise, residuals), count_samples(residuals), parameters)[0]
-    assert got == pytest.approx(expected, rel=1e-10)
+    assert got == pytest.approx(expected, rel=1e-9)
 
 
+@pytest.mark.parametrize("share", [0.3, 0.0])
 @pytest.mark.parametrize("options", [{}, {"sensor": {"top": 0.3}}, {"effective_samples": {"top": 11.0, "drift": 1e9}}])
-def test_white_noises_count_the_samples_that_are_there(rng, options):
-    there = with_gaps(rng)
+def test_white_noises_count_the_samples_that_are_there(rng, options, share):
+    there = with_gaps(rng) if share else np.ones((2, 60), dtype=bool)
     residuals = np.where(there, rng.normal(size=(2, 60)) * [[1.0], [0.02]], np.nan)
     counts = count_samples(residuals)
-    assert counts.samples.tolist() == there.sum(axis=1).tolist()
+    assert np.broadcast_to(getattr(counts, "samples", counts), 2).tolist() == there.sum(axis=1).tolist()
     powers = [min(11.0 / there[0].sum(), 1.0) if "effective_samples" in options else 1.0, 1.0]
     for noise, parameters in (
         (GaussianNoise(CHANNELS, **options), np.array([[0.7, 0.03]])),

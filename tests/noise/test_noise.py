@@ -5,7 +5,6 @@ import warnings
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from fe_likelihoods import (
     AutoregressiveNoise,
@@ -23,14 +22,6 @@ CHANNELS = (Channel("top", "absolute acceleration", "g"), Channel("drift", "rela
 @pytest.fixture
 def noise():
     return GaussianNoise(CHANNELS)
-
-
-def test_equals_the_sum_of_normal_densities(noise, rng):
-    sigma = rng.uniform(0.1, 3.0, (6, 2)) * [1.0, 0.01]
-    residuals = rng.normal(size=(6, 2, 300)) * [[1.0], [0.02]]
-    expected = stats.norm.logpdf(residuals, scale=sigma[:, :, None]).sum(axis=(1, 2))
-    got = noise.log_likelihood((residuals**2).sum(axis=-1), 300, sigma)
-    np.testing.assert_allclose(got, expected, rtol=1e-12)
 
 
 def test_impossible_values_are_minus_infinity_without_a_warning(noise):

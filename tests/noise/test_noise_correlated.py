@@ -10,7 +10,6 @@ from scipy import linalg, stats
 from fe_likelihoods import AutoregressiveNoise, GaussianNoise
 from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.likelihood.posterior import Posterior
-from fe_likelihoods.noise.residuals import lag_one_sums
 from fe_likelihoods.prediction.propagation import propagate
 from fe_likelihoods.priors.distributions import Uniform
 from fe_likelihoods.signals.channels import Channel, Measurements
@@ -19,30 +18,7 @@ from tests import lines
 CHANNELS = (Channel("top", "absolute acceleration", "g"), Channel("drift", "relative displacement", "in"))
 
 
-def autoregressive(rng, shape, rho):
-    """AR(1) series of unit variance along the last axis, by its definition."""
-    errors = rng.standard_normal(shape)
-    for t in range(1, shape[-1]):
-        errors[..., t] = rho * errors[..., t - 1] + math.sqrt(1.0 - rho**2) * errors[..., t]
-    return errors
-
-
 # autoregressive noise -------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("rho", [-0.999, -0.6, 0.0, 0.3, 0.9, 0.9999])
-@pytest.mark.parametrize("n_steps", [1, 2, 60])
-def test_equals_the_normal_density_with_the_toeplitz_covariance(rng, rho, n_steps):
-    noise = AutoregressiveNoise(CHANNELS)
-    assert noise.parameter_names == ("sigma_top", "sigma_drift", "rho_top", "rho_drift")
-    residuals = rng.normal(size=(2, n_steps)) * [[1.0], [0.02]]
-    sigma, rhos = np.array([0.7, 0.03]), np.array([rho, 0.5 * rho])
-    expected = sum(
-        stats.multivariate_normal.logpdf(r, cov=s**2 * linalg.toeplitz(q ** np.arange(n_steps)))
-        for r, s, q in zip(residuals, sigma, rhos, strict=True)
-    )
-    got = noise.log_likelihood(lag_one_sums(residuals)[None], n_steps, np.concatenate([sigma, rhos])[None])
-    assert got[0] == pytest.approx(expected, rel=1e-9)
 
 
 def test_impossible_values_are_minus_infinity_without_a_warning():
@@ -70,7 +46,6 @@ def test_a_known_sensor_adds_its_variance(rng, given):
     noise = GaussianNoise(CHANNELS, sensor=given)
     np.testing.assert_allclose(noise.standard_deviations(sigma), total)
     white = GaussianNoise(CHANNELS)
-    np.testing.assert_allclose(noise.log_likelihood(misfit, 30, sigma), white.log_likelihood(misfit, 30, total))
     shared = GaussianNoise(CHANNELS, groups="all", scales=[2.0, 0.5], sensor=given)
     np.testing.assert_allclose(
         shared.standard_deviations(sigma[:, :1]), np.sqrt((sigma[:, :1] * [2.0, 0.5]) ** 2 + [0.0, 0.03**2])
@@ -81,25 +56,6 @@ def test_a_known_sensor_adds_its_variance(rng, given):
     edge = np.array([[0.5, 0.0], [0.0, 0.5], [0.5, -1e-9], [0.5, math.nan]])
     assert np.isfinite(noise.log_likelihood(misfit, 30, edge)).tolist() == [True, False, False, False]
     assert len({repr(noise), repr(white), repr(GaussianNoise(CHANNELS, sensor=(0.0, 0.04)))}) == 3
-
-
-def test_effective_samples_weigh_the_channels(rng):
-    misfit, sigma = rng.uniform(1.0, 2.0, (4, 2)), rng.uniform(0.1, 1.0, (4, 2))
-    apart = [GaussianNoise([c]).log_likelihood(misfit[:, [k]], 40, sigma[:, [k]]) for k, c in enumerate(CHANNELS)]
-    for given, expected in (
-        ((10.0, 4.0), 0.25 * apart[0] + 0.1 * apart[1]),
-        ({"drift": 4.0}, apart[0] + 0.1 * apart[1]),
-        ((1e9, 40.0), apart[0] + apart[1]),  # at most the number of samples
-    ):
-        noise = GaussianNoise(CHANNELS, effective_samples=given)
-        np.testing.assert_allclose(noise.log_likelihood(misfit, 40, sigma), expected, rtol=1e-13)
-        assert noise == GaussianNoise(CHANNELS, effective_samples=given) != GaussianNoise(CHANNELS)
-        shared = GaussianNoise(CHANNELS, groups="all", scales=[1.0, 1.0], effective_samples=given)
-        np.testing.assert_allclose(
-            shared.log_likelihood(misfit, 40, sigma[:, :1]),
-            noise.log_likelihood(misfit, 40, sigma[:, [0, 0]]),
-            rtol=1e-13,
-        )
 
 
 # in a likelihood ------------------------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ import pickle
 import subprocess
 import sys
 import threading
-from concurrent.futures import CancelledError, Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from concurrent.futures import CancelledError, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from fe_likelihoods.simulation import by_value
 from fe_likelihoods.simulation.executors import LocalPool, as_executor
 from fe_likelihoods.simulation.model import misfit_batch, sent_simulation, simulate_batch
 from tests.faults import treacherous
-from tests.faults.treacherous import Absent, Gated, Large, Treacherous, Unpicklable, gone, line, posterior_of
+from tests.faults.treacherous import Absent, Gated, Large, Treacherous, Unpicklable, gone, posterior_of
 
 SLOW = ("executor", "multiprocessing")  # kinds of pools
 SPAWN = multiprocessing.get_context("spawn")
@@ -196,19 +196,6 @@ def wait_until(condition):
             return
         stop.wait(0.01)
     raise AssertionError("it does not happen")
-
-
-@pytest.mark.parametrize("kind", ["local", "threads"])
-def test_whichever_ends_first_comes_first(kind, function, tmp_path, shared_pool):
-    with shared_pool(2) if kind == "local" else ThreadPoolExecutor(2) as pool:
-        futures = as_executor(pool).submit_all(function, [LONG, *SHORT])
-        arrivals = as_completed(futures, timeout=SECONDS)
-        assert {next(arrivals) for _ in SHORT} == set(futures[1:])
-        assert not futures[0].done()
-        (tmp_path / "go").touch()
-        assert next(arrivals) is futures[0]
-        for future, theta in zip(futures, [LONG, *SHORT], strict=True):
-            np.testing.assert_array_equal(future.result()[0], line(theta))
 
 
 def test_a_function_that_cannot_be_loaded_is_the_error_of_its_items_only(shared_pool):

@@ -467,26 +467,13 @@ def opened(kind, workers):
         yield pool
 
 
-CASES = {
-    "relative": relative,
-    "in a subfolder": lambda theta: write_and_read("results/in.txt", theta),
-    "program": of_program,
-}
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("kind", "workers"),
-    [("local", 2), ("local", 8), ("processes", 2), ("multiprocessing", 2), ("dask1", 2)],
-)
-@pytest.mark.parametrize("case", CASES)
-def test_no_simulation_reads_files_of_another(case, kind, workers, start):
-    n = 300 if case == "relative" else 60
-    thetas = np.random.default_rng(2).uniform(0.5, 1.5, (n, 2))
-    for name in ("in.txt", "out.txt", "results/in.txt"):
-        old(start / name, "1.0 1.0\n")
-    with opened(kind, workers) as pool:
-        assert_right(CASES[case], pool, thetas)
+@pytest.mark.parametrize("kind", ["local", "processes", "multiprocessing", "dask1"])
+def test_no_simulation_reads_files_of_another(kind, start):
+    thetas = np.random.default_rng(2).uniform(0.5, 1.5, (300, 2))
+    old(start / "in.txt", "1.0 1.0\n")
+    with opened(kind, 8 if kind == "local" else 2) as pool:
+        assert_right(relative, pool, thetas)
 
 
 def simulated(theta):

@@ -140,7 +140,14 @@ class DrawsOf:
         pass
 
 
-@pytest.mark.parametrize(("dof", "ndim", "least"), [(3.0, 2, 0.9), (3.0, 5, 0.8), (5.0, 2, 0.9), (5.0, 5, 0.9)])
+LIGHT, HEAVY = [(3.0, 5, 0.8), (5.0, 2, 0.9), (5.0, 5, 0.9)], [(1e7, 1e7), (5.0, 5.0), (5.0, 8.0)]
+
+
+def slow(cases):
+    return [pytest.param(*case, marks=pytest.mark.slow) for case in cases]
+
+
+@pytest.mark.parametrize(("dof", "ndim", "least"), [(3.0, 2, 0.9), *slow(LIGHT)])
 def test_tails_of_a_guide_that_are_too_light_are_reported(dof, ndim, least):
     """A normal guide with half of the variance: the standard deviations are 0.7 to 0.8 of the true ones."""
     posterior = Student(ndim, dof)
@@ -149,7 +156,7 @@ def test_tails_of_a_guide_that_are_too_light_are_reported(dof, ndim, least):
     assert np.mean(statuses != "converged") >= least
 
 
-@pytest.mark.parametrize(("dof", "guide_dof"), [(1e7, 1e7), (1e7, 5.0), (5.0, 5.0), (4.0, 6.0), (5.0, 8.0)])
+@pytest.mark.parametrize(("dof", "guide_dof"), [(1e7, 5.0), (4.0, 6.0), *slow(HEAVY)])
 def test_tails_of_a_guide_that_are_heavy_enough_are_not_reported(dof, guide_dof):
     posterior = Student(3, dof)
     law = stats.multivariate_t(
@@ -157,9 +164,3 @@ def test_tails_of_a_guide_that_are_heavy_enough_are_not_reported(dof, guide_dof)
     )
     _, statuses = outcomes(posterior, DrawsOf(law), 2000, runs=10)
     assert np.all(statuses == "converged")
-
-
-def test_a_heavy_tail_is_not_called_converged():
-    posterior, guide = gaussian(1.0, 1.5, FixedGuide)
-    _, statuses = outcomes(posterior, guide, 400, runs=10)
-    assert not np.any(statuses == "converged") and np.mean(statuses == "not usable") > 0.5

@@ -74,7 +74,7 @@ def test_failures_are_told_from_impossible_noise(vectorize):
     assert near.failed <= posterior.report()["failure_count"] and sampler.verdict.status == "not usable"
 
 
-@pytest.mark.parametrize("limit", [np.inf, 1.0])
+@pytest.mark.parametrize("limit", [pytest.param(np.inf, marks=pytest.mark.slow), 1.0])
 def test_a_run_that_goes_on_from_its_file_says_the_same(tmp_path, limit):
     """The likelihood of the second process has counted no failure: it took all points from the record."""
     whole = run(make_posterior(limit))

@@ -227,21 +227,6 @@ def test_a_second_annealing_counts_the_search_of_the_first(tmp_path):
     assert sampler.simulations == made + 2 * N
 
 
-@pytest.mark.parametrize("where", ["memory", "file"])
-def test_reset_after_a_limit(where, tmp_path):
-    """The chain is discarded, and the run goes on."""
-    whole = make("guide", None)
-    until(whole, 3)
-    sampler = make("guide", 100, None if where == "memory" else tmp_path / "run.h5")
-    halted(sampler, 3)
-    sampler.compute_log_prob(sampler.get_last_sample().coords)
-    sampler.reset()
-    assert sampler.iteration == 0
-    sampler.max_simulations = None
-    until(sampler, 3)
-    assert np.array_equal(sampler.get_chain(), whole.get_chain())
-
-
 def test_nothing_known_is_an_error_that_keeps_what_was_made():
     sampler = make("searching guide", 20)
     with pytest.raises(ValueError, match="there is nothing to report"):

@@ -11,7 +11,6 @@ from samplers.estimates.weights import (
     log_mean_weight,
     normalised_weights,
 )
-from samplers.proposals.mixture import location_and_root
 from samplers.resampling import RESAMPLING
 from samplers.tempering.next_beta import next_beta
 
@@ -103,22 +102,3 @@ def test_evidence_error_sees_points_that_never_move(rng):
     ancestors = RESAMPLING["systematic"](weights, rng)
     halves.resample(ancestors)
     assert halves.weigh(normalised_weights(0.5 * log_likelihood[ancestors])) == pytest.approx(whole, rel=0.05)
-
-
-def test_roots_are_regular_and_follow_units(rng):
-    ndim = 4
-    coords = rng.standard_normal((200, ndim)) @ np.tril(rng.standard_normal((ndim, ndim)))
-    weights = rng.dirichlet(np.ones(200))
-    mean, root = location_and_root(coords, weights)
-    assert np.allclose(root @ root.T, np.cov(coords.T, aweights=weights, ddof=0))
-    units = np.array([1e-4, 1.0, 1e4, 1e11])
-    scaled_mean, scaled_root = location_and_root(coords * units, weights)
-    assert np.allclose(scaled_mean, mean * units)
-    assert np.allclose(scaled_root, units[:, None] * root)
-    for degenerate in (
-        np.repeat(coords[:1], 200, axis=0),
-        np.repeat(coords[:2], 100, axis=0),
-        np.column_stack([coords[:, 0], coords[:, 0], coords[:, 1], np.full(200, 3e10)]),
-    ):
-        _, root = location_and_root(degenerate, weights)
-        assert np.all(np.isfinite(root)) and np.all(root.diagonal() > 0)
