@@ -62,17 +62,6 @@ def test_another_run_simulates_nothing(path, thetas):
     assert info.failures == first.simulator.failures.count > 20
 
 
-def test_duplicates_and_zeros_of_both_signs(path):
-    rows = np.array([[0.0, 0.5], [-0.0, 0.5], [1.0, 0.5], [0.0, 0.5], [np.nan, 0.5]])
-    likelihood_of(Line(), path).misfit(rows[[1, 2]])
-    likelihood = likelihood_of(Line(), path)
-    assert np.isnan(likelihood.misfit(rows)[4]).all()
-    assert (likelihood.simulations, likelihood.simulator.cache_hits, likelihood.simulator.disk_hits) == (0, 4, 4)
-    likelihood.misfit(rows[:3])
-    assert (likelihood.simulator.cache_hits, likelihood.simulator.disk_hits) == (7, 4)
-    assert likelihood.simulator.cache.info().simulations == 2
-
-
 def test_a_batch_of_several_queries(path, rng):
     thetas = np.column_stack([rng.normal(size=2345), np.full(2345, 0.5)])
     likelihood_of(Line(), path).misfit(thetas[::2])
