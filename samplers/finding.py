@@ -25,6 +25,9 @@ class Finding(NamedTuple):
         What to do about it; may be empty.
     numbers : dict of str to float
         The numbers that it was judged by.
+    about : {"input", "data", "fit", "samples"}
+        What was checked: data, motions and model by themselves, data beside responses, the fit, or samples and
+        parameters. A check relies on what stands before it, so a fault there may be its cause.
     """
 
     kind: str
@@ -32,6 +35,7 @@ class Finding(NamedTuple):
     text: str
     action: str = ""
     numbers: dict[str, float] = {}
+    about: str = "samples"
 
     @property
     def message(self) -> str:

@@ -51,6 +51,7 @@ class ModalFit(NamedTuple):
 
     likelihood: Any
     draws: Any  # modes at draws of the prior; None if none can be simulated
+    deviations: np.ndarray  # (2, m) of errors of frequencies, as shares, and of components of shapes, at these draws
     points: np.ndarray | None = None  # samples of the posterior (n, ndim); None before a run
     samples: Any = None  # modes at samples, as `predict_modes` takes them
     held_out: Any = None  # modes that were measured, but not compared, at these samples
@@ -198,7 +199,7 @@ def compare(
         drawn = np.array([measured.values - likelihood.residuals_of(each) for each in batch.response[good]] or drawn)
     except (ChangedModel, StaleCache, TooManyFailures) as error:  # concerns the next sampling, not this result
         logger.warning("the fit is compared with no draws of the prior: %s", error)
-    white, deviations = _errors(likelihood, found.get("after"), point)
+    white, deviations = _errors(likelihood, found.get("after"), point, draws)
     assumed = getattr(sampled_noise(likelihood.noise), "effective_samples", None)
     assumed = None if assumed is None else np.broadcast_to(assumed, measured.n_channels)
     fits = []
@@ -211,14 +212,20 @@ def compare(
 
 
 def _errors(
-    likelihood: FELikelihood, response: np.ndarray | None, point: np.ndarray | None
+    likelihood: FELikelihood, response: np.ndarray | None, point: np.ndarray | None, draws: np.ndarray
 ) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Residuals of a history as the noise whitens them; of data without time, standard deviations of the errors."""
-    if response is None or point is None:
+    """Residuals of a history as the noise whitens them; of data without time, standard deviations of the errors.
+
+    Without a point, these are the ones at the median of the draws.
+    """
+    is_history = likelihood.measurements.is_history
+    if point is None and len(draws) and not is_history:
+        point = np.median(draws, axis=0)
+    if point is None or (is_history and response is None):
         return None, None
     sampled, values = sampled_noise(likelihood.noise), dict(zip(likelihood.parameter_names, point, strict=True))
     parameters = np.array([values.get(name, np.nan) for name in sampled.parameter_names])
-    if not likelihood.measurements.is_history:
+    if not is_history:
         known = hasattr(sampled, "standard_deviations") and np.isfinite(parameters).all()
         return None, sampled.standard_deviations(parameters[None])[0][:, None] if known else None
     residuals = likelihood.measurements.values - response
@@ -263,12 +270,13 @@ def _modes(likelihood: Any, draws: np.ndarray, samples: np.ndarray | None) -> Mo
         try:
             some = points is not None and len(points)
             found.append(likelihood.predict_modes(points, most=4 * max(len(draws), 5)) if some else None)
-        except SimulationFailed as error:
+        except (SimulationFailed, ChangedModel, StaleCache) as error:
             logger.warning("modes are not compared: %s", error)
             found.append(None)
     few = None if samples is None else samples[:: -(-len(samples) // max(len(draws), 1))]
     held_out = None if None in (found[1], likelihood.held_out) else found[1].against(likelihood.held_out)
-    return ModalFit(likelihood, found[0], few, found[1], held_out)
+    deviations = np.median(likelihood.noise.deviations(draws[:, len(likelihood.model.parameter_names) :]), axis=1)
+    return ModalFit(likelihood, found[0], deviations, few, found[1], held_out)
 
 
 def fit_data_sets(run: FinishedRun) -> Fits:

@@ -16,11 +16,12 @@ from ..simulation.model import simulate_batch
 from ..text_tables import listed
 from .compared import MOST_DRAWS, ChannelFit, Fit, checks_of, compare, data_sets_of, draws_to_compare
 from .data_faults import EXPLAINED, Fault, describe_unit, find_faults
-from .finding import CARE, CORRELATED, HALF, NOTE, SMALL_PROBABILITY, SURE, WRONG, Finding, percent
+from .finding import CARE, CORRELATED, HALF, NOTE, SMALL_PROBABILITY, SURE, WRONG, Finding, about, percent
 from .modal_faults import check_modes, check_squares
 from .slow_motion import find_slow_faults, support_gains, supports_apart
 from .steps import motions_to_replace
 from .table import Moments, ParameterRow, rows_of
+from .wrong_values import check_load_cases
 
 __all__ = [
     "SAME_AS_PRIOR",
@@ -57,7 +58,7 @@ FAULTS = {
     "swap": (
         "Channels may be swapped",
         "{where}: each measurement resembles the computed response of the other{better}.",
-        "Look up which cable belongs to which place; if they were exchanged, exchange the columns.",
+        "Look up which cable, or column of the file, belongs to which; if they were exchanged, exchange the columns.",
     ),
     "lag": (
         "Clocks may differ",
@@ -116,10 +117,10 @@ def check_responses(fits: Iterable[Fit]) -> list[Finding]:
     """What responses show of the data and of the fit, if there is one: faults of the data, and missed channels."""
     found, histories = list[Finding](), list[Fit]()
     for fit in fits:
-        found += check_modes(fit.modal) if fit.modal else check_faults(fit)
+        found += check_modes(fit.modal) if fit.modal else about("data", check_load_cases(fit) or check_faults(fit))
         histories += [] if fit.modal else [fit]
     unexplained = all(each.severity != WRONG for each in found)
-    return found + (check_errors(histories) if unexplained else [])
+    return found + (about("fit", check_errors(histories)) if unexplained else [])
 
 
 def check_faults(fit: Fit) -> list[Finding]:
@@ -146,7 +147,8 @@ def check_faults(fit: Fit) -> list[Finding]:
 
 def _of_a_fault(fit: Fit, fault: Fault, severity: str, how: str = "") -> Finding:
     of_fault = [each for each in fit.measurements.channels if each.name in fault.names]
-    near = [describe_unit(fault.value, c.dimension, c.unit) for c in of_fault] if fault.kind == "factor" else []
+    loads = not fit.is_history and len(of_fault) == fit.measurements.n_channels
+    near = [describe_unit(fault.value, c.dimension, c.unit, loads) for c in of_fault] if fault.kind == "factor" else []
     units = " or ".join(filter(None, dict.fromkeys(near)))
     words = {
         "where": fit.where(*fault.names),
@@ -174,7 +176,7 @@ def check_supports(model: Any) -> list[Finding]:
         near = f", about the ratio of {unit}" if unit and gain > 0.0 else ""
         text = f"Where it is slow, the motion {motions[k].name} is {gain:.2g} times that of the other supports{near}."
         action = "Check sign, unit and gain of its file: slow motions of one site are equal, unless it did move so."
-        found.append(Finding(kind, WRONG, text, action, {motions[k].name: gain}))
+        found.append(Finding(kind, WRONG, text, action, {motions[k].name: gain}, "input"))
     return found
 
 

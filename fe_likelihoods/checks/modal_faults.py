@@ -15,11 +15,13 @@ from scipy.stats import t as student
 
 from ..text_tables import listed
 from .data_faults import FACTOR, SAME_UNITS
-from .finding import CARE, HALF, NOTE, SMALL_PROBABILITY, TAIL, WRONG, Finding
+from .finding import CARE, HALF, NOTE, SMALL_PROBABILITY, TAIL, WRONG, Finding, about
 from .steps import LARGE_SHIFT
+from .wrong_values import check_frequency
 
 __all__ = ["check_modes"]
 
+UNREACHED = "The prior does not reach the measurements"
 RESEMBLES = HALF  # MAC; one shape cannot have more than this with two orthogonal ones
 # Mean MAC of the best draw that asks for a fault of a sensor, and the share of 1 - MAC that is left without it. Beams,
 # decks with torsion, and frames of 3 to 12 storeys, 2 to 5 modes at 3 to 9 sensors, 44 cases each with shape errors of
@@ -36,10 +38,14 @@ def check_modes(fit: Any) -> list[Finding]:
 
     What draws show before a run stands after it. Samples make up for a part of a fault, and then show others.
     """
-    found = [] if fit.draws is None else _check_faults(fit.draws)
+    found = [] if fit.draws is None else about("data", _check_faults(fit.draws))
+    if fit.draws is not None and all(each.severity != WRONG for each in found):
+        wrong = about("data", check_frequency(fit))  # which no draw reaches then
+        found = wrong + [each for each in found if not wrong or each.kind != UNREACHED]
     if fit.samples is not None and all(each.severity != WRONG for each in found):
         known = {each.kind for each in found}
-        found += [each for each in _check_faults(fit.samples) if each.kind not in known] + _check_pairs(fit.samples)
+        found += about("data", [each for each in _check_faults(fit.samples) if each.kind not in known])
+        found += _check_pairs(fit.samples)
     if any(each.severity == WRONG for each in found):
         return found
     return found + _check_errors(fit) + ([] if fit.held_out is None else _check_held_out(fit.held_out))
@@ -91,7 +97,7 @@ def check_squares(square: float, n: int, what: str, action: str) -> list[Finding
         "parameters are too narrow."
     )
     severity = WRONG if factor > np.hypot(1.0, LARGE_SHIFT) else CARE
-    return [Finding("Values differ more than their stated errors", severity, text, action, {"factor": factor})]
+    return [Finding("Values differ more than their stated errors", severity, text, action, {"factor": factor}, "fit")]
 
 
 def _check_held_out(modes: Any) -> list[Finding]:
@@ -109,7 +115,7 @@ def _check_held_out(modes: Any) -> list[Finding]:
         return []
     text = f"Modes that were held out are not predicted: {listed(list(shown))}."
     action = "Do not predict what depends on them; look at masses and boundary conditions, or compare these modes too."
-    return [Finding("A held-out mode is not predicted", CARE, text, action, shown)]
+    return [Finding("A held-out mode is not predicted", CARE, text, action, shown, "fit")]
 
 
 def _number(modes: Any, k: int) -> str:
@@ -150,7 +156,7 @@ def _check_frequencies(draws: Any) -> list[Finding]:
     ]
     text = f"No draw of the prior comes near the measured frequency of mode {listed(shown)}."
     action = "Check masses, boundary conditions and priors of the model, and the numbers of the modes."
-    return [Finding("The prior does not reach the measurements", CARE, text, action, numbers)]
+    return [Finding(UNREACHED, CARE, text, action, numbers)]
 
 
 def _check_numbers(modes: Any) -> list[Finding]:

@@ -13,7 +13,7 @@ from tqdm import tqdm
 from ..likelihood.posterior import Posterior
 from ..simulation.model import SimulationBatch, simulate_batch
 from .compared import Fit, compare, data_sets_of, draws_to_compare
-from .finding import CARE, WRONG, Finding, by_severity, percent
+from .finding import CARE, WRONG, Finding, grouped, percent
 from .fit import check_responses, check_supports
 from .screening import check_data, check_gaps
 from .steps import (
@@ -29,7 +29,7 @@ __all__ = ["ModelCheck", "check_model", "refuse_chance"]
 
 
 class ModelCheck(NamedTuple):
-    """What `check_model` has found, the most severe finding first."""
+    """What `check_model` has found, causes first."""
 
     findings: tuple[Finding, ...]
     steps: dict[str, str]  # what half of step and mesh changes at the mean of the prior, in words, by name
@@ -107,7 +107,7 @@ def check_model(posterior: Posterior, *, progress: bool = False) -> ModelCheck:
         finally:
             posterior.when_simulated(None)
     found += [*check_responses(fits), *_check_failures(posterior)]
-    return ModelCheck(by_severity(found), steps, made + _made(posterior) - before, seconds, tuple(fits))
+    return ModelCheck(sum(grouped(found).values(), ()), steps, made + _made(posterior) - before, seconds, tuple(fits))
 
 
 def _made(posterior: Posterior) -> int:
@@ -138,7 +138,7 @@ def _check_chance(response: np.ndarray, later: SimulationBatch) -> list[Finding]
         elif share > NOTHING:
             text = f"Two simulations of the same parameters differ by {100.0 * share:.2g} %: no sampler converges."
     action = "Set the seeds of the model, give each simulation a folder of its own, read no results of earlier runs."
-    return [Finding("The model is not repeatable", WRONG, text, action)] if text else []
+    return [Finding("The model is not repeatable", WRONG, text, action, about="input")] if text else []
 
 
 def _check_failures(posterior: Posterior) -> list[Finding]:

@@ -11,7 +11,7 @@ import numpy as np
 from ..signals.channels import Measurements
 from ..signals.records import Record
 from ..units import from_si
-from .finding import CARE, NOTE, TAIL, Finding, by_severity
+from .finding import CARE, NOTE, TAIL, Finding, about, by_severity
 from .sensor_faults import SensorFault, find_sensor_faults
 
 __all__ = [
@@ -82,7 +82,7 @@ def check_data(measurements: Measurements, record: Record | Sequence[Record] | N
     if "synthetic" in measurements.description.lower():
         text = "The measurements were computed with a model, not measured."
         found.append(Finding("Synthetic data", NOTE, text, "Say so wherever you show the numbers."))
-    return by_severity(found)
+    return by_severity(about("input", found))
 
 
 class Screened(NamedTuple):
@@ -219,7 +219,8 @@ def check_gaps(noise: Any) -> list[Finding]:
         f"Samples are missing in {', '.join(f'{name} ({share:.0%})' for name, share in large.items())}: the share of "
         f"{noise.title} refers to the others, and is too large if the strong part is missing."
     )
-    return [Finding("Gaps in the data", CARE, text, "Use local=1, whose level is taken from samples near by.", large)]
+    action = "Use local=1, whose level is taken from samples near by."
+    return [Finding("Gaps in the data", CARE, text, action, large, "input")]
 
 
 def check_steps_of_mass(names: Sequence[str], step: float) -> list[Finding]:

@@ -39,9 +39,10 @@ __all__ = [
 ]
 
 # Shift of a parameter by half a step, in standard deviations, that limits a result: the mean square of its error is
-# then 1.25 times the variance (0.5^2), and 5 times where the result is wrong (2^2).
+# then 1.25 times the variance (0.5^2), and 5 times where the result is wrong (2^2). For an oscillator with known
+# parameters (eleven noises and steps, six seeds each), 90 % intervals held the stiffness in 17 of 18 runs with shifts
+# of 0.3 to 1.3, in 2 of 12 with 2.1 and 2.5, and in 0 of 36 with 5 to 60.
 SHIFT, LARGE_SHIFT = 0.5, 2.0
-LARGE_SHARE = 0.1  # of the prior's standard deviation: no shift that is smaller makes a result wrong
 NOTHING = 1e-6  # difference of two responses, relative to their norm, well above the round-off of a long response
 STEP, MESH = "Time step", "Mesh"
 NO_STEP = {STEP: "the model takes neither a motion nor a step that could be halved"}
@@ -132,7 +133,7 @@ def check_same_response(difference: float | None, motion: str = "this motion") -
         return []
     text = f"The response to {motion} equals that of the calibration, and so will predictions of other events."
     action = "Let the model read the motion that it is given, and not one file that is always the same."
-    return [Finding("The motion changes nothing", WRONG, text, action, {"difference": difference})]
+    return [Finding("The motion changes nothing", WRONG, text, action, {"difference": difference}, "input")]
 
 
 def relative_difference(difference: np.ndarray, reference: np.ndarray) -> float:
@@ -201,6 +202,6 @@ def _compare(
     moves = ", ".join(f"{name} by {by:.2g}" for name, by in numbers.items())
     change = 100.0 * np.sqrt(squares[0] / squares[1])
     text = f"Half of {what} changes the response by {change:.2g} %, which moves {moves} posterior standard deviations."
-    severity = WRONG if ((shift > LARGE_SHIFT) & ~(shift * widths < LARGE_SHARE)).any() else CARE
+    severity = WRONG if (shift > LARGE_SHIFT).any() else CARE
     action = f"Halve {what} until this is small."
-    return [Finding("The model is too coarse for its data", severity, text, action, numbers)]
+    return [Finding("The model is too coarse for its data", severity, text, action, numbers, "fit")]

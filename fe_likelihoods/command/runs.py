@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..cache.simulation_cache import SimulationCache
-from ..checks.finding import NOTE
+from ..checks.finding import NOTE, grouped
 from ..checks.rehearsal import refuse_chance
 from ..checks.result import judge_run
 from ..checks.run import read_run
@@ -209,7 +209,8 @@ def _write(
     page = folder / "report.html"
     write_page(page, run, prediction, judged, events=predicted, measured=measured, repeat=_command(file, folder))
     tables = write_tables(folder, run, judged, agreement)  # last: they say how many simulations there are
-    sources = {"": judgement.findings, "prediction: ": () if prediction is None else prediction.findings}
+    sources = {f"{title.lower()}: " if title else "": found for title, found in grouped(judgement.findings).items()}
+    sources["prediction: "] = () if prediction is None else prediction.findings
     sources |= {f"event {each.name}: ": each.findings for each in described}
     said = tuple(f"{title}{each}" for title, found in sources.items() for each in found if each.severity != NOTE)
     return (page.name, *tables, samples, *write_events(folder, described)), said, judgement.status != "do not use"

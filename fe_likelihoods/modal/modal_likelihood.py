@@ -7,11 +7,13 @@ import numpy as np
 from scipy.special import ndtri
 
 from ..likelihood.likelihood import FELikelihood
+from ..likelihood.simulator import Simulator
 from ..models.linear_structure import LinearStructure
 from ..noise.protocol import Noise
 from ..noise.student import check_degrees
 from ..priors.points import as_points
-from ..simulation.model import Model, SimulationFailed, simulate_batch
+from ..signals.channels import Measurements
+from ..simulation.model import Model, SimulationFailed
 from ..text_tables import text_table
 from .modal_data import ModalData
 from .modal_noise import ModalNoise
@@ -101,11 +103,16 @@ class ModalLikelihood(FELikelihood):
         if held_out is not None:
             sensor_rows(paired.model, held_out)  # refuses what cannot be predicted
         super().__init__(paired, paired.measurements, noise, pool, **options)
+        modes, own = paired.model, self.simulator
+        nothing = Measurements(modes.channels, modes.dt, np.zeros((len(modes.channels), modes.n_steps)))
+        cheap = isinstance(modes, StructureModes)
+        self._modes = Simulator(modes, nothing, pool=None if cheap else own.pool, cache=own.cache, responses_only=True)
+        self._modes.response_memory = own.response_memory
 
     def with_noise(self, noise: Noise) -> "ModalLikelihood":
         """The same likelihood with other errors, as `FELikelihood.with_noise`."""
         other = object.__new__(type(self))
-        vars(other).update(vars(super().with_noise(noise)) | {"held_out": self.held_out})
+        vars(other).update(vars(super().with_noise(noise)) | {"held_out": self.held_out, "_modes": self._modes})
         return other
 
     def predict_modes(self, samples: Any, data: ModalData | None = None, most: int = 400) -> "PredictedModes":
@@ -113,8 +120,9 @@ class ModalLikelihood(FELikelihood):
 
         `samples` (n, n_parameters), or a mapping of names to samples, have the structural parameters; the parameters of
         the errors may follow, and enter the intervals. Default of `data`: the data of the likelihood. At most `most`
-        samples are simulated, evenly spaced among all. Raises ValueError for samples of another shape, or if the model
-        has other sensors or fewer modes than the data, and SimulationFailed if no sample can be simulated.
+        samples are taken, evenly spaced among all, and simulated where their modes are not cached. Raises ValueError
+        for samples of another shape, or if the model has other sensors or fewer modes than the data, and
+        SimulationFailed if no sample can be simulated.
 
         Examples
         --------
@@ -134,8 +142,7 @@ class ModalLikelihood(FELikelihood):
             known = np.zeros(1) if self.model.frequency_cv is None else self.model.frequency_cv
             squares = np.square(self.noise.standard_deviations(parameters)) - np.square(known)
             errors = np.sqrt(np.maximum(squares.mean(axis=1), 0.0))  # of the modes of the data, for any modes
-        cheap = isinstance(paired.model, StructureModes)
-        batch = simulate_batch(paired.model, paired.of_model(rows), None if cheap else self.simulator.pool)
+        batch = self._modes.simulate(paired.of_model(rows))
         batch.response[:, 0] *= paired.at_mean_temperature(rows)
         good = (batch.response[:, 0] > 0.0).all(axis=1)
         if not good.any():

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ..checks.finding import grouped
 from ..checks.result import JudgedRun, judge_run
 from ..checks.run import FinishedRun, read_run
 from ..information.identifiability import of_samples
@@ -154,7 +155,7 @@ def gather(
         "date": datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
         "status": judgement.status,
         "summary": summary_sentences(run, rows, fits, judgement),
-        "findings": judgement.findings,
+        "findings": grouped(judgement.findings),
         "data": sets,
         "rows": rows,
         "factor": judgement.width_factor,

@@ -7,11 +7,13 @@ import numpy as np
 from fe_likelihoods import (
     Channel,
     FELikelihood,
+    FunctionModes,
     LogNormal,
     ModalData,
     ModalLikelihood,
     Posterior,
     ShearFrame,
+    check_fit,
     check_result,
     propagate,
     report,
@@ -72,3 +74,27 @@ def test_load_cases_are_bars_and_nothing_is_said_of_time(rng, tmp_path):
     assert judgement.status == "use" and not judgement.findings
     assert "roof [mm], 2 values (load case)" in text and "Measured and computed values" in text
     assert "Predicted values" in text and not OF_TIME.findall(text)
+
+
+def test_predicted_modes_are_simulated_once_for_all_reports_also_of_another_process(rng, tmp_path):
+    made = []
+
+    def matrices(theta):
+        made.append(tuple(theta))
+        stiffness = 30e6 * np.array([[theta[0] + theta[1], -theta[1]], [-theta[1], theta[1]]])
+        return stiffness, np.diag([20e3, 20e3])
+
+    def posterior():
+        model = FunctionModes(matrices, tuple(PRIOR), {"floor 1": 0, "roof": 1}, n_modes=2)
+        return Posterior(ModalLikelihood(model, data, cache=tmp_path / "cache"), PRIOR)
+
+    data, theta = modal_likelihood(rng).model.data, np.exp(0.2 * rng.normal(size=(300, 2)))
+    first = posterior()
+    found = str(first.likelihood.predict_modes(theta)), [str(each) for each in check_fit(first, theta)]
+    count = len(made)
+    assert count >= 300
+    assert (str(first.likelihood.predict_modes(theta)), [str(each) for each in check_fit(first, theta)]) == found
+    assert len(made) == count
+    again = posterior()  # which verifies a few rows
+    assert (str(again.likelihood.predict_modes(theta)), [str(each) for each in check_fit(again, theta)]) == found
+    assert len(made) < 1.5 * count

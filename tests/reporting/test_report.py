@@ -257,7 +257,7 @@ def test_the_most_severe_finding_decides_and_is_the_first_sentence(page, vibrati
     remark, care, wrong = (Finding(f"{w.capitalize()} thing", w, "Why.", "What.") for w in ("note", "care", "wrong"))
     assert str(judge([])) == "Use." and str(judge([remark])) == "Use."
     assert str(judge([remark, care])) == "Use with care: care thing."
-    assert str(judge([care, remark, wrong, wrong])) == "Do not use: wrong thing; wrong thing."
+    assert str(judge([care, remark, wrong, wrong])) == "Do not use: wrong thing."
     assert judge([remark, wrong, care]).findings == (wrong, care, remark)
     sampler, posterior = vibrating
     judgement = check_result(sampler, posterior)

@@ -1,0 +1,54 @@
+"""Findings about load tests: exchanged cases, one wrong value, wrong units; right ones are not named."""
+
+import numpy as np
+import pytest
+
+from fe_likelihoods import Channel, FELikelihood, LogNormal, Posterior, check_fit
+from fe_likelihoods.modal.load_cases import LoadTest
+
+SPAN, TRUCK, EI, N = 24.0, 200e3, 2e9, 48  # m, N, N m2, integration points
+AT, CASES = (6.0, 12.0, 18.0), (4.0, 8.0, 13.0, 16.0, 20.0)  # m
+CHANNELS = [Channel(f"at {x:g} m", "displacement", "mm") for x in AT]
+ERRORS = {channel.name: 1e-4 for channel in CHANNELS}
+
+
+def deflections(theta):
+    """Of a girder whose halves have two stiffnesses, by the unit load theorem."""
+    s = (np.arange(N) + 0.5) * SPAN / N
+    moments = np.array([np.minimum(s * (1.0 - a / SPAN), a * (1.0 - s / SPAN)) for a in (*AT, *CASES)])
+    flexibility = SPAN / N / (EI * np.where(s < 0.5 * SPAN, theta[0], theta[1]))
+    return -TRUCK * (moments[: len(AT)] * flexibility) @ moments[len(AT) :].T
+
+
+def findings(change, seed, known=True):
+    rng = np.random.default_rng(seed)
+    values = change(deflections(np.exp(0.2 * rng.normal(size=2))) + 1e-4 * rng.normal(size=(len(AT), len(CASES))))
+    test = LoadTest(CHANNELS, [f"truck at {x:g} m" for x in CASES], values, errors=ERRORS if known else None)
+    noise = test.known if known else {f"sigma_{name}": LogNormal(error, 0.5) for name, error in ERRORS.items()}
+    prior = {f"stiffness_{i}": LogNormal(1.0, 0.2) for i in (1, 2)}
+    return check_fit(Posterior(FELikelihood(test.model(deflections, tuple(prior)), test.measurements), prior | noise))
+
+
+def typo(y):
+    y[1, 2] += 1.5e-3
+    return y
+
+
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize(
+    ("kind", "words", "change"),
+    [
+        ("", "", lambda y: y),
+        ("Load cases may be exchanged", "truck at 4 m and truck at 13 m", lambda y: y[:, [2, 1, 0, 3, 4]]),
+        ("Load cases may be exchanged", "reversed order", lambda y: y[:, ::-1]),
+        ("Channels may be swapped", "at 6 m and at 12 m", lambda y: y[[1, 0, 2]]),
+        ("A value may be wrong", "at 12 m at truck at 13 m", typo),
+        ("A unit may be wrong", "kN and N of the loads", lambda y: 1e-3 * y),
+        ("A sign may be wrong", "at 6 m", lambda y: y * [[-1.0], [1.0], [1.0]]),
+    ],
+)
+def test_each_fault_is_named_before_a_run(kind, words, change, known):
+    for seed in range(5):
+        found = findings(change, seed, known)
+        assert [each.kind for each in found] == [kind] * bool(kind), seed
+        assert all(words in each.text and each.severity == "wrong" for each in found)
