@@ -25,30 +25,14 @@ _NEARLY_ONE = 1.0 - 1e-12  # largest squared correlation
 
 
 class Alignment(NamedTuple):
-    """Lag, gain and sign of channels, and how sure they are.
+    """Lag, gain and sign of channels, and how sure they are; `statement` says it in words."""
 
-    Attributes
-    ----------
-    lag : float
-        Time by which the measurements are later than the reference [s]. ``measurements.shift(-lag)`` corrects them.
-    standard_error : float
-        Standard error of the lag [s], if the highest peak is the right one.
-    gain : dict of str to float
-        Measurement by reference of each channel [-]; negative for a sensor with the opposite sign.
-    correlation : dict of str to float
-        Correlation of each channel with the shifted reference [-].
-    probability : float
-        Probability of the highest peak, compared with the second highest peak at a different lag.
-    second_lag : float or None
-        Lag of the second highest peak [s]; None if there is none.
-    """
-
-    lag: float
-    standard_error: float
-    gain: dict[str, float]
-    correlation: dict[str, float]
-    probability: float
-    second_lag: float | None
+    lag: float  # time by which the measurements are later [s]; ``measurements.shift(-lag)`` corrects them
+    standard_error: float  # of the lag [s], if the highest peak is the right one
+    gain: dict[str, float]  # measurement by reference [-]; negative for a sensor with the opposite sign
+    correlation: dict[str, float]  # of each channel with the shifted reference [-]
+    probability: float  # of the highest peak, compared with the second one
+    second_lag: float | None  # of the second highest peak [s]; None if there is none
 
     @property
     def statement(self) -> str:
@@ -92,52 +76,42 @@ class _Pair(NamedTuple):
         rows = rows[:, np.isfinite(rows).all(axis=0)]
         return rows - rows.mean(axis=1, keepdims=True) if rows.shape[1] > 2 else np.zeros((len(rows), 3))
 
-    def on(self, lags: np.ndarray, step: float) -> np.ndarray:
-        """Squared correlations (n_lags,), on a grid of this step; a channel outside of the reference counts against."""
+    def losses(self, *lags: float) -> list[float]:
+        """Logarithms of the share of the samples' energy that the reference of each lag leaves."""
+        y, *references = self.both(*lags)
+        return [math.log1p(-min(_correlation(y, each) ** 2, _NEARLY_ONE)) for each in references]
+
+    def on(self, lags: np.ndarray) -> np.ndarray:
+        """The same on a grid of lags (n_lags,); a channel outside of the reference counts against."""
         from scipy.signal import correlate  # slow to import
 
+        every = max(1, math.ceil(self.step / self.dt - 1e-9))
+        step = self.step / every
         times = np.arange(int(self.durations[1] / step + 1e-9) + 1) * step
-        every = round(self.step / step)
         there, values = np.zeros((2, every * (len(self.values) - 1) + 1))
         there[::every], values[::every] = np.isfinite(self.values), np.nan_to_num(self.values)
         history = np.nan_to_num(self.at(times))
         power, product = (correlate(*each, method="fft") for each in ((there, history**2), (values, history)))
         squares = product**2 / ((values @ values) * np.maximum(power, _LEAST * power.max()))
         grid = self.start + step * np.arange(1 - len(times), len(there))
-        return np.interp(lags, grid, np.minimum(squares, _NEARLY_ONE), left=0.0, right=0.0)
+        return np.log1p(-np.interp(lags, grid, np.minimum(squares, _NEARLY_ONE), left=0.0, right=0.0))
+
+    def fit(self, lag: float) -> tuple[float, float, float, float]:
+        """Gain, correlation, effective number of samples, and information about the lag [1/s²]."""
+        from scipy.ndimage import uniform_filter1d  # slow to import
+
+        y, r, ahead, behind = self.both(lag, lag + 0.05 * self.dt, lag - 0.05 * self.dt)
+        gain = float(y @ r) / max(float(r @ r), 1e-300)
+        slope = gain * (ahead - behind) / (0.1 * self.dt)
+        errors, slopes = (np.abs(np.fft.fft(each)) ** 2 for each in (y - gain * r, slope))
+        spectrum = uniform_filter1d(errors, max(1, round(_SMOOTH * len(errors))), mode="wrap") + 1e-300
+        scaled = spectrum / spectrum.max()
+        information = (len(y) * (slope @ slope)) ** 2 / max(slopes @ spectrum, 1e-300)
+        return gain, _correlation(y, r), float(scaled.sum() ** 2 / (scaled @ scaled)), float(information)
 
 
-def _fit(y: np.ndarray, r: np.ndarray) -> tuple[float, float, float, np.ndarray]:
-    """Gain, correlation, effective number of samples and spectrum of the errors of samples by a reference (n,)."""
-    from scipy.ndimage import uniform_filter1d  # slow to import
-
-    product, power, own = float(y @ r), float(r @ r), float(y @ y)
-    gain = product / max(power, 1e-300)
-    lines = np.abs(np.fft.fft(y - gain * r)) ** 2
-    spectrum = uniform_filter1d(lines, max(1, round(_SMOOTH * len(lines))), mode="wrap") + 1e-300
-    scaled = spectrum / spectrum.max()
-    correlation = product / math.sqrt(power * own) if power * own > 0.0 else 0.0
-    return gain, correlation, float(scaled.sum() ** 2 / (scaled @ scaled)), spectrum
-
-
-def _information(pair: _Pair, lag: float) -> float:
-    """Information about the lag [1/s²]."""
-    y, r, ahead, behind = pair.both(lag, lag + 0.05 * pair.dt, lag - 0.05 * pair.dt)
-    gain, _, _, spectrum = _fit(y, r)
-    slope = gain * (ahead - behind) / (0.1 * pair.dt)
-    lines = np.abs(np.fft.fft(slope)) ** 2
-    return float((len(slope) * (slope @ slope)) ** 2 / max(lines @ spectrum, 1e-300))
-
-
-def _loss(correlation: float) -> float:
-    return math.log1p(-min(correlation**2, _NEARLY_ONE))
-
-
-def _advantage(pair: _Pair, lag: float, other: float) -> float:
-    """Difference between the log-likelihoods of two lags, over the samples that both compare."""
-    y, first, second = pair.both(lag, other)
-    _, correlation, effective, _ = _fit(y, first)
-    return 0.5 * effective * (_loss(_fit(y, second)[1]) - _loss(correlation))
+def _correlation(y: np.ndarray, r: np.ndarray) -> float:
+    return float(y @ r) / max(math.sqrt(float(y @ y) * float(r @ r)), 1e-300)
 
 
 def align(
@@ -190,34 +164,28 @@ def align(
     longest = min(max(pair.durations) for pair in pairs)
     max_lag = 0.5 * min(min(pair.durations) for pair in pairs) if max_lag is None else max_lag
     if not 0.0 < max_lag < longest:
-        raise ValueError(
-            f"max_lag must be positive and below {longest:g} s, the duration of the longer of record and "
-            f"measurements, got {max_lag!r}"
-        )
-    steps = [pair.step / max(1, math.ceil(pair.step / pair.dt - 1e-9)) for pair in pairs]
-    step = min(steps)
+        raise ValueError(f"max_lag must be positive and below {longest:g} s, the longer duration, got {max_lag!r}")
+    step = min(pair.step / max(1, math.ceil(pair.step / pair.dt - 1e-9)) for pair in pairs)
     lags = step * np.arange(-math.floor(max_lag / step), math.floor(max_lag / step) + 1)
-    score = -sum(np.log1p(-pair.on(lags, own)) for pair, own in zip(pairs, steps, strict=True))
-    best = int(np.argmax(score))
-    if best in (0, len(lags) - 1):
+    score = -sum(pair.on(lags) for pair in pairs)
+    if (best := int(np.argmax(score))) in (0, len(lags) - 1):
         raise ValueError(
             f"the correlation is largest at a lag of {lags[best]:g} s, an end of the range; give a larger max_lag, or "
             "other channels"
         )
     peaks = 1 + np.flatnonzero((score[1:-1] >= score[:-2]) & (score[1:-1] > score[2:]) & (score[1:-1] > 0.0))
-    tops = [  # the peaks of a periodic signal differ on the grid of lags more than at their tops
-        float(
-            minimize_scalar(
-                lambda trial: sum(_loss(_fit(*pair.both(trial))[1]) for pair in pairs),
-                bounds=(lags[k] - step, lags[k] + step),
-                options={"xatol": 1e-4 * step},
-            ).x
-        )
-        for k in peaks[np.argsort(-score[peaks])][:2]
-    ]
-    advantage = sum(_advantage(pair, *tops) for pair in pairs) if len(tops) > 1 else math.inf
+    tops = []  # the peaks of a periodic signal differ on the grid of lags more than at their tops
+    for k in peaks[np.argsort(-score[peaks])][:2]:
+        near, options = (lags[k] - step, lags[k] + step), {"xatol": 1e-4 * step}
+        found = minimize_scalar(lambda lag: sum(each.losses(lag)[0] for each in pairs), bounds=near, options=options)
+        tops.append(float(found.x))
+    advantage = math.inf
+    if len(tops) > 1:
+        losses = [pair.losses(*tops) for pair in pairs]
+        advantage = sum(0.5 * pair.fit(tops[0])[2] * (b - a) for pair, (a, b) in zip(pairs, losses, strict=True))
     lag, *others = tops if advantage >= 0.0 else tops[::-1]
-    fits, information = {pair.name: _fit(*pair.both(lag)) for pair in pairs}, sum(_information(p, lag) for p in pairs)
+    fits = {pair.name: pair.fit(lag) for pair in pairs}
+    information = sum(fit[3] for fit in fits.values())
     return Alignment(
         lag,
         1.0 / math.sqrt(information) if information > 0.0 else math.inf,
@@ -230,17 +198,14 @@ def align(
 
 def _pairs(reference: Record | Measurements, measurements: Measurements, channels: Sequence[str] | None) -> list[_Pair]:
     names = [channel.name for channel in measurements.channels]
-    if isinstance(channels, str):
-        raise ValueError(f"channels takes a sequence of names, for instance [{channels!r}]")
     if isinstance(reference, Record):
-        if channels is None:
-            channels = [each.name for each in measurements.channels if each.dimension == "acceleration"]
-            if len(channels) != 1:
-                raise ValueError(
-                    f"expected one channel of acceleration among {', '.join(names)}, found {len(channels)}; name the "
-                    "one at the base with channels=, or give a simulated response instead of the record"
-                )
-        kinds = tuple(Channel(name, "acceleration", "m/s2") for name in channels)
+        of_motion = [each.name for each in measurements.channels if each.dimension == "acceleration"]
+        if channels is None and len(of_motion) != 1:
+            raise ValueError(
+                f"expected one channel of acceleration among {', '.join(names)}, found {len(of_motion)}; name the one "
+                "at the base with channels=, or give a simulated response instead of the record"
+            )
+        kinds = tuple(Channel(name, "acceleration", "m/s2") for name in channels or of_motion)
         reference = Measurements(kinds, reference.dt, np.tile(reference.acceleration, (len(kinds), 1)))
     if not reference.complete or any(reference.starts):
         raise ValueError("the reference needs all its samples, from time zero; give a simulated response")
@@ -251,12 +216,9 @@ def _pairs(reference: Record | Measurements, measurements: Measurements, channel
     pairs = []
     for name in channels:
         one, other = measurements.select([name]), reference.select([name])
-        (channel,), (values,), (history,) = one.channels, one.values, other.values
-        if channel.dimension != other.channels[0].dimension:
-            raise ValueError(
-                f"channel {name!r} is {channel.quantity!r}, its reference {other.channels[0].dimension!r}; compare "
-                "like with like"
-            )
+        (values,), (history,) = one.values, other.values
+        if (mine := one.channels[0].dimension) != (theirs := other.channels[0].dimension):
+            raise ValueError(f"channel {name!r} is {mine!r}, its reference {theirs!r}; compare like with like")
         if any(np.isfinite(each).sum() < 10 or not np.nanmax(each) > np.nanmin(each) for each in (values, history)):
             raise ValueError(f"channel {name!r} and its reference need ten samples or more that are not constant")
         pairs.append(_Pair(name, one.start, one.dt, values - np.nanmean(values), other.dt, history - history.mean()))
