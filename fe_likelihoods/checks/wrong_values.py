@@ -3,8 +3,8 @@
 Draws of the prior give values of all data together, with a mean and a covariance; the errors of the data add their
 variances. Measured values y less this mean have the distance Q = (y - mean)^T W (y - mean), where W is the inverse of
 the covariance. A value that may be anything reduces it by ``(W (y - mean))_k^2 / W_kk``, and exchanged values by what
-they change. The change that reduces Q most is named if chance does so in 1 of 1000 right tests of normal draws, and if
-it explains the data: what is left is less than 1.5 times what errors make (up to 1.49 in 120 right load tests).
+they change. The change that reduces Q most is named if it does so 1.5 times as much as in any draw with errors (0 of
+200 right frames), and if what is left is less than 1.5 times what errors make (up to 1.49 in 120 right load tests).
 """
 
 from collections.abc import Mapping
@@ -52,8 +52,13 @@ def find_change(
     before, shifts = float(pull @ mean), {name: float(pull[k] / weights[k, k]) for name, k in single.items()}
     drops = {name: pull[k] * shifts[name] for name, k in single.items()}
     drops |= {name: -float(2.0 * each @ pull + each @ weights @ each) for name, each in moved.items()}
-    least = chi2.isf(0.1 * SMALL_PROBABILITY / max(len(drops), 1), 1)
-    good = [k for k in drops if drops[k] > least and before - drops[k] < FACTOR**2 * n]
+    # draws with errors are right tests as well, which are not normal where responses are not linear
+    right = errors - mean + deviations * np.random.default_rng(1).normal(size=errors.shape)
+    places = list(single.values())
+    chance = FACTOR * np.max(np.square(right @ weights)[:, places] / np.diag(weights)[places])
+    exchanged = chi2.isf(SMALL_PROBABILITY / len(drops), 1)
+    least = dict.fromkeys(single, chance) | dict.fromkeys(moved, exchanged)
+    good = [name for name in drops if drops[name] > least[name] and before - drops[name] < FACTOR**2 * n]
     best = max(good, key=lambda name: (name in moved, drops[name]), default=None)  # an exchange has no number to fit
     if best is None:
         return None
@@ -75,7 +80,7 @@ def check_frequency(fit: ModalFit) -> list[Finding]:
     places = np.cumsum(there).reshape(there.shape)[:, 0] - 1
     names = [f"{number} ({f:.4g} Hz)" for number, f in zip(data.mode_numbers, data.mean_frequencies, strict=True)]
     change = find_change(errors[:, there], deviations[there], dict(zip(names, places, strict=True)), {})
-    if change is None or abs(change.shift) < TAIL:  # of right data, draws that are not normal leave up to 4 %
+    if change is None or abs(change.shift) < TAIL:  # such a small one may be the error of the model as well
         return []
     ratio = float(np.exp(change.shift))
     text = f"The frequency of mode {change.name} is {ratio:.3g} times what the other modes and all shapes let expect."
