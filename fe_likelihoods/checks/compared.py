@@ -80,6 +80,7 @@ class Fit:
     white: np.ndarray | None = None  # residuals of the fit as the noise whitens them; None without time
     assumed: np.ndarray | None = None  # (n_channels,) independent samples that the noise assumes at most
     deviations: np.ndarray | None = None  # of the errors (n_channels, 1); None if not known
+    expected: np.ndarray | None = None  # the same at draws of the prior, of data without time
     modal: ModalFit | None = None  # modes, instead of responses
 
     @property
@@ -199,33 +200,32 @@ def compare(
         drawn = np.array([measured.values - likelihood.residuals_of(each) for each in batch.response[good]] or drawn)
     except (ChangedModel, StaleCache, TooManyFailures) as error:  # concerns the next sampling, not this result
         logger.warning("the fit is compared with no draws of the prior: %s", error)
-    white, deviations = _errors(likelihood, found.get("after"), point, draws)
+    white, deviations = _errors(likelihood, found.get("after"), point)
+    expected = None
+    if len(draws) and not measured.is_history:
+        expected = _errors(likelihood, np.empty(0), np.median(draws, axis=0))[1]
     assumed = getattr(sampled_noise(likelihood.noise), "effective_samples", None)
     assumed = None if assumed is None else np.broadcast_to(assumed, measured.n_channels)
     fits = []
     for title, part, rows, cut in _events(likelihood, key):
         of_event = {name: cut(each) for name, each in found.items()}
         own = None if white is None else cut(white)
-        counts, errors = (None if each is None else each[rows] for each in (assumed, deviations))
-        fits.append(Fit(title, part, cut(drawn), white=own, assumed=counts, deviations=errors, **of_event))
+        counts, errors, stated = (None if each is None else each[rows] for each in (assumed, deviations, expected))
+        fits.append(
+            Fit(title, part, cut(drawn), white=own, assumed=counts, deviations=errors, expected=stated, **of_event)
+        )
     return fits, failed
 
 
 def _errors(
-    likelihood: FELikelihood, response: np.ndarray | None, point: np.ndarray | None, draws: np.ndarray
+    likelihood: FELikelihood, response: np.ndarray | None, point: np.ndarray | None
 ) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Residuals of a history as the noise whitens them; of data without time, standard deviations of the errors.
-
-    Without a point, these are the ones at the median of the draws.
-    """
-    is_history = likelihood.measurements.is_history
-    if point is None and len(draws) and not is_history:
-        point = np.median(draws, axis=0)
-    if point is None or (is_history and response is None):
+    """Residuals of a history as the noise whitens them; of data without time, standard deviations of the errors."""
+    if response is None or point is None:
         return None, None
     sampled, values = sampled_noise(likelihood.noise), dict(zip(likelihood.parameter_names, point, strict=True))
     parameters = np.array([values.get(name, np.nan) for name in sampled.parameter_names])
-    if not is_history:
+    if not likelihood.measurements.is_history:
         known = hasattr(sampled, "standard_deviations") and np.isfinite(parameters).all()
         return None, sampled.standard_deviations(parameters[None])[0][:, None] if known else None
     residuals = likelihood.measurements.values - response

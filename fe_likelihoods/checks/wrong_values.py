@@ -93,7 +93,7 @@ def check_frequency(fit: ModalFit) -> list[Finding]:
 def check_load_cases(fit: Fit) -> list[Finding]:
     """Load cases that are exchanged or in reversed order, and one value that does not fit the others."""
     measured, there = fit.measurements, np.isfinite(fit.measurements.values)
-    if fit.deviations is None or not len(fit.draws):
+    if fit.expected is None or not len(fit.draws):
         return []
     cases = [str(each) for each in measured.points or range(1, measured.n_steps + 1)]
     values, n = measured.values, len(cases)
@@ -112,7 +112,7 @@ def check_load_cases(fit: Fit) -> list[Finding]:
         for k in np.flatnonzero(there[row])
     }
     errors = (values - fit.draws)[:, there]
-    deviations = np.broadcast_to(fit.deviations, values.shape)[there]
+    deviations = np.broadcast_to(fit.expected, values.shape)[there]
     change = find_change(errors, deviations, single, moved)
     if change is None:
         return []

@@ -20,13 +20,16 @@ def deflections(theta):
     return -TRUCK * (moments[: len(AT)] * flexibility) @ moments[len(AT) :].T
 
 
-def findings(change, seed, known=True):
+def findings(change, seed, known):
+    """Before a run, and after it with samples about the mean of the prior."""
     rng = np.random.default_rng(seed)
     values = change(deflections(np.exp(0.2 * rng.normal(size=2))) + 1e-4 * rng.normal(size=(len(AT), len(CASES))))
     test = LoadTest(CHANNELS, [f"truck at {x:g} m" for x in CASES], values, errors=ERRORS if known else None)
     noise = test.known if known else {f"sigma_{name}": LogNormal(error, 0.5) for name, error in ERRORS.items()}
     prior = {f"stiffness_{i}": LogNormal(1.0, 0.2) for i in (1, 2)}
-    return check_fit(Posterior(FELikelihood(test.model(deflections, tuple(prior)), test.measurements), prior | noise))
+    posterior = Posterior(FELikelihood(test.model(deflections, tuple(prior)), test.measurements), prior | noise)
+    samples = posterior.prior.mean() * (1.0 + 0.01 * rng.normal(size=(100, posterior.ndim)))
+    return check_fit(posterior), check_fit(posterior, samples)
 
 
 def typo(y):
@@ -49,6 +52,7 @@ def typo(y):
 )
 def test_each_fault_is_named_before_a_run(kind, words, change, known):
     for seed in range(5):
-        found = findings(change, seed, known)
+        found, after = findings(change, seed, known)
         assert [each.kind for each in found] == [kind] * bool(kind), seed
+        assert set(found) <= set(after)
         assert all(words in each.text and each.severity == "wrong" for each in found)

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from fe_likelihoods import Channel, FELikelihood, Posterior, Uniform, check_result, to_si
+from fe_likelihoods import Channel, FELikelihood, Posterior, Uniform, to_si
 from fe_likelihoods.modal.load_cases import LoadTest, read_load_test
-from samplers import SMCSampler
 
 CHANNELS = Channel("midspan", "displacement", "mm"), Channel("bottom", "strain", "microstrain")
 CASES = ("one truck", "two trucks", "four trucks")
@@ -25,28 +24,6 @@ def test_the_posterior_of_a_flexibility_is_normal():
     x = mean + np.array([0.0, 1.0, -2.0]) / np.sqrt(precision)
     logs = posterior(x[:, None])
     np.testing.assert_allclose(logs - logs[0], [0.0, -0.5, -2.0], atol=1e-9)
-
-
-@pytest.mark.parametrize("exchanged", [False, True])
-def test_load_cases_that_are_exchanged_are_named_after_a_run(exchanged):
-    named = 0
-    for seed in range(3):
-        rng, places = np.random.default_rng(seed), np.array([[1.0, 2.0], [2.0, 2.5]])
-        values = 1e-3 * places + 2e-5 * rng.normal(size=(2, 2))
-        channels = [Channel(name, "displacement", "mm") for name in ("quarter", "midspan")]
-        test = LoadTest(
-            channels, ["8 m", "12 m"], values[:, ::-1] if exchanged else values, errors=dict.fromkeys(["quarter"], 2e-5)
-        )
-        model = test.model(lambda theta, places=places: 1e-3 * theta[0] * places ** theta[1], ("flexibility", "power"))
-        prior = {"flexibility": Uniform(0.2, 5.0), "power": Uniform(0.1, 3.0), "sigma_midspan": 2e-5}
-        posterior = Posterior(FELikelihood(model, test.measurements), prior | test.known)
-        sampler = SMCSampler(100, 2, posterior, vectorize=True, seed=seed)
-        sampler.run_mcmc(None, 1, progress=False)
-        judgement = check_result(sampler, posterior)
-        found = [each.kind for each in judgement.findings]
-        named += "Load cases may be exchanged" in found and judgement.status == "do not use"
-        assert "A sensor was silent" not in found
-    assert named == (3 if exchanged else 0)
 
 
 @pytest.mark.parametrize(
