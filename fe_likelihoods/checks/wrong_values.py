@@ -5,6 +5,10 @@ variances. Measured values y less this mean have the distance Q = (y - mean)^T W
 the covariance. A value that may be anything reduces it by ``(W (y - mean))_k^2 / W_kk``, and exchanged values by what
 they change. The change that reduces Q most is named if it does so 1.5 times as much as in any draw with errors (0 of
 200 right frames), and if what is left is less than 1.5 times what errors make (up to 1.49 in 120 right load tests).
+
+Of eleven structures with four seeds, right ones are named in 0 of 44, a frequency 10 % off in 33 of 40 (all rightly),
+20 % in 36; of eleven load tests, right ones in 0 of 44, exchanged cases in 43, reversed ones in 43 (as another exchange
+in 8, which symmetric ones cannot tell apart), a value 10 or 30 deviations off in 43.
 """
 
 from collections.abc import Mapping
