@@ -211,19 +211,6 @@ def test_stored_responses_are_verified(path, thetas):
         likelihood_of(Scaled(1.01), path, noise=AutoregressiveNoise(CHANNELS)).simulate(thetas)
 
 
-def test_pooled_models_are_verified_in_the_workers(filled, thetas):
-    class Pool:
-        n_workers, items = 2, 0
-
-        def map(self, function, items):
-            self.items += len(items)
-            return [function(item) for item in items]
-
-    pool = Pool()
-    likelihood_of(Scaled(), filled, pool=pool).misfit(thetas)
-    assert pool.items == 2
-
-
 # tolerance ------------------------------------------------------------------------------------------------------------
 
 

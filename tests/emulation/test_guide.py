@@ -22,7 +22,6 @@ from fe_likelihoods import (
 from fe_likelihoods.emulation.guide import ResponseGuide
 from samplers import SMCSampler, TMCMCSampler
 from samplers.judgement.guides import check_excluded_runs
-from tests.faults import guided_run
 from tests.statistics.hard_posteriors import CASES
 
 from .problems import vibration
@@ -101,29 +100,6 @@ def test_impossible_guides_are_refused_before_any_simulation():
         Posterior(forgetful, posterior.prior).guide()
     assert posterior.report()["simulations"] == 0
     assert isinstance(posterior.guide(), ResponseGuide)
-
-
-@pytest.mark.slow
-def test_a_second_sampler_repeats_no_simulation(tmp_path):
-    """Neither in the same process nor, with a file, in another one; short parts of the record included."""
-    results, counts, log, before = [], [], tmp_path / "log", 0
-    for number in range(2):
-        posterior = guided_run.make(tmp_path / "cache.sqlite", log)[1]
-        for kind in (SMCSampler, TMCMCSampler):
-            sampler = kind(50, 3, posterior, vectorize=True, seed=1, guide=posterior.guide(2))
-            sampler.run_mcmc(None, 2)
-            results.append(sampler.log_evidence)
-            runs = guided_run.runs(log)[before:]
-            counts.append(len(runs))
-            # the second sampler verifies two rows of every part of the record
-            assert len(runs) - len(set(runs)) <= 2 * len({run[0] for run in runs}) or number == 1
-        before = len(guided_run.runs(log))
-    assert len({run[0] for run in guided_run.runs(log)}) > 1  # parts of the record
-    assert counts[0] > 100
-    parts = len({run[0] for run in guided_run.runs(log)})
-    assert 0 < counts[2] <= counts[3] <= counts[2] + 2 * parts  # each sampler verifies two rows of every part
-    assert counts[3] < 0.15 * counts[0]
-    assert results[:2] == results[2:]
 
 
 def test_a_channel_with_an_offset_of_a_million_times_its_noise():

@@ -117,17 +117,6 @@ def test_control_walkers_counted_as_independent_give_too_small_an_error(seed):
     assert np.all(np.sqrt(np.mean((errors / founders) ** 2, axis=0)) < 1.6)
 
 
-def test_the_error_of_the_standard_deviation_of_independent_draws():
-    """For a normal distribution it is sd / sqrt(2 n), and a parameter that never varies has none."""
-    sampler = SMCSampler(2000, 3, Gaussian(), vectorize=True, seed=1, recycle=False)
-    sampler.run_mcmc(None, 1)
-    draws = np.random.default_rng(2).standard_normal((2000, 3)) * [1.0, 5.0, 0.0]
-    sampler.backend.chain[0] = draws
-    sampler._result = sampler._result._replace(founders=np.arange(2000))
-    assert np.allclose(sampler.sd_error()[:2], np.array([1.0, 5.0]) / np.sqrt(4000.0), rtol=0.1)
-    assert sampler.sd_error()[2] == 0.0
-
-
 def test_a_chain_that_another_sampler_reads_keeps_its_founders(tmp_path):
     posterior, backend = Gaussian(), emcee.backends.HDFBackend(str(tmp_path / "run.h5"))
     sampler = SMCSampler(60, 3, posterior, vectorize=True, seed=1, recycle=False, backend=backend)

@@ -4,11 +4,9 @@ import warnings
 
 import numpy as np
 import pytest
-from emcee.moves import StretchMove
 from scipy.stats import multivariate_normal
 
 from samplers import SMCSampler, TMCMCSampler
-from samplers.judgement import rounds as judged
 from samplers.tempering import recycling
 from tests.statistics import analytic_runs
 
@@ -42,16 +40,9 @@ class TwoModes:
         return np.logaddexp(*self.parts(x))
 
 
-class OneMode(TwoModes):
-    """The wide mode alone."""
-
-    def __call__(self, x):
-        return self.parts(x)[1] + np.log(2.0)
-
-
-def run(seed, target=TwoModes, moves=None):
-    posterior = target(seed)
-    sampler = SMCSampler(500, NDIM, posterior, vectorize=True, seed=seed, moves=moves, recycle=True)
+def run(seed):
+    posterior = TwoModes(seed)
+    sampler = SMCSampler(500, NDIM, posterior, vectorize=True, seed=seed, recycle=True)
     return finish(sampler, posterior)
 
 
@@ -75,18 +66,6 @@ def test_without_components_for_basins_it_is_lost(monkeypatch):
     monkeypatch.setattr(recycling, "MOST_BASINS", 0)
     sampler, share = run(2)
     assert share < 0.05 and sampler.log_evidence == pytest.approx(np.log(0.5), abs=0.1)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("target", "lost"), [(TwoModes, True), (OneMode, False)])
-def test_a_mode_that_moves_lose_after_recycling_found_it_is_reported(target, lost, monkeypatch):
-    """Recycling finds both modes, is not trusted, and the stretch moves after it find one, with 7 of 8 seeds."""
-    monkeypatch.setattr(judged, "RELIABLE_EFFICIENCY", 1.0)
-    sampler, share = run(3, target, moves=StretchMove())
-    assert share < 0.05
-    reported = any("a mode has been lost" in reason for reason in sampler.verdict.reasons)
-    assert reported == lost
-    assert not lost or sampler.verdict.status == "usable"
 
 
 @pytest.mark.slow
