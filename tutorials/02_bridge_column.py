@@ -36,7 +36,9 @@ truth = list(problems.bridge_column_data("short").attributes["truth"].values())
 print(data.description)
 print(f"{data.n_steps} samples at {data.dt:g} s of {', '.join(channel.name for channel in data.channels)}")
 for parameter in posterior.parameters:
-    print(f"{parameter.label:<30} {posterior.prior.distributions[parameter.name]}")
+    prior = posterior.prior.distributions[parameter.name]
+    mean, sd = (parameter.shown(value) for value in prior.moments)
+    print(f"{parameter.label:<30} {type(prior).__name__}, mean {mean:.3g}, standard deviation {sd:.3g}")
 plot_section(model).figure.savefig("section.png")
 
 # %%
