@@ -132,7 +132,9 @@ class Prediction:
             )
         return self.quantiles[self.probabilities.index(probability)]
 
-    def score(self, measured: Measurements | ArrayLike, level: float = 0.9) -> HistoryScores | QuantityScores:
+    def score(
+        self, measured: Measurements | ArrayLike, level: float = 0.9, part: slice = slice(None)
+    ) -> HistoryScores | QuantityScores:
         """Compute proper scores, coverage and sharpness; ``print(prediction.score(measurements))`` is a table.
 
         Parameters
@@ -145,6 +147,8 @@ class Prediction:
         level : float
             Probability of the scored intervals, between 0 and 1. For histories, the prediction must have the quantiles
             with the probabilities (1 - level) / 2 and (1 + level) / 2, which a default prediction has for 0.9.
+        part : slice
+            The samples of the histories to score. Default: all.
 
         Returns
         -------
@@ -155,7 +159,7 @@ class Prediction:
         ------
         ValueError
             If the measurements lack a channel or have samples outside the histories, a measured channel is zero or has
-            no sample, or the histories are from one sample or have no such quantiles. For other quantities:
+            no sample in the part, or the histories are from one sample or have no such quantiles. For other quantities:
             if the measured values have another shape, samples of the channel are missing, or measurements are given
             for a function of the whole response. If less than one sample is expected on each side of the intervals (20
             samples for 0.9).
@@ -188,7 +192,8 @@ class Prediction:
         # Fernandez-Val and Galichon, 2010, doi:10.3982/ECTA7880).
         lower, upper = np.sort([at(each) for each in ends], axis=0)
         _check_number(self.n_samples, 2, level)
-        return score_histories(self.channels, values, (at(self.mean), at(self.sd)), (lower, upper), level)
+        values, mean, sd, lower, upper = (each[:, part] for each in (values, at(self.mean), at(self.sd), lower, upper))
+        return score_histories(self.channels, values, (mean, sd), (lower, upper), level)
 
     def _score_values(self, measured: Measurements | ArrayLike, level: float) -> QuantityScores:
         """Scores of numbers against the same numbers of measurements."""

@@ -198,6 +198,9 @@ def test_coverage_of_measurements(oscillator, rng):
     assert np.array_equal(noisy.score(swapped).coverage, scores.coverage)
     expected = np.sqrt(np.square(noisy.mean - measured).sum(axis=1) / np.square(measured).sum(axis=1))
     assert np.allclose(scores.rrmse, expected)
+    halves = [noisy.score(measurements, part=half) for half in (slice(0, 200), slice(200, 400))]
+    inside = [half.coverage for half in halves]
+    assert np.allclose(np.mean(inside, axis=0), scores.coverage) and not np.allclose(*inside)
     with pytest.raises(ValueError, match=r"no quantile 0\.01"):
         noisy.score(measurements, level=0.98)
     with pytest.raises(ValueError, match=r"400 samples with a step of 0\.02 s .* have 200"):
