@@ -41,7 +41,8 @@ LARGEST_DIFFERENCE = 0.25
 RELIABLE_SHARE, LARGEST_RELIABLE_SHAPE = 0.25, 0.5
 SHORT_TAIL_SHARE, FEW_DRAWS = 0.75, 100
 # Rounds go on while more than this share of the guide's latest known density is hardly reached by the draws of all of
-# them, and the result is not usable if that is so at the end.
+# them, and the result is not usable if that is so at the end. Without this, 1 of 10 ridges E h^3 is wrong (log Z off by
+# .09 with an error of .015), and with it none of 20.
 LARGEST_UNREACHED = 0.03
 # The guide is given up when the mean effective share of the last 4 rounds is below this: 1.5 of 30 draws.
 HOPELESS_ROUNDS, HOPELESS_SHARE = 4, 0.05
