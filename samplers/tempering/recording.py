@@ -55,10 +55,11 @@ def check_end(result: AnnealingResult, coords: np.ndarray) -> list[Finding]:
     if stop is not None and not stop.complete:
         return []  # its points are judged by their weights
     each = np.arange(len(coords))
-    founders, parents = (each if known is None else known for known in (result.founders, result.parents))
+    founders = each if result.founders is None else result.founders
     error = result.ladder[-1].log_evidence_error
 
     def share_error() -> float:
-        return max(mode.share_error for mode in find_clusters(coords[None], founders, parents, error))
+        # as if no point had crossed between modes after the last resampling: the limit was counted with such errors
+        return max(mode.share_error for mode in find_clusters(coords[None], founders, each, error))
 
     return check_evidence(result.log_evidence_ladder, error, result.check, share_error)
