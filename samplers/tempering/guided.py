@@ -39,16 +39,17 @@ from ..estimates.importance import (
 from ..estimates.pareto import LARGEST_SHAPE
 from ..estimates.weights import normalised_weights
 from ..judgement.rounds import (
+    LARGEST_UNREACHED,
     LIGHT_TAILS,
     RELIABLE_SHARE,
     UNREACHED,
     UNSETTLED,
     all_impossible,
     describe_rounds,
+    hardly_reached,
     hopeless,
     is_even,
     is_reliable,
-    reaches,
 )
 from ..reports import GuidedRound, GuideTick, Report
 from .early_stop import StoppedEarly
@@ -106,7 +107,8 @@ class RoundsOfGuide(NamedTuple):
     """Result of `draw_rounds`: all draws `pooled`, their rounds, and the signed sample where its means are better.
 
     `reason` says why the draws cannot be used. `shortfall` says what was not reached although they can be used.
-    `stopped`: the limit of simulations ended the rounds.
+    `stopped`: the limit of simulations ended the rounds. `unreached` is the share of the guide's latest known density
+    that the draws hardly reach, by which the evidence may be too small.
     """
 
     reason: str
@@ -115,13 +117,14 @@ class RoundsOfGuide(NamedTuple):
     rounds: Sequence[Round]
     stopped: bool = False
     signed: SignedSample | None = None
+    unreached: float = 0.0
 
     @property
     def evidence(self) -> tuple[float, float]:
         """Log-evidence and its standard error: the more accurate one of the pooled draws and the signed sample."""
         both = [each for each in (self.pooled, self.signed) if each is not None]
         found = min(both, key=lambda each: each.log_evidence_error)
-        return found.log_evidence, found.log_evidence_error
+        return found.log_evidence, float(np.hypot(found.log_evidence_error, self.unreached))
 
 
 class Batch:
@@ -260,8 +263,9 @@ def draw_rounds(
                 yield tick(f"round {len(rounds)}", True)
                 outcome = _outcome(rounds, pooled, size)
             if refused or budget.refused:  # a search that was cut short goes on first, if the limit is raised
-                reached = not rounds or reaches(partial(log_mixture, rounds), guide.known_density)
-                outcome = RoundsOfGuide("", "" if reached else UNREACHED, pooled, rounds, True)
+                unreached = hardly_reached(partial(log_mixture, rounds), guide.known_density) if rounds else 0.0
+                shortfall = "" if unreached <= LARGEST_UNREACHED else UNREACHED
+                outcome = RoundsOfGuide("", shortfall, pooled, rounds, True, None, unreached)
             if not batches or (outcome is None and _too_few(rounds, batches, size, guide)):
                 return outcome and _with_signed(outcome)
             most = 0  # submitted draws are part of the result
@@ -288,8 +292,9 @@ def draw_rounds(
             yield from asked(guide.refine(points, log_prob, session), f"after round {len(rounds)}")
         if outcome is not None:
             outcome = _with_signed(outcome)
-            if reaches(partial(log_mixture, rounds), guide.known_density):
-                return outcome
+            unreached = hardly_reached(partial(log_mixture, rounds), guide.known_density)
+            if unreached <= LARGEST_UNREACHED:
+                return outcome._replace(unreached=unreached)
             if len(rounds) == MOST_ROUNDS:
                 return outcome._replace(shortfall=UNSETTLED)
         if budget.refused:
