@@ -55,7 +55,7 @@ def _models(record: Record) -> dict[tuple[str, float], Callable[[], np.ndarray]]
 def simulation(repeats: int) -> list[Row]:
     """CPU time of one simulation on one core and its error; the codes run in alternation."""
     ground = _ground()
-    reference = solve(Definition(), ground, DT, tolerance=1e-10).response
+    reference = solve(Definition(), ground, DT, tolerance=1e-10)
     ours = _models(Record("noise", DT, ground))
     for function in ours.values():
         function()  # compile before the measurement
@@ -71,7 +71,7 @@ def simulation(repeats: int) -> list[Row]:
                 note(key, *_timed(function))
         for method, tolerance in SOLVERS:
             options = dict(method=method, tolerance=tolerance)
-            cost, response = _timed(lambda options=options: solve(Definition(), ground, DT, **options).response)
+            cost, response = _timed(lambda options=options: solve(Definition(), ground, DT, **options))
             note((method, tolerance), cost, response)
     return _rows(seconds, errors)
 

@@ -30,7 +30,7 @@ from fe_likelihoods.units import G0, to_si
 if TYPE_CHECKING:  # the process that runs OpenSees does not have to import the compiled model
     from fe_likelihoods.models.rc_column import RCColumn
 
-__all__ = ["PeerColumn", "Push", "Shake", "peer_of", "push", "require_opensees", "shake"]
+__all__ = ["PeerColumn", "Response", "peer_of", "push", "require_opensees", "shake"]
 
 KIP, INCH, KSI = (to_si(1.0, unit).item() for unit in ("kip", "in", "ksi"))
 TO_MASS, GRAVITY = KIP / INCH, G0 / INCH
@@ -56,23 +56,11 @@ class PeerColumn(NamedTuple):
     geometry: str  # "Corotational" or "Linear"
 
 
-class Shake(NamedTuple):
-    """Response to base acceleration; shorter than the record if OpenSees did not converge."""
+class Response(NamedTuple):
+    """Response of the column; shorter than its loading if OpenSees did not converge."""
 
-    response: (
-        np.ndarray
-    )  # (3, n): relative displacement [in], absolute acceleration [in/s2], vertical displacement [in]
-    iterations: np.ndarray  # (n,)
+    response: np.ndarray  # of the top [in, s, kip]; (3, n) under base acceleration, (5, n) under imposed displacement
     seconds: float  # CPU time of the analysis alone
-    recorded: np.ndarray  # (n, n_recorded), empty without recorders
-
-
-class Push(NamedTuple):
-    """Response to imposed displacement; shorter than the targets if OpenSees did not converge."""
-
-    response: np.ndarray  # (5, n): lateral displacement [in], force [kip], vertical displacement, and rotation of the
-    # top, base moment [kip in]
-    seconds: float
     recorded: np.ndarray  # (n, n_recorded), empty without recorders
 
 
@@ -136,7 +124,7 @@ Recorders = Sequence[tuple]  # arguments of eleResponse, with the index of the v
 
 def shake(
     column: PeerColumn, acceleration: np.ndarray, dt: float, tolerance: float = 1e-10, recorders: Recorders = ()
-) -> Shake:
+) -> Response:
     """Apply gravity, then a base acceleration (n,) [in/s²] with step `dt` [s], in a separate process.
 
     `tolerance` is the norm of the last displacement increment [in and rad]; `recorders` are responses of elements that
@@ -145,7 +133,7 @@ def shake(
     return _in_process("_shake", column, np.asarray(acceleration, dtype=float), dt, tolerance, tuple(recorders))
 
 
-def push(column: PeerColumn, targets: np.ndarray, tolerance: float = 1e-10, recorders: Recorders = ()) -> Push:
+def push(column: PeerColumn, targets: np.ndarray, tolerance: float = 1e-10, recorders: Recorders = ()) -> Response:
     """Apply gravity, then move the top through `targets` (n,) [in], one step each, in a separate process."""
     return _in_process("_push", column, np.asarray(targets, dtype=float), tolerance, tuple(recorders))
 
@@ -160,7 +148,7 @@ def _record(ops, recorders: Recorders) -> list[float]:
     ]
 
 
-def _in_process(function: str, *arguments) -> Shake | Push:
+def _in_process(function: str, *arguments) -> Response:
     try:
         return _process().submit(_run, function, arguments).result()
     except BrokenProcessPool as error:
@@ -178,10 +166,18 @@ def _print_nothing() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor)
 
 
-def _run(function: str, arguments: tuple) -> Shake | Push:
+def _run(function: str, arguments: tuple) -> Response:
     import openseespy.opensees as ops
 
     return {"_shake": _shake, "_push": _push}[function](ops, *arguments)
+
+
+def _analyse(ops, tolerance: float) -> None:
+    ops.constraints("Plain")
+    ops.numberer("Plain")
+    ops.system("BandGeneral")
+    ops.test("NormDispIncr", tolerance, MAX_ITERATIONS)
+    ops.algorithm("Newton")
 
 
 def _build(ops, column: PeerColumn, tolerance: float) -> None:
@@ -210,11 +206,7 @@ def _build(ops, column: PeerColumn, tolerance: float) -> None:
     ops.pattern("Plain", 1, 1)
     for i, own in enumerate(column.node_masses):
         ops.load(i + 2, 0.0, -own * GRAVITY - (column.axial_load if i + 1 == n else 0.0), 0.0)
-    ops.constraints("Plain")
-    ops.numberer("Plain")
-    ops.system("BandGeneral")
-    ops.test("NormDispIncr", tolerance, MAX_ITERATIONS)
-    ops.algorithm("Newton")
+    _analyse(ops, tolerance)
     ops.integrator("LoadControl", 0.1)
     ops.analysis("Static")
     if ops.analyze(10):
@@ -222,7 +214,7 @@ def _build(ops, column: PeerColumn, tolerance: float) -> None:
     ops.loadConst("-time", 0.0)
 
 
-def _shake(ops, column: PeerColumn, acceleration: np.ndarray, dt: float, tolerance: float, recorders) -> Shake:
+def _shake(ops, column: PeerColumn, acceleration: np.ndarray, dt: float, tolerance: float, recorders) -> Response:
     _build(ops, column, tolerance)
     top = column.n_elements + 1
     ops.rayleigh(column.a0, 0.0, 0.0, column.a1)
@@ -231,17 +223,12 @@ def _shake(ops, column: PeerColumn, acceleration: np.ndarray, dt: float, toleran
     ops.timeSeries("Path", 2, "-dt", dt, "-values", *values)
     ops.pattern("UniformExcitation", 2, 1, "-accel", 2)
     ops.wipeAnalysis()
-    ops.constraints("Plain")
-    ops.numberer("Plain")
-    ops.system("BandGeneral")
-    ops.test("NormDispIncr", tolerance, MAX_ITERATIONS)
-    ops.algorithm("Newton")
+    _analyse(ops, tolerance)
     ops.integrator("Newmark", 0.5, 0.25)
     ops.analysis("Transient")
     response = np.empty((3, len(acceleration)))
     recorded = np.empty((len(acceleration), len(recorders)))
     recorded[0] = _record(ops, recorders)
-    iterations = np.zeros(len(acceleration), dtype=int)
     response[:, 0] = ops.nodeDisp(top, 1), acceleration[0], ops.nodeDisp(top, 2)
     done = 1
     start = time.process_time()
@@ -249,15 +236,14 @@ def _shake(ops, column: PeerColumn, acceleration: np.ndarray, dt: float, toleran
         response[0, done] = ops.nodeDisp(top, 1)
         response[1, done] = ops.nodeAccel(top, 1)
         response[2, done] = ops.nodeDisp(top, 2)
-        iterations[done] = ops.testIter()
         recorded[done] = _record(ops, recorders)
         done += 1
     seconds = time.process_time() - start
     response[1, 1:] += acceleration[1:]
-    return Shake(response[:, :done], iterations[:done], seconds, recorded[:done])
+    return Response(response[:, :done], seconds, recorded[:done])
 
 
-def _push(ops, column: PeerColumn, targets: np.ndarray, tolerance: float, recorders) -> Push:
+def _push(ops, column: PeerColumn, targets: np.ndarray, tolerance: float, recorders) -> Response:
     _build(ops, column, tolerance)
     top = column.n_elements + 1
     ops.timeSeries("Linear", 2)
@@ -282,4 +268,4 @@ def _push(ops, column: PeerColumn, targets: np.ndarray, tolerance: float, record
         )
         recorded[done] = _record(ops, recorders)
         done += 1
-    return Push(response[:, :done], time.process_time() - start, recorded[:done])
+    return Response(response[:, :done], time.process_time() - start, recorded[:done])

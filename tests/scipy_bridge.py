@@ -12,7 +12,7 @@ from numba import njit
 from scipy.integrate import solve_ivp
 from scipy.linalg import eigh
 
-__all__ = ["CHANNELS", "Definition", "Solution", "peak_errors", "solve"]
+__all__ = ["CHANNELS", "Definition", "peak_errors", "solve"]
 
 CHANNELS = (
     *("Ub_1", "Ub_2", "Fb_1", "Fb_2", "drift_1", "drift_2"),
@@ -71,13 +71,6 @@ class Definition(NamedTuple):
         lever = self.mass * self.centre
         mass = np.array([[self.mass, lever], [lever, self.rotary + lever * self.centre]])
         return 2.0 * self.damping / np.sqrt(eigh(self.stiffness, mass, eigvals_only=True)[0])
-
-
-class Solution(NamedTuple):
-    """Response (12, n), rows as `CHANNELS` [SI], and the number of evaluations of the right-hand side."""
-
-    response: np.ndarray
-    evaluations: int
 
 
 # one structured array: scipy passes it at every evaluation, and passing a tuple of arrays takes longer than that
@@ -192,14 +185,12 @@ def solve(
     *,
     method: str = "LSODA",
     tolerance: float = 1e-9,
-    every: int = 1,
     vertical: np.ndarray | None = None,
-) -> Solution:
-    """Simulate the bridge at its parameters (``Definition().at(theta)``) from rest.
+) -> np.ndarray:
+    """Response (12, n) [SI], rows as `CHANNELS`, of a bridge (``Definition().at(theta)``) from rest.
 
     `acceleration` (n,) and `vertical` (n,), which changes the load on the bearings, belong to the table [m/s²], with
-    step `dt` [s]; there is one output per `every` samples. `tolerance` is relative; the absolute one is a tenth of it,
-    times the typical size of each state.
+    step `dt` [s]. `tolerance` is relative; the absolute one is a tenth of it, times the typical size of each state.
     """
     motion = np.ascontiguousarray(acceleration, dtype=float)
     lift = np.zeros_like(motion) if vertical is None else np.ascontiguousarray(vertical, dtype=float)
@@ -210,7 +201,7 @@ def solve(
         (0.0, times[-1]),
         np.zeros(14),
         method=method,
-        t_eval=times[::every],
+        t_eval=times,
         args=arguments,
         rtol=tolerance,
         atol=0.1 * tolerance * SCALE,
@@ -219,7 +210,7 @@ def solve(
     )
     if not run.success:
         raise RuntimeError(f"{method} stopped at {run.t[-1]:g} s: {run.message}")
-    return Solution(_outputs(run.t, run.y, *arguments), run.nfev)
+    return _outputs(run.t, run.y, *arguments)
 
 
 def peak_errors(response: np.ndarray, reference: np.ndarray) -> np.ndarray:

@@ -8,22 +8,17 @@ history, and the values of the nominal column for tests without reference.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-import numba
 import numpy as np
-import pytest
 
 from fe_likelihoods.kernels import bar_fatigue, concrete04, fiber_section, frame, reinforcing_steel
 from fe_likelihoods.kernels.jit import kernel
 
 BUNDLED = Path(__file__).parent / "data"
 
-compiled_only = pytest.mark.skipif(
-    bool(numba.config.DISABLE_JIT),
-    reason="too slow in pure Python; test_jit.py compares it with compiled kernels",
-)
 
 # Nominal column [kip, in]: constants of concrete04 (fc, e0, ecu, Ec, ft, etu, beta) and of reinforcing_steel.
 CORE = (-7.637057375550651, -0.00854535354081521, -0.01657753172309746, 3320.0, 0.306, 0.0010921686746987952, 0.1)
@@ -54,6 +49,13 @@ def load(folder: Path, part: str) -> dict[str, np.ndarray]:
     if "_meta" in arrays:
         arrays["_meta"] = json.loads(str(arrays["_meta"]))
     return arrays
+
+
+def histories(arrays: dict[str, np.ndarray], material: str) -> Iterator[tuple]:
+    """Yield name, arguments of the material, and the strains, stresses and tangents (3, n) of each history."""
+    for key, values in arrays.items():
+        if key.startswith(f"{material}/") and not key.endswith("/args"):
+            yield key, arrays[key.rsplit("/", 1)[0] + "/args"], values
 
 
 def fibers_of(arrays: dict[str, np.ndarray], name: str = "rms40") -> Fibers:

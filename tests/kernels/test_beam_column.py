@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from fe_likelihoods.kernels import concrete04, reinforcing_steel
-from fe_likelihoods.kernels.beam_column import HEAD, PER_SECTION
 from fe_likelihoods.kernels.static import Position, equilibrate
 
 from . import golden
@@ -40,11 +39,6 @@ def symmetric(upper):
     return out + np.triu(out, 1).T
 
 
-def section_matrix(xi):
-    """Return b(xi), which gives section forces (N, M) from basic forces."""
-    return np.array([[1.0, 0.0, 0.0], [0.0, xi - 1.0, xi]])
-
-
 def stiffness_of_section(column):
     """Return EA and EI of the virgin section."""
     s = column.sections
@@ -52,42 +46,6 @@ def stiffness_of_section(column):
     steel = s.steel[reinforcing_steel.E0]
     ea = modulus @ s.area + steel * s.bar_area.sum()
     return ea, (modulus * s.area) @ s.y**2 + steel * s.bar_area @ s.bar_y**2
-
-
-def basic_forces_by_hand(column, v, scheme):
-    """Return Q after one attempt of Neuenhofer and Filippou's iteration from the present state, or None if it fails.
-
-    `scheme` is 0 for current flexibilities, 1 for the initial ones in every pass, 2 for the initial ones in the first.
-    """
-    row = column.elements.state[0]
-    sections = row[HEAD:].reshape(-1, PER_SECTION)
-    a, b, c = column.elements.initial_flexibility
-    initial = np.array([[a, b], [b, c]])
-    deformation = sections[:, :2].copy()
-    flexibility = [np.array([[s[2], s[3]], [s[3], s[4]]]) for s in sections]
-    resisting = sections[:, 5:].copy()
-    q = row[:3] + symmetric(row[3:9]) @ (v - row[9:12])
-    for number in range(100 if scheme == 1 else 10):
-        from_start = scheme == 1 or (scheme == 2 and number == 0)
-        residual, compliance = v.copy(), np.zeros((3, 3))
-        for m, (xi, weight) in enumerate(zip(column.elements.points, column.elements.tributary[0], strict=True)):
-            along = section_matrix(xi)
-            used = initial if from_start else flexibility[m]
-            deformation[m] += used @ (along @ q - resisting[m])
-            n, moment, axial, coupling, bending = golden.section_forces(*deformation[m], column, m)
-            resisting[m] = n, moment
-            stiffness = np.array([[axial, coupling], [coupling, bending]])
-            with np.errstate(all="ignore"):
-                flexibility[m] = initial if from_start else np.linalg.inv(stiffness)
-            compliance += weight * along.T @ flexibility[m] @ along
-            residual -= weight * along.T @ (deformation[m] + flexibility[m] @ (along @ q - resisting[m]))
-        if not np.isfinite(compliance).all():
-            return None
-        correction = np.linalg.solve(compliance, residual)
-        q = q + correction
-        if abs(residual @ correction) < column.elements.tolerance:
-            return q
-    return None
 
 
 @pytest.mark.parametrize("n_points", range(2, 8))
@@ -162,59 +120,20 @@ def test_tangent_is_the_derivative(rng):
     assert np.mean(np.array(errors) < 1e-3) > 0.9
 
 
-def test_sections_are_in_equilibrium_and_compatible_when_converged(rng):
-    """b Q = (N, M) in every section; the section deformations integrate to v."""
-    column = single(element_tolerance=1e-16)
-    seen = 0
-    for v in states(rng, column, 60, MILD):
-        row = column.elements.state[0]
-        integral = np.zeros(3)
-        for m, section in enumerate(row[HEAD:].reshape(-1, PER_SECTION)):
-            along = section_matrix(column.elements.points[m])
-            unbalanced = along @ row[:3] - section[5:]
-            assert abs(unbalanced[0]) < 1e-3  # kip, of thousands
-            assert abs(unbalanced[1]) < 1e-2  # kip in, of tens of thousands
-            flexibility = np.array([[section[2], section[3]], [section[3], section[4]]])
-            weight = column.elements.tributary[0, m]
-            integral += weight * along.T @ (section[:2] + flexibility @ unbalanced)
-        np.testing.assert_allclose(integral, v, rtol=0, atol=1e-8 * MILD.max())
-        seen += 1
-    assert seen > 50
-
-
-def test_every_scheme_is_reached(rng):
-    """The element returns the result of the first scheme that converges, and succeeds where none of the three does.
-
-    At very large steps the plain iteration sometimes fails, and so do the initial flexibilities in every pass and in
-    the first pass only. Where all three fail, tenths of the step succeed. They nearly always reach the state that 500
-    small trial steps reach; softening sections may have more than one state.
-    """
-    counts = {0: 0, 1: 0, 2: 0, "subdivision": 0}
+def test_large_steps_reach_the_state_of_small_ones(rng):
+    """At steps at which plain iterations often fail: initial flexibilities, then tenths of the step, succeed."""
     gaps = []
-    for _ in range(20):
+    for _ in range(60):
         column = single()
-        for _ in states(rng, column, 3, MILD):
-            before = column.elements.state.copy()
-            for v in rng.normal(size=(6, 3)) * 8.0 * MILD:
-                column.elements.state[:] = before
-                attempts = (basic_forces_by_hand(column, v, number) for number in (0, 1, 2))
-                scheme, expected = next(((i, q) for i, q in enumerate(attempts) if q is not None), (None, None))
-                converged, q, _ = advance(column, v)
-                if scheme is not None:
-                    assert converged
-                    counts[scheme] += 1
-                    np.testing.assert_allclose(q, expected, rtol=1e-7, atol=1e-5)
-                elif converged:
-                    counts["subdivision"] += 1
-                    np.testing.assert_allclose(column.elements.state[0, 9:12], v, rtol=0, atol=1e-15)
-                    column.elements.state[:] = before
-                    start = before[0, 9:12]
-                    if all(advance(column, start + part * (v - start))[0] for part in np.linspace(0.002, 1.0, 500)):
-                        gaps.append(np.abs(q - column.elements.state[0, :3]).max() / np.abs(q).max())
-            column.elements.state[:] = before
-    assert min(counts.values()) > 3
-    assert len(gaps) > 3
-    assert np.median(gaps) < 1e-6
+        list(states(rng, column, 2, MILD))
+        before, v = column.elements.state.copy(), rng.normal(size=3) * 8.0 * MILD
+        converged, q, _ = advance(column, v)
+        column.elements.state[:] = before
+        start = before[0, 9:12]
+        if converged and all(advance(column, start + part * (v - start))[0] for part in np.linspace(0.002, 1.0, 500)):
+            gaps.append(np.abs(q - column.elements.state[0, :3]).max() / np.abs(q).max())
+    assert len(gaps) > 45  # of 60
+    assert np.mean(np.array(gaps) < 1e-6) > 0.7  # softening sections may have more than one state
 
 
 @pytest.mark.parametrize("v", [(-290.0, 0.0, 0.0), (np.nan, 0.0, 0.0), (0.0, np.inf, 0.0)])

@@ -25,11 +25,6 @@ def regularised(increment, displacement, velocity, z, weight, slider, c, law):
 
 
 @kernel
-def coulomb(total, displacement, velocity, pull, weight, slider, law):
-    return bearings.coulomb(total, displacement, velocity, pull, weight, slider, law)
-
-
-@kernel
 def rubber(displacement, law):
     return bearings.rubber(displacement, law)
 
@@ -75,12 +70,3 @@ def test_rubber_is_the_polynomial_and_its_tangent_beyond():
     assert outer[1] == pytest.approx(inner[1], rel=1e-12)
     assert outer[2] == pytest.approx(inner[2], rel=1e-12)
     assert outer[3] == 0.0
-
-
-def test_coulomb_sticks_within_the_bound_and_slides_beyond():
-    bound = 0.055 * 70e3 + 450.0
-    assert coulomb(0.99 * bound, 0.0, 0.0, 1e5, 70e3, BEARING, LAW)[0]
-    sticks, force, _, _, z = coulomb(1.01 * bound, 0.0, 0.0, 1e5, 70e3, BEARING, LAW)
-    assert not sticks
-    assert (force, z) == (pytest.approx(bound), 1.0)
-    assert coulomb(-1.01 * bound, 0.0, 0.0, 1e5, 70e3, BEARING, LAW)[4] == -1.0

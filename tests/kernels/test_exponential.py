@@ -17,15 +17,6 @@ def exponential(a):
     return out
 
 
-@pytest.mark.parametrize("size", [1e-3, 0.3, 4.0, 60.0])
-def test_rotation_and_decay(size):
-    turn = exponential(np.array([[0.0, size], [-size, 0.0]]))
-    closed = np.array([[np.cos(size), np.sin(size)], [-np.sin(size), np.cos(size)]])
-    np.testing.assert_allclose(turn, closed, atol=1e-15 * max(1.0, size))
-    decay = np.array([[-size, 0.0], [0.0, -2.0 * size]])
-    np.testing.assert_allclose(np.diag(exponential(decay)), np.exp([-size, -2.0 * size]), rtol=1e-15 * max(1.0, size))
-
-
 @pytest.mark.parametrize("norm", [1e-3, 0.4, 3.0, 40.0])
 def test_agrees_with_scipy(norm, rng):
     a = rng.normal(size=(18, 18))

@@ -58,51 +58,6 @@ def test_linear_range_is_closed_form(column):
         assert tangent[2] == pytest.approx(ei, rel=1e-7)
 
 
-def test_symmetric_section_does_not_couple(column):
-    ea, _, ei = properties(column)
-    for e0 in (-1e-3, -1e-4, 0.0, 5e-5, 5e-4, 5e-3):
-        n, moment, _, coupling, _ = golden.section_forces(e0, 0.0, column)
-        assert abs(moment) < 1e-13 * (abs(n) + 1.0) * 24.0
-        assert abs(coupling) < 1e-13 * ea * 24.0
-    # control: one bar is moved
-    column.sections.bar_y[0] += 1.0
-    assert abs(golden.section_forces(-1e-3, 0.0, column)[1]) > 1.0
-
-
-@pytest.mark.parametrize("yielded", [False, True])
-def test_tangent_is_the_derivative(column, rng, yielded):
-    """At random memories, where no fiber changes its branch between the two neighbouring states.
-
-    Beyond yield a bar is rarely on a curve with R > 100, whose tangent is by definition the slope at its start.
-    """
-    ea, _, ei = properties(column)
-    scale = np.array([[ea, ea * 24.0], [ea * 24.0, ea * 24.0**2]])
-    size = (2e-3, 2e-4) if yielded else (3e-4, 1e-5)
-    errors = []
-    for _ in range(40):
-        for e0, kappa in rng.normal(size=(3, 2)) * size:
-            golden.section_commit(e0, kappa, column)
-        for e0, kappa in rng.normal(size=(10, 2)) * size:
-            tangent = golden.section_forces(e0, kappa, column)[2:]
-            tangent = np.array([[tangent[0], tangent[1]], [tangent[1], tangent[2]]])
-            sides = []
-            for step in (1e-9, 1e-8):
-                h, k = step, step / 24.0
-                d_e0 = np.subtract(
-                    golden.section_forces(e0 + h, kappa, column)[:2], golden.section_forces(e0 - h, kappa, column)[:2]
-                ) / (2 * h)
-                d_kappa = np.subtract(
-                    golden.section_forces(e0, kappa + k, column)[:2], golden.section_forces(e0, kappa - k, column)[:2]
-                ) / (2 * k)
-                sides.append(np.column_stack([d_e0, d_kappa]))
-            if np.abs((sides[0] - sides[1]) / scale).max() > 1e-5:
-                continue  # a fiber at a corner of its law
-            errors.append(np.abs((tangent - sides[1]) / scale).max())
-    assert len(errors) > 300
-    assert np.mean(np.array(errors) < 1e-5) > (0.95 if yielded else 0.999)
-    assert column.sections.virgin[0] == (0.0 if yielded else 1.0)
-
-
 def test_a_trial_changes_nothing(column, rng):
     sections = column.sections
     memory = (sections.concrete_memory, sections.steel_memory, sections.virgin)
@@ -113,17 +68,3 @@ def test_a_trial_changes_nothing(column, rng):
             golden.section_forces(*trial, column)
         for array, kept in zip(memory, before, strict=True):
             np.testing.assert_array_equal(array, kept)
-
-
-def test_virgin_bars_equal_bars_with_memory(column, rng):
-    """The series below yield and the full law agree, so the flag affects the speed only."""
-    limit = column.sections.steel[reinforcing_steel.YIELD_STRAIN]
-    other = golden.column(golden.circle())
-    other.sections.virgin[0] = 0.0
-    e0, kappa = rng.uniform(-1, 1, size=(2, 200)) * [[0.5 * limit], [0.45 * limit / 21.0]]
-    out = np.zeros((2, 5, 200))
-    golden.section_history(e0, kappa, column, out[0])
-    golden.section_history(e0, kappa, other, out[1])
-    assert column.sections.virgin[0] == 1.0
-    scale = np.abs(out[0]).max(axis=1, keepdims=True)
-    np.testing.assert_allclose(out[1] / scale, out[0] / scale, rtol=0, atol=1e-12)

@@ -47,7 +47,7 @@ def too_large(errors, **bounds):
 
 @pytest.fixture(scope="module")
 def smooth():
-    return {name: solve(Definition().at(theta), GROUND, DT).response for name, theta in PARAMETERS.items()}
+    return {name: solve(Definition().at(theta), GROUND, DT) for name, theta in PARAMETERS.items()}
 
 
 # --- the library compared with it ---
@@ -67,7 +67,7 @@ def test_smooth_law_against_solve_ivp(smooth, name):
 
 
 def test_vertical_motion_against_solve_ivp():
-    reference = solve(Definition(), GROUND, DT, vertical=VERTICAL).response
+    reference = solve(Definition(), GROUND, DT, vertical=VERTICAL)
     response = ours(PARAMETERS["nominal"], vertical=Record("up", DT, VERTICAL))
     assert not too_large(by_kind(response, reference), **SMOOTH)
 
@@ -78,7 +78,7 @@ def test_uplift_between_samples_against_solve_ivp():
     beyond = falling < -9.81
     assert 3 <= beyond.sum() and np.sum(np.diff(beyond)) >= 4  # it begins and ends between samples, several times
     motion = Record("up", DT, falling)
-    reference = solve(Definition(), GROUND[:301], DT, vertical=falling, method="DOP853", tolerance=1e-8).response
+    reference = solve(Definition(), GROUND[:301], DT, vertical=falling, method="DOP853", tolerance=1e-8)
     response = ours(PARAMETERS["nominal"], record=Record("short", DT, GROUND[:301]), vertical=motion)
     assert not too_large(by_kind(response, reference), **{kind: 2.0 * bound for kind, bound in SMOOTH.items()})
 

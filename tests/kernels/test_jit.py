@@ -1,4 +1,4 @@
-"""Compiled kernels against pure Python, and the disk cache, which must never be stale."""
+"""The disk cache of compiled kernels, which must never be stale, and the banded solver."""
 
 import json
 import os
@@ -12,16 +12,10 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import kernels
-from fe_likelihoods.kernels import bar_fatigue, jit, linear_solve
-from fe_likelihoods.kernels.frame import recorder
-from fe_likelihoods.kernels.newmark import HISTORY_ROWS, Dynamics, newmark
-from fe_likelihoods.kernels.static import Iteration, impose_displacement
-
-from . import golden
+from fe_likelihoods.kernels import jit, linear_solve
 
 SOURCES = Path(kernels.__file__).parent
 ROOT = Path(__file__).resolve().parents[2]
-ROUND_OFF = 1e-13
 FOLDER = f"kernels-{jit.KERNEL_HASH}-numba{numba.__version__}"
 
 
@@ -38,9 +32,6 @@ def python(code, *arguments, cwd=SOURCES.parents[1], **environment):
     )
     assert result.returncode == 0, result.stderr
     return result.stdout
-
-
-# --- the cache ---
 
 
 @pytest.fixture
@@ -156,9 +147,7 @@ def test_a_cache_folder_that_cannot_be_written_is_skipped(tmp_path):
     blocked = tmp_path / "blocked"
     blocked.write_text("")
     home = tmp_path / "home"
-    code = "from fe_likelihoods.kernels import jit; print(jit.CACHE_FOLDER)"
-    folder = python(code, FE_LIKELIHOODS_CACHE=str(blocked), XDG_CACHE_HOME=str(home)).strip()
-    assert Path(folder).is_relative_to(home)
+    assert Path(folder_of(FE_LIKELIHOODS_CACHE=blocked, XDG_CACHE_HOME=home)).is_relative_to(home)
 
 
 def folder_of(**environment):
@@ -200,27 +189,6 @@ def test_a_folder_of_somebody_else_is_not_used(tmp_path, monkeypatch, caplog):
     assert jit._find_cache_folder() is None
 
 
-def test_kernels_work_without_a_folder(monkeypatch):
-    monkeypatch.setattr(jit, "CACHE_FOLDER", None)
-    assert jit.kernel(_double)(2.0) == 4.0
-
-
-def _double(x):
-    return 2.0 * x
-
-
-def test_an_edited_kernel_outside_the_library_is_compiled_again(tmp_path):
-    """Its file is not in the name of the folder."""
-    for number in (1.0, 2.0):
-        code = f"from fe_likelihoods.kernels.jit import kernel\n\n\n@kernel\ndef call(x):\n    return x + {number}\n"
-        (tmp_path / "outside.py").write_text(code)
-        (tmp_path / "__pycache__").exists() and shutil.rmtree(tmp_path / "__pycache__")
-        program = "from outside import call; print(call(0.0), sum(call.stats.cache_hits.values()))"
-        for hits in (0, 1):
-            environment = {"PYTHONPATH": str(tmp_path), "FE_LIKELIHOODS_CACHE": str(tmp_path / "cache")}
-            assert python(program, **environment).split() == [str(number), str(hits)]
-
-
 FIRST_EVALUATIONS = """
 import json
 import numba
@@ -239,7 +207,6 @@ with install_recorder("numba:compile") as compiled:
 """
 
 
-@golden.compiled_only
 def test_second_start_compiles_nothing():
     """First likelihoods of both posteriors in a new interpreter, when the machine code is on disk."""
     python(FIRST_EVALUATIONS)  # compiles everything that is not on disk yet
@@ -247,69 +214,6 @@ def test_second_start_compiles_nothing():
     assert finite
     assert events == 0
     assert control > 0
-
-
-# --- compiled kernels against pure Python ---
-
-
-def short_subset() -> dict[str, np.ndarray]:
-    """Return results of materials, a section, a pushover and a run that are short enough for pure Python."""
-    rng = np.random.default_rng(7)
-    out = {}
-    for name, args in (("core", golden.CORE), ("r400", (-6.0, -0.0026, -0.05, 1958.8, 0.744, 0.00138, 0.1))):
-        for number, strain in enumerate(golden.random_walks(rng, 3, 150, 0.003)):
-            out[f"{name} {number}"] = np.zeros((5, 150))
-            golden.concrete_history(strain, golden.concrete_constants(args), out[f"{name} {number}"])
-    # nested reversals decide clips by their last digit: straight runs only
-    peaks = 0.02 * np.linspace(0.1, 1.0, 15) * (-1.0) ** np.arange(15)
-    strain = np.interp(np.arange(150) / 10.0, np.arange(16), np.concatenate([[0.0], peaks]))
-    out["steel"] = np.zeros((3, 150))
-    golden.steel_history(strain, golden.steel_constants(golden.STEEL), out["steel"])
-    failure = np.zeros(bar_fatigue.N_FAILURE)
-    bar_fatigue.constants(0.1, 0.5, 0.4, failure)
-    out["fatigue"], memory = np.zeros((1, 150)), np.zeros(bar_fatigue.N_STATE)
-    c = golden.steel_constants(golden.STEEL)
-    out["fatigue"][0] = [bar_fatigue.update(each, memory, c, failure)[0] for each in strain]
-
-    def column():
-        return golden.column(golden.circle(4, 3), n_points=3)
-
-    out["section"] = np.zeros((5, 60))
-    e0, kappa = rng.normal(size=(2, 60)) * [[5e-4], [1e-4]]
-    golden.section_history(e0, kappa, column(), out["section"])
-    out["pushover"] = np.zeros((9, 12))
-    iteration, fibers = Iteration(1e-10, 50, 4), ((0, 0), (0, 5), (1, -1), (5, -2))
-    pushed, shaken = column(), column()
-    seen = recorder(pushed, 12, sections=True, motion=1, fibers=fibers)
-    impose_displacement(pushed, golden.gravity(), np.linspace(0.0, 4.0, 12), iteration, out["pushover"], seen)
-    out["run"] = np.zeros((len(HISTORY_ROWS), 40))
-    ground = 300.0 * np.sin(np.linspace(0.0, 6.0, 40))
-    dynamics = Dynamics(golden.gravity(), golden.mass(), golden.A0, golden.A1)
-    felt = recorder(shaken, 40, sections=True, motion=3, fibers=fibers)
-    status = newmark(shaken, dynamics, ground, 0.02, 1, iteration, out["run"], felt)
-    out["status"] = np.array(status)
-    for name in ("sections", "motion", "stresses"):
-        out[name], out[f"shaken {name}"] = getattr(seen, name), getattr(felt, name)
-    return out
-
-
-@pytest.mark.slow
-def test_pure_python_gives_the_same_results(tmp_path):
-    code = (
-        "import sys, numba, numpy; assert numba.config.DISABLE_JIT; "
-        "from tests.kernels.test_jit import short_subset; numpy.savez(sys.argv[1], **short_subset())"
-    )
-    python(code, tmp_path / "pure.npz", NUMBA_DISABLE_JIT="1")
-    compiled = short_subset()
-    with np.load(tmp_path / "pure.npz") as pure:
-        assert set(pure.files) == set(compiled)
-        for name, values in compiled.items():
-            scale = np.maximum(np.abs(values).max(axis=-1, keepdims=True), 1e-300)
-            # the iterations of the column stop at 1e-10 in and amplify round-off to that size
-            limit = 1e-9 if name in ("pushover", "run") or name.startswith("shaken") else ROUND_OFF
-            np.testing.assert_allclose(pure[name] / scale, values / scale, rtol=0, atol=limit, err_msg=name)
-    assert np.abs(compiled["run"][0]).max() > 1.0
-    assert compiled["status"][0] == 0
 
 
 def banded(rng, n, definite):

@@ -3,22 +3,10 @@
 import numpy as np
 import pytest
 
-from fe_likelihoods.kernels import bar_fatigue
 from fe_likelihoods.kernels.frame import recorder
-from fe_likelihoods.kernels.static import (
-    GRAVITY_STEPS,
-    LOWERING,
-    Iteration,
-    Position,
-    apply_gravity,
-    equilibrate,
-    impose_displacement,
-    lower,
-)
+from fe_likelihoods.kernels.static import Iteration, impose_displacement
 
 from . import golden
-
-pytestmark = golden.compiled_only
 
 # Rows of a history and their names in the reference results.
 ROWS = {
@@ -71,39 +59,9 @@ def test_reference_pushovers(reference):
     assert not {key: r for key, r in results.items() if not r[1] < limits[r[0]]}
 
 
-def at_gravity(column):
-    """The position after `apply_gravity`."""
-    return Position(column.vectors[4], column.vectors[5], column.matrices[2])
-
-
 @pytest.fixture
 def column():
     return golden.column(golden.circle())
-
-
-def test_gravity_is_the_weight_on_every_section(column):
-    assert apply_gravity(column, golden.gravity(), Iteration(TOLERANCE, 20, 4)) == 0
-    position = at_gravity(column)
-    np.testing.assert_allclose(position.force, golden.gravity(), atol=1e-9 * golden.WEIGHT)
-    sections = column.elements.state[:, 12:].reshape(-1, 7)
-    np.testing.assert_allclose(sections[:, 5], -golden.WEIGHT, rtol=1e-7)
-    np.testing.assert_allclose(sections[:, 6], 0.0, atol=1e-6)
-    assert position.u[4] < 0.0
-    assert abs(position.u[3]) < 1e-12
-    assert GRAVITY_STEPS == 10
-
-
-def test_imposed_displacement_is_reached_and_the_base_balances_it(column):
-    """Equilibrium in the deformed position: M at the base = force x height of the top + weight x its drift."""
-    targets = 2.0 * np.sin(np.linspace(0.0, 4.0 * np.pi, 400)) * np.linspace(0.0, 1.0, 400)
-    status, history = push(column, targets)
-    assert status == (0, 0, 0)
-    np.testing.assert_allclose(history[0], targets, atol=1e-12)
-    moment = -history[3] * (golden.HEIGHT + history[1]) - golden.WEIGHT * history[0]
-    largest = np.abs(history[7]).max()
-    assert largest > 5000.0  # cracked: kip in
-    np.testing.assert_allclose(history[7], moment, atol=1e-6 * largest)
-    np.testing.assert_allclose(history[6], -golden.WEIGHT, rtol=0.03)
 
 
 def test_large_steps_are_retried_and_reach_the_same_force():
@@ -141,47 +99,3 @@ def test_a_failed_run_without_fatigue_is_not_lowered():
     (status, _, lowerings), history = push(golden.column(golden.circle()), targets, max_iterations=4, halvings=3)
     assert (status, lowerings) == (7, 0)
     assert np.isfinite(history[:, :6]).all()
-
-
-def lowered(factor, fractured=1):
-    """Lower a displaced column until it carries `factor` times its weight; some bars of its base have fractured.
-
-    Returns whether it was done, the position, the displacements (6,) before, the load (6,), and the column.
-    """
-    column = golden.column(golden.circle(), bars_fail=True)
-    iteration = Iteration(TOLERANCE, 50, 6)
-    assert apply_gravity(column, golden.gravity(), iteration) == 0
-    position = at_gravity(column)
-    column.sections.virgin[0] = 0.0
-    column.sections.steel_memory[0, :fractured, bar_fatigue.FRACTURED] = 1.0
-    load = golden.gravity()
-    for _ in range(20):
-        assert equilibrate(column, position, load, 3, 0.05, -1, TOLERANCE, 50) < TOLERANCE
-    before = position.u.copy()
-    load = factor * load
-    return lower(column, position, load, 3, iteration), position, before, load, column
-
-
-def test_a_lowered_column_carries_its_load_with_the_lateral_displacement_held():
-    """Where the load can also be added at once, the position is the same, to a tenth of a step of the lowering."""
-    done, position, before, load, _ = lowered(1.5)
-    assert done
-    assert position.u[3] == pytest.approx(before[3], abs=1e-12)
-    assert position.u[4] < before[4]
-    np.testing.assert_allclose(position.force[[0, 1, 2, 4, 5]], load[[0, 1, 2, 4, 5]], atol=1e-5 * golden.WEIGHT)
-    _, other, _, load, column = lowered(1.0)
-    assert equilibrate(column, other, 1.5 * load, 3, 0.0, -1, TOLERANCE, 50) < TOLERANCE
-    np.testing.assert_allclose(position.u, other.u, rtol=0, atol=0.1 * LOWERING * golden.HEIGHT)
-    assert before[4] - position.u[4] > LOWERING * golden.HEIGHT
-
-
-def test_a_load_beyond_the_strength_is_a_collapse():
-    done, *_ = lowered(100.0)
-    assert not done
-
-
-@pytest.mark.parametrize(("factor", "fractured"), [(0.0, 1), (1.5, 0)])
-def test_a_column_without_load_or_with_all_its_bars_is_not_lowered(factor, fractured):
-    done, position, before, *_ = lowered(factor, fractured)
-    assert not done
-    np.testing.assert_array_equal(position.u, before)
