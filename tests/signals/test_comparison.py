@@ -142,10 +142,6 @@ def test_samples_at_times_of_the_response_are_compared_bit_by_bit(rng):
     assert gappy.log_likelihood(x) == pytest.approx(likelihood.log_likelihood(x), rel=1e-13)
     assert isinstance(likelihood.measured, Comparison) and not likelihood.measured.interpolated
     assert not isinstance(FELikelihood(model, fine).measured, Comparison)
-    # the first part, and other noises
-    short = likelihood.first(1.9)
-    assert short.measurements.end == pytest.approx(1.89) and short.model.n_steps == 190
-    assert np.isfinite(short.log_likelihood(x))
     correlated = likelihood.with_noise(AutoregressiveNoise(model.channels))
     zeros = np.zeros(len(model.channels))
     white = likelihood.with_noise(GaussianNoise(model.channels)).log_likelihood(x)

@@ -35,12 +35,8 @@ def test_smc_is_the_same_as_its_csv(shared):
 @pytest.mark.parametrize(
     ("name", "component", "n_steps", "dt", "peak"),
     [
-        ("20180212_211557_WPWS_20.V2A", "S16W", 5800, 0.02, 0.0416),
         ("20180212_211557_WPWS_20.V2A", "S74E", 5800, 0.02, 0.1940),
-        ("20180212_211557_WPWS_20.V2A", "up", 5800, 0.02, 0.0273),
         ("20190430_064319_INHS_21.V1A", "S65E", 17600, 0.005, 0.0040),
-        ("20190430_064319_INHS_21.V1A", "N25E", 17600, 0.005, 0.0027),
-        ("20190430_064319_INHS_21.V1A", "Up", 17600, 0.005, 0.0110),
     ],
 )
 def test_geonet_components(shared, name, component, n_steps, dt, peak):
@@ -114,7 +110,6 @@ def test_the_peak_of_geonet_is_compared_within_the_printed_digits(tmp_path, digi
 @pytest.mark.parametrize(
     ("lines", "message"),
     [
-        (smc(VALUES, 200.0)[:-1], "expected 5 numbers of 10 columns after 56 of 61 samples, got 0"),
         (smc(VALUES, 200.0, "3 VELOCITY"), "looks like a USGS SMC without acceleration file, which is not"),
         (smc(VALUES, 1.7e38), "expected .* an even number of times and accelerations, got 1.7e.38 and 61"),
         (uneven_smc(), "samples are at uneven times; give their nominal step, resample=0.02"),
@@ -122,7 +117,6 @@ def test_the_peak_of_geonet_is_compared_within_the_printed_digits(tmp_path, digi
         (changed(smc(VALUES, 200.0), f"{max(VALUES):15.7E}", f"{2 * max(VALUES):15.7E}"), "states a peak of"),
         (smc(VALUES, 200.0)[:20], "line 21: expected a number, got ''"),
         (geonet({"Up": VALUES}, 0.02)[:30], "the file is truncated"),
-        (geonet({"Up": VALUES}, 0.02)[:-1], "the file is truncated"),
         (
             changed(geonet({"Up": VALUES}, 0.02), "at 0.020", "at 0.010"),
             "0.010 s in the text",
@@ -132,17 +126,14 @@ def test_the_peak_of_geonet_is_compared_within_the_printed_digits(tmp_path, digi
             "states a peak of 31",
         ),
         (geonet({"Up": VALUES, "N": VALUES}, 0.02), "(?s)found 2; choose.*channel Up: .*channel N: "),
-        (knet(COUNTS, 100)[:-1], "announces 100 samples, the file has 96"),
         (changed(knet(COUNTS, 100), "(gal)/6182761", "(gal)/3091380"), "the header states a peak of"),
         (changed(knet(COUNTS, 100), "3920(gal)/", "3920/"), "a scale factor such as"),
-        (esm(VALUES, 0.005)[:-1], "announces 61 samples, the file has 60"),
         (esm(VALUES, 0.005, "VELOCITY"), "got DATA_TYPE 'VELOCITY'"),
         (changed(esm(VALUES, 0.005), f"PGA_CM/S^2: {max(VALUES):.6f}", "PGA_CM/S^2: 1.0"), "a peak of 1"),
         (
             changed(esm(VALUES, 0.005), "UNITS: cm/s^2", "UNITS: g"),
             "a peak of 27.*, the samples have 2[0-9]{4}",
         ),
-        (csmip_v1(V1, 200)[:-3], "expected 8 numbers of 9 columns after 48 of 61 samples, got"),
         (csmip_v1(V1, 200, pairs=True)[:-2], "the file is truncated or damaged"),
         (changed(csmip_v1(V1, 200), f"{max(V1):10.6f}", f"{max(V1) + 1e-4:10.6f}"), "the header states a peak of"),
         (changed(csmip_v1(V1, 200), "200 pts/sec", "100 pts/sec"), "61 samples at 100 per second are not 0.305.* s"),
@@ -200,11 +191,3 @@ def test_v1_with_uneven_times(tmp_path):
         read_record(write(tmp_path / "a.V1", lines))
     record = read_record(tmp_path / "a.V1", resample=0.01)
     assert record.dt == 0.01 and record.source.startswith("a.V1; interpolated linearly to a step of 0.01 s")
-
-
-def test_text_of_an_unknown_format(tmp_path):
-    path = write(tmp_path / "a.acc", ["station 7", "rate 200", "1 2 3", "4 5"])
-    with pytest.raises(
-        ValueError, match="expected 3 cells .* no known format of ground motions and was read as a table"
-    ):
-        read_record(path)

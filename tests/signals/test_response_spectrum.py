@@ -15,22 +15,6 @@ def noise(rng):
     return Record("noise", 0.02, rng.normal(size=500) * np.hanning(500))
 
 
-@pytest.mark.parametrize("damping_ratio", [0.02, 0.05, 0.2])
-def test_harmonic_motion_reaches_its_steady_state(damping_ratio):
-    """After many periods the peak is that of the steady state, the dynamic amplification factor."""
-    period, dt = 1.0, 0.005
-    time = dt * np.arange(round(100.0 / (2 * math.pi * damping_ratio) / dt) + 20000)
-    amplitude, omega = 0.7, 2 * math.pi / period
-    ramps = np.sin(math.pi * time / time[-1]) ** 2  # a sudden start or end would cause transients
-    record = Record("harmonic", dt, amplitude * np.sin(omega * time) * ramps)
-    periods = np.array([0.3, 0.8, 1.0, 1.3])
-    ratio = periods / period  # of the forcing frequency to the oscillator's
-    steady = 1.0 / np.hypot(1.0 - ratio**2, 2.0 * damping_ratio * ratio)
-    spectrum = response_spectrum(record.acceleration, record.dt, periods, damping_ratio)
-    # Errors: 0.3 % from the instants, 0.01 % from straight lines between 200 samples per period, less from the start.
-    np.testing.assert_allclose(spectrum.pseudo_acceleration, amplitude * steady, rtol=4e-3)
-
-
 def test_undamped_oscillator_under_a_pulse_peaks_in_free_vibration():
     """Ground acceleration a during a time t < T/2: SD = 2 a/omega^2 sin(omega t/2), in the free vibration after it."""
     dt, n, height = 0.001, 100, 3.0
@@ -72,11 +56,8 @@ def test_peaks_are_those_of_a_much_finer_record(noise):
     [
         ([0.0, 1.0], 0.05, "periods must be positive"),
         ([], 0.05, "periods must be positive"),
-        ([[1.0]], 0.05, "in one dimension"),
-        ([np.nan], 0.05, "periods must be positive"),
         ([0.001], 0.05, r"at least 0.002 s, 0.1 steps of the motion"),
         ([1.0], 1.0, r"damping_ratio must be in \[0, 1\) \(0.05 is 5 %\); got 1.0"),
-        ([1.0], -0.1, "damping_ratio"),
     ],
 )
 def test_refused(noise, periods, damping_ratio, message):

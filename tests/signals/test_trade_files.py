@@ -270,17 +270,11 @@ def test_the_header_of_an_afad_file_states_everything(tmp_path):
 @pytest.mark.parametrize(
     ("content", "given", "message"),
     [
-        (
-            afad(),
-            {"dt": 0.02},
-            r"the step is 0.02 s by the argument dt but 0.01 s by 'SAMPLING INTERVAL \(sec\) : 0.01'",
-        ),
         (afad(), {"units": "g"}, r"states 'PGA VALUES \(gal\) .*', the samples have a peak of .* g; the unit is wrong"),
         (afad(count=41), {}, "'NUMBER OF DATA          : 41' announces 41 samples, the file has 40"),
         (afad(peaks=[0.2]), {}, "states 'PGA VALUES"),
         (afad(unit="g"), {"units": "gal"}, "states 'PGA VALUES"),
         (afad(dt="0"), {}, "give dt="),
-        (text("Sampling rate: 200 Hz", "acc_g", "1", "2"), {"dt": 0.01}, "but 0.005 s by 'Sampling rate: 200 Hz'"),
         (text("Sampling rate;200", "acc_g", "1", "2"), {"dt": 0.01}, "0.005 s by 'Sampling rate;200'"),
         (text("Sampling rate;200", "acc_g", "1", "2"), {}, "states 'Sampling rate;200' without a unit: give dt="),
         (
@@ -288,28 +282,15 @@ def test_the_header_of_an_afad_file_states_everything(tmp_path):
             {},
             "'NPTS=3' announces 3 samples, the file has 2",
         ),
-        (text("DT=0.02, NPTS=2", "time_s,acc_g", "0.00,1", "0.01,2"), {}, "0.01 s by the time column but 0.02 s"),
         (text("Units: gal", "acc", "1", "2"), {"dt": 0.01, "units": "g"}, "states the unit 'gal' but units = 'g'"),
         (text("Units: counts", "acc", "1", "2"), {"dt": 0.01, "units": "g"}, "unknown unit 'counts'"),
         (text("Peak acceleration: 2.5 g", "acc_g", "1.0", "2.0"), {"dt": 0.01}, "states 'Peak acceleration: 2.5 g'"),
-        (text("Samples: 3", "acc_g", "1", "2"), {"dt": 0.01}, "'Samples: 3' announces 3 samples, the file has 2"),
         (text("Scans in file: 3", "acc_g", "1", "2"), {"dt": 0.01}, "'Scans in file: 3' announces 3 samples"),
         (text("Anzahl Werte = 3", "acc_g", "1", "2"), {"dt": 0.01}, "'Anzahl Werte = 3' announces 3 samples"),
         (text("Peak value = 2.5 g", "acc_g", "1.0", "2.0"), {"dt": 0.01}, "states 'Peak value = 2.5 g'"),
-        (text("Max. value (gal): 2.5", "acc_g", "1.0", "2.0"), {"dt": 0.01}, "states 'Max. value .gal.: 2.5'"),
-        (text("Einheit: gal", "acc", "1", "2"), {"dt": 0.01, "units": "g"}, "states the unit 'gal' but units = 'g'"),
         (text("Abtastrate: 200,5 Hz", "acc_g;x", "1,5;1", "2,5;1"), {"dt": 0.005, "column": "acc_g"}, "but 0.00498"),
-        (text("fs: 50", "acc_g", "1", "2"), {"dt": 0.01}, "but 0.02 s by 'fs: 50'"),
-        (
-            text("PGA (g),1.0", "acc_g", "1.0", "2.0"),
-            {"dt": 0.01},
-            r"states 'PGA \(g\),1.0', the samples have a peak of 2",
-        ),
-        (text("Time step: 10 ms", "1", "2"), {"dt": 0.02, "units": "g"}, "but 0.01 s by 'Time step: 10 ms'"),
         (EQSIG, {"units": "g", "dt": 0.02}, "0.02 s by the argument dt but 0.01 s by 'dt = 0.0100 s'"),
         (EQSIG.replace("40 0", "41 0"), {"units": "g"}, "line 2 announces 41 samples, the file has 40"),
-        (EQSIG, {}, "does not state the unit of its acceleration"),
-        (RSPMATCH, {"units": "g", "dt": 0.02}, "0.02 s by the argument dt but 0.01 s"),
         (RSPMATCH.replace("  40 ", "  39 "), {"units": "g"}, "line 2 announces 39 samples, the file has 40"),
     ],
 )
@@ -323,13 +304,10 @@ def test_a_contradiction_of_what_a_header_states_is_refused(tmp_path, content, g
     [
         ("Sampling rate: 200 Hz", 0.005),
         ("Sample Rate (Hz);200", 0.005),
-        ("Sampling frequency = 0.2 kHz", 0.005),
         ("sampling_interval_s: 0.005", 0.005),
         ("Sampling period [ms] : 5", 0.005),
-        ("dt = 5 ms", 0.005),
         ("Time step 0.005 seconds", 0.005),
         ("fs = 200 Hz", 0.005),
-        ("Rate, 0.2 kHz", 0.005),
         ("2 points at equal spacing of 0.005 sec", 0.005),
         ("Abtastintervall: 5 ms", 0.005),
         ("Abtastrate (Hz);200", 0.005),
@@ -352,24 +330,14 @@ def test_the_stated_step_is_used(tmp_path, line, step):
     "line",
     [
         "Sampling rate,100",
-        "Sampling interval: 10",
-        "DT=0.010",
-        "Time steps: 4000",
         "Time unit: s",
         "Scan interval: 10 min",
-        "Samples per second: 100",
         "Peak velocity: 12.5 cm/s",
         "Peak value: 12.5",
-        "Max. value = 7.3 cm",
         "Abtastrate: 100 Hz",
-        "Scans in file: 3",
-        "PGA: 4",
         "PGA (g): 4.0",
         "Peak acc.: -39.2 m/s2 at 0.02 s",
-        "Number of data points: 3",
-        "Samples: 3",
         "Samples: 3 of 12 channels",
-        "fs: 100",
         "Rate of the clock: 7",
         "PGA (g),4.0",
     ],
@@ -404,11 +372,6 @@ def test_arguments_must_agree_with_a_file_that_states_them(tmp_path, form, unit)
     for key, value in (("time_unit", "s"), ("time", "t"), ("skip", 2), ("missing", (-999.0,))):
         with pytest.raises(ValueError, match=f"states its times and samples; leave {key} out"):
             read_record(tmp_path / name, **{key: value})
-
-
-def test_decimal_commas_of_a_table_are_those_of_its_header(tmp_path):
-    record = read(tmp_path, "a.txt", text("Abtastintervall: 2,5 ms", "Zeit [s];a [g]", "0,0000;1,5", "0,0025;2,5"))
-    assert record.dt == 0.0025
 
 
 def test_text_about_other_samples_is_left_out_by_skip(tmp_path):
@@ -478,10 +441,6 @@ def test_the_advice_for_repeated_times_of_smc_works(tmp_path):
     values[30] += 0.5  # the mean of the two
     expected = np.interp(record.time, times[kept], values[kept])
     np.testing.assert_allclose(record.acceleration, 1e-2 * expected, atol=2e-3)
-    more = smc(values, 200.0)
-    path.write_text(text(*more, more[-2]))
-    with pytest.raises(ValueError, match="announces 61 samples but has more after them"):
-        read_record(path)
 
 
 @pytest.mark.parametrize("seed", range(2))
