@@ -11,7 +11,6 @@ from fe_likelihoods.models.rc_column_parts import bar_circle, circular_strips, g
 
 INCH, KSI = to_si(1.0, "in").item(), to_si(1.0, "ksi").item()
 RADIUS, CORE_RADIUS = 24.0, 43.375 / 2  # of the tested column [in]
-CORE, COVER, STEEL = 1, 2, 3  # materials of the reference fibers
 
 
 def second_moment(fibers):
@@ -21,11 +20,6 @@ def second_moment(fibers):
 @pytest.fixture(scope="module")
 def lhpost():
     return RCColumn.lhpost(Record("rest", 0.01, np.zeros(3)))
-
-
-@pytest.fixture(scope="module")
-def golden(shared):
-    return np.load(shared / "golden" / "column" / "golden_A_section.npz")
 
 
 @pytest.mark.parametrize("n", [4, 6, 20, 40, 200, 2000])
@@ -60,11 +54,6 @@ def test_first_angle_rotates_the_bars():
     oblique = bar_circle(20.0, 18, 1.56, 0.1)
     assert len(oblique) == 18
     assert second_moment(oblique) == pytest.approx(second_moment(straight), rel=1e-12)
-
-
-def as_sorted(y, area):
-    order = np.argsort(y)
-    return np.array([y[order], area[order]])
 
 
 @pytest.mark.parametrize(

@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 
-from fe_likelihoods import HalfNormal, Posterior, TruncatedNormal
-from fe_likelihoods.emulation.modes import find_modes
 from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
@@ -32,7 +30,6 @@ def cases():
     return {
         "oscillator": (LinearOscillator(RECORD), 5.003),
         "column": (column, 5.003),
-        "column, substeps": (RCColumn.lhpost(RECORD, mesh=10, substeps=2), 5.003),
         "column, imposed": (RCColumn.lhpost(imposed, mesh=10, parameters=("Ec", "ft")), 3.2),
         "bridge": (vertical, 1.2321),
         "bridge, vertical, every third": (
@@ -195,16 +192,3 @@ def test_a_part_under_a_record():
 def test_a_jacobian_needs_the_number_of_samples_as_well():
     with pytest.raises(ValueError, match="expected jacobian with the argument n_steps, as function has it; got"):
         FunctionModel(vibrates, ("a",), CHANNEL, 0.02, 300, jacobian=lambda theta: slopes(theta))
-
-
-def test_a_search_on_growing_parts_takes_fewer_simulations():
-    prior = {"a": TruncatedNormal(1.0, 0.3), "sigma_y": HalfNormal(0.2)}
-    values = vibrates([1.3]) + 0.05 * np.random.default_rng(1).standard_normal((1, 300))
-    found = []
-    for function in (vibrates, lambda theta: vibrates(theta)):
-        model = FunctionModel(function, ("a",), CHANNEL, 0.02, 300)
-        posterior = Posterior(FELikelihood(model, Measurements(CHANNEL, 0.02, values)), prior)
-        search = find_modes(posterior, seed=1)
-        assert search.modes[0].parameters[0] == pytest.approx(1.3, abs=0.01)
-        found.append(search.simulations)
-    assert found[0] < 0.6 * found[1]

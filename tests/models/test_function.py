@@ -3,10 +3,7 @@
 import functools
 import math
 import multiprocessing
-import os
 import pickle
-import subprocess
-import sys
 import threading
 from dataclasses import dataclass
 from multiprocessing.pool import ThreadPool
@@ -15,18 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fe_likelihoods import (
-    Channel,
-    FunctionModel,
-    Record,
-    SimulationFailed,
-)
+from fe_likelihoods import Channel, FunctionModel, Record, SimulationFailed
 from fe_likelihoods.simulation.label import ModelLabel, value_digest
 from fe_likelihoods.simulation.model import split_seconds
 from tests.faults import treacherous as bad
-from tests.faults.treacherous import CHANNELS, DT, N_STEPS, line, posterior_of, treacherous
+from tests.faults.treacherous import CHANNELS, DT, N_STEPS, line, treacherous
 
-ROOT = Path(__file__).parents[2]
 NAMES = ("offset", "slope")
 THETA = np.array([0.3, 0.1])
 
@@ -141,25 +132,6 @@ def test_memory_is_limited():
     assert reason.startswith("MemoryError")
 
 
-@pytest.mark.parametrize("pool", [None, 2])
-def test_failures_are_in_the_report_with_their_duration(pool):
-    posterior = posterior_of(model_of(time_limit=0.5), top=10.0, pool=pool)
-    x = np.array([[what + 0.5, 0.1, 0.5] for what in (bad.FINE, bad.RAISES, bad.HANGS, bad.CRASHES, bad.RAISES)])
-    x[4, 1] = 0.2
-    values = posterior(x)
-    assert np.isfinite(values[0])
-    assert np.isneginf(values[1:]).all()
-    report = posterior.report()
-    assert report["failure_count"] == 4
-    assert report["failure_reasons"] == {
-        "ZeroDivisionError: float division by zero": 2,
-        "stopped at the time limit of 0.5 s": 1,
-        "the worker process died (signal 11)": 1,
-    }
-    (stopped,) = (each for each in report["failures"] if each["parameters"]["offset"] == bad.HANGS + 0.5)
-    assert all(entry["seconds"] >= 0.0 for entry in report["failures"]) and stopped["seconds"] >= 0.5
-
-
 @pytest.mark.parametrize(
     ("options", "advice"),
     [
@@ -215,8 +187,8 @@ class Storey(NamedTuple):
 def f(theta):
     return theta[0] * Storey().half() * Storey().double
 """
-MADE = "from collections import namedtuple\nS = namedtuple('S', 'mass', defaults=(3.0,))\ndef f(x):\n    return S()\n"
-BOUND = "apply = (1.0 * np.eye(2)).dot\nfirst = {1: 2.0}.get\ndef f(x): return apply(first(1)), dict.fromkeys(x)\n"
+
+
 CHANGES = {
     CODE: [
         ("G = 9.8", "G = 9.81"),
@@ -227,12 +199,10 @@ CHANGES = {
         ("1.5", "15"),
     ],
     TUPLE: [("3.0", "4.0"), ("/ 2", "/ 3"), ("* 2", "* 4"), ("mass", "load")],
-    MADE: [("3.0", "4.0")],
-    BOUND: [("1.0", "2.0"), ("2.0}", "3.0}")],
 }
 
 
-@pytest.mark.parametrize("code", CHANGES, ids=["function", "tuple", "made tuple", "bound method"])
+@pytest.mark.parametrize("code", CHANGES, ids=["function", "tuple"])
 def test_equal_code_has_equal_digests_and_every_change_another(code):
     assert value_digest(defined(code)) == value_digest(defined(code))
     assert value_digest(defined(code)) == value_digest(defined("# a comment\n" + code.replace(" * ", "*")))
@@ -279,31 +249,6 @@ def test_fingerprint_depends_on_names_channels_and_steps():
     ]
     assert len({model.fingerprint for model in models}) == len(models)
     assert model_of(time_limit=1.0).fingerprint == models[0].fingerprint  # the process does not change a response
-
-
-@pytest.mark.parametrize("hash_seed", ["0", "123"])
-def test_fingerprint_is_the_same_in_another_process(hash_seed):
-    code = (
-        "from tests.faults.treacherous import *; from fe_likelihoods.models.function import FunctionModel;"
-        "print(FunctionModel(treacherous, ('offset', 'slope'), CHANNELS, DT, N_STEPS).fingerprint)"
-    )
-    environment = os.environ | {"PYTHONHASHSEED": hash_seed, "PYTHONPATH": str(ROOT)}
-    run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=environment, capture_output=True, text=True)
-    assert run.stdout.strip() == model_of().fingerprint, run.stderr
-
-
-def test_equal_values_have_equal_digests():
-    """Whether two equal values are one object may differ between processes, so it must not enter the digest."""
-    one = (1.5, [2.5])
-    assert value_digest(scaled((one, one))) == value_digest(scaled(((1.5, [2.5]), (1.5, [2.5]))))
-
-
-def test_objects_that_contain_themselves_have_a_digest():
-    circle = [1.0]
-    circle.append(circle)
-    other = [2.0]
-    other.append(other)
-    assert value_digest(scaled(circle)) != value_digest(scaled(other))
 
 
 def test_attributes_of_a_subclass_are_part_of_the_label():

@@ -1,13 +1,10 @@
 """One run for several data sets: what it returns, how often it runs, and what is refused."""
 
-import sys
-
 import numpy as np
 import pytest
 
 from fe_likelihoods import (
     Channel,
-    ExecutableModel,
     FELikelihood,
     FunctionModel,
     JointLikelihood,
@@ -32,15 +29,6 @@ TEST = LoadTest([TOP], ["pull", "push"], [[2.1, -2.1]], errors={"top": 0.05})
 DATA = ModalData([0.098, 0.257], [[0.6, 1.0], [-1.0, 0.6]], ("a", "b"), frequency_cv=0.01, shape_error=0.02)
 PARTS = {"modes": (modal_channels(("a", "b")), 1.0, 2), "static": ((TOP,), 1.0, 2)}
 PRIOR = {"k1": LogNormal(1.0, 0.2), "k2": LogNormal(1.0, 0.2)} | TEST.known
-PROGRAM = """
-import sys
-import numpy as np
-
-k1, k2 = map(float, sys.argv[1:3])
-values, shapes = np.linalg.eigh([[k1 + k2, -k2], [-k2, k2]])
-np.savetxt("modes.txt", np.column_stack([np.sqrt(values) / (2 * np.pi), shapes.T]))
-open("static.txt", "w").write(f"{1 / k1 + 1 / k2!r}\\n{-1 / k1 - 1 / k2!r}  # push\\n")
-"""
 
 
 def both(theta):
@@ -132,23 +120,6 @@ def test_what_does_not_fit_is_a_failed_run(returned, text):
 def test_files_of_other_parts_are_refused():
     with pytest.raises(ValueError, match="an output for each of the parts modes, static"):
         one_run(PARTS, {"modes": "modes.txt"}, None)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("pool", [None, 2])
-def test_a_program_that_writes_both_files_runs_once(pool, tmp_path, runs):
-    (tmp_path / "program.py").write_text(PROGRAM)
-    command = [sys.executable, tmp_path / "program.py", "${k1}", "${k2}"]
-    files = {"modes": "modes.txt", "static": "static.txt"}
-    models = one_run(
-        PARTS,
-        files,
-        lambda output, **options: ExecutableModel(command, {}, output, NAMES, **options, time_limit=60),
-    )
-    points = np.array([[1.0, 1.0], [1.1, 0.9], [0.9, 1.2]])
-    found = joint(models, pool=pool)(points)
-    assert sum(runs) == 3
-    np.testing.assert_allclose(found, joint(of_function())(points), rtol=1e-9)
 
 
 def test_histories_keep_their_step():

@@ -9,8 +9,7 @@ import pytest
 
 from fe_likelihoods import LinearOscillator, OpenSeesModel, Record, SimulationFailed
 from fe_likelihoods.models.opensees import _Codes
-from fe_likelihoods.simulation.local_pool import LocalPool
-from fe_likelihoods.simulation.model import simulate_batch, split_seconds
+from fe_likelihoods.simulation.model import split_seconds
 from tests.opensees_column import require_opensees
 from tests.opensees_oscillator import CHANNELS, DAMPING, PERIOD, Oscillator
 
@@ -74,15 +73,6 @@ def test_the_run_after_a_failure_is_not_affected(model):
         assert text.startswith(reason)
         assert seconds is not None
         np.testing.assert_array_equal(model.simulate([1.0, 1.0]), expected)
-
-
-def test_same_bits_in_two_workers(model, rng):
-    thetas = rng.uniform(0.5, 1.5, size=(6, 2))
-    expected = [model.simulate(theta) for theta in thetas]
-    with LocalPool(2) as pool:
-        batch = simulate_batch(model, thetas, pool)
-    assert batch.reasons == [""] * 6
-    np.testing.assert_array_equal(batch.response, expected)
 
 
 def test_an_analysis_that_stops_after_a_number_of_samples(record):
@@ -164,18 +154,6 @@ def by_name():
         advance(1, HARD_DT)
 
     return step
-
-
-class Held:
-    """An object that has imported the function by name."""
-
-    def __init__(self):
-        from openseespy.opensees import analyze
-
-        self.advance = analyze
-
-    def __call__(self, ops, sample):
-        self.advance(1, HARD_DT)
 
 
 def says_so_and_goes_on(ops, sample):
@@ -282,37 +260,24 @@ def test_a_script_may_repeat_what_has_failed(script):
     np.testing.assert_allclose(model.simulate([1]), model.simulate([50]), atol=1e-6)
 
 
-@pytest.mark.parametrize("script", ["by name", pytest.param("object", marks=pytest.mark.slow)])
-def test_functions_that_the_script_has_imported_by_name_are_watched(script):
+@pytest.mark.slow
+def test_functions_that_the_script_has_imported_by_name_are_watched():
     """In a process of its own, since this script imports OpenSees."""
     require_opensees()
     code = (
         "import tests.models.test_opensees as t, pytest\n"
-        f"model = t.hard(t.step_by_step({'t.by_name' if script == 'by name' else 't.Held'}()))\n"
+        "model = t.hard(t.step_by_step(t.by_name()))\n"
         "assert model.simulate([50]).any()\n"
         "with pytest.raises(t.SimulationFailed, match='did not look at it'): model.simulate([1])\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_an_exception_of_the_script_is_the_reason():
-    def collapses(ops, sample):
-        if ops.analyze(1, HARD_DT) != 0:
-            raise SimulationFailed(f"collapse at {ops.getTime():.2f} s")
-
-    with pytest.raises(SimulationFailed, match="^collapse at 0.00 s after"):
-        hard(step_by_step(collapses)).simulate([1])
-
-
 LOOKS = {
     "if": lambda code: not code,
     "comparison": lambda code: code < 0,
-    "reflected comparison": lambda code: 0 == code,
     "in a tuple": lambda code: code in (0, 1),
-    "in a set": lambda code: code in {0, 1},
     "any": lambda code: any([0, code]),
-    "sum": lambda code: sum([0, code]),
-    "max": lambda code: max(0, code),
     "int": int,
     "float": float,
     "abs": abs,
@@ -331,12 +296,3 @@ def test_what_is_a_look_at_a_code(look):
     assert ("did not look" in codes.reason) == (look in NO_LOOKS) and (codes.reason == "") == (look in LOOKS)
     assert code == -3 and hash(code) == hash(-3)
     assert codes.reason == ""
-
-
-def test_a_look_at_a_code_stands_for_those_after_it_and_none_before():
-    codes = _Codes()
-    first, second, third = (codes.analyze(lambda: -3) for _ in range(3))
-    codes.analyze(lambda: 0)
-    assert any([second, third])
-    assert codes.reason.startswith("ops.analyze returned -3 at call 1 of 4 and the script did not look")
-    assert first < 0 and codes.reason == ""

@@ -5,13 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fe_likelihoods import (
-    DisplacementHistory,
-    RCColumn,
-    SimulationFailed,
-    material_curves,
-    moment_curvature,
-)
+from fe_likelihoods import DisplacementHistory, RCColumn, SimulationFailed, material_curves, moment_curvature
 
 REVERSALS = (0.05, -0.05, 0.1, -0.08)  # [m]; beyond, crushing cover has two states of equilibrium
 
@@ -63,10 +57,9 @@ def test_a_section_that_cannot_carry_its_load_fails(column):
 
 
 def test_wrong_arguments(column):
-    with pytest.raises(ValueError, match="vector of finite curvatures"):
-        moment_curvature(column, np.ones(3), [[0.01]])
-    with pytest.raises(ValueError, match="vector of finite curvatures"):
-        moment_curvature(column, np.ones(3), [np.nan])
+    for curvature in ([[0.01]], [np.nan]):
+        with pytest.raises(ValueError, match="vector of finite curvatures"):
+            moment_curvature(column, np.ones(3), curvature)
     with pytest.raises(ValueError, match="strains between"):
         material_curves(column, np.ones(3), [5.0])
     with pytest.raises(ValueError, match="one value for each"):

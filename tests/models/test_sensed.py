@@ -9,23 +9,18 @@ from fe_likelihoods import (
     Channel,
     FELikelihood,
     FunctionModel,
-    HalfNormal,
     LinearOscillator,
     LinearStructure,
     LogNormal,
     Measurements,
-    Posterior,
-    Prior,
     Record,
     SensedModel,
     Sensor,
     TruncatedNormal,
     Uniform,
     propagate,
-    read_record,
 )
 from fe_likelihoods.simulation.model import simulate_batch
-from samplers import SMCSampler
 
 STEP, N = 0.01, 600
 TIME = STEP * np.arange(N)
@@ -129,31 +124,6 @@ def test_the_gain_has_its_closed_form():
     assert integral - other == pytest.approx(joint, abs=1e-6)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("gain", "lag"), [(0.5, 0.0), (2.0, 0.05), (-1.0, -0.03), (1.0, 0.0)])
-def test_a_fault_of_a_sensor_is_found_as_such(gain, lag):
-    """Sampling gives the structure and the sensor that made the data; a right sensor is found to be right."""
-    wide = Uniform(-3.0, 3.0)
-    model = FunctionModel(
-        lambda x: np.stack([motion(TIME, 3.0 * x[0]), 0.02 * motion(TIME, 3.0 * x[0])]), ["f"], (TOP, DRIFT), STEP, N
-    )
-    rng = np.random.default_rng(1)
-    values = np.stack([gain * motion(TIME - lag, 3.3), 0.02 * motion(TIME, 3.3)])
-    data = Measurements((TOP, DRIFT), STEP, values + rng.standard_normal(values.shape) * [[0.02], [0.0004]])
-    sensed = SensedModel(model, {"top": Sensor(wide, LAG)})
-    priors = {"f": TruncatedNormal(1.0, 0.1), "sigma_top": HalfNormal(0.5), "sigma_drift": HalfNormal(0.01)}
-    posterior = Posterior(FELikelihood(sensed, data), Prior(priors | sensed.priors))
-    sampler = SMCSampler(
-        100, posterior.ndim, posterior, vectorize=True, seed=1, guide=posterior.guide(), max_simulations=1600
-    )
-    sampler.run_mcmc(None, 1)
-    samples = sampler.get_chain(flat=True)
-    mean, sd = samples.mean(axis=0), samples.std(axis=0)
-    for name, truth in (("f", 1.1), ("gain_top", gain), ("lag_top", lag)):
-        k = posterior.parameter_names.index(name)
-        assert abs(mean[k] - truth) < 4.0 * sd[k] and sd[k] < 0.01, name
-
-
 def test_sensors_that_do_not_exist_are_refused():
     record = Record("EQ", STEP, motion(TIME))
     for make, message in (
@@ -167,34 +137,3 @@ def test_sensors_that_do_not_exist_are_refused():
     ):
         with pytest.raises(ValueError, match=message):
             make()
-
-
-@pytest.mark.slow
-def test_faults_of_a_sensor_in_a_real_event_leave_the_structure_alone(shared):
-    """Meloland 1979, the middle of the deck: without a sensor, frequency and damping take the gain and the lag."""
-    path = next((shared / "measured" / "meloland_bridge").glob("*ce01336p.zip"))
-    footing, *ends, middle = (read_record(path, number) for number in (2, 3, 13, 7))
-    deck = LinearStructure(BridgeDeck("middle"), [footing, *ends])
-
-    def fit(factor=1.0, steps=0, **priors):
-        """Means of the parameters of the deck and its sensor, for a fault of the measured channel."""
-        model = SensedModel(deck, {"middle": Sensor(**priors)}) if priors else deck
-        prior = {"frequency": Uniform(1.0, 15.0), "damping": Uniform(0.01, 0.9), "share": Uniform(0.0, 1.0)}
-        prior |= getattr(model, "priors", {}) | {"sigma_middle": HalfNormal(2.0)}
-        values = factor * np.concatenate([np.zeros(steps), middle.acceleration[: middle.n_steps - steps]])
-        posterior = Posterior(FELikelihood(model, Measurements(deck.channels, deck.dt, [values])), Prior(prior))
-        options = {"vectorize": True, "seed": 1, "guide": posterior.guide(), "max_simulations": 800}
-        sampler = SMCSampler(100, posterior.ndim, posterior, **options)
-        sampler.run_mcmc(None, 1)
-        return sampler.get_chain(flat=True).mean(axis=0)
-
-    right, half, late = fit(), fit(0.5), fit(steps=3)
-    assert half[0] > 2.0 * right[0] and half[1] > 5.0 * right[1]  # controls
-    assert late[0] < 0.7 * right[0] and late[1] > 5.0 * right[1]
-    found = fit(0.5, gain=LogNormal(1.0, 0.05))
-    np.testing.assert_allclose(found[:2], right[:2], rtol=0.03)
-    assert found[3] == pytest.approx(0.5, rel=0.02)
-    # the clock of the right channel differs by half a step
-    first, second = fit(lag=LAG), fit(steps=3, lag=LAG)
-    np.testing.assert_allclose(second[:2], first[:2], rtol=0.03)
-    assert second[3] - first[3] == pytest.approx(0.06, abs=0.002)

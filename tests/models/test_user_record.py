@@ -16,7 +16,7 @@ from fe_likelihoods import (
     Record,
     propagate,
 )
-from tests.opensees_oscillator import CHANNELS, DAMPING, PERIOD, Oscillator
+from tests.opensees_oscillator import CHANNELS, DAMPING, PERIOD
 
 NAMES = ("stiffness", "damping")
 ROOF = (Channel("roof", "displacement", "mm"),)
@@ -37,10 +37,6 @@ def oscillator(theta, record):
 
 def roof(theta, record):
     return oscillator(theta, record)[1:, ::4]
-
-
-def in_opensees(ops, theta, record):
-    return Oscillator(record.acceleration, record.dt, 5)(ops, theta)
 
 
 @pytest.fixture

@@ -28,22 +28,9 @@ PROPERTIES = "properties_circular_columns.csv"
 
 
 class TestedColumn(NamedTuple):
-    """A tested column: model and measurement at the kept samples.
+    """A tested column: model and measured force at the kept samples, and the whole history [m, N].
 
-    Attributes
-    ----------
-    name : str
-        Name of the test.
-    number : int
-        Number of the test in the table of properties.
-    model : RCColumn
-        Model under the imposed displacements at the kept samples.
-    force : (n_steps,) float
-        Measured lateral force [N].
-    half, failure : int
-        First kept sample of the second half of the history, and the first one after failure (`find_failure`).
-    displacement, whole_force : (n,) float
-        All samples of the displacement [m] and of the force [N].
+    `half` is the first kept sample of the second half, `failure` the first one after failure (`find_failure`).
     """
 
     name: str
@@ -57,29 +44,10 @@ class TestedColumn(NamedTuple):
 
 
 def read_column(folder: Path, history: str, every: int, parameters: tuple[str, ...]) -> TestedColumn:
-    """Read a tested column.
+    """Read a tested column from the file of its history; one sample in `every` is kept, and every turning point.
 
-    Parameters
-    ----------
-    folder : path
-        Where the files are.
-    history : str
-        File of the history, such as ``2017_Lehman_415.csv``.
-    every : int
-        One sample in `every` is kept, and every turning point.
-    parameters : tuple of str
-        Parameters of the model.
-
-    Returns
-    -------
-    TestedColumn
-        Its model has "linear" geometry, for a force that is the base moment divided by the height.
-
-    Raises
-    ------
-    ValueError
-        If the table has no row for this test, or lacks a value that the model needs, the history lacks a column, or the
-        values describe no column.
+    The model has "linear" geometry, for a force that is the base moment divided by the height. ValueError if the table
+    has no row for this test or lacks a value.
     """
     test, v = _properties(folder, history)
 
