@@ -75,7 +75,6 @@ def test_python_blocks_run_as_printed(page, tmp_path):
         for page in PAGES
         if blocks(page, "python") != blocks(page, "python", slow=False)
         and page not in SHOWN  # test_first_examples_print_what_is_shown
-        and page.name != "decisions.rst"  # tests/prediction/test_page_of_decisions.py runs its blocks
     ],
     ids=name_of,
 )
@@ -120,21 +119,16 @@ def test_every_python_block_is_found():
         assert "::python" not in page.read_text(), name_of(page)
 
 
-def test_shell_blocks_name_targets_and_files_that_exist():
+def test_targets_and_files_that_pages_name_exist():
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     for page in PAGES:
+        for target in re.findall(r"`make ([a-z-]+)`", page.read_text()):
+            assert target in targets, f"{name_of(page)}: make {target}"
         for code in blocks(page, "sh"):
             for target in re.findall(r"^make ([a-z-]+)", code, re.MULTILINE):
                 assert target in targets, f"{name_of(page)}: make {target}"
             for path in re.findall(r"\b(?:tutorials|tests|docs|data)/[\w/.]+", code):
                 assert (ROOT / path).exists(), f"{name_of(page)}: {path}"
-
-
-def test_make_targets_in_the_text_exist():
-    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
-    for page in PAGES:
-        for target in re.findall(r"`make ([a-z-]+)`", page.read_text()):
-            assert target in targets, f"{name_of(page)}: make {target}"
 
 
 def test_links_to_files_lead_somewhere():

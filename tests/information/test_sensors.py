@@ -10,7 +10,6 @@ from fe_likelihoods import (
     LinearOscillator,
     LogNormal,
     Prior,
-    RCColumn,
     SimulationFailed,
     TruncatedNormal,
     peak,
@@ -136,17 +135,6 @@ def test_derivatives_of_the_model_replace_differences():
     )
     assert exact.chosen == rough.chosen and (exact.counts["simulations"], rough.counts["simulations"]) == (40, 50)
     np.testing.assert_allclose(exact.target_left, rough.target_left, rtol=0.03)
-
-
-def test_strains_of_the_column_near_the_base_are_ranked_before_mid_height():
-    record = problems.bridge_column_data("short").record.trim(3.0, 5.0)
-    bar = RCColumn.lhpost(record).bar_circle_radius
-    heights = (0.2, 1.8, 3.6)
-    column = RCColumn.lhpost(record, outputs=tuple(f"strain@{height}:{bar}" for height in heights))
-    prior = {name: TruncatedNormal(1.0, 0.2) for name in column.parameter_names}
-    ranking = rank_sensors(column, prior, noise={"strain": 5e-5}, effective_samples=50.0, draws=3)
-    assert ranking.chosen[0].startswith("strain@0.2:") and (np.diff(ranking.alone) < 0.0).all()
-    assert ranking.lead[0] > 2.0 * ranking.errors["lead"][0]
 
 
 @pytest.mark.parametrize(

@@ -7,19 +7,15 @@ import pytest
 
 from fe_likelihoods import (
     Events,
-    FELikelihood,
     IsolatedBridge,
     LinearOscillator,
     LinearStructure,
-    Measurements,
-    RCColumn,
     Record,
     ShearFrame,
     average_predictions,
     peak,
     propagate,
 )
-from fe_likelihoods.problems import bridge_column_data
 
 
 class Slip:
@@ -39,11 +35,6 @@ class Slip:
 
     def simulate(self, theta):
         return np.cumsum(np.maximum(np.abs(self.record.acceleration) - theta[0], 0.0))[None]
-
-
-@pytest.fixture
-def eq1():
-    return bridge_column_data().record.trim(8.0, 9.0)
 
 
 def last(model, record, rest, theta):
@@ -70,32 +61,16 @@ def test_state_is_carried_through_or_not(record):
         average_predictions({"a": end, "b": virgin}, {"a": 0.5, "b": 0.5})
 
 
-def test_default_is_named_in_a_warning_at_the_line_of_the_user(record):
-    model, samples = Slip(record), np.array([[0.1]])
+def test_the_default_is_named_in_a_warning_at_the_line_of_the_user_where_it_matters(record):
     with pytest.warns(UserWarning, match='Slip may depend .* virgin structure.*from_state="end"') as caught:
-        prediction = propagate(model, samples, record=record.scale(2.0), progress=False)
+        prediction = propagate(Slip(record), np.array([[0.1]]), record=record.scale(2.0), progress=False)
     assert prediction.from_state == "virgin" and caught[0].filename == __file__
-
-
-def test_no_warning_without_memory_or_without_a_record(record):
-    oscillator, samples = LinearOscillator(record), np.ones((2, 2))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert propagate(oscillator, samples, record=record, progress=False).from_state == "virgin"
+        found = propagate(LinearOscillator(record), np.ones((2, 2)), record=record, progress=False)
+        assert found.from_state == "virgin"
         propagate(Slip(record), np.array([[0.1]]), progress=False)
         propagate(Slip(record), np.array([[0.1]]), record=record, from_state="virgin", progress=False)
-
-
-def test_the_column_is_cracked_by_the_first_record(eq1):
-    column = RCColumn.lhpost(eq1)
-    measurements = Measurements(column.channels, column.dt, column.simulate(np.ones(5)))
-    weaker = eq1.scale(0.5)
-    prediction = propagate(
-        FELikelihood(column, measurements), np.ones((1, 5)), record=weaker, from_state="end", rest=0.2, progress=False
-    )
-    both = column.with_record(eq1.followed_by(weaker, rest=0.2))
-    np.testing.assert_array_equal(prediction.mean, both.simulate(np.ones(5))[:, -weaker.n_steps :])
-    assert np.abs(prediction.mean - column.with_record(weaker).simulate(np.ones(5))).max() > 0.1
 
 
 @pytest.mark.parametrize("every", [1, 4])

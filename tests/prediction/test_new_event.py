@@ -1,12 +1,8 @@
 """Prediction of a new event: closed forms of numbers and histories; coverage where errors are correlated."""
 
-import warnings
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy import stats
-from scipy.signal import bilinear, lfilter
 
 from fe_likelihoods import GaussianNoise
 from fe_likelihoods.events.hierarchical_posterior import HierarchicalPosterior, Varying
@@ -23,7 +19,6 @@ from fe_likelihoods.prediction.reliability import exceedance
 from fe_likelihoods.priors.distributions import HalfNormal, LogNormal
 from fe_likelihoods.priors.priors import Prior
 from fe_likelihoods.signals.channels import Channel, Measurements
-from fe_likelihoods.signals.records import Record
 
 TOP = Channel("top", "displacement", "mm")
 TIME = 0.02 * np.arange(100)
@@ -155,26 +150,6 @@ def test_each_number_has_its_own_scatter_from_the_parameters():
         event_ratios({"gain": 1.0}, {"EQ": likelihood}, numbers, spread={"gain": 0.0})
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("correlation", (0.0, -0.8))
-@pytest.mark.parametrize("n_events", (5, 10))
-def test_intervals_cover_new_events_whose_ratio_goes_with_their_parameters(n_events, correlation, rng):
-    sets, new = 200, 20
-    hierarchy = population([f"EQ{k}" for k in range(n_events)], rng)
-    scales = 1.0 + 0.3 * np.arange(n_events)
-    mixing = np.array([[SPREAD, 0.0], [0.1 * correlation, 0.1 * np.sqrt(1.0 - correlation**2)]])
-    together = np.empty((sets, new))
-    for row in range(sets):
-        gains, ratios = np.exp(mixing @ rng.standard_normal((2, n_events + new)))
-        peaks = MEDIAN * LARGEST * gains * ratios
-        posteriors = likelihoods(scales * peaks[:n_events])
-        options = {"model": Amplified(), "quantity": peak("top"), "n": 400, "seed": row, "prior_events": 1e-9}
-        found = predict_new_event(hierarchy, posteriors, 1.0, **options)
-        together[row] = np.searchsorted(np.sort(found.values), peaks[n_events:]) / 400.0
-    for level in (0.5, 0.9):
-        assert abs((np.abs(together - 0.5) <= 0.5 * level).mean() - level) < 0.03
-
-
 def test_histories_of_a_new_event_have_noise_of_its_own_level(hierarchy, posterior):
     prediction = predict_new_event(hierarchy, {"EQ0": posterior}, 0.1, noise=True, n=2000, seed=1)
     squared = MEDIAN**2 * np.exp(2.0 * SPREAD**2)  # mean square of a log-normal gain
@@ -193,84 +168,24 @@ def test_draws_of_impossible_shares_are_left_out(hierarchy, posterior):
 
 def test_what_cannot_be_predicted_is_refused(events, hierarchy, posterior):
     population_of_four, posteriors = events
-    options = {"quantity": peak("top")}
-    with pytest.raises(ValueError, match="posteriors of 'EQ0', 'EQ1' are missing"):
-        predict_new_event(population_of_four, {k: posteriors[k] for k in ("EQ2", "EQ3")}, 1.0, **options)
-    for function in (np.max, [peak("top"), "top"]):
-        with pytest.raises(ValueError, match="need numbers such as"):
-            predict_new_event(population_of_four, posteriors, 1.0, quantity=function)
     other = Amplified()
     other.parameter_names = ["stiffness"]
-    with pytest.raises(ValueError, match="stiffness belong"):
-        predict_new_event(population_of_four, posteriors, 1.0, model=other, **options)
-    with pytest.raises(ValueError, match="contain the errors of measurements already"):
-        predict_new_event(population_of_four, posteriors, 1.0, noise=True, **options)
-    with pytest.raises(ValueError, match="noise=True needs a posterior"):
-        predict_new_event(hierarchy, {"EQ0": Amplified()}, 1.0, noise=True)
-    with pytest.raises(ValueError, match="expected the posteriors of the events by name"):
-        predict_new_event(hierarchy, posterior, 1.0, **options)
-    with pytest.raises(ValueError, match="needs a posterior or a likelihood with measurements"):
-        event_ratios({"gain": 1.0}, {"EQ0": Amplified()}, peak("top"))
-    still = {"EQ0": FELikelihood(Amplified(0.0), posterior.likelihood.measurements, NOISE)}
-    with pytest.raises(ValueError, match="event 'EQ0': ratios of events need positive values"):
-        event_ratios({"gain": 1.0}, still, peak("top"))
-
-
-class Resonant(FunctionModel):
-    """An oscillator of 2 Hz, whose frequency and damping are multiples, under a base acceleration."""
-
-    def __init__(self, motion):
-        super().__init__(self.respond, ["frequency", "damping"], [TOP], 0.02, len(motion))
-        self.record, self.path_dependent = Record("motion", 0.02, motion), False
-
-    def respond(self, theta):
-        omega = 4.0 * np.pi * theta[0]
-        system = ([-1.0], [1.0, 2.0 * 0.05 * theta[1] * omega, omega**2])
-        return [lfilter(*bilinear(*system, fs=50.0), self.record.acceleration)]
-
-    def with_record(self, motion):
-        return Resonant(motion)
-
-
-@pytest.fixture(scope="module")
-def resonant():
-    """Six events under filtered noise, whose frequencies and damping ratios differ by 3 and 40 %."""
-    rng = np.random.default_rng(4)
-    motions = rng.standard_normal((6, 1000))
-    truths = np.exp([0.03, 0.4] * rng.standard_normal((6, 2)))
-    prior = Prior({"frequency": LogNormal(1.0, 0.2), "damping": LogNormal(1.0, 0.7)})
-    posteriors, tests = {}, {}
-    for k, (motion, truth) in enumerate(zip(motions, truths, strict=True)):
-        model = Resonant(motion)
-        posteriors[f"EQ{k}"] = FELikelihood(model, Measurements([TOP], 0.02, model.simulate(truth)), NOISE)
-        tests[f"EQ{k}"] = StoredPosterior(truth * np.exp([0.005, 0.05] * rng.standard_normal((200, 2))), prior)
-    varying = {name: Varying(each, HalfNormal(0.4)) for name, each in prior.distributions.items()}
-    known = [*np.exp(np.log(truths).mean(axis=0)), 0.03, 0.4]
-    known = np.array([known[0], 0.03, known[1], 0.4]) * np.exp(1e-3 * rng.standard_normal((50, 4)))
-    return Hierarchy(HierarchicalPosterior(tests, varying), known), posteriors
-
-
-def test_a_harmonic_near_resonance_widens_the_interval_and_other_motions_hardly(resonant):
-    hierarchy, posteriors = resonant
-    time = 0.02 * np.arange(1000)
-    options = {"quantity": peak("top"), "spread": {"frequency": 0.03, "damping": 0.4}, "n": 200, "seed": 1}
-    options["calibrated"] = ()
-    with pytest.warns(UserWarning, match="as a harmonic has"):
-        near = predict_new_event(hierarchy, posteriors, np.sin(4.0 * np.pi * time), **options)
-    with pytest.warns(UserWarning, match="as a harmonic has"):
-        far = predict_new_event(hierarchy, posteriors, np.sin(np.pi * time), **options)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        alike = predict_new_event(hierarchy, posteriors, np.random.default_rng(9).standard_normal(1000), **options)
-    of_events = np.asarray(alike.ratios.prior_sd)
-    assert alike.ratios.new_sd < 1.2 * of_events.max() > far.ratios.new_sd / 1.2
-    ratios, predicted = near.ratios, near.predicted
-    assert ratios.new_sd > 1.4 * of_events.max() and alike.findings == ()
-    model, rng = Resonant(np.sin(4.0 * np.pi * time)), np.random.default_rng(5)
-    truths = np.exp([0.03, 0.4] * rng.standard_normal((100, 2)))  # of new events under the harmonic
-    values = np.array([np.abs(model.simulate(truth)).max() for truth in truths])
-    widened, alone = (
-        np.mean(np.abs(each.probability_above(values / predicted, np.log(predicted)) - 0.5) <= 0.45)
-        for each in (ratios, replace(ratios, new_sd=None))
-    )
-    assert widened > 0.75 and alone < 0.6, "the control: without the scatter of the new motion"
+    few = {name: posteriors[name] for name in ("EQ2", "EQ3")}
+    for known, of_events, options, message in (
+        (population_of_four, few, {}, "posteriors of 'EQ0', 'EQ1' are missing"),
+        (population_of_four, posteriors, {"quantity": np.max}, "need numbers such as"),
+        (population_of_four, posteriors, {"quantity": [peak("top"), "top"]}, "need numbers such as"),
+        (population_of_four, posteriors, {"model": other}, "stiffness belong"),
+        (population_of_four, posteriors, {"noise": True}, "contain the errors of measurements already"),
+        (hierarchy, {"EQ0": Amplified()}, {"noise": True, "quantity": None}, "noise=True needs a posterior"),
+        (hierarchy, posterior, {}, "expected the posteriors of the events by name"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            predict_new_event(known, of_events, 1.0, **{"quantity": peak("top")} | options)
+    still = FELikelihood(Amplified(0.0), posterior.likelihood.measurements, NOISE)
+    for event, message in (
+        (Amplified(), "needs a posterior or a likelihood with measurements"),
+        (still, "event 'EQ0': ratios of events need positive values"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            event_ratios({"gain": 1.0}, {"EQ0": event}, peak("top"))

@@ -181,7 +181,3 @@ def test_levels_per_event_are_means_of_the_channels_measured_in_the_event(rng):
     expected[0, :61], expected[1, :61] = np.mean(mean**2), np.mean(samples[:, 3] ** 2)
     expected[0, 110:161] = np.mean(samples[:, 4] ** 2)
     np.testing.assert_allclose(added, expected, rtol=1e-9, atol=1e-9)
-    named = quiet(likelihood, samples, model=other.with_record(records[0]), noise="EQ1")
-    assert named.mean.shape == (2, 61)
-    with pytest.raises(ValueError, match="give the event whose levels hold for it"):
-        quiet(likelihood, samples, model=other.with_record(records[0]), noise=True)

@@ -261,12 +261,14 @@ def test_average_of_two_models_is_their_mixture(rng):
     assert average_predictions(named, {"two": 0.6, "one": 0.4}).findings == found  # of each model, once
     errors = np.stack([p.standard_error for p in predictions.values()])
     assert np.allclose(average.standard_error, np.hypot(0.4 * errors[0], 0.6 * errors[1]))
-    with pytest.raises(ValueError, match="sum to one"):
-        average_predictions(predictions, {"one": 0.4, "two": 0.4})
-    with pytest.raises(ValueError, match="expected one probability for each"):
-        average_predictions(predictions, {"one": 0.4, "three": 0.6})
-    with pytest.raises(ValueError, match="one quantity"):
-        average_predictions(predictions | {"two": quiet(Line(), second, quantity="a")}, {"one": 0.4, "two": 0.6})
+    other = predictions | {"two": quiet(Line(), second, quantity="a")}
+    for given, weights, message in (
+        (predictions, {"one": 0.4, "two": 0.4}, "sum to one"),
+        (predictions, {"one": 0.4, "three": 0.6}, "expected one probability for each"),
+        (other, {"one": 0.4, "two": 0.6}, "one quantity"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            average_predictions(given, weights)
 
 
 @pytest.mark.parametrize(

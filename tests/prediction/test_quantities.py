@@ -72,10 +72,8 @@ def test_an_energy_has_its_own_name_dimension_and_unit():
         ("energy of force", "energy", "kJ"),
         ("deck", "acceleration", "g"),
     ]
-    assert [str(each) for each in both.quantity] == ["Arias intensity of deck", "energy of force", "peak of deck"]
-    scores = both.score(DATA, level=0.5)
-    table = str(scores).splitlines()
-    assert table[2].split()[:5] == ["energy", "of", "force", "kJ", f"{measured_quantity(WORK, DATA) / 1e3:.3g}"]
+    row = str(both.score(DATA, level=0.5)).splitlines()[2].split()
+    assert row[:5] == ["energy", "of", "force", "kJ", f"{measured_quantity(WORK, DATA) / 1e3:.3g}"]
     work = propagate(MODEL, SAMPLES, quantity=WORK, progress=False)
     assert exceedance(work, 7.5, unit="kJ").probability == 0.25
     with pytest.raises(ValueError, match="a unit of energy, got 'kip'"):

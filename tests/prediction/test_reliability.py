@@ -55,20 +55,16 @@ def test_units_and_shapes_of_thresholds(record, rng):
         warnings.filterwarnings("error", message=".*beside all")
         exceedance(p, 0.3)
         exceedance(p, 0.1 * shown, unit=p.channels[0].unit)
-    with pytest.raises(ValueError, match="expected a unit of displacement, got 'kN'"):
-        exceedance(p, 10.0, unit="kN")
-    with pytest.raises(ValueError, match="unknown unit"):
-        exceedance(p, 10.0, unit="furlong")
-    with pytest.raises(ValueError, match="finite"):
-        exceedance(p, np.nan)
-    with pytest.raises(ValueError, match="must be numbers"):
-        exceedance(p, "10 cm")
-    with pytest.raises(ValueError, match=r"shape \(3,\); got shape \(2,\)"):
-        exceedance(np.zeros((50, 3)), [1.0, 2.0])
     assert exceedance(np.zeros((50, 3)), [1.0, -1.0, 2.0]).probability.tolist() == [0.0, 1.0, 0.0]
-    with pytest.raises(ValueError, match="quantity, such as peak"):
-        exceedance(propagate(model, samples, progress=False), 0.1)
-    with pytest.raises(ValueError, match="values must be finite"):
-        exceedance([1.0, np.nan], 0.1)
-    with pytest.raises(ValueError, match="level"):
-        exceedance(p, 0.1, level=95)
+    for values, limit, options, message in (
+        (p, 10.0, {"unit": "kN"}, "expected a unit of displacement, got 'kN'"),
+        (p, 10.0, {"unit": "furlong"}, "unknown unit"),
+        (p, np.nan, {}, "finite"),
+        (p, "10 cm", {}, "must be numbers"),
+        (np.zeros((50, 3)), [1.0, 2.0], {}, r"shape \(3,\); got shape \(2,\)"),
+        (propagate(model, samples, progress=False), 0.1, {}, "quantity, such as peak"),
+        ([1.0, np.nan], 0.1, {}, "values must be finite"),
+        (p, 0.1, {"level": 95}, "level"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            exceedance(values, limit, **options)
