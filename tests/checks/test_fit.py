@@ -17,14 +17,13 @@ from fe_likelihoods import (
     Measurements,
     Posterior,
     Record,
-    SensedModel,
-    Sensor,
     TruncatedNormal,
     Uniform,
     check_fit,
 )
 from fe_likelihoods.problems import table_motion
 from samplers import SMCSampler
+from tests.checks.fitted import fitted
 
 MOTION = table_motion().trim(0.0, 8.0).resample(0.02)
 DECK = {"frequency": Uniform(2.0, 7.0), "damping": Uniform(0.01, 0.3), "share": Uniform(0.2, 1.0)}
@@ -49,12 +48,15 @@ def deck(late=0):
     return model, Measurements(model.channels, 0.02, true + 0.1 * true.std() * error)
 
 
-def sampled(model, measured, prior, **noise):
+def posterior_of(model, measured, prior, **noise):
     law = GaussianNoise(model.channels, **noise)
-    scale = 0.3 if noise else float(measured.root_mean_squares[0])
-    posterior = Posterior(
-        FELikelihood(model, measured, law), prior | {n: HalfNormal(scale) for n in law.parameter_names}
-    )
+    scale = HalfNormal(0.3 if noise else float(measured.root_mean_squares[0]))
+    return Posterior(FELikelihood(model, measured, law), prior | dict.fromkeys(law.parameter_names, scale))
+
+
+def sampled(*arguments, **noise):
+    """A posterior, and the chain of a run."""
+    posterior = posterior_of(*arguments, **noise)
     sampler = SMCSampler(60, posterior.ndim, posterior, vectorize=True, seed=1)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -82,14 +84,14 @@ def test_a_unit_that_is_wrong_is_named_after_the_run_and_before_it(noise):
 
 def test_a_late_recorder_of_an_input_is_not_used():
     model, measured = deck(late=5)
-    posterior, samples = sampled(model, measured, DECK)
-    assert names(check_fit(posterior, samples))
+    posterior = posterior_of(model, measured, DECK)
+    assert names(check_fit(posterior, fitted(posterior, starts=2)))
 
 
 def test_parameters_at_bounds_and_far_from_their_prior_are_named():
     model, measured = deck()
-    posterior, samples = sampled(model, measured, DECK | {"frequency": Uniform(2.0, 3.0)})
-    assert "At the edge of the prior" in {each.kind for each in check_fit(posterior, samples)}
+    posterior = posterior_of(model, measured, DECK | {"frequency": Uniform(2.0, 3.0)})
+    assert "At the edge of the prior" in {each.kind for each in check_fit(posterior, fitted(posterior, starts=2))}
 
 
 @pytest.mark.slow
@@ -105,19 +107,3 @@ def test_the_fault_of_one_event_is_named_with_it():
     prior |= {name: HalfNormal(1.0) for name in likelihood.noise.parameter_names}
     (found,) = check_fit(Posterior(likelihood, prior))
     assert "(EQ2)" in found.text and " m and mm" in found.text
-
-
-@pytest.mark.slow
-def test_the_lag_of_a_recorder_is_found_as_a_parameter():
-    """The ends are 0.1 s late; with their lags as parameters the fit is right, and nothing speaks against it."""
-    model, measured = deck(late=5)
-    late = Sensor(lag=TruncatedNormal(0.0, 0.1, lower=-np.inf))
-    model = SensedModel(model, inputs={1: late, 2: late})
-    posterior, samples = sampled(model, measured, DECK | model.priors)
-    mean, sd = samples.mean(axis=0), samples.std(axis=0)
-    found = dict(zip(posterior.parameter_names, mean, strict=True))
-    assert found["lag_support_1"] == pytest.approx(0.1, abs=0.005) and found["lag_support_2"] == pytest.approx(
-        0.1, abs=0.005
-    )
-    assert (np.abs(mean[:3] - [4.0, 0.08, 0.6]) < 4.0 * sd[:3] + 0.01).all()
-    assert not [each for each in check_fit(posterior, samples) if each.severity == "wrong"]

@@ -5,20 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fe_likelihoods import (
-    FunctionModes,
-    LogNormal,
-    ModalData,
-    ModalLikelihood,
-    Posterior,
-    ShearFrame,
-    check_fit,
-)
+from fe_likelihoods import FunctionModes, LogNormal, ModalData, ModalLikelihood, Posterior, ShearFrame, check_fit
 from fe_likelihoods.checks.compared import compare
 from fe_likelihoods.checks.fit import check_responses
 from fe_likelihoods.checks.rehearsal import check_model
-from fe_likelihoods.emulation.modes import find_modes
 from fe_likelihoods.modal.mode_models import StructureModes
+from tests.checks.fitted import fitted
 
 FLOORS = {f"floor {i}": i for i in (1, 2, 3, 4)}
 FRAME = ShearFrame(FLOORS, [20e3] * 4, [30e6] * 4)
@@ -51,7 +43,7 @@ def before(data, model=FRAME, prior=PRIOR):
 
 
 def test_right_data_are_not_blamed():
-    assert not [found for seed in range(20) for found in before(identified(seed, **KNOWN))]
+    assert not [found for seed in range(8) for found in before(identified(seed, **KNOWN))]
 
 
 @pytest.mark.parametrize(
@@ -80,7 +72,7 @@ def test_frequencies_out_of_reach_are_named():
 
 def test_held_out_modes_outside_of_their_interval_are_named():
     rng, named = np.random.default_rng(1), [0, 0]
-    for seed in range(10):
+    for seed in range(4):
         data = identified(seed, (1, 2, 3, 4), **KNOWN)
         theta = np.exp(0.2 * np.random.default_rng(seed).normal(size=4))
         for k, factor in enumerate((1.0, 1.06)):
@@ -88,7 +80,7 @@ def test_held_out_modes_outside_of_their_interval_are_named():
             likelihood = ModalLikelihood(FRAME, data.select([1, 2]), held_out=held_out)
             found = check_fit(Posterior(likelihood, PRIOR), theta * (1.0 + 0.01 * rng.normal(size=(50, 4))))
             named[k] += [each.kind for each in found] == ["A held-out mode is not predicted"]
-    assert named[0] == 0 and named[1] >= 9
+    assert named[0] == 0 and named[1] >= 3
 
 
 @pytest.mark.parametrize(
@@ -103,12 +95,12 @@ def test_held_out_modes_outside_of_their_interval_are_named():
 def test_faults_of_sensors_are_named(gain, order, wanted):
     """With the right names, except where a fault changes the shapes as another one does."""
     named = 0
-    for seed in range(10):
+    for seed in range(4):
         data = identified(seed)
         shapes = (data.shapes[0] * [1.0, 1.0, 1.0, gain])[:, order]
         found = check_fit(Posterior(ModalLikelihood(FRAME, changed(data, shapes=shapes)), PRIOR))
         named += any(each.kind == "A sensor may be wrong" and wanted in each.text for each in found)
-    assert named >= 9
+    assert named >= 3
 
 
 def test_a_mode_that_was_identified_twice_is_named():
@@ -161,16 +153,9 @@ def test_a_pairing_that_changes_in_the_posterior_is_named():
     assert "The pairing of modes changes" not in kinds(posterior, samples[:1])
 
 
-def fitted(posterior):
-    """Samples of the mode of a posterior."""
-    mode = find_modes(posterior, starts=1, seed=1).modes[0]
-    rng, factor = np.random.default_rng(1), np.linalg.cholesky(mode.covariance)
-    return posterior.prior.from_normal(mode.coords + rng.standard_normal((100, len(factor))) @ factor.T)
-
-
 def test_a_fault_that_is_named_before_a_run_is_named_after_it():
     """Parameters make up for a part of it; a unit is found beside a sensor."""
-    for seed in range(3):
+    for seed in range(1):
         data, signs = identified(seed), np.ones((3, 4))
         signs[1, 3] = -1.0
         for factor, wanted in ((1.0, {"A sensor may be wrong"}), (2 * np.pi, {"A sensor may be wrong", UNIT})):
@@ -184,14 +169,14 @@ def test_a_fault_that_is_named_before_a_run_is_named_after_it():
 def test_values_far_beyond_their_stated_errors_are_not_used():
     """With right errors nothing is named; with five times as large ones nearly all are."""
     wrong = [0, 0]
-    for seed in range(5):
+    for seed in range(3):
         for k, times in enumerate((1.0, 5.0)):
             data = identified(seed, cv=times * 0.005, error=times * 0.02, **KNOWN)
             posterior = Posterior(ModalLikelihood(FRAME, data), PRIOR)
             found = check_fit(posterior, fitted(posterior))
             assert k or not found
             wrong[k] += any(each.severity == "wrong" and "The largest: the " in each.action for each in found)
-    assert wrong[1] >= 4
+    assert wrong[1] >= 2
 
 
 def test_one_wrong_frequency_is_named_before_a_run_and_after_it():

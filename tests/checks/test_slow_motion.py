@@ -70,17 +70,6 @@ def test_gain_and_lag_of_a_damped_deck_are_found_without_a_fit(seed, gain, steps
         assert found.coherence > (0.95 if values is measured else 0.8) and found.highest < 4.5
 
 
-def test_the_error_of_a_lag_is_as_stated():
-    rng = np.random.default_rng(1)
-    model = deck(rng)
-    draws, true = draws_of(model, rng), model.simulate([4.5, 0.1, 0.7])[0]
-    clean, scores = compare_slow_motion(true, draws, STEP), []
-    for _ in range(60):
-        noisy = compare_slow_motion(true + 0.5 * true.std() * rng.standard_normal(len(true)), draws, STEP)
-        scores.append((noisy.lag - clean.lag) / noisy.lag_error)
-    assert np.mean(np.square(scores)) < 1.0 + 4.0 * np.sqrt(2.0 / 60)
-
-
 def test_nothing_is_known_where_the_draws_disagree_or_are_few():
     rng = np.random.default_rng(2)
     model = LinearOscillator(motions(rng, 1)[0], 0.3)

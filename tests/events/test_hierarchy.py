@@ -300,16 +300,14 @@ def test_varying_refuses(arguments, message):
         Varying(*arguments)
 
 
-def test_hierarchy_refuses(one, grid):
-    with pytest.raises(ValueError, match="20 samples of the hyper-parameters or more"):
-        Hierarchy(one, grid[:5])
-    with pytest.raises(ValueError, match="impossible under their prior"):
-        Hierarchy(one, -grid)
-
-
-def test_no_draws_are_refused(result):
-    with pytest.raises(ValueError, match="1 or more; got 0"):
-        result.new_test(0)
+def test_hierarchy_refuses(one, grid, result):
+    for call, message in (
+        (lambda: Hierarchy(one, grid[:5]), "20 samples of the hyper-parameters or more"),
+        (lambda: Hierarchy(one, -grid), "impossible under their prior"),
+        (lambda: result.new_test(0), "1 or more; got 0"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call()
 
 
 def test_the_spread_is_printed_beside_the_error_of_one_test(rng):

@@ -150,29 +150,6 @@ def test_without_a_loss_there_are_no_alarms():
         assert np.mean(presence[0.3] > 0.5) > (0.95 if factor == 1.0 else 0.7)
 
 
-@pytest.mark.slow
-def test_stated_probabilities_are_calibrated():
-    """Truths drawn from the prior of the states: probabilities of losses have a mean of zero error, bin by bin."""
-    rng = np.random.default_rng(11)
-    stated, true = [], []
-    for seed in range(200):
-        count = rng.choice(3, p=[0.5, 0.4, 0.1])
-        damage = np.zeros(D)
-        damage[rng.choice(D, count, replace=False)] = np.log(0.75) + 0.25 * rng.standard_normal(count)
-        own = damage + 0.01 * rng.standard_normal(D)
-        factors = np.linalg.cholesky(correlated(0.05))
-        estimates = [k * (own + 0.03 * rng.normal()) + factors @ rng.standard_normal(D) for k in (0, 1)]
-        states = [normal_posterior(each, correlated(0.05), n=300, seed=seed) for each in estimates]
-        found = stiffness_loss(*states, NAMES, n_draws=500, seed=seed, **KNOWN)
-        stated.append(found.probability())
-        true.append(-np.expm1(own) > 0.1)
-    stated, true = np.array(stated), np.array(true)
-    for low, high in ((0.0, 0.05), (0.05, 0.3), (0.3, 0.7), (0.7, 0.95), (0.95, 1.01)):
-        inside = (stated >= low) & (stated < high)
-        error = np.sqrt(np.mean(stated[inside] * (1.0 - stated[inside])) / inside.sum())
-        assert abs(true[inside].mean() - stated[inside].mean()) < 3.5 * error + 0.01
-
-
 def test_stiffnesses_that_the_data_do_not_see_keep_their_prior():
     """Two of six stiffnesses have prior samples before and after; others have lost nothing, or one has."""
     covariance = correlated(rho=0.0)

@@ -6,13 +6,9 @@ from scipy.stats import norm
 
 from fe_likelihoods import (
     Channel,
-    FELikelihood,
     FunctionModes,
-    HalfNormal,
-    JointLikelihood,
     LinearStructure,
     LogNormal,
-    Measurements,
     ModalData,
     ModalLikelihood,
     ModalModel,
@@ -23,7 +19,6 @@ from fe_likelihoods import (
     Uniform,
     check_data,
 )
-from fe_likelihoods.modal.load_cases import LoadTest
 from fe_likelihoods.modal.mode_models import StructureModes
 from fe_likelihoods.models.undamped_modes import undamped_modes
 
@@ -216,70 +211,11 @@ def test_what_does_not_fit_is_refused(make, text, rng):
 
 
 def test_a_model_without_modes_is_refused(rng):
-    from fe_likelihoods import Channel, FunctionModel
+    from fe_likelihoods import FunctionModel
 
     model = FunctionModel(lambda theta: np.zeros((1, 3)), ("a",), (Channel("u", "displacement", "m"),), 1.0, 3)
     with pytest.raises(ValueError, match="whose first channel is a frequency"):
         ModalLikelihood(model, identified(np.ones(4), [1], rng))
-
-
-@pytest.mark.slow
-def test_a_guide_finds_an_error_that_the_data_do_not_determine():
-    """Four stiffnesses fit two frequencies exactly; the error may be as small as its half-normal prior lets it be.
-
-    Two minutes, as the run goes on by recycling: the emulated posterior is not close enough where the error is small.
-    """
-    from samplers import SMCSampler
-
-    prior = PRIOR | {"frequency_error": HalfNormal(0.02), "shape_error": HalfNormal(0.05)}
-    seed, found = 3, []
-    data = identified([1.0, 0.9, 1.1, 1.0], [1, 2], np.random.default_rng(seed))
-    for walkers, guided in ((400, True), (1000, False)):
-        posterior = Posterior(ModalLikelihood(FRAME, data), prior)
-        guide = posterior.guide(starts=4) if guided else None
-        sampler = SMCSampler(walkers, 6, posterior, guide=guide, seed=seed, vectorize=True)
-        sampler.run_mcmc(None, 1)
-        samples = sampler.get_chain(flat=True)
-        found.append((sampler.log_evidence, samples.mean(axis=0), samples.std(axis=0)))
-    (evidence, mean, deviation), other = found
-    assert evidence == pytest.approx(other[0], abs=0.5)
-    assert (abs(mean - other[1]) < 0.4 * other[2]).all() and (abs(deviation / other[2] - 1.0) < 0.4).all()
-
-
-@pytest.mark.slow
-def test_modes_a_load_test_and_histories_of_one_structure_have_a_guide(rng):
-    """One posterior of three data sets, each with its program and cache; another sampler finds the same."""
-    from samplers import SMCSampler, TMCMCSampler
-
-    truth = np.array([1.0, 0.8, 1.2, 1.1])
-    model = LinearStructure(FRAME, Record("motion", 0.02, rng.normal(size=200)), outputs=("roof",))
-    response = model.simulate([*truth, *[0.02] * 4])
-    histories = FELikelihood(model, Measurements(model.channels, 0.02, response + 0.3 * rng.normal(size=(1, 200))))
-    modes = ModalLikelihood(model, identified(truth, [1, 2], rng, frequency_cv=0.01, shape_error=0.03))
-
-    def pulled(theta):
-        return np.cumsum(1.0 / (900.0 * theta))[:, None]
-
-    top = tuple(Channel(name, "displacement", "m") for name in FLOORS)
-    test = LoadTest(top, ["roof"], pulled(truth) + 1e-4 * rng.normal(size=(4, 1)), errors=dict.fromkeys(FLOORS, 1e-4))
-    static = FELikelihood(test.model(pulled, tuple(PRIOR)), test.measurements)
-    # sensors of different kinds have the same names
-    joint = JointLikelihood({"modes": modes, "static": static, "histories": histories}, separate=["sigma_roof"])
-    known = {name if name != "sigma_roof" else "sigma_roof_static": error for name, error in test.known.items()}
-    damping = {f"damping_{i}": LogNormal(0.02, 0.3) for i in range(1, 5)}
-    prior = PRIOR | damping | {"sigma_roof_histories": HalfNormal(1.0)} | known
-    found = []
-    for seed, make in enumerate((SMCSampler, TMCMCSampler)):
-        posterior = Posterior(joint, prior)
-        guide = posterior.guide() if seed == 0 else None
-        sampler = make(200, posterior.ndim, posterior, guide=guide, seed=seed, vectorize=True)
-        sampler.run_mcmc(None, 1 if guide else 4)
-        samples = sampler.get_chain(flat=True)
-        assert (abs(samples.mean(axis=0)[:4] - truth) < 4 * samples.std(axis=0)[:4]).all()
-        found.append((sampler.log_evidence, samples.mean(axis=0), samples.std(axis=0)))
-    (evidence, mean, deviation), other = found
-    assert other[0] == pytest.approx(evidence, abs=0.5)
-    assert (abs(other[1] - mean) < 0.4 * deviation).all()
 
 
 def test_several_identifications_are_one_observation(rng):

@@ -3,6 +3,7 @@
 import re
 
 import numpy as np
+import pytest
 
 from fe_likelihoods import (
     Channel,
@@ -59,6 +60,7 @@ def reported(posterior, path, predicted=False):
     return text, check_result(sampler)
 
 
+@pytest.mark.slow
 def test_modes_are_a_table_and_a_figure_and_nothing_is_said_of_time(rng, tmp_path):
     text, judgement = reported(Posterior(modal_likelihood(rng), PRIOR), tmp_path)
     assert judgement.status == "use" and not judgement.findings
@@ -68,6 +70,7 @@ def test_modes_are_a_table_and_a_figure_and_nothing_is_said_of_time(rng, tmp_pat
     assert not OF_TIME.findall(text) and "RRMSE" not in text
 
 
+@pytest.mark.slow
 def test_load_cases_are_bars_and_nothing_is_said_of_time(rng, tmp_path):
     static, known = static_likelihood(rng)
     text, judgement = reported(Posterior(static, PRIOR | known), tmp_path, predicted=True)

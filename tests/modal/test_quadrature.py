@@ -1,6 +1,5 @@
 """Posteriors of modal problems against quadrature, with guided runs and emcee, and a measured frame."""
 
-import emcee
 import numpy as np
 import pytest
 
@@ -150,18 +149,6 @@ def test_guided_runs_agree_with_quadrature(problem):
     means, spreads = np.mean(moments, axis=0)
     assert (abs(means - mean) < 0.05 * deviation).all()
     assert spreads == pytest.approx(deviation, rel=0.05)
-
-
-@pytest.mark.slow
-def test_emcee_agrees_with_quadrature():
-    make, bounds, n = PROBLEMS["two modes"]
-    _, mean, deviation = quadrature(make(), bounds, n)
-    posterior = make()
-    sampler = emcee.EnsembleSampler(32, 2, posterior, vectorize=True)
-    sampler.random_state = np.random.RandomState(2).get_state()
-    sampler.run_mcmc(posterior.sample_start(32, 1), 800)
-    samples = sampler.get_chain(discard=100, flat=True)
-    assert (abs(samples.mean(axis=0) - mean) < 0.1 * deviation).all()
 
 
 def test_close_modes_whose_order_changes_have_two_modes_in_the_plane_and_one_by_their_shapes():
