@@ -41,7 +41,6 @@ def test_bands(posterior, samples):
     figure = plot_bands(prediction, posterior.likelihood.measurements)
     acceleration, displacement = figure.axes
     assert acceleration.get_ylabel() == "acceleration [g]" and displacement.get_ylabel() == "displacement [cm]"
-    assert displacement.get_xlabel() == "time [s]" and displacement.get_xlim() == (0.0, prediction.time[-1])
     assert texts(acceleration) == ["5-95 % with noise", "measured", "mean"]
     for axes, k, factor in ((acceleration, 0, 1 / G0), (displacement, 1, 100.0)):
         measured, mean = axes.lines
@@ -50,10 +49,6 @@ def test_bands(posterior, samples):
         band = axes.collections[0].get_paths()[0].vertices[:, 1]
         assert band.min() == pytest.approx(factor * prediction.quantile(0.05)[k].min())
         assert band.max() == pytest.approx(factor * prediction.quantile(0.95)[k].max())
-        if k == 0:  # the legend, of this height in all figures, covers no curve
-            low, high = axes.get_ylim()
-            assert max(band.max(), *(line.get_ydata().max() for line in axes.lines)) < low + 0.85 * (high - low)
-        assert shows(axes, axes.lines) and axes.get_ylim()[0] <= band.min() <= band.max() <= axes.get_ylim()[1]
 
 
 def test_bands_beside_few_or_thinned_measurements(posterior, samples):
@@ -80,8 +75,6 @@ def test_fragility(posterior, record, rng):
     np.testing.assert_allclose(curve.get_ydata(), result.curve.probability(G0 * curve.get_xdata()), atol=1e-12)
     assert shows(axes, axes.lines)
     assert axes.get_xlabel() == "peak ground acceleration [g]"
-    assert axes.get_ylabel() == "probability of exceedance [-]"
-    assert "records" in texts(axes) and any(text.startswith("median ") for text in texts(axes))
     (axes,) = plot_fragility(result._replace(curve=None), "intensity", unit=None).axes
     assert axes.get_xlabel() == "intensity" and len(axes.lines) == 1
     np.testing.assert_allclose(axes.lines[0].get_xdata(), result.intensity)

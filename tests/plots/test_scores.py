@@ -3,7 +3,6 @@
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from matplotlib.text import Text
 
 from fe_likelihoods.plots.scores import plot_scores
 from fe_likelihoods.prediction.scores import score_histories, score_values
@@ -55,24 +54,3 @@ def test_scores_that_do_not_belong_together_are_refused(rng):
             plot_scores(wrong)
     with pytest.raises(ValueError, match=r"divided by the measured values.*drift"):
         plot_scores(numbers(np.array([1.0, 0.0]), rng))
-
-
-def boxes(figure, artists):
-    figure.canvas.draw()
-    return [Text.get_window_extent(each) for each in artists if each.get_text()]  # of an annotation without its line
-
-
-def overlaps(found):
-    return [(i, j) for i, a in enumerate(found) for j, b in enumerate(found[:i]) if a.overlaps(b)]
-
-
-@pytest.mark.parametrize("n", [3, 40])
-def test_labels_of_axes_do_not_overlap(rng, n):
-    figure = plot_scores({f"EQ{k}": numbers(np.exp(rng.normal(size=2)), rng) for k in range(n)})
-    figure.canvas.draw()
-    labels = [axes.xaxis.label for axes in figure.axes] + [axes.yaxis.label for axes in figure.axes]
-    labels += figure.axes[0].get_yticklabels() + figure.axes[0].get_xticklabels()
-    labels += [axes.title for axes in figure.axes]
-    assert not overlaps(boxes(figure, labels))
-    assert figure.get_figheight() < 15.0 and figure.axes[1].get_window_extent().height > 100.0
-    plt.close(figure)

@@ -189,26 +189,14 @@ def test_slashes_in_names(tmp_path):
     assert "acc_top" in again["posterior_predictive"]
 
 
-@pytest.fixture(scope="module")
-def oscillator():
-    from fe_likelihoods import Channel, FELikelihood, FunctionModel, HalfNormal, Measurements
-
-    time = 0.05 * np.arange(80)
-    channels = [Channel("top", "displacement", "mm")]
-    model = FunctionModel(lambda theta: 0.05 * np.cos(6.0 * theta[0] * time)[None], ["stiffness"], channels, 0.05, 80)
-    noise = 0.002 * np.random.default_rng(1).standard_normal((1, 80))
-    measured = Measurements(model.channels, model.dt, model.simulate([1.1]) + noise)
-    return Posterior(
-        FELikelihood(model, measured), {"stiffness": TruncatedNormal(1.0, 0.3), "sigma_top": HalfNormal(0.01)}
-    )
-
-
-def test_what_is_refused(linear, runs, oscillator):
+def test_what_is_refused(linear, runs):
+    likelihood = likelihood_of(("a", "b"), np.random.default_rng(4), 60, SIGMA)
+    smaller = Posterior(likelihood, {name: linear.prior.distributions[name] for name in ("a", "b")})
     with pytest.raises(ValueError, match="chains of the same shape"):
         to_arviz([runs[0], run(linear, steps=1)])
     with pytest.raises(ValueError, match="no measured_data and no predictive_draws"):
         to_arviz(runs[0], Gaussian())
     with pytest.raises(ValueError, match="the posterior has 2 parameters, but the sampler 3"):
-        to_arviz(runs[0], oscillator)
+        to_arviz(runs[0], smaller)
     with pytest.raises(ValueError, match="draws must be"):
         to_arviz(runs, linear, draws=1)

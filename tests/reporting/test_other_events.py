@@ -79,14 +79,14 @@ def test_what_are_no_predictions_of_events_is_refused(vibrating, tmp_path):
     sampler, posterior = vibrating
     path = tmp_path / "report.html"
     measured = posterior.likelihood.measurements
-    with pytest.raises(ValueError, match="events must be a mapping of names"):
-        report(sampler, posterior, out=path, events=predicted(vibrating)["peaks"])
-    with pytest.raises(ValueError, match="expected the result of propagate for each event.*'second' is 3.0"):
-        report(sampler, posterior, out=path, events={"second": 3.0})
-    with pytest.raises(ValueError, match="'second' has no prediction; give the result of propagate"):
-        report(sampler, posterior, out=path, events={"second": {}})
-    with pytest.raises(ValueError, match="measured has third, .* no event has this name"):
-        report(sampler, posterior, out=path, events={"second": predicted(vibrating)}, measured={"third": measured})
-    with pytest.raises(ValueError, match="measured must be a mapping of the names of events"):
-        report(sampler, posterior, out=path, events={"second": predicted(vibrating)}, measured=measured)
+    known = {"second": predicted(vibrating)}
+    for options, message in (
+        ({"events": known["second"]["peaks"]}, "events must be a mapping of names"),
+        ({"events": {"second": 3.0}}, "expected the result of propagate for each event.*'second' is 3.0"),
+        ({"events": {"second": {}}}, "'second' has no prediction; give the result of propagate"),
+        ({"events": known, "measured": {"third": measured}}, "measured has third, .* no event has this name"),
+        ({"events": known, "measured": measured}, "measured must be a mapping of the names of events"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            report(sampler, posterior, out=path, **options)
     assert not path.exists()

@@ -240,16 +240,15 @@ def test_every_data_set_and_every_event_has_its_block():
 def test_what_does_not_fit_is_refused_before_anything_is_written(vibrating, tmp_path):
     sampler, posterior = vibrating
     out = tmp_path / "none.html"
-    with pytest.raises(ValueError, match="needs a sampler that has run"):
-        report(posterior, sampler, out=out)
-    with pytest.raises(ValueError, match="call run_mcmc|Call run_mcmc"):
-        report(SMCSampler(20, 3, posterior), posterior, out=out)
-    with pytest.raises(ValueError, match="unknown parameters mass"):
-        report(sampler, posterior, out=out, truth={"mass": 1.0})
-    with pytest.raises(ValueError, match="the chain has 3 parameters"):
-        report(sampler, Gaussian(ndim=2), out=out)
-    with pytest.raises(ValueError, match="result of propagate"):
-        report(sampler, posterior, "bands", out)
+    for arguments, options, message in (
+        ((posterior, sampler), {}, "needs a sampler that has run"),
+        ((SMCSampler(20, 3, posterior), posterior), {}, "call run_mcmc|Call run_mcmc"),
+        ((sampler, posterior), {"truth": {"mass": 1.0}}, "unknown parameters mass"),
+        ((sampler, Gaussian(ndim=2)), {}, "the chain has 3 parameters"),
+        ((sampler, posterior, "bands"), {}, "result of propagate"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            report(*arguments, out=out, **options)
     assert not out.exists()
 
 
