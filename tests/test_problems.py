@@ -47,10 +47,8 @@ def strong(data):
 def test_the_data_have_the_features_of_the_paper(data):
     record, measurements, attributes = data
     assert (record.dt, record.n_steps) == (1 / 256, 12800)
-    assert record.n_steps * record.dt == 50.0
     assert np.abs(record.acceleration).max() / G0 == pytest.approx(0.2, abs=0.02)
     assert (measurements.n_channels, measurements.n_steps, measurements.dt) == (2, 12800, 1 / 256)
-    assert [c.name for c in measurements.channels] == ["acceleration", "displacement"]
     assert 1.5 < np.abs(measurements.channel("displacement")).max() / INCH < 3.0
     # The velocity is zero at the end. A stochastic record easily has a drift of velocity.
     velocity = np.cumsum(record.acceleration) * record.dt
@@ -143,10 +141,6 @@ def failures(model, thetas):
     return [f"{theta}: {reason}" for theta, reason in zip(thetas, reasons, strict=True) if reason]
 
 
-def draws_of_the_papers_posterior(n, rng):
-    return TRUTH * (1 + PAPER_CV * rng.standard_normal((n, 5)))
-
-
 def test_strong_shaking_does_not_fail(strong, rng):
     draws = bridge_column_prior().rvs(100, rng)[:, :5]
     # One failure in a hundred is ten times the share that the slow test allows.
@@ -155,14 +149,15 @@ def test_strong_shaking_does_not_fail(strong, rng):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("which", "n", "allowed"), [("prior", 400, 2), ("posterior", 400, 0)])
-def test_simulations_do_not_fail_on_the_real_record(shared, rng, which, n, allowed):
+@pytest.mark.parametrize(("which", "allowed"), [("prior", 2), ("posterior", 0)])
+def test_simulations_do_not_fail_on_the_real_record(shared, rng, which, allowed):
     """Simulations that fail inside the bulk of the posterior would bias it."""
+    n = 400
     record = read_record(shared / "records" / REAL_RECORD).scale(0.85)
     model = RCColumn.lhpost(record)
-    draws = bridge_column_prior().rvs(n, rng)[:, :5] if which == "prior" else draws_of_the_papers_posterior(n, rng)
+    draws = TRUTH * (1 + PAPER_CV * rng.standard_normal((n, 5)))
+    draws = bridge_column_prior().rvs(n, rng)[:, :5] if which == "prior" else draws
     failed = [reason for part in np.split(draws, range(100, n, 100)) for reason in failures(model, part)]
-    print(f"\n{len(failed)} of {n} draws of the {which} failed: {failed}")
     assert len(failed) <= allowed, failed
 
 

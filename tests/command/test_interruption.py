@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.command.test_command import OSCILLATOR, ROOT, folder
+from tests.command.test_command import OSCILLATOR, ROOT, folder, function_settings
 
 __all__ = ["folder"]  # the fixture
 
@@ -75,13 +75,7 @@ def simulate(theta, record):
         time.sleep(0.3)
     return LinearOscillator(record, 0.8).simulate([*theta])
 """
-OWN = OSCILLATOR.replace(
-    'kind = "oscillator"\nperiod = "0.8 s"',
-    """kind = "function"
-function = "my_model.py:simulate"
-parameters = ["stiffness", "damping"]
-channels = {acceleration = "absolute acceleration [g]", displacement = "relative displacement [cm]"}""",
-)
+OWN = function_settings("my_model")
 
 
 @pytest.mark.slow

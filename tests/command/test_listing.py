@@ -173,22 +173,6 @@ def test_data_without_time_have_sections_of_their_own(tmp_path, text, section, g
     assert listed(path)[1][section] == {"file": str(path)} | given
 
 
-def test_channels_of_a_real_structure_in_a_zip_archive(shared):
-    folder = shared / "measured/painter_street_bridge"
-    output, lines = listed(folder / "petrolia_25apr1992_ce89324p.zip")
-    assert (
-        "23 channels" in output
-        and "CHAN 7: 360 DEG (STA CHN: 7) LOCATION: UNDERSIDE OF GIRDER AT CENTER BENT" in output
-    )
-    record, measured = read_as_listed(lines)
-    channels = [Channel(f"ch{k}", "acceleration", "g") for k in (1, 7)]
-    known = read_columns(folder / "petrolia_1992_mainshock/acc_cm_s2_dt0.02.csv", channels, ["ch1", "ch7"], "cm/s2")
-    found = measured.select(["ch1", "ch7"])
-    np.testing.assert_allclose(found.values, known.values, atol=1e-4)
-    np.testing.assert_array_equal(record.acceleration, found.values[0])
-    assert "ch7 is CHAN 7: 360 DEG" in measured.description
-
-
 @pytest.mark.parametrize(
     ("given", "message"),
     [

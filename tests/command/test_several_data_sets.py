@@ -98,6 +98,7 @@ def test_three_data_sets_are_one_posterior(settings_of):
     assert parts["load_test"].model.parameter_names == ("stiffness_1", "stiffness_2")
 
 
+@pytest.mark.slow
 def test_a_check_and_a_run_have_one_report(settings_of, tmp_path):
     said = call("check", "frame.toml", "--quiet")
     assert "mode  measured [Hz]" in said and "top: 2 values" in said and "roof: 300 samples" in said

@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from fe_likelihoods.command import structure
-from tests.command.test_command import OSCILLATOR, call, folder  # noqa: F401
+from tests.command.test_command import call, folder, function_settings  # noqa: F401
 
 FUNCTION = """
 from fe_likelihoods import LinearOscillator
@@ -14,13 +14,7 @@ from fe_likelihoods import LinearOscillator
 def simulate(theta, record):
     return LinearOscillator(record, 0.8).simulate([*theta])
 """
-OWN = OSCILLATOR.replace(
-    'kind = "oscillator"\nperiod = "0.8 s"',
-    """kind = "function"
-function = "strange_model.py:simulate"
-parameters = ["stiffness", "damping"]
-channels = {acceleration = "absolute acceleration [g]", displacement = "relative displacement [cm]"}""",
-)
+OWN = function_settings("strange_model")
 RESULTS = {".html", ".txt", ".csv", ".nc"}
 HOSTILE = "open('was_run', 'w').close()\n"
 
