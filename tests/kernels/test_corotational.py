@@ -5,6 +5,10 @@ import pytest
 
 from fe_likelihoods.kernels.corotational import add_to_stiffness, deformations
 from fe_likelihoods.kernels.jit import kernel
+from fe_likelihoods.kernels.static import Iteration, Position, apply_gravity, equilibrate
+
+from . import golden
+from .test_beam_column import stiffness_of_section
 
 LENGTH = 1.3
 # Basic stiffness K11 K12 K13 K22 K23 K33 of a fictitious linear element, without zero or equal entries.
@@ -93,3 +97,38 @@ def test_tangent_is_the_derivative_of_the_forces(rng, corotational, size):
         derivative = central(lambda w, q0=q0: element(w, q0, corotational=corotational)[0], u, 1e-5)
         np.testing.assert_allclose(stiffness, derivative, rtol=0, atol=2e-6)
         np.testing.assert_allclose(stiffness, stiffness.T, rtol=0, atol=1e-12)
+
+
+def amplified_deflection(n_elements, corotational=True):
+    """Return the tip deflection over P h^3 / 3 EI of a very slender cantilever with k h = 1, and the closed form.
+
+    The cantilever is so slender that its strains stay below 1e-6, where concrete and steel are linear to 1e-6.
+    """
+    column = golden.column(
+        golden.circle(),
+        n_elements=n_elements,
+        height=100 * golden.HEIGHT,
+        corotational=corotational,
+        element_tolerance=1e-24,
+    )
+    _, ei = stiffness_of_section(column)
+    h = 100 * golden.HEIGHT
+    weight, lateral = ei / h**2, 1e-5 * ei / h**2
+    load = golden.gravity(n_elements, weight)
+    assert apply_gravity(column, load, Iteration(1e-9, 20, 0)) == 0
+    position = Position(column.vectors[4], column.vectors[5], column.matrices[2])
+    load[-3] = lateral
+    assert equilibrate(column, position, load, -1, 0.0, -1, 1e-9, 20) < 1e-9
+    return position.u[-3] / (lateral * h**3 / (3 * ei)), 3 * (np.tan(1.0) - 1.0)
+
+
+def test_p_delta_amplification_converges_to_the_closed_form():
+    """Each element has a straight chord, so the convergence is of second order in the number of elements."""
+    n = np.array([2, 4, 8, 16])
+    deflections = [amplified_deflection(k) for k in n]
+    errors = np.array([abs(value - exact) for value, exact in deflections])
+    rates = np.log2(errors[:-1] / errors[1:])
+    assert np.all(np.abs(rates - 2.0) < 0.1)
+    assert errors[-1] < 2e-3 * deflections[-1][1]
+    # control: without geometric effects there is no amplification
+    assert amplified_deflection(4, corotational=False)[0] == pytest.approx(1.0, abs=1e-4)
