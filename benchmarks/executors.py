@@ -5,14 +5,17 @@ process, ``python -m benchmarks.executors WHAT POOL REPEATS WORKERS``, killed if
 """
 
 import contextlib
+import importlib
 import importlib.util
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 import tempfile
 import time
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -23,7 +26,7 @@ from fe_likelihoods.models.executable import ExecutableModel
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.simulation.executors import LocalPool, as_executor
 from fe_likelihoods.simulation.model import simulate_batch
-from tests.faults.pooled_run import NAMES, POOLS, WORKERS
+from tests.faults.pooled_run import CASES, NAMES, WORKERS
 from tests.faults.treacherous import (
     CHANNELS,
     DT,
@@ -42,6 +45,15 @@ MODULES = {"dask": "distributed", "mpi": "mpi4py", "loky": "joblib"}
 ITEMS = 1000
 LIMIT = 20.0  # seconds of a case, after which it hangs
 THREADS = 64
+SPAWN = multiprocessing.get_context("spawn")
+POOLS = {
+    "local": CASES["local"][1],
+    "executor": lambda: ProcessPoolExecutor(WORKERS, mp_context=SPAWN),
+    "multiprocessing": lambda: SPAWN.Pool(WORKERS),
+    "loky": lambda: importlib.import_module("joblib.externals.loky").get_reusable_executor(WORKERS),
+    "dask": CASES["dask"][1],
+    "mpi": lambda: importlib.import_module("mpi4py.futures").MPIPoolExecutor(WORKERS),
+}
 
 
 def executors(repeats: int) -> list[Row]:

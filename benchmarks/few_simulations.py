@@ -1,10 +1,8 @@
 """Posteriors from a few hundred simulations: samplers with a budget on problems whose answers are known.
 
-The problems are the small posteriors of `tests.statistics.hard_posteriors`, whose references are found by brute force
-(ten seconds each, kept in ``results/few_simulations.json``), and those of `few_simulations_problems`, whose references
-are stored in ``few_simulations_references.json``, each with its method: importance sampling from the known modes, a
-long run of the default sampler, or quadrature. The code that made them is at the git tag ``studies-0.3``. No simulation
-is shared between references and runs.
+The references of the problems are stored in ``few_simulations_references.json``, each with its method: importance
+sampling from the known modes or by one annealing per mode, a long run of the default sampler, or quadrature. The code
+that made them is at the git tag ``studies-0.3``. No simulation is shared between references and runs.
 
 Methods: ``guide`` is ``SMCSampler(100, ndim, posterior, vectorize=True, guide=posterior.guide(), max_simulations=N)``,
 ``default`` the sampler with 500 walkers and without budget.
@@ -23,16 +21,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fe_likelihoods import Posterior
-from tests.statistics.brute_force import Reference, reference
-from tests.statistics.guided_runs import compare, run
-from tests.statistics.hard_posteriors import CASES
 
 from .few_simulations_problems import PROBLEMS
+from .guided_runs import compare, run
 
 __all__ = ["few_simulations", "reference_of"]
 
 FILE = Path(__file__).with_name("few_simulations_references.json")
-BRUTE_FORCE = Path("results") / "few_simulations.json"
 METHODS = ("guide", "default")
 DEFAULT = ("few_samples", "two_modes", "banana", "oscillator", "column4", "twin")
 
@@ -57,7 +52,6 @@ class Run(NamedTuple):
     sd: float | None = None
     share: float | None = None
     wall_s: float | None = None
-    own_CPU_s: float | None = None
 
 
 def few_simulations(
@@ -73,20 +67,16 @@ def few_simulations(
     repeats : int
         Number of seeds, of data and sampler.
     problems : tuple of str
-        Names in `CASES` and `PROBLEMS`.
+        Names in `PROBLEMS`.
     budgets : tuple of int
         Largest numbers of simulations.
     methods : tuple of str
         Some of `METHODS`.
     """
-    for name in _known(problems, (*CASES, *PROBLEMS)):
+    for name in _known(problems, tuple(PROBLEMS)):
         for method in _known(methods, METHODS):
             for budget in budgets if method != "default" else (0,):
                 for seed in range(1, repeats + 1):
-                    missing = PROBLEMS[name].needs() if name in PROBLEMS else ""
-                    if missing:
-                        yield Run(name, seed, method, budget, missing)
-                        break
                     yield _one(name, method, budget, seed)
 
 
@@ -96,15 +86,8 @@ def _known(names: tuple[str, ...], known: tuple[str, ...]) -> tuple[str, ...]:
     return names
 
 
-def _posterior(name: str, seed: int) -> tuple[Posterior, Any]:
-    """Posterior, and the function that gives the number of the mode of samples."""
-    if name in CASES:
-        return CASES[name].posterior(seed, name), CASES[name].label
-    return PROBLEMS[name].posterior(seed), PROBLEMS[name].labels
-
-
 def _one(name: str, method: str, budget: int, seed: int) -> Run:
-    posterior, labels = _posterior(name, seed)
+    posterior = PROBLEMS[name].posterior(seed)
     known = reference_of(name, seed, posterior)
     if method == "default":
         outcome = run(posterior, seed, None, guided=False, nwalkers=500)
@@ -113,7 +96,7 @@ def _one(name: str, method: str, budget: int, seed: int) -> Run:
     start = name, seed, method, budget
     if outcome.failed:
         return Run(*start, outcome.failed)
-    errors = None if known is None else compare(outcome, known, labels)
+    errors = None if known is None else compare(outcome, known, PROBLEMS[name].labels)
     cost = outcome.weighted, outcome.simulations, outcome.effective_sample_size
     evidence = outcome.log_evidence, outcome.log_evidence_error
     if errors is None:
@@ -121,7 +104,7 @@ def _one(name: str, method: str, budget: int, seed: int) -> Run:
     else:
         against = errors.log_evidence, errors.log_evidence_z, errors.mean, errors.sd, errors.share
         row = Run(*start, errors.judgement, outcome.status, *cost, *evidence, *against)
-    return row._replace(wall_s=outcome.seconds, own_CPU_s=outcome.overhead)
+    return row._replace(wall_s=outcome.seconds)
 
 
 # ---------------------------------------------------------------- references
@@ -129,32 +112,14 @@ def _one(name: str, method: str, budget: int, seed: int) -> Run:
 
 def reference_of(name: str, seed: int, posterior: Posterior) -> Any:
     """Reference of a problem and seed, or None. It is of the posterior: data may differ in their last bits."""
-    if name in CASES:
-        return _by_brute_force(name, seed)
     if PROBLEMS[name].exact is not None:
         return PROBLEMS[name].exact(posterior)
-    entry = load().get(key_of(name, seed))
+    entry = load().get(f"{name.removesuffix('_jacobian')} {seed}")  # derivatives do not change a posterior
     if entry is None:
         return None
     return SimpleNamespace(**{key: np.array(v) if isinstance(v, list) else v for key, v in entry.items()})
 
 
-def _by_brute_force(name: str, seed: int) -> Reference:
-    """Reference of a small posterior, computed once."""
-    kept = json.loads(BRUTE_FORCE.read_text()) if BRUTE_FORCE.exists() else {}
-    key = f"{name} {seed}"
-    if key not in kept:
-        kept[key] = [np.asarray(value).tolist() for value in reference(CASES[name], seed)]
-        BRUTE_FORCE.parent.mkdir(parents=True, exist_ok=True)
-        BRUTE_FORCE.write_text(json.dumps(kept))
-    return Reference(*[np.array(value) if isinstance(value, list) else value for value in kept[key]])
-
-
 def load() -> dict[str, dict[str, Any]]:
     """The stored references."""
     return json.loads(FILE.read_text())
-
-
-def key_of(name: str, seed: int) -> str:
-    """Key of a problem and seed: measured data have one reference, and derivatives do not change a posterior."""
-    return f"{name.removesuffix('_jacobian')} {1 if PROBLEMS[name].measured else seed}"

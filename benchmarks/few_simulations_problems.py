@@ -1,7 +1,6 @@
 """Posteriors on which few simulations are counted: every problem is a function of a seed.
 
-Seed 1 is the bundled data set where there is one; other seeds have new noise. Measured data are the same for all
-seeds.
+Seed 1 is the bundled data set where there is one; other seeds have new noise.
 """
 
 from collections.abc import Callable
@@ -22,9 +21,9 @@ from fe_likelihoods import (
     TruncatedNormal,
     problems,
 )
-from tests import opensees_frame
+from tests.statistics.hard_posteriors import CASES
 
-from . import many_stiffnesses, tested_column
+from . import many_stiffnesses
 
 __all__ = ["PROBLEMS", "Problem", "oscillator"]
 
@@ -42,10 +41,6 @@ class Problem(NamedTuple):
         Simulations of the whole record in which 100 effective samples are wanted.
     labels : callable, optional
         Function of samples (n, ndim) that returns the number of the mode (n,).
-    needs : callable
-        Returns why the problem cannot be run here, or an empty string.
-    measured : bool
-        Whether the data are measured ones, the same for every seed, so that all seeds have one reference.
     exact : callable, optional
         Function of the posterior that returns its `Reference` by quadrature, at once.
     """
@@ -54,8 +49,6 @@ class Problem(NamedTuple):
     posterior: Callable[[int], Posterior]
     goal: int
     labels: Callable[[np.ndarray], np.ndarray] | None = None
-    needs: Callable[[], str] = str
-    measured: bool = False
     exact: Callable[[Posterior], Any] | None = None
 
 
@@ -120,23 +113,6 @@ PROBLEMS = {
     ),
     "column4": Problem("bridge column, one sample in 4, 5 parameters", column_one_in_four, 400),
     "column": Problem("bridge column, all data, 5 parameters", column, 750),
-    "opensees": Problem(
-        "OpenSees frame of fiber beams, 5 parameters", opensees_frame.posterior, 500, needs=opensees_frame.missing
-    ),
-    "lehman_white": Problem(
-        "tested column (Lehman 415), 7 parameters, white noise",
-        tested_column.white,
-        800,
-        needs=tested_column.missing,
-        measured=True,
-    ),
-    "lehman_ar1": Problem(
-        "tested column (Lehman 415), 7 parameters and 2 of autoregressive noise",
-        tested_column.autoregressive,
-        800,
-        needs=tested_column.missing,
-        measured=True,
-    ),
 }
 PROBLEMS |= {
     f"shear{storeys}{suffix}": Problem(
@@ -147,6 +123,7 @@ PROBLEMS |= {
     for storeys, goal in ((10, 200), (20, 400), (30, 600), (50, 1000))
     for suffix in ("", "_jacobian")
 }
+PROBLEMS |= {name: Problem(case.what, case.posterior, 500, case.label) for name, case in CASES.items()}
 PROBLEMS |= {
     name: Problem(
         f"only the product E h^3 is identified, {name}",

@@ -20,6 +20,7 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -30,30 +31,12 @@ from fe_likelihoods.units import G0, to_si
 if TYPE_CHECKING:  # the process that runs OpenSees does not have to import the compiled model
     from fe_likelihoods.models.rc_column import RCColumn
 
-__all__ = ["PeerColumn", "Response", "peer_of", "push", "require_opensees", "shake"]
+__all__ = ["Response", "peer_of", "push", "require_opensees", "shake"]
 
 KIP, INCH, KSI = (to_si(1.0, unit).item() for unit in ("kip", "in", "ksi"))
 TO_MASS, GRAVITY = KIP / INCH, G0 / INCH
 CORE, COVER, STEEL = 1, 2, 3  # material tags
 MAX_ITERATIONS = 50
-
-
-class PeerColumn(NamedTuple):
-    """Input of OpenSees in kip, inch and second."""
-
-    core: tuple  # Concrete04: fc, eps_c, eps_cu (negative), Ec, ft, eps_tu, beta
-    cover: tuple
-    steel: tuple  # ReinforcingSteel: fy, fu, Es, Esh, eps_sh, eps_u
-    fibers: np.ndarray  # (3, n): y, area, material (CORE, COVER, STEEL)
-    mass: tuple  # along x, along y, rotational
-    node_masses: tuple  # of the column itself, from the first node above the base
-    axial_load: float
-    a0: float
-    a1: float
-    height: float
-    n_elements: int
-    n_points: int
-    geometry: str  # "Corotational" or "Linear"
 
 
 class Response(NamedTuple):
@@ -80,8 +63,8 @@ def why_no_opensees() -> str:
     return f"openseespy does not start (it needs libblas3 and liblapack3): {last}" if probe.returncode else ""
 
 
-def peer_of(model: RCColumn, theta: np.ndarray) -> PeerColumn:
-    """Return the column of `model` at multiples `theta` of its nominal parameters."""
+def peer_of(model: RCColumn, theta: np.ndarray) -> SimpleNamespace:
+    """Input of OpenSees in kip, inch and second: the column at multiples `theta` of its nominal parameters."""
     values = dict(model.nominal)
     for name, factor in zip(model.parameters, theta, strict=True):
         values[name] *= float(factor)
@@ -98,13 +81,15 @@ def peer_of(model: RCColumn, theta: np.ndarray) -> PeerColumn:
         for part, tag in ((core, CORE), (cover, COVER), (bars, STEEL))
     ]
     mass = values["mass"] / TO_MASS
-    return PeerColumn(
+    return SimpleNamespace(
+        # Concrete04: fc, eps_c, eps_cu (negative), Ec, ft, eps_tu, beta
         core=(-fc * confinement.strength_ratio, -core_peak, -max(confinement.ultimate_strain, 1.05 * core_peak))
         + tension,
         cover=(-fc, -peak, -max(concrete.ultimate_strain, 1.5 * peak)) + tension,
+        # ReinforcingSteel: fy, fu, Es, Esh, eps_sh, eps_u
         steel=tuple(values[name] / KSI for name in ("fy", "fu", "Es", "Esh"))
         + (steel.hardening_strain, steel.ultimate_strain),
-        fibers=np.concatenate(fibers).T,
+        fibers=np.concatenate(fibers).T,  # (3, n): y, area, material
         mass=(mass, mass, model.rotational_inertia / (KIP * INCH)),
         node_masses=tuple(
             np.append(np.ones(model.n_elements - 1), 0.5) * model.column_mass / model.n_elements / TO_MASS
@@ -123,7 +108,7 @@ Recorders = Sequence[tuple]  # arguments of eleResponse, with the index of the v
 
 
 def shake(
-    column: PeerColumn, acceleration: np.ndarray, dt: float, tolerance: float = 1e-10, recorders: Recorders = ()
+    column: SimpleNamespace, acceleration: np.ndarray, dt: float, tolerance: float = 1e-10, recorders: Recorders = ()
 ) -> Response:
     """Apply gravity, then a base acceleration (n,) [in/s²] with step `dt` [s], in a separate process.
 
@@ -133,7 +118,7 @@ def shake(
     return _in_process("_shake", column, np.asarray(acceleration, dtype=float), dt, tolerance, tuple(recorders))
 
 
-def push(column: PeerColumn, targets: np.ndarray, tolerance: float = 1e-10, recorders: Recorders = ()) -> Response:
+def push(column: SimpleNamespace, targets: np.ndarray, tolerance: float = 1e-10, recorders: Recorders = ()) -> Response:
     """Apply gravity, then move the top through `targets` (n,) [in], one step each, in a separate process."""
     return _in_process("_push", column, np.asarray(targets, dtype=float), tolerance, tuple(recorders))
 
@@ -180,7 +165,7 @@ def _analyse(ops, tolerance: float) -> None:
     ops.algorithm("Newton")
 
 
-def _build(ops, column: PeerColumn, tolerance: float) -> None:
+def _build(ops, column: SimpleNamespace, tolerance: float) -> None:
     """Build the column and apply its gravity load; the clock is reset to zero."""
     n = column.n_elements
     ops.wipe()
@@ -214,7 +199,7 @@ def _build(ops, column: PeerColumn, tolerance: float) -> None:
     ops.loadConst("-time", 0.0)
 
 
-def _shake(ops, column: PeerColumn, acceleration: np.ndarray, dt: float, tolerance: float, recorders) -> Response:
+def _shake(ops, column: SimpleNamespace, acceleration: np.ndarray, dt: float, tolerance: float, recorders) -> Response:
     _build(ops, column, tolerance)
     top = column.n_elements + 1
     ops.rayleigh(column.a0, 0.0, 0.0, column.a1)
@@ -243,7 +228,7 @@ def _shake(ops, column: PeerColumn, acceleration: np.ndarray, dt: float, toleran
     return Response(response[:, :done], seconds, recorded[:done])
 
 
-def _push(ops, column: PeerColumn, targets: np.ndarray, tolerance: float, recorders) -> Response:
+def _push(ops, column: SimpleNamespace, targets: np.ndarray, tolerance: float, recorders) -> Response:
     _build(ops, column, tolerance)
     top = column.n_elements + 1
     ops.timeSeries("Linear", 2)

@@ -23,22 +23,17 @@ class SimulatedCluster:
     """A log-density on simulated workers; `target` is the log-density of a batch of points (n, ndim).
 
     `length` is a function of points (n, ndim) that returns how long their evaluations take (n,). `now` is the time of
-    the clock, `busy` the time of all evaluations so far, `evaluations` their number.
+    the clock, `evaluations` the number of all evaluations so far.
     """
 
     def __init__(self, target, workers: int, length: Callable[[np.ndarray], np.ndarray]):
         self._target, self.workers, self._length = target, workers, length
         self.ndim, self.log_prior, self.sample_prior = target.ndim, target.log_prior, target.sample_prior
         self.fast_parameters = getattr(target, "fast_parameters", ())
-        self.now = self.busy = 0.0
+        self.now = 0.0
         self.evaluations = 0
         self._free = [0.0] * workers
         self._running: list[tuple[float, int, float]] = []
-
-    @property
-    def utilisation(self) -> float:
-        """Share of the time of all workers in which they were busy."""
-        return self.busy / (self.workers * self.now)
 
     def __call__(self, coords: np.ndarray) -> np.ndarray:
         """Log-densities (n,) of a batch, when all of it is finished."""
@@ -60,7 +55,6 @@ class SimulatedCluster:
             end = max(heapq.heappop(self._free), self.now) + length
             heapq.heappush(self._free, end)
             heapq.heappush(self._running, (end, ticket, value))
-            self.busy += length
         return tickets
 
     def collect(self) -> list[tuple[int, float]]:

@@ -4,15 +4,13 @@ It measures the checkout in the current folder: lines by room beside their budge
 `run_mcmc` (included) to the user's function (excluded), counted while the function runs.
 """
 
-import ast
 import sys
+import traceback
 import warnings
-from importlib import import_module
 from pathlib import Path
 
-import numpy as np
-
-from tests.prose import docstrings
+import samplers
+from tests.contract.targets import Gaussian
 
 ROOT = Path.cwd()
 BUDGETS = {  # lines of Python files, docstrings included
@@ -46,81 +44,43 @@ BUDGETS = {  # lines of Python files, docstrings included
     "benchmarks": 2500,
     "tutorials": 2000,
 }
-WALKERS = 300  # enough that SMCSampler recycles
 
 
-def lines_of(folder: str) -> tuple[int, int]:
-    """Lines, and lines of code (no blank lines, comments and docstrings), of the Python files of a folder."""
-    lines = code = 0
-    for path in sorted((ROOT / folder).rglob("*.py")):
-        text = path.read_text()
-        prose = {n for node in docstrings(ast.parse(text)) for n in range(node.lineno, node.end_lineno + 1)}
-        numbered = list(enumerate(text.splitlines(), 1))
-        lines += len(numbered)
-        code += sum(bool(s := line.strip()) and s[0] != "#" and n not in prose for n, line in numbered)
-    return lines, code
+def lines_of(folder: str) -> int:
+    """Lines of the Python files of a folder."""
+    return sum(len(path.read_text().splitlines()) for path in (ROOT / folder).rglob("*.py"))
 
 
-class Normal:
-    """Standard normal prior and a Gaussian likelihood; notes the stack at each call."""
+class Watched(Gaussian):
+    """Notes the deepest stack from `run_mcmc` to its calls, as files of frames."""
 
-    def __init__(self):
-        self.stacks: list[list[str]] = []
-
-    def log_prior(self, x):
-        return -0.5 * np.sum(x**2, axis=-1) - 1.5 * np.log(2 * np.pi)
-
-    def sample_prior(self, n, random):
-        return random.standard_normal((n, 3))
+    deepest = ()
 
     def __call__(self, x):
-        self.stacks.append(stack_to("run_mcmc"))
-        return self.log_prior(x) - 0.5 * np.sum((x - 0.7) ** 2, axis=-1) / 0.1**2
-
-
-def stack_to(name: str) -> list[str]:
-    """Files of the frames between the caller and the outermost frame of this name, which is included."""
-    files, found, frame = [], 0, sys._getframe(2)
-    while frame is not None:
-        files.append(frame.f_code.co_filename)
-        found = len(files) if frame.f_code.co_name == name else found
-        frame = frame.f_back
-    return files[:found]
-
-
-def describe(stacks: list[list[str]]) -> str:
-    """Frames and distinct files of the deepest stack."""
-    stack = max(stacks, key=len)
-    return f"{len(stack)} frames in {len(set(stack))} files"
-
-
-def frames_of(sampler: type) -> list[str]:
-    """Deepest stacks of the two parts of a run: annealing, and steps at beta = 1."""
-    posterior, found = Normal(), []
-    run = sampler(WALKERS, 3, posterior)
-    for start, steps in ((np.random.default_rng(1).standard_normal((WALKERS, 3)), 0), (None, 3)):
-        posterior.stacks.clear()
-        run.run_mcmc(start, steps)
-        found.append(describe(posterior.stacks))
-    return found
+        codes = [frame.f_code for frame, _ in traceback.walk_stack(sys._getframe(1))]
+        first = max(k for k, code in enumerate(codes) if code.co_name == "run_mcmc")
+        self.deepest = max(self.deepest, [code.co_filename for code in codes[: first + 1]], key=len)
+        return super().__call__(x)
 
 
 def rows():
     """Pairs of label and value, in the order of the table."""
     for folder, budget in BUDGETS.items():
-        lines, code = lines_of(folder)
-        yield f"{folder}: lines, budget, lines of code", f"{lines:6d} {budget:6d} {code:6d}"
+        yield f"{folder}: lines, budget", f"{lines_of(folder):6d} {budget:6d}"
     pages = [path for path in (ROOT / "docs").rglob("*.rst") if not {"api", "tutorials", "_build"} & set(path.parts)]
     words = sum(len(path.read_text().split()) for path in pages)
     yield "docs: pages, words, budget", f"{len(pages)} {words} 45000"
     yield "README: words", str(len((ROOT / "README.md").read_text().split()))
-    for name in ("SMCSampler", "TMCMCSampler"):
-        annealing, final = frames_of(getattr(import_module("samplers"), name))
-        yield f"{name}: run_mcmc to the function, annealing, at beta = 1", f"{annealing}; {final}"
+    for Sampler in (samplers.SMCSampler, samplers.TMCMCSampler):
+        run = Sampler(300, 3, posterior := Watched())  # enough walkers that SMCSampler recycles
+        for part, steps in (("annealing", 0), ("at beta = 1", 3)):
+            posterior.deepest = ()
+            run.run_mcmc(None, steps)
+            frames = f"{len(posterior.deepest)} frames in {len(set(posterior.deepest))} files"
+            yield f"{Sampler.__name__}: run_mcmc to the function, {part}", frames
 
 
 if __name__ == "__main__":
-    sys.path.insert(0, str(ROOT))
     warnings.simplefilter("ignore")
     for label, value in rows():
         print(f"{label:<70} {value}", flush=True)

@@ -244,31 +244,6 @@ def test_finished_chunks_of_an_interrupted_batch_are_stored(path, rng, monkeypat
 # processes and threads ------------------------------------------------------------------------------------------------
 
 
-def _simulate_some(likelihood, thetas, results):
-    results.put((likelihood.misfit(thetas), likelihood.simulations, likelihood.simulator.disk_hits))
-
-
-@pytest.mark.parametrize("method", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
-def test_other_processes_share_the_file(path, thetas, method):
-    if method not in multiprocessing.get_all_start_methods():
-        pytest.skip(f"NO {method} ON THIS SYSTEM")
-    likelihood = likelihood_of(Line(), path)
-    expected = likelihood.misfit(thetas[:200])
-    context = multiprocessing.get_context(method)
-    results = context.Queue()
-    process = context.Process(target=_simulate_some, args=(likelihood, thetas, results))
-    process.start()
-    misfit, simulations, disk_hits = results.get(timeout=60)
-    process.join(60)
-    assert process.exitcode == 0
-    np.testing.assert_array_equal(misfit[:200], expected)
-    # a forked process has a copy of the cache in memory, a spawned one reads from disk
-    assert (simulations, disk_hits) == (300, 0 if method == "fork" else 200)
-    likelihood.misfit(thetas)  # the rows of the other process
-    assert likelihood.simulations == 200
-    assert likelihood.simulator.disk_hits == 100
-
-
 def test_forks_while_threads_write(path, rng):
     """A lock held by another thread, or an inherited connection, would block or break the child."""
     if not hasattr(os, "fork"):

@@ -12,7 +12,7 @@ from fe_likelihoods.noise.residuals import lag_one_sums
 from fe_likelihoods.noise.statistics import sums_of_squares
 from fe_likelihoods.priors.distributions import TruncatedNormal
 from samplers import SMCSampler
-from tests.statistics.case import HardPosterior
+from tests.statistics.hard_posteriors import HardPosterior
 
 
 @pytest.mark.parametrize("statistic", [sums_of_squares, lag_one_sums])
@@ -54,15 +54,8 @@ def _linear(theta):
 @pytest.mark.slow
 def test_a_run_does_not_hold_its_responses_in_memory():
     """All responses have 310 MiB; all copies of them had 840."""
-    n_channels, n_steps = 40, 5000
     prior = {name: TruncatedNormal(1.0, 0.3) for name in ("a", "b")}
-    size = {"n_steps": n_steps, "n_channels": n_channels}
-    shapes = HardPosterior("linear", prior, _linear, (1.1, 0.9), **size).shapes
-
-    def respond(theta):
-        return np.tensordot(theta, shapes, axes=1)
-
-    posterior = HardPosterior("linear", prior, respond=respond, truth=(1.1, 0.9), **size).posterior(1)
+    posterior = HardPosterior("linear", prior, _linear, (1.1, 0.9), n_steps=5000, n_channels=40).posterior(1)
     posterior.likelihood.simulator.response_memory.most = 2**24
     guide, limit = posterior.guide(), 400
     sampler = SMCSampler(100, 2, posterior, vectorize=True, guide=guide, max_simulations=limit, seed=1)

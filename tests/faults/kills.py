@@ -1,4 +1,4 @@
-"""Kills by signal 9, after which the same script is started again until it ends: ``python -m tests.faults.kills``.
+"""Kills by signal 9, after which the same script is started again until it ends.
 
 Kills come at a chosen event of a forked process: before, within or after a write to the record or to the HDF5 file
 (whose writes go through a Python file), or in an evaluation. Chain, log-probabilities, blobs, counts, failures, ladder,
@@ -6,7 +6,6 @@ evidence and verdict must be those of a run that was not killed, and no evaluati
 running.
 """
 
-import argparse
 import contextlib
 import io
 import logging
@@ -16,17 +15,15 @@ import random
 import shutil
 import signal
 import tempfile
-import time
 import traceback
 import warnings
-from collections import Counter
 from pathlib import Path
 
 import h5py
 
 import samplers.evaluation.evaluator
 import samplers.record
-from tests.faults.resumable_run import BURN_IN, KINDS, STEPS, N, calls, go_on, make, outcome
+from tests.faults.resumable_run import BURN_IN, STEPS, calls, go_on, make, outcome
 
 COMPARED = 2  # points by which a new sampler compares its function with the record
 
@@ -153,7 +150,7 @@ def whole_outcomes(kind, folder):
     return found, count
 
 
-def evaluated_again(log, kind):
+def evaluated_again(log):
     """Points that were evaluated again although they were known: each process may repeat what ran, and compare."""
     by_process: dict[int, list[list[bytes]]] = {}
     for process, points in calls(log):
@@ -162,9 +159,7 @@ def evaluated_again(log, kind):
     for made in by_process.values():
         points = {point for call in made for point in call}
         lost += max(len((points & seen) - running) - COMPARED, 0)
-        # all points of a submission, or those that have ended while the sampler computed proposals
-        last = {"asynchronous": 4 * N, "map": 8}.get(kind, 1)
-        running |= {point for call in made[-last:] for point in call}
+        running |= set(made[-1])
         seen |= points
     return lost
 
@@ -190,7 +185,7 @@ def trial(kind, folder, whole, count, choose, number):
     if status != 0:
         return kills, f"stuck: {said.decode()}"
     found, steps = pickle.loads(said)
-    if lost := evaluated_again(folder / "log", kind):
+    if lost := evaluated_again(folder / "log"):
         return kills, f"lost: {lost} evaluations were made again"
     if kind == "reset":  # evaluations of a burn-in that was given up count, and so in the verdict
         found, whole = found[:5], [each[:5] for each in whole]
@@ -200,49 +195,15 @@ def trial(kind, folder, whole, count, choose, number):
     return kills, ""
 
 
-# ---------------------------------------------------------------------- the campaign
-
-
-def kill(number, kinds=KINDS, seed=1, show=print):
-    """Make kills of each kind of run; returns counts and messages of what went wrong.
-
-    Counts are by (kind, "kills"), (kind, "runs"), and (kind, "stuck" | "wrong" | "lost").
-    """
-    choose, counts, messages = random.Random(seed), Counter(), []
-    folder = Path(tempfile.mkdtemp(dir="/dev/shm" if os.access("/dev/shm", os.W_OK) else None))
-    try:
-        for kind in kinds:
-            whole, count = whole_outcomes(kind, folder / f"whole {kind}")
-            while counts[kind, "kills"] < number:
-                where = folder / "trial"
-                kills, wrong = trial(kind, where, whole, count, choose, choose.randint(1, 3))
-                counts[kind, "kills"] += kills
-                counts[kind, "runs"] += 1
-                if wrong:
-                    counts[kind, wrong.split(":")[0]] += 1
-                    messages.append(f"{kind}: {wrong}")
-                    show(messages[-1])
-                    if counts[kind, "runs"] > 20 + 3 * number:
-                        break
-                shutil.rmtree(where)
-            show(kind, *(f"{counts[kind, what]} {what}" for what in ("kills", "runs", "stuck", "wrong", "lost")))
-    finally:
-        shutil.rmtree(folder)
-    return counts, messages
-
-
-def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("kinds", nargs="*", default=KINDS, help=", ".join(KINDS))
-    parser.add_argument("--kills", type=int, default=60, help="of each kind")
-    parser.add_argument("--seed", type=int, default=1)
-    args = parser.parse_args()
-    start = time.perf_counter()
-    counts, messages = kill(args.kills, args.kinds, args.seed, lambda *words: print(*words, flush=True))
-    total = {what: sum(n for (_, w), n in counts.items() if w == what) for what in ("kills", "stuck", "wrong", "lost")}
-    print(f"{total} in {time.perf_counter() - start:.0f} s")
-    return 1 if messages else 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+def kill(number, kind, seed):
+    """Make kills of a kind of run; returns how many there were, and messages of what went wrong."""
+    choose, made, messages = random.Random(seed), 0, []
+    with tempfile.TemporaryDirectory(dir="/dev/shm" if os.access("/dev/shm", os.W_OK) else None) as folder:
+        whole, count = whole_outcomes(kind, Path(folder, "whole"))
+        while made < number and len(messages) < number:
+            where = Path(folder, "trial")
+            kills, wrong = trial(kind, where, whole, count, choose, choose.randint(1, 3))
+            made += kills
+            messages += [wrong] * bool(wrong)
+            shutil.rmtree(where)
+    return made, messages

@@ -1,14 +1,13 @@
 """Runs that a test can kill: their posterior writes down every point, counts failures, and returns blobs."""
 
 import os
-import time
 from concurrent.futures import Executor, Future
 from pathlib import Path
 
 import emcee
 import numpy as np
 
-from samplers import SMCSampler, TMCMCSampler
+from samplers import SMCSampler
 from tests.contract.targets import WithBlobs
 from tests.tempering.guides import SearchingGuide
 
@@ -27,7 +26,6 @@ class InOrder(Executor):
 KINDS = {
     "smc": (SMCSampler, {"recycle": True}),
     "moves": (SMCSampler, {"recycle": False}),
-    "tmcmc": (TMCMCSampler, {}),
     "guided": (SMCSampler, {"guide": SearchingGuide}),
     "map": (SMCSampler, {"recycle": True}),
     "asynchronous": (SMCSampler, {"recycle": True, "asynchronous": True, "pool": InOrder}),
@@ -61,14 +59,14 @@ class Queue:
 
 
 class Watched(WithBlobs):
-    """Writes the points of every call to a file, fails for a few of them, and takes time in every call.
+    """Writes the points of every call to a file, and fails for a few of them.
 
     `event` is called before the values are computed.
     """
 
-    def __init__(self, log=None, seconds=0.0, event=None, **kwargs):
+    def __init__(self, log=None, event=None, **kwargs):
         super().__init__(**kwargs)
-        self.log, self.seconds, self.event = log, seconds, event
+        self.log, self.event = log, event
 
     def __call__(self, x):
         if self.log is not None:
@@ -78,7 +76,6 @@ class Watched(WithBlobs):
                 file.write(np.vstack([note, points]).tobytes())
         if self.event is not None:
             self.event()
-        time.sleep(self.seconds)
         values = super().__call__(x)
         values[..., 0] = np.where(np.asarray(x)[..., 0] < -1.7, np.nan, values[..., 0])
         return values
@@ -103,10 +100,10 @@ def points_of(log) -> list[bytes]:
     return [point for _, points in calls(log) for point in points]
 
 
-def make(path, kind, seconds=0.0, sd=0.01, log=None, event=None, **changes):
+def make(path, kind, sd=0.01, log=None, event=None, **changes):
     """The sampler with a file, or in memory without a path."""
     Sampler, settings = KINDS[kind]
-    posterior = Watched(log, seconds, event, ndim=NDIM, sd=sd)
+    posterior = Watched(log, event, ndim=NDIM, sd=sd)
     backend = None if path is None else emcee.backends.HDFBackend(str(path))
     settings = {"seed": 5, **settings, **changes}
     if "guide" in settings:

@@ -99,17 +99,6 @@ def test_a_limit_counts_what_is_running(kind, limit, tmp_path):
         assert more.verdict.status != "not usable" and further <= COMPARED + more.evaluations - limit
 
 
-def test_threads_take_single_points():
-    """The result is that of the posterior."""
-    posterior = Gaussian(NDIM, sd=0.05)
-    with ThreadPoolExecutor(2) as pool:
-        sampler = SMCSampler(N, NDIM, posterior, pool=pool, seed=3, recycle=True, asynchronous=True)
-        sampler.run_mcmc(None, 1)
-    assert abs(sampler.log_evidence - posterior.log_evidence) < 4 * sampler.log_evidence_error
-    mean, sd = sampler.get_chain(flat=True).mean(axis=0), posterior.sd / np.sqrt(N)
-    assert np.all(np.abs(mean - posterior.mean) < 4 * sd)
-
-
 class Ends(Gaussian):
     """Raises an exception at one of its evaluations; notes the points."""
 

@@ -118,4 +118,4 @@ def test_points_of_a_batch_that_ctrl_c_ends_are_kept(tmp_path):
         go_on(sampler, "map")
         points = points_of(log)
         assert len(points) - sampler.evaluations <= 1  # that point
-    assert evaluated_again(log, "smc") == 0
+    assert evaluated_again(log) == 0

@@ -298,7 +298,7 @@ def test_a_program_that_writes_to_the_file(whole_smc, tmp_path, monkeypatch):
         again = make(place, "smc", log=log)
         assert again.iteration == (STEPS if place == path else 1)
         assert outcome(go_on(again)) == whole_smc
-    assert evaluated_again(log, "smc") == 0 and not list(tmp_path.rglob("*.damaged"))
+    assert evaluated_again(log) == 0 and not list(tmp_path.rglob("*.damaged"))
 
 
 def test_a_sampler_that_does_not_know_the_chain_of_another_one_leaves_it_alone(tmp_path):
@@ -350,7 +350,7 @@ def test_a_full_disk(size, ballast, tmp_path):
     status, said = end(*fork(unlimited))
     assert status == 0, said.decode()
     assert pickle.loads(said) == expected
-    assert evaluated_again(log, "smc") == 0
+    assert evaluated_again(log) == 0
 
 
 # ---------------------------------------------------------------------- half-opened records, names, earlier steps

@@ -16,6 +16,7 @@ import numpy as np
 
 from fe_likelihoods.kernels import bar_fatigue, concrete04, fiber_section, frame, reinforcing_steel
 from fe_likelihoods.kernels.jit import kernel
+from fe_likelihoods.models.rc_column_parts import gauss_lobatto
 
 BUNDLED = Path(__file__).parent / "data"
 
@@ -84,14 +85,6 @@ def circle(n_strips: int = 12, n_levels: int = 5) -> Fibers:
     return Fibers(core, cover, bars)
 
 
-def lobatto(n_points: int) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss-Lobatto points and weights on [0, 1]."""
-    legendre = np.polynomial.legendre.Legendre.basis(n_points - 1)
-    x = np.concatenate([[-1.0], np.sort(legendre.deriv().roots().real), [1.0]])
-    weights = 2.0 / (n_points * (n_points - 1) * legendre(x) ** 2)
-    return 0.5 * (1.0 + x), 0.5 * weights
-
-
 def column(
     fibers: Fibers,
     core: tuple = CORE,
@@ -109,7 +102,7 @@ def column(
 
     Bars that fail have a fatigue that does not matter: they fail where a test says so.
     """
-    points, weights = lobatto(n_points)
+    points, weights = gauss_lobatto(n_points)
     out = frame.allocate(
         n_elements=n_elements,
         height=height,

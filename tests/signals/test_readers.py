@@ -110,6 +110,10 @@ LOGGERS = {
     "separators at ends of rows": (lines("time_s;acc_m/s2", *(f"{row};" for row in SEMICOLONS)), {}),
     "separator at the end of the header line": (lines("time_s;acc_m/s2;", *SEMICOLONS), {}),
     "no header": (lines(*POINTS), {"time_unit": "s", "units": "m/s²"}),
+    "names without units": (
+        lines("Test 7", "t,x,a", "0,9,0.1", "10,9,-0.25", "20,9,12.5", "30,9,0"),
+        {"time_unit": "ms", "units": "m/s²", "column": "a"},
+    ),
 }
 
 

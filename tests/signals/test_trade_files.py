@@ -289,6 +289,7 @@ def test_the_header_of_an_afad_file_states_everything(tmp_path):
         (text("Anzahl Werte = 3", "acc_g", "1", "2"), {"dt": 0.01}, "'Anzahl Werte = 3' announces 3 samples"),
         (text("Peak value = 2.5 g", "acc_g", "1.0", "2.0"), {"dt": 0.01}, "states 'Peak value = 2.5 g'"),
         (text("Abtastrate: 200,5 Hz", "acc_g;x", "1,5;1", "2,5;1"), {"dt": 0.005, "column": "acc_g"}, "but 0.00498"),
+        (text("1", "2"), {"channel": 1, "column": 1, "units": "g", "dt": 0.01}, "give channel= or column=, not both"),
         (EQSIG, {"units": "g", "dt": 0.02}, "0.02 s by the argument dt but 0.01 s by 'dt = 0.0100 s'"),
         (EQSIG.replace("40 0", "41 0"), {"units": "g"}, "line 2 announces 41 samples, the file has 40"),
         (RSPMATCH.replace("  40 ", "  39 "), {"units": "g"}, "line 2 announces 39 samples, the file has 40"),
@@ -386,18 +387,6 @@ def test_a_stated_peak_is_compared_without_numbers_for_missing_samples(tmp_path)
     path = tmp_path / "a.txt"
     path.write_text(text("PGA (g): 4.0", "time_s acc_g", "0.00 1", "0.01 -9999", "0.02 -4"))
     assert np.isnan(read_columns(path, [TOP], ["acc_g"], missing=(-9999,)).values[0, 1])
-
-
-def test_read_record_takes_the_arguments_of_a_plain_table(tmp_path):
-    path = tmp_path / "a.txt"
-    path.write_text("Test 7\nt,a,b\n0,1,5\n10,2,6\n20,4,7\n")
-    record = read_record(path, units="g", column="b", time_unit="ms")
-    assert record.dt == 0.01
-    np.testing.assert_allclose(record.acceleration / G0, [5, 6, 7])
-    path.write_text("1\n2\n4\n")
-    np.testing.assert_allclose(read_record(path, units="g", dt=0.01).acceleration / G0, [1, 2, 4])
-    with pytest.raises(ValueError, match="give channel= or column=, not both"):
-        read_record(path, 1, "g", dt=0.01, column=1)
 
 
 # single formats -------------------------------------------------------------------------------------------------------

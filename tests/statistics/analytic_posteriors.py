@@ -12,8 +12,6 @@ from functools import lru_cache
 import numpy as np
 from scipy import special, stats
 
-from tests.statistics.hard_posteriors import hash_uniform
-
 __all__ = [
     "Posterior",
     "banana",
@@ -252,6 +250,18 @@ def student(seed: int, ndim: int = 10, dof: float = 3.0) -> Posterior:
     return Posterior(ndim, density, 0.0, centre, np.full(ndim, np.sqrt(dof / (dof - 2.0))), -100.0, 100.0)
 
 
+def _hash_uniform(x: np.ndarray, salt: int) -> np.ndarray:
+    """Numbers in [0, 1), one per row of x (n, d): equal rows give equal numbers, others look independent."""
+    bits = np.ascontiguousarray(x, dtype=float).view(np.uint64)
+    state = np.full(len(bits), 0x9E3779B97F4A7C15 + salt, dtype=np.uint64)
+    for column in bits.T:  # the finaliser of SplitMix64, once per column
+        state = state ^ column
+        state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        state = state ^ (state >> np.uint64(31))
+    return (state >> np.uint64(11)) / 2.0**53
+
+
 def rough(seed: int, jump: float) -> Posterior:
     """A round Gaussian in 5-D, sd 0.05, whose log-likelihood has normal jumps of standard deviation `jump`.
 
@@ -263,7 +273,7 @@ def rough(seed: int, jump: float) -> Posterior:
 
     def density(x: np.ndarray) -> np.ndarray:
         z = (x - centre) / width
-        jumps = special.ndtri(np.clip(hash_uniform(np.floor(20.0 * z), seed), 1e-12, 1.0 - 1e-12))
+        jumps = special.ndtri(np.clip(_hash_uniform(np.floor(20.0 * z), seed), 1e-12, 1.0 - 1e-12))
         return -0.5 * np.sum(z**2, axis=1) + jump * jumps
 
     log_evidence = ndim * (np.log(width) + 0.5 * LOG_2_PI) + 0.5 * jump**2

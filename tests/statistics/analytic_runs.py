@@ -6,7 +6,6 @@ errors and 0.5, or a mean by more than four stated errors and a quarter of the s
 """
 
 import itertools
-import time
 import warnings
 from typing import Any, NamedTuple
 
@@ -73,7 +72,7 @@ def run(cell: Cell, seed: int, steps: int = 5, settings: dict[str, Any] | None =
     The seed belongs to the posterior and to the sampler. Returns errors of the result and what the run said about
     itself; JSON can store it.
     """
-    posterior, start = _posterior(cell, seed), time.perf_counter()
+    posterior = _posterior(cell, seed)
     sampler = SAMPLERS[cell.sampler](
         cell.walkers, posterior.ndim, posterior, vectorize=True, seed=1000 + seed, **(settings or {})
     )
@@ -83,26 +82,17 @@ def run(cell: Cell, seed: int, steps: int = 5, settings: dict[str, Any] | None =
     warned = [str(each.message) for each in caught if issubclass(each.category, SamplingWarning)]
     chain = sampler.get_chain(flat=True)
     mean_error = np.maximum(sampler.mean_error(), 1e-300)
-    check = sampler.log_evidence_check
     found: dict[str, Any] = {
         **cell._asdict(),
-        "seed": seed,
         "ndim": posterior.ndim,
-        "seconds": time.perf_counter() - start,
         "evaluations": sampler.evaluations,
         "log_evidence_error": sampler.log_evidence - posterior.log_evidence,
         "stated_error": sampler.log_evidence_error,
-        "ladder_error": sampler.log_evidence_ladder - posterior.log_evidence,
-        "ladder_stated": sampler.ladder[-1].log_evidence_error,
-        "check": None if check is None else check._asdict() | {"reliable": check.reliable},
-        "recycled": sampler.ladder[0].moves == 0,
         "mean_z": ((chain.mean(axis=0) - posterior.mean) / mean_error).tolist(),
         "mean_off": ((chain.mean(axis=0) - posterior.mean) / posterior.sd).tolist(),
         "sd_ratio": (chain.std(axis=0) / posterior.sd).tolist(),
         "warnings": warned,
         "status": sampler.verdict.status,
-        "reasons": list(sampler.verdict.reasons),
-        "effective_sample_size": sampler.verdict.effective_sample_size,
     }
     if posterior.responsibilities is not None:
         shares = posterior.responsibilities(chain).mean(axis=0)

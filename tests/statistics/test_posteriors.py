@@ -2,7 +2,6 @@
 
 from functools import cache
 
-import emcee
 import numpy as np
 import pytest
 from scipy import stats
@@ -201,15 +200,6 @@ def test_units_change_no_draw(mode, unit, seed):
     assert np.allclose(plain.get_chain() * unit, scaled.get_chain(), rtol=1e-8)
     assert [s.moves for s in plain.ladder] == [s.moves for s in scaled.ladder]
     assert scaled.log_evidence == pytest.approx(plain.log_evidence, abs=1e-8)
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_the_backend_changes_no_draw(mode, seed, tmp_path):
-    backend = emcee.backends.HDFBackend(str(tmp_path / "run.h5"))
-    memory, stored = plain_run(mode, seed), runs(Gaussian(3), seed, count=1, backend=backend, **MODES[mode])[0]
-    assert np.array_equal(memory.get_chain(), stored.get_chain())
-    assert np.array_equal(memory.get_log_prob(), stored.get_log_prob())
-    assert memory.log_evidence == stored.log_evidence
 
 
 @pytest.mark.slow
