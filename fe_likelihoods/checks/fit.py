@@ -47,13 +47,13 @@ FAULTS = {
     "factor": (
         "A {what} may be wrong",
         "{where}: measured values are {value} times the computed ones{units}{better}.",
-        "Look up unit and gain of the channel and of the base motion, and correct the wrong one; a model of your own "
-        "must return SI units.",
+        "Look up unit and gain of the channel and of the base motion or loads, and correct the wrong one; a model of "
+        "your own must return SI units.",
     ),
     "sign": (
         "A sign may be wrong",
         "{where}: measured and computed values have opposite signs{better}.",
-        "Where the sensor counts the other way, name it in `reversed` of [measurements], or change its sign.",
+        "Where the sensor counts the other way, change its sign (`reversed` in [measurements] does so).",
     ),
     "swap": (
         "Channels may be swapped",

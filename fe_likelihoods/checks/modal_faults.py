@@ -43,7 +43,7 @@ def check_modes(fit: Any) -> list[Finding]:
         wrong = about("data", check_frequency(fit))  # which no draw reaches then
         found = wrong + [each for each in found if not wrong or each.kind != UNREACHED]
     if fit.samples is not None and all(each.severity != WRONG for each in found):
-        known = {each.kind for each in found}
+        known = {each.kind for each in found} | {UNREACHED}  # samples are no draws of the prior
         found += about("data", [each for each in _check_faults(fit.samples) if each.kind not in known])
         found += _check_pairs(fit.samples)
     if any(each.severity == WRONG for each in found):
@@ -70,9 +70,10 @@ def _check_errors(fit: Any) -> list[Finding]:
     n_modes, best = fit.samples.data.n_modes, squares[np.nanargmin(squares.sum(axis=1))]
     largest = np.argsort(-np.nan_to_num(best))[:2]
     of_shape, numbers = largest // (n_modes * noise.n_sets), largest // noise.n_sets % n_modes
+    of_set = [f" in set {k % noise.n_sets + 1}" if noise.n_sets > 1 else "" for k in largest]
     places = [
-        f"the {'shape' if shape else 'frequency'} of mode {_number(fit.samples, k)}"
-        for shape, k in zip(of_shape, numbers, strict=True)
+        f"the {'shape' if shape else 'frequency'} of mode {_number(fit.samples, k)}{place}"
+        for shape, k, place in zip(of_shape, numbers, of_set, strict=True)
     ]
     action = (
         f"The largest: {listed(places)}. Look for a wrong number or sensor, and at the model. If both are right, add "
@@ -251,12 +252,15 @@ def _check_sensors(modes: Any) -> tuple[list[Finding], Any]:
         if n > 3 and not one_mode:  # a shape of two sensors fits nearly anything
             after, each, draw = best(data.at([other for other in data.sensors if other != name]))
             after = 1.0 - (1.0 - after) * (n - 1) / (n - 2)  # as if the others were as many as all of them
-            if (text := _fault_of_gain(each, draw, data, j)) and after > fitted:
+            text, gain = _fault_of_gain(each, draw, data, j)
+            if abs(gain) > 2.0 * TAIL:  # a sign in one mode, without which the others fit, is no gain of all
+                after = best(replace(data, shapes=data.shapes / np.where(np.arange(n) == j, gain, 1.0)))[0]
+            if text and after > fitted:
                 found[text] = after, each
     text, (after, corrected) = max(found.items(), key=lambda each: each[1][0], default=("", (before, modes)))
     if not 1.0 - after < MENDED * (1.0 - before):
         return [], modes
-    said = f"If {text}, the mean MAC of the best sample is {after:.2f} instead of {before:.2f}."
+    said = f"If {text}, the mean MAC of the best draw is {after:.2f} instead of {before:.2f}."
     action = "Check directions, places, gains and names of sensors, and the rows or channels of the model."
     if " in mode " in text:
         action = (
@@ -265,8 +269,8 @@ def _check_sensors(modes: Any) -> tuple[list[Finding], Any]:
     return [Finding("A sensor may be wrong", WRONG, said, action, {"before": before, "after": after})], corrected
 
 
-def _fault_of_gain(modes: Any, draw: int, data: Any, j: int) -> str:
-    """What sensor j measures, if the others, which `modes` are of, are right."""
+def _fault_of_gain(modes: Any, draw: int, data: Any, j: int) -> tuple[str, float]:
+    """What sensor j measures, if the others, which `modes` are of, are right, and its gain."""
     names = [channel.name for channel in modes.paired.model.channels]
     shapes = modes.computed[draw][:, modes.numbers[draw] - 1]
     others, own = shapes[[names.index(name) for name in modes.data.sensors]], shapes[names.index(data.sensors[j])]
@@ -275,10 +279,10 @@ def _fault_of_gain(modes: Any, draw: int, data: Any, j: int) -> str:
     expected = scales * own
     gain = float(np.nansum(measured[:, j] * expected) / np.nansum(np.square(expected * ~np.isnan(measured[:, j]))))
     if 1.0 / FACTOR < abs(gain) < FACTOR:
-        return f"the sensor {data.sensors[j]} counts the other way round" if gain < 0.0 else ""
+        return (f"the sensor {data.sensors[j]} counts the other way round" if gain < 0.0 else ""), gain
     if abs(gain) < 2.0 * TAIL:
-        return f"the sensor {data.sensors[j]} is dead (gain {gain:.2f})"
-    return f"the sensor {data.sensors[j]} has a gain of {gain:.2g}"
+        return f"the sensor {data.sensors[j]} is dead (gain {gain:.2f})", gain
+    return f"the sensor {data.sensors[j]} has a gain of {gain:.2g}", gain
 
 
 def _check_shapes(modes: Any) -> list[Finding]:

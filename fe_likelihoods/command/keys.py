@@ -267,4 +267,7 @@ def parse_prior(text: str, dimension: str | None = None) -> Distribution:
     if name == "log-normal" and _split_number(arguments[1])[1]:
         raise ValueError(f"expected {form}, which has no unit; got {text!r}")
     expected = "a number, or a number with a unit such as '0.1 g'"
-    return _MAKE[name](*(_parse(argument.strip(), dimension, expected) for argument in arguments))
+    numbers = [_parse(argument.strip(), dimension, expected) for argument in arguments]
+    if name == "normal" and len(numbers) == 2 and numbers[0] <= 0.0:
+        raise ValueError(f"expected {form}, so a mean of zero or less needs bounds; got {text!r}")
+    return _MAKE[name](*numbers)

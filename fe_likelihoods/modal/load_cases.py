@@ -128,7 +128,7 @@ def read_load_test(
     >>> sensors = [Channel("midspan", "displacement", "mm")]
     >>> test = read_load_test("truck.csv", sensors, errors={"midspan": 1e-4})  # doctest: +SKIP
     """
-    table = read_table(path)
+    table = read_table(path, labels=cases or "")
     names, values = [column.name for column in table.columns], []
     plain = [re.sub(r"\s*[\[(].*", "", name).strip() for name in names]
     for channel in channels:
@@ -140,6 +140,8 @@ def read_load_test(
                 f"{table.file}: expected one column {wanted!r} of the channel {channel.name}; the columns are "
                 f"{', '.join(names)}"
             )
+        if table.columns[places[0]].kind != "number":
+            raise ValueError(f"{table.file}: expected numbers in the column {names[places[0]]!r} of {channel.name}")
         column = table.columns[places[0]].values
         unit = column_unit(table, places[0], column, given, channel.dimension, f"{table.file}, {channel.name}")
         values.append(to_si(column, unit, channel.dimension))

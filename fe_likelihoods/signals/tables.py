@@ -517,14 +517,16 @@ def read_table(
     time: int | str | None = None,
     along_rows: bool = False,
     missing: Sequence[float | str] | None = None,
+    labels: str | None = None,
 ) -> Table:
     """Read columns of numbers from a text file, or from the first sheet of an Excel workbook (needs openpyxl).
 
     `skip` lines are above the table, None finds them; lines with ``#`` are comments. `time` is the name or number of
     the column of times, by default found; with `time_unit`, the first column of a file without a header line has them.
     With `along_rows` the numbers are one column, row after row, and the last row may be shorter. Cells of rows with the
-    texts in `missing` are missing samples. ValueError if the file cannot be read, has no rows or rows of different
-    length, has a cell that is no finite number, or states another number of samples.
+    texts in `missing` are missing samples. The column `labels` (by its name; "": the first one) is text if not all its
+    cells are numbers. ValueError if the file cannot be read, has no rows or rows of different length, a cell that is no
+    finite number, or states another number of samples.
     """
     if skip is not None and (isinstance(skip, bool) or not isinstance(skip, int) or skip < 0):
         raise ValueError(f"skip must be a number of lines, zero or more, got {skip!r}")
@@ -550,7 +552,7 @@ def read_table(
         rows, stated = announced
     names, below, rows = _header(rows, file)
     rows, commas = _with_points(rows, separator, file)
-    columns, clock = _columns(names, below, rows, file, marks)
+    columns, clock = _columns(names, below, rows, file, marks, labels)
     above = [line for number, line in lines if number < rows[0][0]]
     found = read_statements([*comments, *stated, *above], commas)
     title = "".join([*comments, *stated][:1])
@@ -903,14 +905,17 @@ _PLAUSIBLE_SENTINELS = (-999.0, 99999.0, -99999.0, 32767.0, -32768.0)
 
 
 def _columns(
-    names: list[str], below: list[str], rows: list[_Line], file: str, marks: Sequence[str]
+    names: list[str], below: list[str], rows: list[_Line], file: str, marks: Sequence[str], labels: str | None = None
 ) -> tuple[tuple[Column, ...], ClockTime | None]:
     """Columns of numbers, clock times and text, and the first clock time; `marks` are for the message."""
     columns, first, lines = [], None, [f"{file}, line {number}" for number, _ in rows]
     for k, cells in enumerate(zip(*(row for _, row in rows), strict=True)):
         filled = [cell for cell in cells if cell]
         kind, decimals = "number", 0
-        if any(map(is_clock, filled)):
+        is_label = labels == names[k] or (labels == "" and k == 0) if names else False
+        if is_label and not all(map(is_number, filled)):
+            kind, values = "text", [math.nan] * len(cells)
+        elif any(map(is_clock, filled)):
             kind = "clock"
             times = [_parse_clock(cell, where) if cell else None for cell, where in zip(cells, lines, strict=True)]
             values = _seconds_of(times, file)

@@ -193,8 +193,9 @@ def unreached_share(log_density: Callable[[np.ndarray], np.ndarray], latest: Kno
 
 
 def _meets_known(r: Round) -> bool:
-    """Whether a round has a possible draw, and a draw where the known density is positive."""
-    return bool(np.max(r.log_weights) > -np.inf and np.max(r.log_known) > -np.inf)
+    """Whether a round has a possible draw, and the known density there is a positive number of its own density."""
+    with np.errstate(over="ignore"):
+        return bool(np.max(r.log_weights) > -np.inf and 0.0 < np.exp(np.max(r.log_known)) < np.inf)
 
 
 def _differences(r: Round) -> tuple[np.ndarray, float]:

@@ -52,8 +52,7 @@ def check_ends(ended: int, made: int, wanted: int, grown: bool) -> list[Finding]
     text = (
         f"only {ended} of {made} starts led to the one mode that was found, the others were given up far below it: "
         f"{1.0 - 0.05 ** (1.0 / ended):.0%} of such starts may lead to modes that were not found. Use more starts; "
-        "where the model is a function, let it take n_steps, so that the search begins with the first part of the "
-        "record"
+        "for histories, let a function take n_steps, so that the search begins with the first part of the record"
     )
     return [find_missing_part(text)]
 

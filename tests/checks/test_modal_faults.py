@@ -200,3 +200,21 @@ def test_one_wrong_frequency_is_named_before_a_run_and_after_it():
             if seed == 0 and known:
                 assert found[0] in check_fit(posterior, fitted(posterior))
         assert named >= 8
+
+
+def test_exchanged_frequencies_are_named():
+    for seed, (i, j) in enumerate([(0, 1), (1, 2), (0, 2)]):
+        data = identified(seed, **KNOWN)
+        frequencies = data.frequencies.copy()
+        frequencies[:, [i, j]] = frequencies[:, [j, i]]
+        (found,) = check_fit(Posterior(ModalLikelihood(FRAME, replace(data, frequencies=frequencies)), PRIOR))
+        assert found.kind == "Values may be exchanged" and f"the modes {i + 1} (" in found.text
+
+
+def test_the_set_of_a_wrong_number_is_named():
+    sets = [identified(1) for _ in range(4)]
+    frequencies, shapes = (np.concatenate([getattr(each, name) for each in sets]) for name in ("frequencies", "shapes"))
+    frequencies[2, 1] *= 1.1
+    posterior = Posterior(ModalLikelihood(FRAME, ModalData(frequencies, shapes, tuple(FLOORS), **KNOWN)), PRIOR)
+    (found,) = [each for each in check_fit(posterior, fitted(posterior)) if "stated errors" in each.kind]
+    assert "The largest: the frequency of mode 2" in found.action and " in set 3" in found.action

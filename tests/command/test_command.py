@@ -485,7 +485,16 @@ def test_quantities_and_priors_as_text():
     assert parse_prior("half-normal(5mm)", "displacement").sd == 5e-3
     assert parse_prior("half-normal(0.1 g)", "acceleration").sd == pytest.approx(0.980665)
     assert parse_prior("normal(1, 0.5, 0.2, inf)").bounds == (0.2, float("inf"))
-    wrong = "uniform(1)", "normal", "gamma(1, 2)", "normal(1, a)", "log-normal(1 mm, 0.3 mm)", "normal(1, nan)", 3
+    wrong = (
+        "uniform(1)",
+        "normal",
+        "gamma(1, 2)",
+        "normal(1, a)",
+        "log-normal(1 mm, 0.3 mm)",
+        "normal(1, nan)",
+        "normal(0, 1)",
+        3,
+    )
     for text in wrong:
         with pytest.raises(ValueError, match="expected"):
             parse_prior(text)

@@ -51,6 +51,14 @@ def test_a_file_has_a_line_for_each_load_case(tmp_path):
     path.write_text("truck at [m];midspan [mm]\n7,5;1,1\n15;2,2\n")
     test = read_load_test(path, CHANNELS[:1])
     assert test.cases == (7.5, 15.0) and test.measurements.axis == "truck at [m]"
+    for names in (("1 truck", "2 trucks"), ("100 kN", "200 kN"), ("LC 1", "2"), ("1a", "1")):
+        path.write_text("case,midspan [mm]\n" + "".join(f"{name},1.1\n" for name in names))
+        assert (
+            read_load_test(path, CHANNELS[:1]).cases == names == read_load_test(path, CHANNELS[:1], cases="case").cases
+        )
+    path.write_text("midspan [mm]\n1.1\n1 mm\n")
+    with pytest.raises(ValueError, match="expected numbers in the column 'midspan .mm.' of midspan"):
+        read_load_test(path, CHANNELS[:1])
     path.write_text("midspan [mm]\n1.1\n2.2\n")
     assert read_load_test(path, CHANNELS[:1]).cases == ("1", "2")
     for options, text in (
