@@ -14,8 +14,6 @@ from pathlib import Path
 
 import numpy as np
 
-__all__ = ["bar_stresses"]
-
 
 def bar_stresses(steel: tuple, options: tuple, histories: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Stresses (n,) of new bars under several strain histories (n,).

@@ -1,11 +1,7 @@
 """The bridge column built in OpenSees, a peer for tests and benchmarks.
 
-The same column as `RCColumn`, from elements of OpenSees: Concrete04 and ReinforcingSteel fibers, force-based elements
-with Gauss-Lobatto points, corotational transformation, Newmark's average acceleration with Newton iterations.
-`peer_of` translates an `RCColumn` and its parameters into kip and inch (it uses the fibers and the confinement of the
-model, none of its kernels); `shake` and `push` run it.
-
-OpenSees has one model per process and may end that process. Therefore all runs are made in a second process.
+It uses the fibers and the confinement of the model, none of its kernels. OpenSees has one model per process and may end
+that process; all runs are made in a second one.
 """
 
 from __future__ import annotations
@@ -30,8 +26,6 @@ from fe_likelihoods.units import G0, to_si
 
 if TYPE_CHECKING:  # the process that runs OpenSees does not have to import the compiled model
     from fe_likelihoods.models.rc_column import RCColumn
-
-__all__ = ["Response", "peer_of", "push", "require_opensees", "shake"]
 
 KIP, INCH, KSI = (to_si(1.0, unit).item() for unit in ("kip", "in", "ksi"))
 TO_MASS, GRAVITY = KIP / INCH, G0 / INCH

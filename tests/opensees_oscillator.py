@@ -7,8 +7,6 @@ import numpy as np
 
 from fe_likelihoods.signals.channels import Channel
 
-__all__ = ["CHANNELS", "PERIOD", "DAMPING", "Oscillator"]
-
 PERIOD, DAMPING = 0.7, 0.05
 CHANNELS = (
     Channel("acceleration", "absolute acceleration", "g"),

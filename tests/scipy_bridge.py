@@ -12,8 +12,6 @@ from numba import njit
 from scipy.integrate import solve_ivp
 from scipy.linalg import eigh
 
-__all__ = ["CHANNELS", "Definition", "peak_errors", "solve"]
-
 CHANNELS = (
     *("Ub_1", "Ub_2", "Fb_1", "Fb_2", "drift_1", "drift_2"),
     *("shear_1", "shear_2", "acc_p1", "acc_p2", "Ud", "acc_d"),

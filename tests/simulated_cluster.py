@@ -1,8 +1,6 @@
 """A cluster on a simulated clock: evaluations take a stated time on a stated number of workers, and nobody waits.
 
-A point starts when a worker is free, in the order of submission. `SimulatedCluster` is called with a batch, as a
-synchronous sampler does, or used as a queue of evaluations. The clock advances by the evaluations only; what the parent
-process does takes no time.
+A point starts when a worker is free, in the order of submission. What the parent process does takes no time.
 """
 
 import heapq
@@ -15,8 +13,6 @@ from functools import partial
 import numpy as np
 
 from fe_likelihoods.simulation.executors import PoolExecutor
-
-__all__ = ["DelayedPool", "SimulatedCluster"]
 
 
 class SimulatedCluster:

@@ -3,9 +3,7 @@
 import ast
 import importlib
 import warnings
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,23 +11,14 @@ import pytest
 from tests.scripts import run_script
 
 TUTORIALS = {path.stem: path for path in sorted((Path(__file__).parents[1] / "tutorials").glob("[0-9]*.py"))}
-CHECKS: dict[str, Callable[[dict[str, Any]], None]] = {}
 
 
-def check(function: Callable[[dict[str, Any]], None]) -> Callable:
-    """Register the check of a tutorial's variables, ``check_NN``, by its number."""
-    CHECKS[function.__name__.removeprefix("check_")] = function
-    return function
-
-
-@check
 def check_01(found):
     truth, samples = found["truth"], found["samples"]
     assert (np.abs(samples.mean(axis=0) - truth) < 4.0 * samples.std(axis=0)).all()
     assert found["coverage"] == pytest.approx([0.9, 0.9], abs=0.04)  # 800 samples: 4 standard errors
 
 
-@check
 def check_02(found):
     """The data were made with softening in tension."""
     moments, evidence = found["moments"], found["sampler"].log_evidence - found["other"].log_evidence
@@ -37,7 +26,6 @@ def check_02(found):
     assert found["sampler"].simulations < 1200
 
 
-@check
 def check_03(found):
     """The program prints all digits, so that both runs are the same."""
     assert found["difference"] == pytest.approx(0.0, abs=1e-12) and found["report"]["failure_count"] == 0
@@ -45,7 +33,6 @@ def check_03(found):
     assert (np.abs(mean - found["TRUTH"]) < 4.0 * sd).all()
 
 
-@check
 def check_04(found):
     """SMC and TMCMC find the exact shares (500 walkers: 4 standard errors), emcee does not leave its mode."""
     share = found["exact"]["share"]
@@ -56,21 +43,18 @@ def check_04(found):
     assert found["shares"]["emcee"] == 1.0
 
 
-@check
 def check_05(found):
     assert found["sampler"].simulations < 600
     apart = (found["mean"].value - np.array(list(found["truth"].values()))) / found["sd"].value
     assert np.abs(apart).max() < 4.0
 
 
-@check
 def check_06(found):
     inside, scores = found["inside"], found["scores"]
     assert inside["one event"].value < 0.7 < inside["population of eight"].value
     assert scores["population of eight"] < 0.7 * scores["one event"]
 
 
-@check
 def check_07(found):
     truth = np.array(list(found["TRUTH"].values()))
     assert (np.abs(found["samples"].mean(axis=0) - truth) < 4.0 * found["samples"].std(axis=0)).all()
@@ -80,7 +64,6 @@ def check_07(found):
     assert 0.0 < rates[1] < rates[0] < 0.05, "the rate of the weakest motion"
 
 
-@check
 def check_08(found):
     """Gauges tell less along the column and towards its axis; a strong motion tells of the steel, and none of a1."""
     assert found["best"] == "EQ2"
@@ -96,7 +79,6 @@ def check_08(found):
     assert left["EQ2"]["Es"] < 0.5 * left["EQ1"]["Es"] and min(each["a1"] for each in left.values()) > 0.85
 
 
-@check
 def check_09(found):
     loss, truth = found["found"], found["truths"]["after"]
     assert loss.presence() > 0.95 and found["control"].presence() < 0.1
@@ -106,7 +88,6 @@ def check_09(found):
     assert np.median(loss.common) == pytest.approx(0.97, abs=0.02)
 
 
-@check
 def check_10(found):
     """The modes that were left out are near their intervals, the girder has 0.9 of its stiffness."""
     losses = found["loss"].probability(0.1)
@@ -126,7 +107,7 @@ def test_tutorial_is_right_and_warns_of_nothing(name, tmp_path):
     spoken = [each for each in caught if issubclass(each.category, UserWarning | RuntimeWarning)]
     assert not spoken, [str(each.message) for each in spoken]
     assert list(tmp_path.glob("*.png"))
-    CHECKS[name[:2]](found)
+    globals()[f"check_{name[:2]}"](found)
 
 
 def test_tutorials_are_short_and_import_names_that_exist():

@@ -318,6 +318,3 @@ def test_responses_are_bounded(path, rng):
     kept = [response is not None for response in stored_outcomes(cache, Batched(np.inf), thetas)]
     assert kept == [False] * 15 + [True] * 10
     assert cache.info().simulations == 25
-
-
-# the ready-made posterior ---------------------------------------------------------------------------------------------

@@ -11,8 +11,6 @@ from fe_likelihoods.problems import bridge_column_data, isolated_bridge_data
 from fe_likelihoods.signals.read import read_record
 from fe_likelihoods.signals.strong_motion import find_channels
 
-__all__ = ["RealChannel", "real_channels"]
-
 
 class RealChannel(NamedTuple):
     """Samples of a sensor, and of a motion."""

@@ -1,8 +1,7 @@
 """A posterior that every client can sample in seconds, and its exact moments and evidence.
 
-The model is a strongly damped linear oscillator with four parameters, each with a different kind of prior. It is chosen
-so that errors of a client are visible. Thirty samples leave the posterior wide, skewed and truncated by the lower bound
-of the damping. In three fifths of the prior the simulation fails (the oscillator is overdamped), so every client
+The model is a strongly damped linear oscillator with four parameters, each with a different kind of prior. In three
+fifths of the prior the simulation fails (it is overdamped), so every client
 meets -inf; a client that drops such points instead of counting them has a log-evidence that is too large by 0.9.
 
 The exact answer is computed independently of the library: with distributions of `scipy.stats`, an explicit likelihood
@@ -28,8 +27,6 @@ from fe_likelihoods import (
     Uniform,
 )
 from fe_likelihoods.signals.sdof import respond
-
-__all__ = ["CRITICAL", "PRIOR", "Exact", "exact", "make_posterior", "reference_log_prob"]
 
 PERIOD, DAMPING_RATIO, DT, N_STEPS = 0.8, 0.5, 0.05, 30
 CRITICAL = 1.0 / DAMPING_RATIO  # multiple of the nominal damping above which all simulations fail

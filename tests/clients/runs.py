@@ -17,8 +17,6 @@ from fe_likelihoods.adapters import to_bilby, to_pymc
 
 from .scoring import Found, chains, replicates, weighted
 
-__all__ = ["CLIENTS", "Client"]
-
 
 def _emcee(posterior: Posterior, seed: int) -> Found:
     import emcee

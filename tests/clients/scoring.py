@@ -9,8 +9,6 @@ from .problem import Exact
 
 arviz = lazy_loader.load("arviz")  # its import takes seconds
 
-__all__ = ["Found", "chains", "check", "replicates", "weighted"]
-
 STANDARD_ERRORS = 5.0  # of a moment: the errors come from a few hundred draws and are uncertain themselves
 EVIDENCE_ERRORS = 4.0
 

@@ -8,8 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-__all__ = ["KINDS", "WRONG", "Process", "free_port", "line"]
-
 TIME = 0.1 * np.arange(20)
 WRONG = ["nan", "-inf", "NaN", '"1.0"', "null", "[1.0]", "true", "1.0, 1.0"]  # at slopes of 90, 91, ...
 

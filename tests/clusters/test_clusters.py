@@ -109,6 +109,3 @@ def test_one_machine_stopped_by_a_signal_goes_on(place, monkeypatch):
     with started(place, "one_machine.py", "--cores", "2") as parent:
         assert parent.wait(300) == 0
     check_result(place, 2)
-
-
-# jobs on one machine -------------------------------------------------------------------------------------------------

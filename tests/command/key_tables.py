@@ -17,8 +17,6 @@ from fe_likelihoods.command.sections import (
 )
 from fe_likelihoods.units import DIMENSIONS
 
-__all__ = ["PAGE", "key_tables"]
-
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "keys.rst"
 START, END = ".. keys begin\n", ".. keys end\n"
 

@@ -53,6 +53,20 @@ class Box:
         return rng.uniform(self.low, self.high, size=(n, self.ndim))
 
 
+class Modes(Box):
+    """Gaussian modes of one width in a cube: their shares are the weights of their normal densities."""
+
+    def __init__(self, centres, shares, width, side):
+        self.centres, self.shares, self.width = np.array(centres), np.array(shares), width
+        ndim = len(self.centres[0])
+        super().__init__(np.zeros(ndim), np.full(ndim, side), self._log_likelihood)
+        self.mean, self.log_evidence = self.shares @ self.centres, -ndim * np.log(side)
+
+    def _log_likelihood(self, x):
+        densities = [np.sum(stats.norm.logpdf(x, centre, self.width), axis=-1) for centre in self.centres]
+        return np.logaddexp.reduce([np.log(w) + each for w, each in zip(self.shares, densities, strict=True)])
+
+
 class WithBlobs(Gaussian):
     """A Gaussian that returns the squared radius and the first coordinate beside the log-density."""
 

@@ -197,9 +197,6 @@ def test_another_function_on_a_backend_in_memory_is_refused(kind):
         other.run_mcmc(None, 1)
 
 
-# ---------------------------------------------------------------- the record makes the file again
-
-
 # ---------------------------------------------------------------- limits and interrupts
 
 

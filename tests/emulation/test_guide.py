@@ -72,6 +72,20 @@ def test_every_noise_is_sampled_together_with_its_parameters(noise):
     assert (difference < 0.5 * expected.std(axis=0)).all()
 
 
+def test_densities_are_normalised_and_draws_are_inside_the_support():
+    """The mean over draws of any normalised density divided by that of the guide is one."""
+    posterior = vibration()
+    sampler = SMCSampler(100, 2, posterior, vectorize=True, seed=1, guide=posterior.guide())
+    sampler.run_mcmc(None, 0)
+    guide = sampler.guide
+    coords = guide.draw(4000, np.random.RandomState(5))
+    assert np.isfinite(posterior.log_prior(coords)).all()
+    centre, spread = coords.mean(axis=0), coords.std(axis=0)
+    log_normal = -0.5 * np.square((coords - centre) / spread).sum(axis=1) - np.log(2.0 * np.pi * spread.prod())
+    ratio = np.exp(log_normal - guide.log_density(coords))
+    assert ratio.mean() == pytest.approx(1.0, abs=4.0 * ratio.std() / np.sqrt(4000))
+
+
 def test_impossible_guides_are_refused_before_any_simulation():
     posterior = vibration()
     with pytest.raises(ValueError, match="starts must be a whole number"):

@@ -1,9 +1,7 @@
 """Kills by signal 9, after which the same script is started again until it ends.
 
-Kills come at a chosen event of a forked process: before, within or after a write to the record or to the HDF5 file
-(whose writes go through a Python file), or in an evaluation. Chain, log-probabilities, blobs, counts, failures, ladder,
-evidence and verdict must be those of a run that was not killed, and no evaluation may be made again but those that were
-running.
+Kills come before, within or after a write to the record or to the HDF5 file (through a Python file), or in an
+evaluation. The outcome must be that of a run without kills, and only evaluations that were running are made again.
 """
 
 import contextlib

@@ -143,22 +143,6 @@ def test_killed_while_writing(path, rng, kills):
 # several at once ------------------------------------------------------------------------------------------------------
 
 
-def test_programs_that_create_a_cache_at_the_same_moment(tmp_path):
-    for attempt in range(5):
-        path = tmp_path / f"{attempt}.sqlite"
-
-        def begin(number, path=path):
-            thetas = batch_of(1, number)
-            SimulationCache(path).store(FINGERPRINT, thetas, sums_of(thetas), [""] * len(thetas))
-
-        assert at_once(begin, [(number,) for number in range(6)]) == [0] * 6
-        assert integrity(path) == [("ok",)]
-        cache = SimulationCache(path)
-        for number in range(6):
-            thetas = batch_of(1, number)
-            np.testing.assert_array_equal(cache.look_up(FINGERPRINT, thetas, 2).values, sums_of(thetas))
-
-
 def test_two_programs_on_one_cache(path, thetas, expected):
     """Both get the right values and together store every simulation, so a third one runs none."""
 
@@ -199,51 +183,36 @@ def warnings_of(caplog, text):
     return sum(text in record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING)
 
 
-def no_database(path):
-    path.write_bytes(b"what is this?\n" * 500)
+DAMAGES = {
+    "no database": lambda data: b"what is this?\n" * 500,
+    "zeros": lambda data: bytes(4096) + data[4096:],
+    "cut off": lambda data: data[: len(data) // 2 // 4096 * 4096],
+    "cut to its header": lambda data: data[:50],
+    "overwritten": lambda data: data[:8192] + b"\xa5" * (len(data) // 2 - 8192) + data[len(data) // 2 :],
+    "another column": lambda data: data.replace(b"theta BLOB", b"thete BLOB"),
+    "without a table": None,
+}
 
 
-def zeros(path):
-    path.write_bytes(bytes(4096) + path.read_bytes()[4096:])
-
-
-def cut_off(path):
-    os.truncate(path, path.stat().st_size // 2 // 4096 * 4096)
-
-
-def overwritten_in_the_middle(path):
-    data = bytearray(path.read_bytes())
-    data[8192 : len(data) // 2] = b"\xa5" * (len(data) // 2 - 8192)
-    path.write_bytes(data)
-
-
-def another_column(path):
-    path.write_bytes(path.read_bytes().replace(b"theta BLOB", b"thete BLOB"))
-
-
-def without_a_table(path):
+def spoil(path, damage):
+    if DAMAGES[damage] is not None:
+        path.write_bytes(DAMAGES[damage](path.read_bytes()))
+        return
     with sqlite3.connect(path) as connection:
         connection.execute("DROP TABLE rows")
     connection.close()
 
 
-def cut_to_its_header(path):
-    os.truncate(path, 50)
-
-
-DAMAGES = [zeros, cut_off, cut_to_its_header, overwritten_in_the_middle, another_column, without_a_table]
-
-
-@pytest.mark.parametrize("damage", [no_database, *DAMAGES], ids=lambda damage: damage.__name__)
+@pytest.mark.parametrize("damage", DAMAGES)
 @pytest.mark.parametrize("when", ["before", "during the run"])
 def test_a_damaged_file_is_set_aside(filled, thetas, expected, caplog, damage, when):
     likelihood = likelihood_of(filled)
     likelihood.misfit(thetas[: 50 * (when != "before")])
     likelihood.simulator.cache.close()  # as it happens before a fork
     filled.with_name(f"{filled.name}.damaged-1").write_text("an earlier one")
-    damage(filled)
+    spoil(filled, damage)
     data = filled.read_bytes()
-    if when == "before" and damage is no_database:
+    if when == "before" and damage == "no database":
         with pytest.raises(ValueError, match="is not a cache of simulations"):
             likelihood_of(filled)
         return
@@ -366,7 +335,7 @@ def test_rows_under_each_others_key_are_missing(filled, thetas, expected):
 
 def test_programs_that_find_a_damaged_file_at_once(filled):
     """It is set aside once, and all use the new one."""
-    zeros(filled)
+    spoil(filled, "zeros")
     data = filled.read_bytes()
 
     def begin(number):
@@ -571,7 +540,7 @@ def test_a_link_leads_to_one_cache(tmp_path, thetas):
     likelihood.misfit(thetas)
     assert likelihood.simulations == 0
     likelihood.simulator.cache.close()
-    zeros(real)
+    spoil(real, "zeros")
     SimulationCache(link)
     assert link.is_symlink() and list(real.parent.glob("*.damaged-1"))
 

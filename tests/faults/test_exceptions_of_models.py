@@ -105,13 +105,10 @@ def test_sys_exit_in_a_function_of_a_pool_does_not_end_this_process(pool):
         pool.map(lambda item: leave(), [1])
 
 
-@pytest.mark.parametrize("make", [Plain, of_function, isolated])
-def test_keyboard_interrupt_in_a_worker_ends_the_run(make, pool):
-    with pytest.raises(KeyboardInterrupt):
-        simulate_batch(make(interrupt), THETAS, pool)
-    if make is isolated:
+def test_keyboard_interrupt_in_an_isolated_process_ends_the_run(pool):
+    for where in (pool, None):
         with pytest.raises(KeyboardInterrupt):
-            simulate_batch(make(interrupt), THETAS)
+            simulate_batch(isolated(interrupt), THETAS, where)
 
 
 def interrupt():

@@ -120,45 +120,24 @@ def test_a_record_with_a_changed_byte(whole, chain, tmp_path, caplog):
         make(path, kind)
 
 
-def damage_accepted(group):
-    group["accepted"][0] += 1
-
-
-def damage_iteration(group):
-    group.attrs["iteration"] -= 1
-
-
-def damage_random_state(group):
-    group.attrs["random_state_2"] += 1
-
-
-def damage_last_step(group):
-    group["blobs"][STEPS - 1, 3] += 1.0
-
-
-def damage_an_earlier_step(group):
-    group["chain"][0, 3] += 1.0
-
-
-def damage_ladder(group):
-    group["tempering"][3:] = 0
-
-
-def lose_an_attribute(group):
-    del group.attrs["has_blobs"]
-
-
 @pytest.mark.parametrize(
-    "damage",
-    [damage_accepted, damage_iteration, damage_random_state, damage_last_step, damage_ladder]
-    + [damage_an_earlier_step, lose_an_attribute],
+    "change",
+    [
+        "group['accepted'][0] += 1",
+        "group.attrs['iteration'] -= 1",
+        "group.attrs['random_state_2'] += 1",
+        "group['blobs'][-1, 3] += 1.0",
+        "group['chain'][0, 3] += 1.0",
+        "group['tempering'][3:] = 0",
+        "del group.attrs['has_blobs']",
+    ],
 )
-def test_a_chain_that_something_else_has_changed_is_made_again(whole, damage, tmp_path):
+def test_a_chain_that_something_else_has_changed_is_made_again(whole, change, tmp_path):
     """Nothing is evaluated but a comparison."""
     kind, path, expected = whole
     path = copied(path, tmp_path)
     with h5py.File(path, "a") as file:
-        damage(file["mcmc"])
+        exec(change, {"group": file["mcmc"]})
     sampler = go_on(make(path, kind, log=tmp_path / "log"))
     assert outcome(sampler) == expected and Path(f"{path}.damaged").exists()
     assert len(points_of(tmp_path / "log")) <= 2
@@ -385,7 +364,7 @@ def test_a_second_process_that_finds_a_live_run_does_not_touch_its_files(tmp_pat
     first = make(path, "smc")
     first.run_mcmc(None, 1)
     with h5py.File(path, "a") as file:
-        damage_last_step_of(file["mcmc"])
+        file["mcmc/blobs"][0, 3] += 1.0
     before = path.read_bytes()
 
     def second():
@@ -394,10 +373,6 @@ def test_a_second_process_that_finds_a_live_run_does_not_touch_its_files(tmp_pat
     status, said = end(*fork(second))
     assert status != 0 and b"another run is writing" in said
     assert path.read_bytes() == before
-
-
-def damage_last_step_of(group):
-    group["blobs"][0, 3] += 1.0
 
 
 @pytest.mark.parametrize("in_file", [True, False])

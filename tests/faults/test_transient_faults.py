@@ -142,9 +142,6 @@ def test_a_failure_that_depends_on_the_measurements_is_not_used_for_others(tmp_p
     assert stored_outcomes(cache, Faulty(), THETAS) == [None] * 3
 
 
-# time limits ---------------------------------------------------------------------------------------------------------
-
-
 # real faults ---------------------------------------------------------------------------------------------------------
 
 

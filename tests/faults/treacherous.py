@@ -210,9 +210,8 @@ def third(theta: np.ndarray) -> np.ndarray:
 
 def posterior_of(model, top: float = 1.0, **options):
     """Posterior of a model of two parameters, whose offset is between 0 and `top`."""
-    from fe_likelihoods.likelihood.likelihood import (
-        FELikelihood,
-    )  # not needed by workers, which start faster without it
+    # not needed by workers, which start faster without it
+    from fe_likelihoods.likelihood.likelihood import FELikelihood
     from fe_likelihoods.likelihood.posterior import Posterior
     from fe_likelihoods.priors.distributions import HalfNormal, Uniform
 

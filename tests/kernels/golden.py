@@ -1,8 +1,7 @@
 """Reference results and the columns that they belong to, in kip, inch and second, the units of their computation.
 
-Two folders have them in the same form: `BUNDLED`, a small extract that is part of the tests, and ``golden/column`` of
-the reference material outside the project. This module also has drivers that take one material or one section through a
-history, and the values of the nominal column for tests without reference.
+Two folders have them: `BUNDLED`, a small extract, and ``golden/column`` of the reference material outside the project.
+Drivers take one material or one section through a history.
 """
 
 from __future__ import annotations
@@ -200,18 +199,6 @@ def section_history(e0, kappa, column, out):
     for i in range(e0.shape[0]):
         out[0, i], out[1, i], out[2, i], out[3, i], out[4, i] = section_forces(e0[i], kappa[i], column)
         section_commit(e0[i], kappa[i], column)
-
-
-@kernel
-def restore(u, column, force, stiffness):
-    """Write restoring forces and tangent at `u`; return False when an element fails."""
-    return frame.assemble(u, column, force, stiffness)
-
-
-@kernel
-def commit(column):
-    """Commit the last trial."""
-    frame.commit_sections(column)
 
 
 def random_walks(rng, n_walks: int, n_steps: int, amplitude: float):

@@ -8,8 +8,6 @@ from scipy import stats
 from fe_likelihoods import Channel, FELikelihood, Measurements
 from fe_likelihoods.simulation.model import SimulationBatch
 
-__all__ = ["KnownNoise", "Linear", "exact_log_evidence", "likelihood_of"]
-
 
 @dataclass(frozen=True)
 class KnownNoise:

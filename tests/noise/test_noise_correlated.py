@@ -95,6 +95,3 @@ def test_predictions_draw_correlated_errors(rng):
     assert np.all(np.abs(low - 0.05) < 4.5 * math.sqrt(0.05 * 0.95 / n))
     with pytest.raises(ValueError, match="correlation between -1 and 1"):
         propagate(posterior, samples + [0, 0, 0, 0, 0.2, 0], noise=True, progress=False)
-
-
-# problems -------------------------------------------------------------------------------------------------------------

@@ -2,8 +2,6 @@
 
 import numpy as np
 
-__all__ = ["shows", "texts"]
-
 
 def texts(axes) -> list[str]:
     """Texts of the legend."""

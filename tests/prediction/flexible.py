@@ -8,8 +8,6 @@ from fe_likelihoods.signals.records import Record
 from fe_likelihoods.simulation.model import SimulationFailed
 from fe_likelihoods.units import G0
 
-__all__ = ["DISPERSION", "MEDIAN", "Flexible", "strongest", "under"]
-
 MEDIAN, DISPERSION = 0.4 * G0, 0.35
 
 

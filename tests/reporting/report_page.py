@@ -6,8 +6,6 @@ from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree
 
-__all__ = ["Page", "read_page"]
-
 ADDRESSES = ("src", "href", "action", "data", "poster", "srcset")
 
 

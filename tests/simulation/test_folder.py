@@ -446,33 +446,26 @@ def relative(theta):
     return write_and_read("in.txt", theta)
 
 
-@contextlib.contextmanager
-def opened(kind, workers):
-    """A pool of a kind."""
-    if kind.startswith("dask"):
-        distributed = pytest.importorskip("distributed")
-        options = {"dashboard_address": None, "silence_logs": logging.CRITICAL}
-        with (
-            distributed.LocalCluster(workers, threads_per_worker=int(kind[4:]), **options) as cluster,
-            distributed.Client(cluster) as pool,
-        ):
-            yield pool
-        return
-    make = {
-        "local": LocalPool,
-        "processes": lambda n: ProcessPoolExecutor(n, mp_context=multiprocessing.get_context("spawn")),
-        "multiprocessing": multiprocessing.get_context("spawn").Pool,
-    }[kind]
-    with make(workers) as pool:
-        yield pool
+def client():
+    distributed = pytest.importorskip("distributed")
+    return distributed.Client(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=logging.CRITICAL)
+
+
+SPAWN = multiprocessing.get_context("spawn")
+POOLS = {
+    "local": lambda: LocalPool(8),
+    "processes": lambda: ProcessPoolExecutor(2, mp_context=SPAWN),
+    "multiprocessing": lambda: SPAWN.Pool(2),
+    "dask": client,
+}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["local", "processes", "multiprocessing", "dask1"])
+@pytest.mark.parametrize("kind", POOLS)
 def test_no_simulation_reads_files_of_another(kind, start):
     thetas = np.random.default_rng(2).uniform(0.5, 1.5, (300, 2))
     old(start / "in.txt", "1.0 1.0\n")
-    with opened(kind, 8 if kind == "local" else 2) as pool:
+    with POOLS[kind]() as pool:
         assert_right(relative, pool, thetas)
 
 

@@ -12,20 +12,6 @@ from functools import lru_cache
 import numpy as np
 from scipy import special, stats
 
-__all__ = [
-    "Posterior",
-    "banana",
-    "bounds",
-    "gaussian",
-    "modes",
-    "narrow_mode",
-    "rosenbrock",
-    "rotated_banana",
-    "rough",
-    "student",
-    "three_shapes",
-]
-
 LOG_2_PI = float(np.log(2.0 * np.pi))
 
 

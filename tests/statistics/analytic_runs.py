@@ -14,8 +14,6 @@ import numpy as np
 from samplers import SamplingWarning, SMCSampler, TMCMCSampler
 from tests.statistics import analytic_posteriors as targets
 
-__all__ = ["SAMPLERS", "SINGLE", "Cell", "is_doubted", "is_lost", "run"]
-
 SAMPLERS = {"SMC": SMCSampler, "TMCMC": TMCMCSampler}
 LOST_SHARE = 0.15
 FAR = 4.0

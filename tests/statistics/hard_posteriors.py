@@ -24,8 +24,6 @@ from fe_likelihoods import (
 )
 from fe_likelihoods.priors.distributions import Distribution
 
-__all__ = ["CASES", "HardPosterior"]
-
 DT = 0.02  # s
 
 

@@ -1,9 +1,8 @@
 """Simulation-based calibration: over draws of the prior and of data, the truth is one more draw of the posterior.
 
-theta is drawn from the prior, data from the model, and the sampler runs on them. Among independent draws of the
-posterior, the rank of theta is then uniform, parameter by parameter, and so is that of any function of theta and data;
-the log-likelihood is one that sees the parameters together. Talts, Betancourt, Simpson, Vehtari & Gelman (2018),
-arXiv:1804.06788; Modrak et al. (2023), doi:10.1214/23-BA1404 (which functions).
+Among independent draws of the posterior, the rank of theta is uniform, parameter by parameter, and so is the one of the
+log-likelihood. Talts, Betancourt, Simpson, Vehtari & Gelman (2018), arXiv:1804.06788; Modrak et al. (2023),
+doi:10.1214/23-BA1404 (which functions).
 """
 
 import numpy as np

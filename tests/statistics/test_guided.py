@@ -7,23 +7,11 @@ import pytest
 from scipy import stats
 
 from samplers import SMCSampler
-from tests.contract.targets import Box, Gaussian
-from tests.tempering.guides import FixedGuide, LearningGuide
+from tests.contract.targets import Gaussian, Modes
+from tests.tempering.guides import DrawsOf, FixedGuide, LearningGuide
 
 N = 100
 RUNS = 40
-
-
-class TwoModes(Box):
-    """Two Gaussian modes of equal mass in a square; the evidence is that of both."""
-
-    def __init__(self, width=0.05):
-        super().__init__([0.0, 0.0], [1.0, 1.0], self._log_likelihood)
-        self.width, self.centres = width, np.array([[0.3, 0.3], [0.7, 0.7]])
-        self.mean, self.log_evidence = np.array([0.5, 0.5]), np.log(2.0 * 2.0 * np.pi * width**2)
-
-    def _log_likelihood(self, x):
-        return np.logaddexp(*(-0.5 * np.sum(((x - c) / self.width) ** 2, axis=-1) for c in self.centres))
 
 
 def gaussian(scale, shift, guide, **more):
@@ -32,9 +20,10 @@ def gaussian(scale, shift, guide, **more):
     return posterior, guide(posterior, posterior.mean + shift * posterior.sd, [covariance], **more)
 
 
-def two_modes(modes, guide, width=0.05, **more):
-    posterior = TwoModes(width)
-    covariances = np.stack([np.eye(2) * width**2] * modes)
+def two_modes(modes, guide, **more):
+    """Two modes of equal mass, of which the guide knows a number."""
+    posterior = Modes([[0.3, 0.3], [0.7, 0.7]], [0.5, 0.5], 0.05, 1.0)
+    covariances = np.stack([np.eye(2) * 0.05**2] * modes)
     return posterior, guide(posterior, posterior.centres[:modes], covariances, **more)
 
 
@@ -122,22 +111,9 @@ class Student:
         return 50.0 * random.standard_normal((n, self.ndim))
 
 
-class DrawsOf:
-    """A guide that draws from a distribution of scipy and does not learn."""
-
-    findings = ()
-
-    def __init__(self, law):
-        self.law = law
-
-    def draw(self, n, random):
-        return self.law.rvs(size=n, random_state=random)
-
-    def log_density(self, x):
-        return np.atleast_1d(self.law.logpdf(x))
-
-    def refine(self, coords, log_prob, session):
-        pass
+def of_law(law):
+    """A guide that draws from a distribution of scipy."""
+    return DrawsOf(lambda n, random: law.rvs(size=n, random_state=random), law.logpdf)
 
 
 LIGHT, HEAVY = [(3.0, 5, 0.8), (5.0, 2, 0.9), (5.0, 5, 0.9)], [(1e7, 1e7), (5.0, 5.0), (5.0, 8.0)]
@@ -151,7 +127,7 @@ def slow(cases):
 def test_tails_of_a_guide_that_are_too_light_are_reported(dof, ndim, least):
     """A normal guide with half of the variance: the standard deviations are 0.7 to 0.8 of the true ones."""
     posterior = Student(ndim, dof)
-    guide = DrawsOf(stats.multivariate_normal(np.zeros(ndim), 0.5 * posterior.variance * np.eye(ndim)))
+    guide = of_law(stats.multivariate_normal(np.zeros(ndim), 0.5 * posterior.variance * np.eye(ndim)))
     _, statuses = outcomes(posterior, guide, 2000, runs=10)
     assert np.mean(statuses != "converged") >= least
 
@@ -162,5 +138,5 @@ def test_tails_of_a_guide_that_are_heavy_enough_are_not_reported(dof, guide_dof)
     law = stats.multivariate_t(
         np.zeros(3), posterior.variance * (guide_dof - 2.0) / guide_dof * np.eye(3), df=guide_dof
     )
-    _, statuses = outcomes(posterior, DrawsOf(law), 2000, runs=10)
+    _, statuses = outcomes(posterior, of_law(law), 2000, runs=10)
     assert np.all(statuses == "converged")

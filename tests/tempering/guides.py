@@ -151,3 +151,18 @@ class SearchingGuide(LearningGuide):
 
 def digest(what, coords):
     return what + hashlib.sha256(np.ascontiguousarray(coords)).hexdigest()
+
+
+class DrawsOf:
+    """A guide that does not learn; `rvs` is a function of the number of draws and the random state."""
+
+    findings = ()
+
+    def __init__(self, rvs, logpdf):
+        self.draw, self.logpdf = rvs, logpdf
+
+    def log_density(self, x):
+        return np.atleast_1d(self.logpdf(x))
+
+    def refine(self, coords, log_prob, session):
+        pass

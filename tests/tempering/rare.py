@@ -3,8 +3,6 @@
 import numpy as np
 from scipy import integrate, stats
 
-__all__ = ["four_branches", "four_branches_exact", "linear", "summarise"]
-
 
 def linear(points):
     """Standard normal, of standard normal parameters."""

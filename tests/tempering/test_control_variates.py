@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from samplers import SMCSampler
 from samplers.estimates.control_variates import signed_sample
 from samplers.estimates.importance import KnownDensity, Round, add_round, pool_rounds
 from samplers.judgement.verdict import judge
 from tests.contract.targets import Box, Gaussian
 from tests.tempering.guides import FixedGuide
+from tests.tempering.test_guided import laplace, run
 
 NDIM, POOL, LOG_EVIDENCE = 3, 2000, 4.0
 POSTERIOR = stats.multivariate_normal(np.zeros(NDIM))
@@ -148,15 +148,7 @@ def test_a_variance_below_its_error_is_no_standard_deviation(rng):
         assert np.isnan(found.value).tolist() == [False, True, False]
         assert np.isnan(found.error).tolist() == [False, True, False]
     posterior = Gaussian(3)
-    sampler = SMCSampler(
-        50,
-        3,
-        posterior,
-        vectorize=True,
-        seed=2,
-        guide=KnowingGuide(posterior, posterior.mean, [np.diag((1.3 * posterior.sd) ** 2)]),
-    )
-    sampler.run_mcmc(None, 1)
+    sampler = run(posterior, laplace(posterior, scale=1.3, guide=KnowingGuide), nwalkers=50, seed=2)
     before = judge(sampler._result, 50, 3, 100)
     assert not any("is not determined" in reason for reason in before.reasons)
     after = judge(sampler._result._replace(signed=sample._replace(coords=far)), 50, 3, 100)
@@ -178,11 +170,7 @@ def test_a_sampler_uses_what_its_guide_knows():
     covariances = [np.diag((1.3 * posterior.sd) ** 2)]
     runs = {}
     for Guide in (FixedGuide, KnowingGuide):
-        sampler = SMCSampler(
-            50, 3, posterior, vectorize=True, seed=2, guide=Guide(posterior, posterior.mean, covariances)
-        )
-        sampler.run_mcmc(None, 1)
-        runs[Guide] = sampler
+        runs[Guide] = run(posterior, Guide(posterior, posterior.mean, covariances), nwalkers=50, seed=2)
     plain, knowing = runs[FixedGuide], runs[KnowingGuide]
     assert plain.signed_sample is None
     assert np.array_equal(plain.get_chain(), knowing.get_chain())  # the chain has exact weights in both
@@ -224,8 +212,7 @@ class GrowingGuide(FixedGuide):
 def test_rounds_that_missed_a_part_of_the_posterior_do_no_harm():
     exact = two_modes([0.5, 0.5])
     box = Box([-4.0, -4.0], [4.0, 4.0], lambda x: exact.log_density(np.atleast_2d(x)).reshape(np.shape(x)[:-1]))
-    sampler = SMCSampler(100, 2, box, vectorize=True, seed=4, guide=GrowingGuide(box))
-    sampler.run_mcmc(None, 1)
+    sampler = run(box, GrowingGuide(box), seed=4)
     error = sampler.log_evidence + np.log(64.0)
     assert abs(error) < 4.0 * sampler.log_evidence_error + 1e-9 < 0.4
     assert sampler.verdict.status == "converged"
@@ -254,8 +241,7 @@ def test_a_density_that_still_grows_is_followed_or_refused(modes, refused):
     ends = [-4.0, -4.0], [modes + 4.0, 4.0]
     whole = UncoveringGuide(Box(*ends, lambda x: 0.0), modes, modes).known_density
     box = Box(*ends, lambda x: whole.log_density(np.atleast_2d(x)).reshape(np.shape(x)[:-1]))
-    sampler = SMCSampler(100, 2, box, vectorize=True, seed=4, guide=UncoveringGuide(box, modes))
-    sampler.run_mcmc(None, 1)
+    sampler = run(box, UncoveringGuide(box, modes), seed=4)
     error = sampler.log_evidence + np.log(8.0 * (modes + 8.0))
     assert (abs(error) > 4.0 * sampler.log_evidence_error + 1e-9) == refused
     assert (sampler.verdict.status == "not usable") == refused

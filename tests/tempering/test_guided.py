@@ -18,7 +18,7 @@ from samplers.estimates.importance import (
 )
 from samplers.moves.population_moves import GuideMove
 from tests.contract.targets import Gaussian
-from tests.tempering.guides import FixedGuide, LearningGuide, SearchingGuide
+from tests.tempering.guides import DrawsOf, FixedGuide, LearningGuide, SearchingGuide
 
 N = 100
 
@@ -233,19 +233,6 @@ def test_the_shape_of_the_tail_counts_only_where_the_tail_does():
     assert tail_shape(np.zeros(3)) == np.inf
 
 
-def test_failed_draws_count_as_impossible_and_are_reported():
-    class Fails(Gaussian):
-        def __call__(self, x):
-            return np.where(x[..., 0] > self.mean[0], np.nan, super().__call__(x))
-
-    posterior = Fails()
-    with pytest.warns(SamplingWarning, match="evaluations failed"):
-        sampler = run(posterior, laplace(posterior, guide=LearningGuide), max_failure_share=0.9)
-    assert sampler.get_chain()[..., 0].max() <= posterior.mean[0]
-    assert abs(sampler.log_evidence - posterior.log_evidence - np.log(0.5)) < 4.0 * sampler.log_evidence_error
-    assert f"{sampler.failure_count} of {sampler.evaluations} evaluations failed" in str(sampler.verdict)
-
-
 class PartlyImpossible(Gaussian):
     """A share of the parameter space has zero likelihood, as where simulations fail."""
 
@@ -261,26 +248,10 @@ class PartlyImpossible(Gaussian):
         return values if np.ndim(x) == 2 else values[0]
 
 
-class DrawsOfThePrior:
-    findings = ()
-
-    def __init__(self, posterior):
-        self.posterior = posterior
-
-    def draw(self, n, random):
-        return self.posterior.sample_prior(n, random)
-
-    def log_density(self, coords):
-        return self.posterior.log_prior(coords)
-
-    def refine(self, coords, log_prob, session):
-        return None
-
-
 def test_a_model_that_always_fails_is_noticed_soon():
     posterior = PartlyImpossible(1.0)
     with pytest.raises(ValueError, match="none of 55 draws of the guide has a finite log-probability: check the model"):
-        run(posterior, DrawsOfThePrior(posterior))
+        run(posterior, DrawsOf(posterior.sample_prior, posterior.log_prior))
     assert len(posterior.points) == 55
 
 
@@ -290,7 +261,8 @@ def test_a_model_that_often_fails_is_sampled(share):
     """Control: 20 % or 90 % of all points are impossible; the run ends with an answer, in each of ten cases."""
     for seed in range(10):
         posterior = PartlyImpossible(share)
-        sampler = run(posterior, DrawsOfThePrior(posterior), seed=seed)
+        sampler = run(posterior, DrawsOf(posterior.sample_prior, posterior.log_prior), seed=seed)
         assert np.all(np.isfinite(sampler.get_log_prob()))
         error = sampler.log_evidence - (posterior.log_evidence + np.log(1.0 - share))
         assert abs(error) < 5.0 * sampler.log_evidence_error + 0.1 or sampler.verdict.status == "not usable"
+        assert not sampler.failure_count
