@@ -1,7 +1,6 @@
 """Size of the project in one table: ``python -m tests.size``, or ``make size``.
 
-It measures the checkout in the current folder: lines by room beside their budgets, words, and frames on the stack from
-`run_mcmc` (included) to the user's function (excluded), counted while the function runs.
+Of the checkout in the current folder. Frames are from `run_mcmc` (included) to the user's function (excluded).
 """
 
 import sys

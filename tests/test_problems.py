@@ -20,7 +20,7 @@ from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.datasets import Dataset, read_dataset, write_dataset
 from fe_likelihoods.signals.read import read_record
 from fe_likelihoods.units import G0, to_si
-from samplers import SMCSampler
+from tests.emulation.problems import guided
 from tests.scipy_bridge import exchange_piers
 
 INCH = to_si(1.0, "in").item()
@@ -71,8 +71,7 @@ def test_the_data_set_can_be_made_again(data, tmp_path, monkeypatch):
 def test_the_first_example_finds_its_truth_and_can_be_used():
     posterior = bridge_column(data="short")
     truth = bridge_column_data("short").attributes["truth"]
-    sampler = SMCSampler(100, posterior.ndim, posterior, vectorize=True, seed=1, guide=posterior.guide())
-    sampler.run_mcmc(None, 1)
+    sampler = guided(posterior)
     samples = sampler.get_chain(flat=True)
     low, high = np.quantile(samples, [0.05, 0.95], axis=0)
     known = np.array([truth[name] for name in posterior.parameter_names])

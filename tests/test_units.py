@@ -23,6 +23,10 @@ from fe_likelihoods.units import UNITS, find_unit, from_si, to_si
         (1, "MN", 1e6),
         (1, "GPa", 1e9),
         (20, "ms", 0.02),
+        (20, "milliseconds", 0.02),
+        (1, "us", 1e-6),
+        (1, "um", 1e-6),
+        (1, "mg", 9.80665e-3),
         (180, "deg", np.pi),
         (1000, "mrad", 1.0),
         (1, "kip in", 112.9848290276167),  # NIST SP 811
@@ -69,6 +73,8 @@ SPELLINGS = {
     "acceleration": ["cm/s2", "CM/SEC/SEC", "cm/sec2", "cm/s/s", "cm/s^2", "cm/s**2", "cm_s2", "cm/s²"],
     "moment": ["kN m", "kN-m", "kNm", "kN·m", "kN*m", "KN M"],
     "strain": ["microstrain", "ue", "µε", "με", "Microstrain"],
+    "time": ["us", "µs", "μs", "microseconds", "microsec"],
+    "displacement": ["um", "µm", "μm", "UM"],
 }
 
 

@@ -22,7 +22,7 @@ from fe_likelihoods.checks.steps import halve_steps
 from fe_likelihoods.emulation.modes import find_modes
 from fe_likelihoods.problems import table_motion
 from fe_likelihoods.simulation.model import simulate_batch
-from samplers import SMCSampler
+from tests.emulation.problems import guided
 
 MOTION = table_motion().trim(0.0, 4.0).resample(0.01)
 TOP = (Channel("top", "relative displacement", "mm"),)
@@ -90,8 +90,7 @@ def test_a_coarse_step_limits_the_result_of_a_run(joint):
             second = posterior_of(lambda theta, record: central_differences(theta, record, 8), 0.02).likelihood
             likelihood = JointLikelihood({"a": posterior.likelihood, "b": second})
             posterior = Posterior(likelihood, posterior.prior)
-        sampler = SMCSampler(40, posterior.ndim, posterior, vectorize=True, seed=1, guide=posterior.guide())
-        sampler.run_mcmc(None, 1)
+        sampler = guided(posterior, walkers=40)
         before = posterior.likelihood.simulations
         judgement = check_result(sampler)
         return judgement, posterior.likelihood.simulations - before
@@ -108,8 +107,7 @@ def test_a_coarse_step_limits_the_result_of_a_run(joint):
 def test_a_motion_that_is_not_read_is_named_after_a_run_as_well():
     """The parameters may be right, but every prediction repeats the calibration; the step is not tested then."""
     posterior = posterior_of(lambda theta, record: central_differences(theta, MOTION, 8)[:, : record.n_steps])
-    sampler = SMCSampler(40, posterior.ndim, posterior, vectorize=True, seed=1, guide=posterior.guide())
-    sampler.run_mcmc(None, 1)
+    sampler = guided(posterior, walkers=40)
     judgement = check_result(sampler)
     assert judgement.status == "do not use" and judgement.findings[0].kind == "The motion changes nothing"
     assert not [each for each in judgement.findings if "finer" in each.kind or "tested" in each.kind]

@@ -1,11 +1,9 @@
 """A posterior that every client can sample in seconds, and its exact moments and evidence.
 
 The model is a strongly damped linear oscillator with four parameters, each with a different kind of prior. In three
-fifths of the prior the simulation fails (it is overdamped), so every client
-meets -inf; a client that drops such points instead of counting them has a log-evidence that is too large by 0.9.
+fifths of the prior the simulation fails; a client that drops such points has a log-evidence that is too large by 0.9.
 
-The exact answer is computed independently of the library: with distributions of `scipy.stats`, an explicit likelihood
-and quadrature.
+The exact answer uses distributions of `scipy.stats`, an explicit likelihood and quadrature.
 """
 
 import functools

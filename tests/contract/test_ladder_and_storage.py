@@ -35,9 +35,8 @@ def test_stages_account_for_everything():
     assert check.evaluations == N
     asked = sum(s.evaluations for s in sampler.ladder) + N
     assert 0.98 * asked < sampler.evaluations == posterior.calls <= asked  # a point that is proposed again is known
-    assert all(
-        s.evaluations == N * s.moves for s in sampler.ladder[1:]
-    )  # the prior is unbounded, so all proposals are evaluated
+    # the prior is unbounded, so all proposals are evaluated
+    assert all(s.evaluations == N * s.moves for s in sampler.ladder[1:])
     assert all(2 <= s.moves <= 7 and 0 < s.acceptance <= 1 for s in sampler.ladder)
     assert all(abs(s.effective_sample_size / (0.5 * N) - 1) < 1e-4 for s in sampler.ladder[:-1])
     assert sampler.ladder[-1].effective_sample_size >= 0.5 * N

@@ -14,6 +14,7 @@ from fe_likelihoods import (
     TruncatedNormal,
     Uniform,
 )
+from samplers import SMCSampler
 
 N_STEPS, DT = 200, 0.02
 CHANNELS = (Channel("top", "displacement", "mm"), Channel("base", "force", "kN"))
@@ -127,3 +128,11 @@ def misleading(seed=1):
 def _marginal(model, measured, prior):
     prior = prior | {"sigma_top": HalfNormal(0.5)}
     return Posterior(FELikelihood(model, measured, GaussianNoise(model.channels)), prior).marginal()
+
+
+def guided(posterior, limit=None, starts=None, seed=1, steps=1, walkers=100, Sampler=SMCSampler):
+    """A run with the guide of its posterior and a limit of simulations."""
+    guide = posterior.guide() if starts is None else posterior.guide(starts)
+    sampler = Sampler(walkers, posterior.ndim, posterior, vectorize=True, seed=seed, guide=guide, max_simulations=limit)
+    sampler.run_mcmc(None, steps)
+    return sampler

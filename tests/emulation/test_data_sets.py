@@ -1,7 +1,5 @@
 """Guides of several data sets with parameters in common."""
 
-import warnings
-
 import numpy as np
 import pytest
 
@@ -19,7 +17,7 @@ from fe_likelihoods import (
     Uniform,
 )
 from fe_likelihoods.emulation.target import ResponseTarget, at_once
-from samplers import SMCSampler
+from tests.emulation.problems import guided
 
 DT, N = 0.02, 100
 CHANNEL = (Channel("top", "displacement", "mm"),)
@@ -147,24 +145,8 @@ def exact(posterior):
     return log_evidence, mean, np.sqrt(weights @ (grid - mean) ** 2 / weights.sum())
 
 
-def guided(posterior, limit=700, seed=1, **options):
-    sampler = SMCSampler(
-        N,
-        posterior.ndim,
-        posterior,
-        vectorize=True,
-        seed=seed,
-        guide=posterior.guide(),
-        max_simulations=limit,
-        **options,
-    )
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the limit ends the steps at beta = 1
-        sampler.run_mcmc(None, 1 - sampler.iteration)
-    return sampler
-
-
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
 def test_two_events_take_hundreds_of_simulations():
     """The result is that of quadrature; every simulation is one run of each model."""
     log_evidence, mean, sd = exact(joint())
@@ -193,6 +175,7 @@ def test_control_one_event_alone_has_another_posterior():
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
 def test_a_limit_that_ends_the_search_repeats_no_simulation(monkeypatch):
     """The draws that fill the limit are of a guide that has not ended its search; they stay in the count."""
     calls, call = [], Vibration.__call__
@@ -202,15 +185,13 @@ def test_a_limit_that_ends_the_search_repeats_no_simulation(monkeypatch):
         return call(self, theta)
 
     monkeypatch.setattr(Vibration, "__call__", count)
-    whole = guided(joint(), seed=0)
+    whole = guided(joint(), 700, seed=0)
     posterior = joint()
     calls.clear()
     sampler = guided(posterior, limit=50, seed=0)
     assert sampler.simulations == 50
     sampler.max_simulations = 700
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        sampler.run_mcmc(None, 0)  # the step of the limited run is replaced
+    sampler.run_mcmc(None, 0)  # the step of the limited run is replaced
     assert np.array_equal(sampler.get_chain(), whole.get_chain()) and sampler.log_evidence == whole.log_evidence
     # the list of calls is a value of the model that changes: earlier points are run again, to see whether it matters
     distinct = len(calls) - posterior.report()["verifications"]

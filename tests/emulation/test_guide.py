@@ -1,6 +1,5 @@
 """The guide behind the samplers: right on small posteriors, exact counts, budgets, refusals."""
 
-import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -24,7 +23,7 @@ from samplers import SMCSampler, TMCMCSampler
 from samplers.judgement.guides import check_excluded_runs
 from tests.statistics.hard_posteriors import CASES
 
-from .problems import vibration
+from .problems import guided, vibration
 
 
 def quadrature(posterior):
@@ -46,8 +45,7 @@ def quadrature(posterior):
 def test_evidence_and_means_against_quadrature(Sampler):
     posterior = vibration()
     log_evidence, means = quadrature(vibration())
-    sampler = Sampler(100, 2, posterior, vectorize=True, seed=1, guide=posterior.guide(), max_simulations=600)
-    sampler.run_mcmc(None, 1)
+    sampler = guided(posterior, 600, Sampler=Sampler)
     assert sampler.verdict.status == "converged"
     assert abs(sampler.log_evidence - log_evidence) < 3.0 * sampler.log_evidence_error < 0.3
     assert (np.abs(sampler.get_chain(flat=True).mean(axis=0) - means) < 4.0 * sampler.mean_error()).all()
@@ -58,10 +56,7 @@ def test_evidence_and_means_against_quadrature(Sampler):
 @pytest.mark.parametrize("noise", ["autoregressive", "effective"])
 def test_every_noise_is_sampled_together_with_its_parameters(noise):
     posterior = vibration(noise)
-    sampler = SMCSampler(
-        100, posterior.ndim, posterior, vectorize=True, seed=2, guide=posterior.guide(3), max_simulations=500
-    )
-    sampler.run_mcmc(None, 1)
+    sampler = guided(posterior, 500, starts=3, seed=2)
     assert sampler.verdict.status == "converged"
     reference = SMCSampler(250, posterior.ndim, vibration(noise), vectorize=True, seed=3)
     reference.run_mcmc(None, 2)
@@ -75,9 +70,7 @@ def test_every_noise_is_sampled_together_with_its_parameters(noise):
 def test_densities_are_normalised_and_draws_are_inside_the_support():
     """The mean over draws of any normalised density divided by that of the guide is one."""
     posterior = vibration()
-    sampler = SMCSampler(100, 2, posterior, vectorize=True, seed=1, guide=posterior.guide())
-    sampler.run_mcmc(None, 0)
-    guide = sampler.guide
+    guide = guided(posterior, steps=0).guide
     coords = guide.draw(4000, np.random.RandomState(5))
     assert np.isfinite(posterior.log_prior(coords)).all()
     centre, spread = coords.mean(axis=0), coords.std(axis=0)
@@ -108,10 +101,7 @@ def test_a_channel_with_an_offset_of_a_million_times_its_noise():
     for offset in (0.0, 1e6):
         case = CASES["smooth"]
         posterior = replace(case, offset=offset * case.noise).posterior(1)
-        sampler = SMCSampler(
-            100, posterior.ndim, posterior, vectorize=True, seed=1, guide=posterior.guide(2), max_simulations=500
-        )
-        sampler.run_mcmc(None, 1)
+        sampler = guided(posterior, 500, starts=2)
         assert sampler.verdict.status == "converged"
         results.append((sampler.log_evidence, sampler.verdict.simulations))
     assert results[0][1] == results[1][1] <= 500
@@ -137,8 +127,7 @@ def test_springs_in_series_are_emulated_in_flexibilities():
     prior = {name: TruncatedNormal(1.0, 0.2) for name in model.parameter_names}
     prior |= {f"sigma_{c.name}": HalfNormal(1.0) for c in model.channels}
     posterior = Posterior(FELikelihood(model, measured, GaussianNoise(model.channels)), prior).marginal()
-    sampler = SMCSampler(100, n, posterior, vectorize=True, seed=1, guide=posterior.guide())
-    sampler.run_mcmc(None, 0)
+    sampler = guided(posterior, steps=0)
     (emulator,) = sampler.guide.emulators
     assert np.abs(np.subtract(*emulator.left_out_statistics())).max() < 1e-6  # with logarithms: 0.1
     assert sampler.verdict.simulations < 250
@@ -149,6 +138,7 @@ def test_springs_in_series_are_emulated_in_flexibilities():
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::UserWarning")
 @pytest.mark.parametrize("n", [8, 12])
 def test_a_banana_is_right_or_has_a_concern(n):
     """In 12 dimensions its ends are missing: standard deviations .84 to .90 of the true ones, with a concern in 3 of 3.
@@ -169,10 +159,7 @@ def test_a_banana_is_right_or_has_a_concern(n):
         FELikelihood(model, Measurements(model.channels, 0.1, values, "SYNTHETIC")),
         prior | {"sigma_y": LogNormal(1.0, 0.2)},
     )
-    sampler = SMCSampler(100, n + 1, posterior, vectorize=True, seed=1, guide=posterior.guide(), max_simulations=1500)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        sampler.run_mcmc(None, 1)
+    sampler = guided(posterior, 1500)
     # x1 and the noise apart, the first value is normal with the mean -9 x0^2
     x, sigma = np.meshgrid(np.linspace(-5.0, 5.0, 1001), np.exp(np.linspace(-1.2, 1.2, 201)), indexing="ij")
     density = norm.logpdf(values[0, 0], -9.0 * x**2, np.hypot(15.0, sigma)) + norm.logpdf(x)
@@ -184,6 +171,7 @@ def test_a_banana_is_right_or_has_a_concern(n):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::UserWarning")
 @pytest.mark.parametrize("seed", [12, 18])
 def test_a_long_ridge_is_followed_to_the_bounds_of_its_prior(seed):
     """E h^3 alone is identified. In parameters, in which few runs are emulated as well, the ridge is curved."""
@@ -197,10 +185,7 @@ def test_a_long_ridge_is_followed_to_the_bounds_of_its_prior(seed):
     values = of_stiffness(0.95) + 1e-3 * np.random.default_rng(seed).standard_normal((1, 300))
     prior = {"E": Uniform(0.1, 5.0), "h": Uniform(0.3, 2.0), "sigma_tip": HalfNormal(0.003)}
     posterior = Posterior(FELikelihood(model, Measurements(channels, 0.02, values)), prior).marginal()
-    sampler = SMCSampler(100, 2, posterior, vectorize=True, seed=seed, guide=posterior.guide(), max_simulations=800)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        sampler.run_mcmc(None, 1)
+    sampler = guided(posterior, 800, seed=seed)
     k, h = np.linspace(0.85, 1.05, 801), np.linspace(0.3, 2.0, 2001)
     inside = (k[:, None] / h**3 > 0.1) & (k[:, None] / h**3 < 5.0)
     of_k = np.where(inside, h**-3.0 / 4.9 / 1.7, 0.0).sum(axis=1) * (h[1] - h[0])

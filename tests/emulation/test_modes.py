@@ -28,10 +28,10 @@ from fe_likelihoods.emulation.modes import (
     unseen_share,
 )
 from fe_likelihoods.emulation.target import ResponseTarget
-from samplers import SamplingWarning, SMCSampler
+from samplers import SamplingWarning
 from samplers.judgement.guides import DOUBTED_SHARE
 
-from .problems import acts_late, free_vibration, late_response, misleading, noisy, symmetric, vibration
+from .problems import acts_late, free_vibration, guided, late_response, misleading, noisy, symmetric, vibration
 
 
 def _log_density(posterior, coords):
@@ -183,10 +183,9 @@ def test_a_curved_ridge_is_sampled_whole_or_doubted(seed):
     measured = Measurements(channels, 0.02, model.simulate(np.array([0.8, 0.6])) + noise)
     prior = {"a": Uniform(-2.0, 2.0), "b": Uniform(-2.0, 2.0), "sigma_top": Uniform(0.005, 0.5)}
     posterior = Posterior(FELikelihood(model, measured), prior)
-    sampler = SMCSampler(60, 3, posterior, vectorize=True, seed=seed, guide=posterior.guide(), max_simulations=600)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SamplingWarning)
-        sampler.run_mcmc(None, 1)
+        sampler = guided(posterior, 600, seed=seed, walkers=60)
     whole = np.allclose(sampler.get_chain(flat=True)[:, :2].std(axis=0), np.sqrt(0.5), rtol=0.2)
     assert whole or sampler.verdict.status != "converged"
 

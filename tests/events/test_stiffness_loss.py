@@ -24,7 +24,7 @@ from fe_likelihoods import (
 )
 from fe_likelihoods.checks.finding import CARE, Finding
 from fe_likelihoods.emulation.modes import find_modes
-from samplers import SMCSampler
+from tests.emulation.problems import guided
 
 D, SD = 6, 0.02
 NAMES = tuple(f"k_{i + 1}" for i in range(D))
@@ -192,8 +192,7 @@ def calibrated():
     posteriors = [building(factors, seed) for seed, factors in enumerate(([1.0, 1.1, 0.9], [0.98, 0.8085, 0.882]))]
     samplers = []
     for posterior in posteriors:
-        sampler = SMCSampler(60, posterior.ndim, posterior, vectorize=True, seed=1, guide=posterior.guide())
-        sampler.run_mcmc(None, 1)
+        sampler = guided(posterior, walkers=60)
         samplers.append(sampler)
     return posteriors, samplers
 

@@ -143,6 +143,22 @@ def test_killed_while_writing(path, rng, kills):
 # several at once ------------------------------------------------------------------------------------------------------
 
 
+def test_programs_that_create_a_cache_at_the_same_moment(tmp_path):
+    for attempt in range(5):
+        path = tmp_path / f"{attempt}.sqlite"
+
+        def begin(number, path=path):
+            thetas = batch_of(1, number)
+            SimulationCache(path).store(FINGERPRINT, thetas, sums_of(thetas), [""] * len(thetas))
+
+        assert at_once(begin, [(number,) for number in range(6)]) == [0] * 6
+        assert integrity(path) == [("ok",)]
+        cache = SimulationCache(path)
+        for number in range(6):
+            thetas = batch_of(1, number)
+            np.testing.assert_array_equal(cache.look_up(FINGERPRINT, thetas, 2).values, sums_of(thetas))
+
+
 def test_two_programs_on_one_cache(path, thetas, expected):
     """Both get the right values and together store every simulation, so a third one runs none."""
 

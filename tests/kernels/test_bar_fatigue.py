@@ -102,9 +102,8 @@ def test_half_cycles_of_constant_amplitude_follow_coffin_and_manson():
         found.append(np.argmax(damage > 1.0) / 200.0)
         expected.append(1.0 / one)
     assert expected[0] / expected[-1] > 8.0
-    np.testing.assert_allclose(
-        found, expected, atol=1.5
-    )  # the first half cycle begins at zero, the last is not complete
+    # the first half cycle begins at zero, the last is not complete
+    np.testing.assert_allclose(found, expected, atol=1.5)
 
 
 def test_strength_decreases_with_the_damage_and_ends_with_fracture():

@@ -5,7 +5,7 @@ import pytest
 
 from fe_likelihoods import LogNormal, ModalData, ModalLikelihood, Posterior, ShearFrame, StoredPosterior, stiffness_loss
 from fe_likelihoods.modal.mode_models import StructureModes
-from samplers import SMCSampler
+from tests.emulation.problems import guided
 
 FLOORS = {"floor 1": 1, "floor 2": 2, "floor 4": 4, "roof": 6}
 FRAME = ShearFrame(FLOORS, [300e3] * 6, [400e6] * 6)
@@ -19,8 +19,7 @@ def calibrated(stiffnesses, temperature, rng):
     frequencies = modes[0] * (1.0 - 0.0015 * (temperature - 20.0)) * (1.0 + 0.005 * rng.normal(size=(5, 4)))
     data = ModalData(frequencies, shapes, tuple(FLOORS)).mean()
     posterior = Posterior(ModalLikelihood(FRAME, data), dict.fromkeys(NAMES, LogNormal(1.0, 0.2)))
-    sampler = SMCSampler(200, 6, posterior, guide=posterior.guide(starts=2), seed=1, vectorize=True)
-    sampler.run_mcmc(None, 1)
+    sampler = guided(posterior, starts=2, walkers=200)
     return StoredPosterior.from_run(sampler, posterior)
 
 

@@ -21,7 +21,7 @@ from fe_likelihoods import (
 )
 from fe_likelihoods.modal.load_cases import LoadTest
 from fe_likelihoods.modal.mode_models import StructureModes
-from samplers import SMCSampler
+from tests.emulation.problems import guided
 
 FLOORS = {"floor 1": 1, "roof": 2}
 FRAME = ShearFrame(FLOORS, [20e3] * 2, [30e6] * 2)
@@ -50,8 +50,7 @@ def static_likelihood(rng):
 
 def reported(posterior, path, predicted=False):
     """Text of the report of a guided run, without styles and pictures, and the judgement."""
-    sampler = SMCSampler(100, posterior.ndim, posterior, guide=posterior.guide(starts=3), seed=1, vectorize=True)
-    sampler.run_mcmc(None, 1)
+    sampler = guided(posterior, starts=3)
     samples = sampler.get_chain(flat=True)[:10]
     page = report(sampler, posterior, propagate(posterior, samples) if predicted else None, out=path / "report.html")
     text = page.read_text()

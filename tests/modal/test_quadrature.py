@@ -19,7 +19,7 @@ from fe_likelihoods import (
     read_modal_data,
     to_si,
 )
-from samplers import SMCSampler
+from tests.emulation.problems import guided
 
 
 def quadrature(posterior, bounds, n):
@@ -33,13 +33,6 @@ def quadrature(posterior, bounds, n):
     total = density.sum()
     mean = density @ points / total
     return logs.max() + np.log(total), mean, np.sqrt(density @ np.square(points - mean) / total)
-
-
-def guided(posterior, walkers=300, seed=3):
-    """A guided run."""
-    sampler = SMCSampler(walkers, posterior.ndim, posterior, guide=posterior.guide(), seed=seed, vectorize=True)
-    sampler.run_mcmc(None, 1)
-    return sampler
 
 
 def two_storeys(theta):
@@ -139,7 +132,7 @@ def moments_of(run):
 def test_guided_runs_agree_with_quadrature(problem):
     make, bounds, n = PROBLEMS[problem]
     evidence, mean, deviation = quadrature(make(), bounds, n)
-    runs = [guided(make(), seed=seed) for seed in range(5)]
+    runs = [guided(make(), seed=seed, walkers=300) for seed in range(5)]
     assert all(run.log_evidence == pytest.approx(evidence, abs=0.05) for run in runs)
     # 1500 draws of the chains alone have an error of 0.026 standard deviations
     moments = [
@@ -167,7 +160,7 @@ def test_held_out_modes_of_a_measured_frame_are_predicted(shared):
     frame = ShearFrame(floors, [to_si(12.06, "lb")] * 4, [to_si(10.0, "lbf/in")] * 4)
     likelihood = ModalLikelihood(frame, data.select([1, 2]), "common")
     prior = {f"stiffness_{i}": LogNormal(1.0, 0.2) for i in (1, 2, 3, 4)} | {"frequency_error": LogNormal(0.01, 0.5)}
-    samples = guided(Posterior(likelihood, prior), 200).get_chain(flat=True)
+    samples = guided(Posterior(likelihood, prior), seed=3, walkers=200).get_chain(flat=True)
     modes = likelihood.predict_modes(samples, data)
     low, high = modes.interval(0.9)
     assert (low < data.frequencies[0]).all() and (data.frequencies[0] < high).all()

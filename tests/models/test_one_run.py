@@ -21,7 +21,7 @@ from fe_likelihoods.modal.load_cases import LoadTest
 from fe_likelihoods.modal.mode_models import modal_channels, modal_response
 from fe_likelihoods.models import one_run as module
 from fe_likelihoods.models.one_run import one_run
-from samplers import SMCSampler
+from tests.emulation.problems import guided
 
 NAMES = ("k1", "k2")
 TOP = Channel("top", "displacement", "m")
@@ -78,8 +78,7 @@ def test_a_joint_posterior_runs_once_at_each_point(rng, runs):
 def test_a_guided_run_with_its_checks_and_a_cache_runs_once(tmp_path, runs):
     cache = SimulationCache(tmp_path / "both.db", verify=False)
     posterior = joint(of_function(), cache=cache)
-    sampler = SMCSampler(100, 2, posterior, guide=posterior.guide(starts=3), seed=1, vectorize=True)
-    sampler.run_mcmc(None, 1)
+    sampler = guided(posterior, starts=3)
     assert sum(runs) == posterior.likelihood["modes"].simulations == posterior.likelihood["static"].simulations
     made = sum(runs)
     other = joint(of_function(), cache=cache)

@@ -122,9 +122,8 @@ def test_intervals_of_the_probability_cover_the_true_probability(limit, rng):
 
 
 def test_intervals_contain_their_own_probability(hierarchy, rng):  # noqa: F811
-    few = EventRatios(
-        [0.9887505, 1.00023499, 1.00460618], prior_events=1e-9
-    )  # P has the tail of t with 2 degrees of freedom
+    # P has the tail of t with 2 degrees of freedom
+    few = EventRatios([0.9887505, 1.00023499, 1.00460618], prior_events=1e-9)
     limits = np.array([0.01, 0.1, 0.5, 0.9, 1.0, 1.1, 2.0, 10.0, 100.0])
     found = exceedance(np.ones(200), limits, ratios=few)
     assert np.all(found.lower <= found.probability) and np.all(found.probability <= found.upper)

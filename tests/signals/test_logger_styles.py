@@ -5,7 +5,7 @@ import pytest
 
 from fe_likelihoods import Channel, read_columns
 from fe_likelihoods.signals.read import read_record
-from fe_likelihoods.units import G0, to_si
+from fe_likelihoods.units import G0
 from tests.signals.logger_styles import ACCELERATION, COLUMNS, READ, REFUSED, STEP
 
 TOP = Channel("top", "acceleration", "g")
@@ -55,16 +55,6 @@ def test_a_unix_time_beside_an_elapsed_one(tmp_path):
 def test_numbers_of_other_countries_and_programs(tmp_path, cell, value):
     (tmp_path / "a.csv").write_text(f"time_s;acc [mm/s2]\n0.0;1\n0.1;{cell}\n")
     assert read_record(tmp_path / "a.csv").acceleration[1] == pytest.approx(1e-3 * value, rel=1e-12)
-
-
-def test_micro_and_milli():
-    for name in ("us", "µs", "μs", "microseconds", "microsec"):
-        assert to_si(1.0, name, "time") == 1e-6
-    for name in ("ms", "milliseconds", "msec"):
-        assert to_si(1.0, name, "time") == 1e-3
-    for name in ("um", "µm", "μm", "UM"):
-        assert to_si(1.0, name, "displacement") == 1e-6
-    assert to_si(1.0, "mg", "acceleration") == 1e-3 * G0
 
 
 @pytest.mark.parametrize("name", ["Top [µm]", "Top (μm)", "top_um"])

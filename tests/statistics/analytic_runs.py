@@ -65,11 +65,7 @@ def _posterior(cell: Cell, seed: int) -> targets.Posterior:
 
 
 def run(cell: Cell, seed: int, steps: int = 5, settings: dict[str, Any] | None = None) -> dict[str, Any]:
-    """Run a sampler once, with a chain of `steps`, and compare with the truth.
-
-    The seed belongs to the posterior and to the sampler. Returns errors of the result and what the run said about
-    itself; JSON can store it.
-    """
+    """Errors of a run with a chain of `steps`, and what it said; posterior and sampler have the same seed."""
     posterior = _posterior(cell, seed)
     sampler = SAMPLERS[cell.sampler](
         cell.walkers, posterior.ndim, posterior, vectorize=True, seed=1000 + seed, **(settings or {})
