@@ -80,8 +80,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
         blobs; the log-prior is added to its values. Its attributes are used like attributes of `log_prob_fn`.
     guide : Guide, optional
         An object that proposes draws near the posterior (`samplers.tempering.guide`). Its weighted draws replace the
-        annealing, and the sweeps at beta = 1 are proposals of the guide. If the draws cannot be trusted, recycling
-        starts from them, with a `SamplingWarning`.
+        annealing, and the sweeps at beta = 1 are proposals of the guide. If the draws cannot be trusted, the run is
+        "not usable", with a `SamplingWarning`.
     max_simulations : float, optional
         Largest number of simulations (`simulations`). When it is reached, the posterior is estimated from the known
         points, the final walkers are stored as one step if the chain is empty, and a `SamplingWarning` says so; see

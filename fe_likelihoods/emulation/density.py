@@ -112,7 +112,8 @@ class EmulatedPosterior:
     def known_density(self) -> KnownDensity:
         """This density of the parameters, with the pool."""
         parameters = self._target.parameters(self._pool)
-        return KnownDensity(self._log_density_of, parameters, self._weights, self.log_evidence_error)
+        used = self._weights > 0.0  # points far away, whose numbers may be infinite, have none
+        return KnownDensity(self._log_density_of, parameters[used], self._weights[used], self.log_evidence_error)
 
     def _log_density_of(self, parameters: np.ndarray) -> np.ndarray:
         """Normalised log-density (n,) of parameters (n, ndim)."""

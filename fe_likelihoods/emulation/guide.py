@@ -27,6 +27,7 @@ from samplers.judgement.guides import (
     check_draws_in_memory,
     check_ends,
     check_excluded_runs,
+    check_tops,
     check_unseen_modes,
     find_missing_part,
 )
@@ -111,7 +112,7 @@ class ResponseGuide:
         self._target = ResponseTarget(posterior)
         self._posterior, self._starts = posterior, starts
         self.search: ModeSearch | None = None
-        self.simulations = 0.0
+        self.simulations, self.highest = 0.0, -np.inf  # the highest log-density of a draw
         self._regions: list[Region] = []
         self._emulated: EmulatedPosterior | None = None
         self._wide: Mixture | None = None
@@ -155,6 +156,7 @@ class ResponseGuide:
             made = len(search.ends)
             wanted = enough(search, self._starts) if made < MOST_STARTS * self._starts else self._starts
             found += check_ends(ended(search), made, wanted, search.grown)
+        found += check_tops(self.highest - max((mode.log_density for mode in search.modes), default=np.inf))
         if self._emulated is not None:
             found += check_draws_in_memory(self._emulated.largest_weight)
             found += check_excluded_runs(*self._emulated.of_runs)
@@ -238,6 +240,9 @@ class ResponseGuide:
     def refine(self, parameters: np.ndarray, log_prob: np.ndarray, session: Any) -> None:
         """Learn from evaluated points (n, ndim): new emulators."""
         alive = np.isfinite(log_prob)
+        coords = self._target.coordinates(parameters)
+        heights = log_prob - self._posterior.log_prior(parameters) + self._target.log_prior(coords)
+        self.highest = max(self.highest, float(np.max(heights[alive], initial=-np.inf)))
         latest = np.where(alive, np.where(alive, log_prob, 0.0) - self.log_density(parameters), -np.inf)
         drawn = session.weighted()
         fitted = None if drawn is None else self._fit_draws(latest, *drawn)

@@ -19,7 +19,7 @@ from fe_likelihoods import (
     Uniform,
 )
 from fe_likelihoods.emulation.guide import ResponseGuide
-from samplers import SMCSampler, TMCMCSampler
+from samplers import SamplingWarning, SMCSampler, TMCMCSampler
 from samplers.judgement.guides import check_excluded_runs
 from tests.statistics.hard_posteriors import CASES
 
@@ -216,3 +216,24 @@ def test_a_rough_response_is_no_ridge(rng):
     emulated = -rng.uniform(0.0, 3.0, 60)
     (found,) = check_excluded_runs(emulated + 2.0 * rng.standard_normal(60), emulated)
     assert "the response is rough" in found.text and "ridge" not in found.text
+
+
+def test_a_search_that_ends_below_the_modes_is_refused():
+    """Equal aliases of a frequency: ascents end where the amplitude is small, and draws find some of five modes."""
+    times = 0.25 * np.arange(40)
+
+    def vibration(theta):
+        amplitude, frequency = theta
+        decay = amplitude * (1.0 + 0.01 * frequency) * np.exp(-0.05 * times)
+        return [decay * np.cos(2.0 * np.pi * frequency * times)]
+
+    model = FunctionModel(vibration, ["amplitude", "frequency"], [Channel("top", "displacement", "m")], 0.25, 40)
+    noise = 0.15 * np.random.default_rng(1).standard_normal((1, 40))
+    measured = Measurements(model.channels, 0.25, model.simulate([1.0, 3.3]) + noise)
+    prior = {"amplitude": TruncatedNormal(1.0, 0.3), "frequency": Uniform(0.2, 9.8), "sigma_top": HalfNormal(0.45)}
+    posterior = Posterior(FELikelihood(model, measured), prior).marginal()
+    for seed in (1, 3):
+        sampler = SMCSampler(50, 2, posterior, vectorize=True, seed=seed, guide=posterior.guide(), max_simulations=400)
+        with pytest.warns(SamplingWarning, match="above the top of every mode"):
+            sampler.run_mcmc(None, 0)
+        assert sampler.verdict.status == "not usable"
