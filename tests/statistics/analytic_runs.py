@@ -65,7 +65,7 @@ def _posterior(cell: Cell, seed: int) -> targets.Posterior:
 
 
 def run(cell: Cell, seed: int, steps: int = 5, settings: dict[str, Any] | None = None) -> dict[str, Any]:
-    """Errors of a run with a chain of `steps`, and what it said; posterior and sampler have the same seed."""
+    """Errors of a run with a chain of `steps`, and what it said; the seed is of both."""
     posterior = _posterior(cell, seed)
     sampler = SAMPLERS[cell.sampler](
         cell.walkers, posterior.ndim, posterior, vectorize=True, seed=1000 + seed, **(settings or {})
