@@ -1,9 +1,8 @@
 """Shared fixtures: the folder of reference material beside the project, and the seed of the statistical tests.
 
-Linear algebra uses one thread per process, also in the scripts that tests start. The workers of pytest-xdist occupy all
-cores, and threads of OpenBLAS that wait for each other on small matrices take three times the processor time.
-
-The longest tests come first, and `make test` distributes tests by stealing: no worker waits for another one at the end.
+Linear algebra uses one thread per process, also in the scripts that tests start: threads of OpenBLAS that wait for each
+other on small matrices take three times the processor time. The longest tests come first: `make test` distributes by
+stealing, and no worker waits for another one at the end.
 """
 
 import os

@@ -1,7 +1,4 @@
-"""A reinforcing bar in OpenSees, a peer for tests: the material ReinforcingSteel with fatigue.
-
-OpenSees may end its process, so each call starts one: ``python -m tests.opensees_bar JOB RESULT``.
-"""
+"""A reinforcing bar in OpenSees, a peer for tests: the material ReinforcingSteel with fatigue."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """The isolated bridge as an ordinary differential equation for scipy's `solve_ivp`, a peer for tests and benchmarks.
 
-This implementation shares no code with the kernels of the library. It uses the free bodies of the deck and of the two
-blocks on their piers (moments about the centre of mass of a block, not assembled matrices), rate equations of friction
-and dampers, and outputs from the equations of motion. Friction is the Bouc-Wen law with exponent 2.
+It shares no code with the kernels: free bodies of the deck and of the two blocks on their piers, rate equations of
+friction (Bouc-Wen, exponent 2) and of dampers.
 """
 
 from typing import NamedTuple

@@ -16,7 +16,7 @@ from fe_likelihoods.simulation.executors import PoolExecutor
 
 
 class SimulatedCluster:
-    """A log-density on simulated workers; `target` is the log-density of a batch of points (n, ndim).
+    """A log-density of batches (n, ndim) on simulated workers.
 
     `length` is a function of points (n, ndim) that returns how long their evaluations take (n,). `now` is the time of
     the clock, `evaluations` the number of all evaluations so far.
@@ -68,10 +68,7 @@ class SimulatedCluster:
 
 
 class DelayedPool(PoolExecutor):
-    """Threads in which each simulation takes a random time of a millisecond on average.
-
-    `simulations` counts them; one of a part of the record, of `n_steps`, counts as a fraction.
-    """
+    """Threads whose simulations take a millisecond on average, and are counted; parts of `n_steps` are fractions."""
 
     def __init__(self, workers: int, seed: int, n_steps: int):
         super().__init__(ThreadPoolExecutor(workers))

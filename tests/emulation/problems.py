@@ -57,11 +57,7 @@ def vibration(noise="marginal", function=free_vibration, seed=1, truth=TRUTH, da
 
 
 class Shortened:
-    """A model of one displacement that can be shortened to `n_steps` of the `whole` record.
-
-    `respond` is a function of theta (d,) and phase (n,), from 0 to 1 over the whole record, that returns the
-    displacement (n,).
-    """
+    """A displacement `respond(theta, phase)` (n,), phase from 0 to 1 over the `whole` record; it can be shortened."""
 
     channels = (Channel("top", "displacement", "mm"),)
     dt = DT
