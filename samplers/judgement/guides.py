@@ -34,7 +34,7 @@ HEAVY = 0.01  # largest weight of a draw of the emulated posterior; 0.006 in rig
 # round, and none of 12 right ones; none of 40 right runs with other priors and on four problems.
 PROBABLE, EXCLUDED = 3.0, 4.0
 # Log-density of the highest draw above the tops of all modes of a search: 28 to 68 in 9 of 11 searches that ended where
-# the frequency of a vibration has no effect (7 of them had no other reason), 490 and 506 on two ridges that are refused
+# the frequency of a vibration has no effect (6 of them had no other reason), 490 and 506 on two ridges that are refused
 # for others as well, at most 0.9 in 60 right runs on 22 problems.
 HIGHER = 5.0
 # Median difference of the two among probable simulations, above which the response is rough: 0.00 on four ridges, 0.4
