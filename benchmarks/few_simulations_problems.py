@@ -23,7 +23,7 @@ from fe_likelihoods import (
 )
 from tests.statistics.hard_posteriors import CASES
 
-from . import many_stiffnesses
+from . import many_stiffnesses, tested_column
 
 __all__ = ["PROBLEMS", "Problem", "oscillator"]
 
@@ -74,16 +74,6 @@ def bridge(data: str, seed: int) -> Posterior:
     return problems.isolated_bridge(data=test, channels=usual.likelihood.model.outputs).marginal()
 
 
-def bridge_twin(seed: int) -> Posterior:
-    """Ten parameters, one mode."""
-    return bridge("twin", seed)
-
-
-def bridge_means(seed: int) -> Posterior:
-    """Ten parameters, two modes."""
-    return bridge("means", seed)
-
-
 def column(seed: int, every: int = 1) -> Posterior:
     """Bridge column with new noise."""
     if seed == 1:
@@ -93,25 +83,20 @@ def column(seed: int, every: int = 1) -> Posterior:
     return problems.bridge_column(data=test, every=every).marginal()
 
 
-def column_one_in_four(seed: int) -> Posterior:
-    """Bridge column, one sample in four."""
-    return column(seed, every=4)
-
-
 def _pier_with_more_friction(samples: np.ndarray) -> np.ndarray:
     return (samples[:, 1] >= samples[:, 4]).astype(int)
 
 
 PROBLEMS = {
     "oscillator": Problem("linear oscillator, 2 parameters", oscillator, 100),
-    "twin": Problem("isolated bridge, 10 parameters", bridge_twin, 280),
+    "twin": Problem("isolated bridge, 10 parameters", partial(bridge, "twin"), 280),
     "means": Problem(
         "isolated bridge, means of both piers: 10 parameters, 2 modes",
-        bridge_means,
+        partial(bridge, "means"),
         800,
         labels=_pier_with_more_friction,
     ),
-    "column4": Problem("bridge column, one sample in 4, 5 parameters", column_one_in_four, 400),
+    "column4": Problem("bridge column, one sample in 4, 5 parameters", partial(column, every=4), 400),
     "column": Problem("bridge column, all data, 5 parameters", column, 750),
 }
 PROBLEMS |= {
@@ -122,6 +107,10 @@ PROBLEMS |= {
     )
     for storeys, goal in ((10, 200), (20, 400), (30, 600), (50, 1000))
     for suffix in ("", "_jacobian")
+}
+PROBLEMS |= {
+    f"tested_{name}": Problem(f"tested column {name}, 7 parameters", partial(tested_column.column, name), 800)
+    for name in tested_column.HISTORIES
 }
 PROBLEMS |= {name: Problem(case.what, case.posterior, 500, case.label) for name, case in CASES.items()}
 PROBLEMS |= {

