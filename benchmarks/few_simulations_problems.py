@@ -29,27 +29,13 @@ __all__ = ["PROBLEMS", "Problem", "oscillator"]
 
 
 class Problem(NamedTuple):
-    """A posterior by seed, and what is known of it.
-
-    Attributes
-    ----------
-    what : str
-        Description.
-    posterior : callable
-        Function of the seed.
-    goal : int
-        Simulations of the whole record in which 100 effective samples are wanted.
-    labels : callable, optional
-        Function of samples (n, ndim) that returns the number of the mode (n,).
-    exact : callable, optional
-        Function of the posterior that returns its `Reference` by quadrature, at once.
-    """
+    """A posterior by seed, and what is known of it."""
 
     what: str
-    posterior: Callable[[int], Posterior]
-    goal: int
-    labels: Callable[[np.ndarray], np.ndarray] | None = None
-    exact: Callable[[Posterior], Any] | None = None
+    posterior: Callable[[int], Posterior]  # of the seed
+    goal: int  # simulations of the whole record in which 100 effective samples are wanted
+    labels: Callable[[np.ndarray], np.ndarray] | None = None  # numbers (n,) of the modes of samples (n, ndim)
+    exact: Callable[[Posterior], Any] | None = None  # `Reference` of the posterior by quadrature, at once
 
 
 def oscillator(seed: int, truth: tuple[float, float] = (1.15, 0.8)) -> Posterior:
