@@ -105,7 +105,7 @@ def test_values_are_those_of_single_points_on_every_pool(make, tmp_path):
     again = posterior_of(Treacherous(), top=1.2, pool=pool, cache=tmp_path / "cache.sqlite")
     with again.evaluation_queue() as queue:
         np.testing.assert_array_equal(collect(queue, queue.submit(x)), expected)  # from the disk
-    assert (again.likelihood.simulations, again.likelihood.simulator.verifications) == (0, 2)
+    assert again.likelihood.simulations == 0 < again.likelihood.simulator.verifications < 3  # by the order of arrival
     assert again.likelihood.simulator.disk_hits in (36, 37)  # the duplicate may find its point in memory
     for end in ("terminate", "shutdown", "close"):
         if hasattr(pool, end):
