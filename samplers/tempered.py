@@ -28,7 +28,7 @@ from .budget import Budget, BudgetExhausted, as_limit
 from .emcee_internals import get_moves, get_previous_state, get_random, set_moves, set_previous_state
 from .evaluation.asynchronous import AsynchronousEvaluator, check_asynchronous
 from .evaluation.evaluator import Evaluator, unpack
-from .evaluation.user_target import Target, advise_on_pool
+from .evaluation.user_target import Target
 from .evaluation.values import most_common_reasons
 from .interrupts import deferred_interrupts, interrupts_end_the_run
 from .judgement.checks import check_likelihood, check_prior
@@ -171,7 +171,6 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._first_moves = copy.deepcopy(followed), get_moves(self)[1]
         set_moves(self, followed, get_moves(self)[1])
         refuse_unused(given, guide is not None)
-        advise_on_pool(pool)
         if given.ess_floor >= nwalkers:
             raise ValueError(f"ess_floor={given.ess_floor} must be below nwalkers={nwalkers}")
         target.parameter_names = self.parameter_names if self.params_are_named else None

@@ -12,8 +12,6 @@ import dask_jobqueue
 import problem
 from dask.distributed import Client
 
-from fe_likelihoods import DaskExecutor
-
 CLUSTERS = {"slurm": dask_jobqueue.SLURMCluster, "pbs": dask_jobqueue.PBSCluster}
 
 
@@ -29,7 +27,6 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--lifetime", default="7h", help="of a worker: the walltime less more than one simulation")
     parser.add_argument("--stagger", default="20m", help="spread of the lifetimes, so that jobs do not end together")
     parser.add_argument("--jobs", type=int, default=8, help="most jobs at once")
-    parser.add_argument("--longest-wait", type=float, default=72.0, help="for a first job in the queue [h]")
     return parser.parse_args()
 
 
@@ -51,4 +48,4 @@ if __name__ == "__main__":
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # scancel and qdel act as Ctrl-C: the jobs are ended
     with make_cluster(args) as cluster, Client(cluster) as client:
         cluster.adapt(minimum_jobs=1, maximum_jobs=args.jobs)
-        problem.update(pool=DaskExecutor(client, longest_wait=3600.0 * args.longest_wait))
+        problem.update(pool=client)

@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 
 from samplers.interrupts import process_name
 
-from .faults import SimulationFailed, TransientReason, UnusableModel, reason_of, reworded
+from .faults import SimulationFailed, TransientReason
 from .files import Opened, RunningSimulation, observing, of_this_library, refuse_shared, running_simulation
 
 __all__ = [
@@ -40,7 +40,7 @@ __all__ = [
     "working_folder",
 ]
 
-KEEP = "FE_LIKELIHOODS_KEEP_FAILURES"  # environment variable: where the folders of failed simulations are kept
+KEEP = "FE_LIKELIHOODS_KEEP_FAILURES"  # environment variable: where the folders of failed programs are kept
 _MOST_KEPT = 20
 _MOST_LINKS = 500  # in subfolders; other subfolders are links. A link takes 10 us, 1 ms on slow file systems
 _MOST_BESIDE = 3000  # entries beside the working folder, which ``..`` shows
@@ -51,18 +51,16 @@ _places: set[str] = set()  # folders for the folders of workers
 
 
 class Sender(NamedTuple):
-    """The process that sends simulations: its name, its working folder, a place for folders, and `KEEP`."""
+    """The process that sends simulations: its name, its working folder, and a place for folders."""
 
     process: bytes
     folder: str
     place: str
-    keep: str
 
     @classmethod
     def here(cls) -> "Sender":
         """This process."""
-        keep = os.path.abspath(os.environ[KEEP]) if os.environ.get(KEEP) else ""
-        return cls(process_name(), working_folder(), _place(os.getpid()), keep)
+        return cls(process_name(), working_folder(), _place(os.getpid()))
 
 
 def working_folder() -> str:
@@ -132,7 +130,7 @@ def run_in_folder(function: Callable[[Any], Any], item: Any, sender: Sender | No
         simulation = RunningSimulation(thread)
         return simulation.run(function, item), simulation.shared
     try:
-        result, error, shared = _run_in_mirror(_mirror_for(sender), function, item, sender, thread)
+        result, error, shared = _run_in_mirror(_mirror_for(sender), function, item, thread)
     except OSError as failure:
         text = f"the working folder of a simulation could not be made: {failure}"
         raise SimulationFailed(TransientReason(text)) from failure
@@ -164,7 +162,7 @@ def _mirror_for(sender: Sender) -> "_Mirror":
 
 
 def _run_in_mirror(
-    mirror: "_Mirror", function: Callable[[Any], Any], item: Any, sender: Sender, thread: int
+    mirror: "_Mirror", function: Callable[[Any], Any], item: Any, thread: int
 ) -> tuple[Any, BaseException | None, str]:
     """Result or exception of a simulation, and the first file that it shares with others."""
     is_wanted = True
@@ -183,38 +181,23 @@ def _run_in_mirror(
         if mirror.owner != os.getpid():  # the simulation has forked, and its copy has returned as well
             return result, error, ""
         is_wanted = mirror.was_written_through() and not isinstance(error, KeyboardInterrupt)
-    is_failure = isinstance(result, tuple) and len(result) == 2 and result[0] is None and isinstance(result[1], str)
-    reason = reason_of(error) if error is not None else result[1] if is_failure else ""
-    kept = None
-    if reason and sender.keep and mirror.has_changed:
-        kept = keep_folder(Path(mirror.path), sender.keep, reason)
-    mirror.is_new = kept is None and not simulation.has_programs  # which may still write
-    if kept is not None and not isinstance(error, UnusableModel | KeyboardInterrupt):
-        reason = reworded(reason, f"{reason} (its folder is {kept})")
-        error, result = (None, (None, reason)) if error is None else (SimulationFailed(reason), None)
+    mirror.is_new = not simulation.has_programs  # which may still write
     return result, error, simulation.shared
 
 
-def keep_folder(place: Path, folder: str | Path, reason: str) -> Path | None:
-    """Move what a failed simulation has left in `place` into a new folder in `folder`, with a file ``reason.txt``.
+def keep_folder(place: Path, folder: str, reason: str) -> None:
+    """Move what a failed program has left in `place` into a new folder in `folder`, with a file ``reason.txt``.
 
-    None if 20 folders are there already, or it fails: a full disk must not hide the reason of the failure.
+    Not if 20 folders are there already, or it fails: a full disk must not hide the reason of the failure.
     """
-    folder = Path(folder)
+    folder = Path(working_folder(), folder)
     with contextlib.suppress(OSError), of_this_library():
         folder.mkdir(parents=True, exist_ok=True)
         if len(list(folder.glob("failure_*"))) < _MOST_KEPT:
-            for link in [path for path in place.rglob("*") if path.is_symlink()]:  # the links of a mirror end with it
-                target = os.path.realpath(link)
-                link.unlink()
-                link.symlink_to(target)
-            kept = tempfile.mkdtemp(prefix="failure_", dir=folder)
+            kept = Path(tempfile.mkdtemp(prefix="failure_", dir=folder))
             for path in place.iterdir():
                 shutil.move(path, kept)
-            (Path(kept) / "reason.txt").unlink(missing_ok=True)  # a link shows a file of the user
-            (Path(kept) / "reason.txt").write_text(reason)
-            return Path(kept)
-    return None
+            (kept / "reason.txt").write_text(reason)
 
 
 # places -------------------------------------------------------------------------------------------------------------
@@ -246,19 +229,11 @@ def _remove(process: subprocess.Popen, owner: int) -> None:
         process.wait()
 
 
-def discard(process: int, reason: str = "") -> str:
-    """Remove the folder of a killed worker process; returns what to add to the reason of its simulation.
-
-    With the `reason` of a failure, the folder is kept if `KEEP` says so.
-    """
-    kept = None
-    for place in [os.path.join(place, str(process)) for place in _places]:
-        if os.path.isdir(place):
-            for run in Path(place).glob("run_*") if reason and os.environ.get(KEEP) else ():
-                kept = keep_folder(run, os.environ[KEEP], reason)
-            with of_this_library():  # which may run in a simulation's thread
-                shutil.rmtree(place, ignore_errors=True)
-    return "" if kept is None else f" (its folder is {kept})"
+def discard(process: int) -> None:
+    """Remove the folder of a killed worker process."""
+    for place in _places:
+        with of_this_library():  # which may run in a simulation's thread
+            shutil.rmtree(os.path.join(place, str(process)), ignore_errors=True)
 
 
 class _Mirror:
@@ -374,11 +349,6 @@ class _Mirror:
         self._private |= written
         self.is_new = self.is_new and not written
         return bool(written)
-
-    @property
-    def has_changed(self) -> bool:
-        """Whether a simulation has added or removed files or folders."""
-        return not all(map(self._is_untouched, self._shown))
 
     def _is_untouched(self, folder: str) -> bool:
         """Whether a simulation has added and removed nothing in a folder."""

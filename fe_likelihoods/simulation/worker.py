@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 from samplers.interrupts import become_worker
 
 from .by_value import CannotLoad, Pickled, Recent, without_addresses
-from .faults import SimulationFailed, TransientReason, is_transient, reworded
+from .faults import SimulationFailed, TransientReason, is_transient
 from .files import of_this_library
 from .folder import discard, working_folder
 
@@ -139,19 +139,18 @@ class Worker:
         return self._ask(message, seconds, "stopped at the time limit of {:g} s")
 
     def _ask(self, message: bytes, seconds: float, slow: str) -> "Answer":
-        """Answer to a message; without one, the process is killed, and its simulation's folder may be kept."""
+        """Answer to a message; `SimulationFailed` without one, and the process is killed."""
         start = time.monotonic()
+        with suppress(OSError):  # `_receive` notices that the process has died
+            self._connection.send_bytes(message)
         try:
-            try:
-                self._connection.send_bytes(message)
-            except OSError:  # `_receive` notices that the process has died
-                pass
             if (answer := self._receive(start + seconds)) is not None:
                 return answer
             reason = TransientReason(slow.format(seconds))
         except SimulationFailed as error:
             reason = error.reason
-        raise SimulationFailed(reworded(reason, reason + self.kill(reason)), time.monotonic() - start)
+        self.kill()
+        raise SimulationFailed(reason, time.monotonic() - start)
 
     def _receive(self, stop: float) -> "Answer | None":
         """The answer; None if there is none until the time `stop`."""
@@ -177,11 +176,11 @@ class Worker:
             reason = "; ".join(filter(None, [describe_exit(self._process.wait(), "the worker process"), said]))
             raise SimulationFailed(TransientReason(reason)) from None
 
-    def kill(self, reason: str = "") -> str:
-        """Kill the process and its session; with the `reason` of a failure, returns what to add to it."""
+    def kill(self) -> None:
+        """Kill the process and its session."""
         self._end()
         self._process.wait()
-        return discard(self._process.pid, reason)
+        discard(self._process.pid)
 
 
 class Answer(NamedTuple):

@@ -14,7 +14,7 @@ from ..record import EvaluatedBatch
 from .starts import not_of_the_prior
 from .values import Caught, log_densities, most_common_reasons, outcomes
 
-__all__ = ["Target", "advise_on_pool", "map_in"]
+__all__ = ["Target", "map_in"]
 
 logger = logging.getLogger(__name__)
 
@@ -26,15 +26,6 @@ def map_in(pool: Any) -> Callable:
     if not hasattr(pool, "gather"):
         return pool.map
     return lambda function, items: pool.gather(pool.map(function, list(items), pure=False))
-
-
-def advise_on_pool(pool: Any) -> None:
-    """Warn in the log about a dask client whose workers are jobs of a queueing system: ended jobs are not replaced."""
-    if hasattr(pool, "gather") and hasattr(getattr(pool, "cluster", None), "job_script"):
-        logger.warning(
-            "nobody may replace the jobs of this dask client when they end, as by their walltime, and the run would "
-            "wait for workers for ever: pass pool=fe_likelihoods.DaskExecutor(client), which replaces them"
-        )
 
 
 class Target:

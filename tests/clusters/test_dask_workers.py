@@ -6,8 +6,6 @@ import time
 import numpy as np
 import pytest
 
-from fe_likelihoods.simulation import dask_executor
-from fe_likelihoods.simulation.executors import DaskExecutor
 from tests.faults.treacherous import Gated, Treacherous, posterior_of
 
 pytestmark = pytest.mark.skipif(
@@ -23,12 +21,11 @@ async def dask_setup(worker):
 
 
 @pytest.fixture
-def cluster(monkeypatch):
+def cluster():
     """A function that makes a client of a cluster without workers, whose workers take some seconds to start."""
     import dask
     from dask.distributed import Client, LocalCluster
 
-    monkeypatch.setattr(dask_executor, "SECONDS_BETWEEN_CHECKS", 0.05)
     opened = []
 
     def make(seconds):
@@ -52,19 +49,12 @@ def test_simulations_wait_for_workers_that_are_still_starting(cluster, caplog):
     assert "has no worker; 4 simulations wait" in caplog.text
 
 
-def test_a_cluster_that_stays_without_workers_ends_the_run(cluster):
-    with pytest.raises(RuntimeError, match="the dask cluster has had no worker for 0.3 s: start workers"):
-        DaskExecutor(cluster(0.0), longest_wait=0.3).map(abs, [1, 2, 3])
-    with pytest.raises(ValueError, match="longest_wait must be"):
-        DaskExecutor(None, longest_wait=0)
-
-
-def test_workers_that_the_cluster_has_given_up_are_started_again(cluster, tmp_path):
+def test_an_adaptive_cluster_replaces_its_workers(cluster, tmp_path):
     """Both workers are closed while a simulation runs."""
     client = cluster(0.0)
-    client.cluster.scale(2)
+    client.cluster.adapt(minimum=2, maximum=2, interval="0.1s")
     client.wait_for_workers(2)
-    posterior = posterior_of(Gated(tmp_path), top=20.0, pool=DaskExecutor(client))
+    posterior = posterior_of(Gated(tmp_path), top=20.0, pool=client)
     with posterior.evaluation_queue() as queue:
         (ticket,) = queue.submit([[0.95, 0.1, 0.5]])
         stop = time.monotonic() + 30.0

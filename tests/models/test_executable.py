@@ -150,7 +150,8 @@ def test_processes_left_by_a_program_are_killed(tmp_path, monkeypatch):
 
 def test_folders_of_failed_runs_are_kept_up_to_a_limit(tmp_path, monkeypatch):
     monkeypatch.setattr(folder_of_simulation, "_MOST_KEPT", 2)
-    monkeypatch.setenv(folder_of_simulation.KEEP, str(tmp_path / "kept"))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv(folder_of_simulation.KEEP, "kept")
     model_of().simulate(THETA)
     assert not (tmp_path / "kept").exists()
     for _ in range(3):

@@ -19,7 +19,6 @@ import pytest
 
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.signals.channels import Channel
-from fe_likelihoods.simulation import folder
 from fe_likelihoods.simulation.executors import LocalPool, as_executor
 from fe_likelihoods.simulation.faults import UnusableModel
 from fe_likelihoods.simulation.folder import Observed
@@ -281,27 +280,6 @@ def test_the_label_names_files_of_the_starting_folder(start):
         [(text, opened)] = one.map(Observed(read), [THETAS[0]])
     assert text == "own1"
     assert [path for path in opened.files if path.endswith(".txt")] == [str(start / "input.txt")]
-
-
-def test_the_folder_of_a_failed_simulation_is_kept_if_asked(start, tmp_path_factory, monkeypatch):
-    def fails(theta):
-        Path("in.txt").write_text(str(theta[0]))
-        if theta[1] == 2.0:
-            time.sleep(60.0)
-        raise RuntimeError("diverged")
-
-    kept = tmp_path_factory.mktemp("kept")
-    monkeypatch.setenv(folder.KEEP, str(kept))
-    isolated, late = model(fails, isolated=True), model(fails, time_limit=1.0)
-    with LocalPool(1) as one:
-        reasons = simulate_batch(model(fails), [np.array([1.0, 1.0])], one).reasons
-    reasons += simulate_batch(isolated, [np.array([2.0, 1.0])]).reasons
-    reasons += simulate_batch(late, [np.array([3.0, 2.0])]).reasons
-    places = [Path(reason.split("its folder is ")[1].split(")")[0]) for reason in reasons]
-    assert [place.parent for place in places] == [kept] * 3
-    assert [next(place.rglob("in.txt")).read_text() for place in places] == ["1.0", "2.0", "3.0"]
-    assert [(place / "reason.txt").read_text().partition(":")[0] for place in places[:2]] == ["RuntimeError"] * 2
-    assert reasons[2].startswith("stopped at the time limit of 1 s")
 
 
 def test_folders_are_removed_with_the_process(tmp_path):
