@@ -36,7 +36,7 @@ def make_posterior(pool=None) -> Posterior:
     # for a slow model also time_limit=7200.0 [s], memory_limit=4 * 2**30 [bytes] and runs_per_process=100
     model = FunctionModel(free_vibration, names, channels, 0.01, 500)
     prior = Prior({name: TruncatedNormal(1.0, 0.3) for name in names} | {"sigma_top": HalfNormal(0.01)})
-    return Posterior(FELikelihood(model, measured, pool=pool, cache="simulations.db", max_failure_share=0.5), prior)
+    return Posterior(FELikelihood(model, measured, pool=pool, cache="simulations.db"), prior)
 
 
 def update(pool=None) -> SMCSampler:

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..cache.verification import StaleCache
-from ..likelihood.failure_log import TooManyFailures
 from ..likelihood.likelihood import FELikelihood
 from ..likelihood.posterior import Posterior
 from ..noise.marginal import sampled_noise
@@ -200,7 +199,7 @@ def compare(
         batch = likelihood.simulate(draws[:, :n])
         good = [not reason for reason in batch.reasons]
         drawn = np.array([measured.values - likelihood.residuals_of(each) for each in batch.response[good]] or drawn)
-    except (ChangedModel, StaleCache, TooManyFailures) as error:  # concerns the next sampling, not this result
+    except (ChangedModel, StaleCache) as error:  # concerns the next sampling, not this result
         logger.warning("the fit is compared with no draws of the prior: %s", error)
     white, deviations = _errors(likelihood, found.get("after"), point)
     expected = None

@@ -53,12 +53,8 @@ def evaluation_queue(posterior: Any, responses: bool = False) -> PointQueue:
     def give_up(futures: list[Future]) -> None:
         for future in futures:
             future.cancel()
-        for part in parts:
-            part.simulator.pending = None
 
     threads = Threads(lambda: (size() or _MOST_THREADS) if streams else 0)
-    for part in parts if streams else ():  # failures may end sooner: points that wait may be successes
-        part.simulator.pending = lambda: len(threads.pending)
     return PointQueue(start, size, give_up)
 
 

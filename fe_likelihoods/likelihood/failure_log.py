@@ -10,14 +10,13 @@ import numpy as np
 from ..simulation.faults import TransientReason
 from ..simulation.model import split_seconds
 
-__all__ = ["FailureLog", "TooManyFailures", "reason_without_numbers"]
+__all__ = ["FailureLog", "reason_without_numbers"]
 
 logger = logging.getLogger(__name__)
 
 _MAX_RECORDS = 1000
 _MAX_REASONS = 100
 _OTHER_REASONS = "other reasons"
-_MIN_SIMULATIONS = 20  # before the share of failures is checked
 # A point without digits after it belongs to the number in arrays, "[1. 2.]", and before an exponent, "2.e-3".
 _DIGITS = r"\d+(?:\.\d+|\.(?=\s*(?:[-+\d\]),]|\.\d)|e[-+]?\d))?|\.\d+"
 _NUMBER = re.compile(rf"(?:(?<![\w.])[-+])?(?<![\w.])(?:0x[0-9a-f]+|(?:{_DIGITS})(?:e[-+]?\d+)?)", re.IGNORECASE)
@@ -36,25 +35,17 @@ def reason_without_numbers(reason: str) -> str:
     return _NUMBER.sub("#", reason)
 
 
-class TooManyFailures(RuntimeError):
-    """More simulations failed than allowed. Finished simulations are kept, and no further ones are run."""
-
-
 class FailureLog:
     """Failed simulations of one likelihood: their number, their reasons, and the parameters of the first thousand.
 
-    `max_share`, in [0, 1], is the largest share that `check` accepts. `outcomes` counts simulations with a known
-    outcome (run here, read from the disk, or recalled), `count` failures, and `transient` failures whose cause is not
-    the model, so that a later run simulates the point again. `records` has ``{"parameters": {name: value}, "reason":
-    str}`` of the first 1000 failures of each of these two kinds, with ``"seconds"`` where known and ``"transient":
-    True``. `reasons` counts failures per reason; after the first 100 reasons by their text without numbers, and after
-    100 of these together.
+    `outcomes` counts simulations with a known outcome (run here, read from the disk, or recalled), `count` failures,
+    and `transient` failures whose cause is not the model, so that a later run simulates the point again. `records` has
+    ``{"parameters": {name: value}, "reason": str}`` of the first 1000 failures of each of these two kinds, with
+    ``"seconds"`` where known and ``"transient": True``. `reasons` counts failures per reason; after the first 100
+    reasons by their text without numbers, and after 100 of these together.
     """
 
-    def __init__(self, parameter_names: Sequence[str], max_share: float) -> None:
-        if not 0.0 <= max_share <= 1.0:
-            raise ValueError(f"FELikelihood: max_failure_share must be in [0, 1]; got {max_share!r}")
-        self.max_share = max_share
+    def __init__(self, parameter_names: Sequence[str]) -> None:
         self.outcomes = self.count = self.transient = 0
         self.records: list[dict] = []
         self.reasons: Counter[str] = Counter()
@@ -95,19 +86,3 @@ class FailureLog:
             if text in self.reasons or len(self.reasons) < most:
                 return text
         return _OTHER_REASONS
-
-    def check(self, running: int = 0) -> None:
-        """Raise `TooManyFailures` if too large a share of the simulations (20 or more) failed.
-
-        The `running` simulations count as successes, because failures often end sooner.
-        """
-        n_simulations = self.outcomes + running
-        if n_simulations >= _MIN_SIMULATIONS and self.count > self.max_share * n_simulations:
-            (reason, count), *_ = self.reasons.most_common(1)
-            running_too = f" ({running} of them still run)" if running else ""
-            raise TooManyFailures(
-                f"{self.count} of {n_simulations} simulations{running_too} failed, {count} of them with the reason "
-                f"{reason!r}; the "
-                f"largest share allowed is {self.max_share:g}. See failures and report(); then correct the model, "
-                "narrow the prior or raise max_failure_share"
-            )

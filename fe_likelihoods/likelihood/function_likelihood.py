@@ -68,7 +68,7 @@ class FunctionLikelihood(SumOfParts):
             raise ValueError(f"FunctionLikelihood: units of {', '.join(sorted(unknown))}, which are no parameters")
         self.function, self.parameter_names, self.vectorize = function, names, vectorize
         self._units = dict(units or {})
-        self._failures = FailureLog(names, 1.0)
+        self._failures = FailureLog(names)
         self._evaluations = 0
 
     @property

@@ -68,10 +68,6 @@ class FELikelihood(SumOfParts):
         one, or with a pool that has ``map`` only, a batch is simulated in chunks of a
         few seconds that are stored one by one. The responses of `simulate` are stored as well, up to the
         `max_response_bytes` of the cache.
-    max_failure_share : float
-        Largest share of failed simulations, in [0, 1]. If more have failed, of 20 or more, the next request for a
-        simulation raises `TooManyFailures`; with a pool also a request whose simulations still run, if more have failed
-        even when all of these succeed.
 
     Attributes
     ----------
@@ -121,7 +117,6 @@ class FELikelihood(SumOfParts):
         memory_rows: int = 100_000,
         memory_bytes: int = 2**28,
         cache: SimulationCache | str | os.PathLike | None = None,
-        max_failure_share: float = 1.0,
     ) -> None:
         check_model(model)
         measurements = match_measurements(model, join_measurements(model, measurements))
@@ -142,7 +137,6 @@ class FELikelihood(SumOfParts):
             cache=cache,
             memory_rows=memory_rows,
             memory_bytes=memory_bytes,
-            max_failure_share=max_failure_share,
         )
         self.n_samples = count_samples(getattr(self.measured, "values", self.measured))
         self.shortened: list[FELikelihood] = []
@@ -329,7 +323,6 @@ class FELikelihood(SumOfParts):
             cache=own.cache,
             memory_rows=own.memory_cache.most,
             memory_bytes=own.response_memory.most,
-            max_failure_share=own.failures.max_share,
         )
         other.simulator.share(own)
         return other

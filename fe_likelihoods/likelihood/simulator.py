@@ -109,10 +109,9 @@ class Simulator(VerifiedModel):
         cache: SimulationCache | str | os.PathLike | None = None,
         memory_rows: int = 100_000,
         memory_bytes: int = 2**28,
-        max_failure_share: float = 1.0,
         responses_only: bool = False,
     ) -> None:
-        self.failures = FailureLog(model.parameter_names, max_failure_share)
+        self.failures = FailureLog(model.parameter_names)
         self.memory_cache, self.response_memory = MemoryCache(memory_rows), ResponseMemory(memory_bytes)
         self.measurements, self._responses_only = measurements, responses_only
         measured = compare_with(measurements, model.dt, model.n_steps)
@@ -124,10 +123,9 @@ class Simulator(VerifiedModel):
         self._recalled: set[bytes] = set()
         self.when_simulated: Callable[[int], None] | None = None
         self._in_pool: _Running | None = None
-        self.pending: Callable[[], int] | None = None  # number of points of a queue that have not ended
 
     def __getstate__(self) -> dict:
-        return super().__getstate__() | {"when_simulated": None, "_in_pool": None, "pending": None}
+        return super().__getstate__() | {"when_simulated": None, "_in_pool": None}
 
     # counts and identity ------------------------------------------------------------------------------------------
 
@@ -184,8 +182,8 @@ class Simulator(VerifiedModel):
 
         With `full`, also a `SimulationBatch` of the responses. Duplicates are simulated once, results are cached,
         cached ones are reused, and non-finite rows are skipped. Where `possible`, called unless all rows are in memory,
-        is False (n,), nothing is simulated and rows may be NaN. Raises `TooManyFailures`, `ChangedModel` or
-        `StaleCache`; simulations that have ended are cached, except after the model has changed.
+        is False (n,), nothing is simulated and rows may be NaN. Raises `ChangedModel` or `StaleCache`;
+        simulations that have ended are cached, except after the model has changed.
         """
         keys, which = distinct_keys(thetas)
         if not full:
@@ -224,8 +222,8 @@ class Simulator(VerifiedModel):
     def recall(self, thetas: np.ndarray, statistics: np.ndarray | None, reasons: Sequence[str]) -> None:
         """Cache statistics (n, n_numbers) of an earlier run in memory, at structural parameters (n, n_structural).
 
-        Failures (with a reason) are recorded, and all rows count for `max_failure_share`. Rows that are cached already
-        are not changed. Nothing is written to the cache on disk. Without statistics, only failures are cached.
+        Failures (with a reason) are recorded. Rows that are cached already are not changed. Nothing is written to the
+        cache on disk. Without statistics, only failures are cached.
         """
         keys, which = distinct_keys(thetas)
         known = self.memory_cache.look_up(keys, self.n_numbers)[1]
@@ -334,9 +332,6 @@ class Simulator(VerifiedModel):
             self._in_pool = _Running()
         return self._in_pool
 
-    def _check_failures(self) -> None:
-        self.failures.check(max(len(self._running.keys), 0 if self.pending is None else self.pending()))
-
     def _chunk(self, n: int, full: bool) -> int:
         """Number of simulations, of n, between two writes to the cache on disk, or two reports of progress."""
         most = most_responses(self.model) if self.pool is None or self._returns_responses(full) else n
@@ -358,8 +353,6 @@ class Simulator(VerifiedModel):
         try:
             while left:
                 self._receive(request, left, take_all(arrived))
-                if left:
-                    self._check_failures()
         except BaseException:
             self.pool.give_up(list(left))
             with suppress(Exception):  # simulations that have ended are cached
@@ -456,9 +449,8 @@ class Simulator(VerifiedModel):
     # the model ----------------------------------------------------------------------------------------------------
 
     def _check_model(self) -> None:
-        """Check failures and the model before simulations, not after them, so that finished simulations are stored."""
+        """Look at the model before simulations, so that finished simulations are stored."""
         with self._running.lock:
-            self._check_failures()
             self._drop_if_changed(self._check_before)
 
     def _earlier_point(self) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -11,7 +11,6 @@ import numpy as np
 
 from ..cache.verification import StaleCache
 from ..checks.steps import relative_difference
-from ..likelihood.failure_log import TooManyFailures
 from ..likelihood.joint import JointLikelihood
 from ..signals.events import find_events, motions_of
 from ..simulation.faults import ChangedModel
@@ -131,7 +130,7 @@ def difference_of_responses(
             return None
     try:
         batch = source.likelihood.simulate(theta[None])
-    except (ChangedModel, StaleCache, TooManyFailures) as error:  # concerns the next sampling, not this prediction
+    except (ChangedModel, StaleCache) as error:  # concerns the next sampling, not this prediction
         logger.warning("the response is not compared with the response to the calibration motion: %s", error)
         return None
     if batch.reasons[0]:

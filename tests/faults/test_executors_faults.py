@@ -8,20 +8,14 @@ import sys
 import time
 from pathlib import Path
 
-import emcee
 import numpy as np
 import pytest
 
-from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.simulation.executors import LocalPool
 from fe_likelihoods.simulation.model import simulate_batch
-from samplers import SMCSampler
 from tests.faults import treacherous as bad
-from tests.faults.pooled_run import NAMES, WORKERS, at_work
+from tests.faults.pooled_run import WORKERS, at_work
 from tests.faults.treacherous import (
-    CHANNELS,
-    DT,
-    N_STEPS,
     DiesLoading,
     DiesOnce,
     Treacherous,
@@ -181,27 +175,3 @@ def test_nothing_outlives_a_parent_that_is_killed(pool, tmp_path, tmp_path_facto
         assert at_work(tmp_path) - {parent.pid} <= set(children)
         assert gone(children)
     assert list(place.glob("fe_likelihoods_*")) == []
-
-
-# models that fail ---------------------------------------------------------------------------------------------------
-
-
-def third(**options):
-    return posterior_of(FunctionModel(bad.third, NAMES, CHANNELS, DT, N_STEPS), **options)
-
-
-@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning:emcee")  # emcee subtracts -inf from -inf
-def test_too_many_failures_stop_the_run_and_keep_finished_simulations(tmp_path, seed):
-    """A third of the prior fails where 0.25 is allowed: the run stops with an error."""
-    for share in (-0.1, 1.1, float("nan")):
-        with pytest.raises(ValueError, match="max_failure_share must be in"):
-            third(max_failure_share=share)
-    posterior = third(max_failure_share=0.25)
-    backend = emcee.backends.HDFBackend(str(tmp_path / "run.h5"))
-    sampler = SMCSampler(200, posterior.ndim, posterior, vectorize=True, seed=seed, backend=backend)
-    with pytest.raises(RuntimeError, match=r"TooManyFailures: \d+ of \d+ simulations failed.*allowed is 0.25"):
-        sampler.run_mcmc(None, 2)
-    assert sampler.evaluations >= 200
-    report = posterior.report()
-    assert report["simulations"] >= 200
-    assert report["failure_count"] == len(report["failures"]) > 0.25 * report["simulations"]

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from fe_likelihoods.cache.simulation_cache import SimulationCache
-from fe_likelihoods.likelihood.failure_log import TooManyFailures
 from fe_likelihoods.likelihood.joint import JointLikelihood
 from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.likelihood.posterior import Posterior
@@ -23,7 +22,6 @@ from fe_likelihoods.signals.channels import Measurements
 from fe_likelihoods.signals.records import Record
 from fe_likelihoods.simulation.executors import LocalPool
 from fe_likelihoods.simulation.faults import ChangedModel
-from tests.faults import treacherous as bad
 from tests.faults.treacherous import Gated, Treacherous, posterior_of
 
 SECONDS = 60.0  # after which a test gives up
@@ -159,27 +157,6 @@ def test_a_joint_likelihood_simulates_later_parts_where_earlier_ones_are_possibl
             assert queue.workers == {2: 3, 1: 2, 0: 1}[sum(pooled)]
             np.testing.assert_array_equal(collect(queue, queue.submit(x)), expected)
     assert posterior.report()["simulations"] == reference.report()["simulations"]
-
-
-def test_the_same_failures_end_a_run_as_in_a_call(tmp_path):
-    """Failures that come early are no reason, because successes may take longer."""
-    x = np.concatenate([LONG, SHORT, SHORT + [0.0, 0.01, 0.0]])
-    x[2:13, 0] += bad.RAISES  # 11 of 26
-    with ThreadPoolExecutor(3) as pool:
-        posterior = posterior_of(Gated(tmp_path), top=20.0, pool=pool, max_failure_share=0.3)
-        with posterior.evaluation_queue() as queue:
-            queue.submit(x)
-            values = {}
-            with pytest.raises(TooManyFailures, match=r"of 2[6-9] simulations \(\d+ of them still run\) failed"):
-                while True:
-                    values.update(queue.collect())
-            assert 8 <= np.isneginf(list(values.values())).sum() <= 11
-            with pytest.raises(TooManyFailures):
-                queue.collect()
-            (tmp_path / "go").touch()
-        posterior = posterior_of(Gated(tmp_path), top=20.0, pool=pool, max_failure_share=0.5)
-        with posterior.evaluation_queue() as queue:
-            np.testing.assert_array_equal(collect(queue, queue.submit(x)), posterior_of(Treacherous(), top=20.0)(x))
 
 
 class Changing(Treacherous):

@@ -280,7 +280,7 @@ def test_reasons_without_their_numbers(reason, text):
 
 
 def test_reasons_are_bounded_and_later_ones_are_counted_apart():
-    log = FailureLog(["x"], 1.0)
+    log = FailureLog(["x"])
     for k in range(300):
         log.add(np.array([k]), f"no convergence at step {k}")
     log.add(np.array([0.0]), "buckled")

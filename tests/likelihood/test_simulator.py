@@ -209,25 +209,6 @@ def test_statistics_from_stored_responses(path, thetas):
     assert_same_log_likelihood(third, thetas, 0)  # the statistics have been stored
 
 
-@pytest.mark.parametrize("source", ["disk", "disk, responses", "recalled"])
-def test_known_failures_are_compared_with_all_known_simulations(source, path, thetas, monkeypatch):
-    """Failures of an earlier run must not stop a run that has simulated little itself."""
-    monkeypatch.setattr("fe_likelihoods.likelihood.simulator._SECONDS_PER_CHUNK", 0.0)
-    thetas = np.concatenate([thetas, thetas + [10.0, 0.4], thetas + [20.0, 0.4]])
-    new = np.column_stack([np.arange(40.0), np.full(40, 0.5)])
-    first = likelihood_of(Line(), cache=None if source == "recalled" else path)
-    batch = first.simulate(thetas)
-    assert 30 < first.simulator.failures.count < 0.5 * len(thetas)
-    second = likelihood_of(Line(), cache=first.simulator.cache, max_failure_share=0.5)
-    if source == "recalled":
-        second.simulator.recall(thetas, first.simulator.statistics(thetas), batch.reasons)
-    request = second.simulate if source == "disk, responses" else second.simulator.statistics
-    request(np.concatenate([thetas, new[:25]]))
-    request(new)
-    assert second.simulator.failures.count == first.simulator.failures.count
-    assert second.simulator.statistics(new).shape == (40, 2)
-
-
 def test_known_statistics_are_recalled_without_a_simulation(thetas):
     first = likelihood_of(Line())
     batch, statistics = first.simulate(thetas), first.simulator.statistics(thetas)
