@@ -1,6 +1,6 @@
 """The record and the measurements that a TOML file names."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,37 +11,28 @@ from ..signals.channels import Channel, Measurements
 from ..signals.datasets import Dataset, read_dataset
 from ..signals.read import read_columns, read_record
 from ..signals.records import Record
-from .job import Job
+from .job import HDF5, Job
 from .keys import did_you_mean, read_quantity
 from .sections import Measured
 
-__all__ = [
-    "FEWEST_SAMPLES",
-    "is_dataset",
-    "read_base_motion",
-    "read_measured",
-    "read_supports",
-    "reduce_data",
-    "within",
-]
+__all__ = ["is_dataset", "read_base_motion", "read_measured", "read_supports", "reduce_data"]
 
-_HDF5 = (".h5", ".hdf5")
+FEWEST_SAMPLES = 10  # of a channel, where others lie outside the record
 
 
 def is_dataset(job: Job, section: str) -> bool:
     """Whether the file of a section is a data set in HDF5, which has record and measurements."""
     given = getattr(job, section)
-    return given is not None and Path(given.file or "").suffix.lower() in _HDF5
+    return given is not None and Path(given.file or "").suffix.lower() in HDF5
 
 
-def _dataset(job: Job, section: str) -> Dataset | None:
-    """The data set that a section names; None for other files, ValueError without a file."""
-    file = getattr(job, section).file
-    if file is None:
-        raise ValueError(f"{job.where(section)} file: this key is missing; it names the data")
-    if not is_dataset(job, section):
-        return None
-    return job.located(section, lambda: read_dataset(job.path(section, "file", file)))
+def _file(job: Job, section: str) -> tuple[Path, Dataset | None]:
+    """The file that a section names, and its contents if it is a data set."""
+    given = getattr(job, section)
+    if given is None or given.file is None:
+        raise ValueError(f'{job.where(section)} file: this key is missing; it names the data, such as file = "top.csv"')
+    path = job.path(section, "file", given.file)
+    return path, job.located(section, read_dataset, path) if is_dataset(job, section) else None
 
 
 def read_base_motion(job: Job) -> Record | None:
@@ -61,13 +52,9 @@ def read_base_motion(job: Job) -> Record | None:
         return None
     if given.supports is not None:
         return read_supports(job)[0]
-    dataset = _dataset(job, "record")
-    if dataset is None:
-        path = job.path("record", "file", given.file)
-        options = given.given("channel", "column", "units", "missing", *given.READING)
-        record = job.located("record", lambda: read_record(path, **options))
-    else:
-        record = dataset.record
+    path, dataset = _file(job, "record")
+    options = given.given("channel", "column", "units", "missing", *given.READING)
+    record = dataset.record if dataset else job.located("record", read_record, path, **options)
     return record if given.scale is None else record.scale(given.scale)
 
 
@@ -77,26 +64,23 @@ def read_supports(job: Job) -> list[Record]:
         raise ValueError(
             f"{job.where('record')} {[*more][0]}: leave it out with supports, which name files and columns"
         )
-    found = []
-    for text in job.record.supports:
-        file, _, column = text.partition(":")
-        one = replace(job.record, supports=None, file=file, column=column or None)
-        found.append(read_base_motion(replace(job, kind="", record=one)))
-    return found
+    places = [text.partition(":") for text in job.record.supports]
+    alone = [replace(job.record, supports=None, file=file, column=column or None) for file, _, column in places]
+    return [read_base_motion(replace(job, kind="", record=one)) for one in alone]
 
 
 def reduce_data(
     job: Job, record: Record | None, measured: Measurements | None
 ) -> tuple[Record | None, Measurements | None]:
     """The first part of the data, reduced to every n-th sample."""
-    duration, every = (None, 1) if job.record is None else (job.record.duration, job.record.every)
+    given = job.record
 
     def reduce() -> tuple[Record, Measurements | None]:
         shorter, fewer = record, measured
-        if duration is not None:
-            shorter, fewer = shorter.trim(0.0, duration), fewer and fewer.trim(0.0, duration)
-        if every != 1:
-            shorter, fewer = shorter.resample(shorter.dt * every), fewer and fewer.decimate(every)
+        if given.duration is not None:
+            shorter, fewer = shorter.trim(0.0, given.duration), fewer and fewer.trim(0.0, given.duration)
+        if given.every != 1:
+            shorter, fewer = shorter.resample(shorter.dt * given.every), fewer and fewer.decimate(given.every)
         return shorter, fewer
 
     return (record, measured) if record is None else job.located("record", reduce)
@@ -107,32 +91,18 @@ def read_measured(job: Job, channels: Sequence[Channel], record: Record | None) 
 
     ValueError, which names the key, if the file does not exist, cannot be read or lacks a column.
     """
+    path, dataset = _file(job, "measurements")
     given = job.measurements
-    if given is None:
-        raise ValueError(
-            f"{job.where('measurements')} file: this key is missing; give the measured response, such as "
-            'file = "top.csv"'
-        )
-    dataset = _dataset(job, "measurements")
-    if dataset is None:
-        path = job.path("measurements", "file", given.file)
-        measured = job.located("measurements", lambda: _read_columns(path, given, channels))
-    else:
-        measured = dataset.measurements
-    steps: dict[str, Callable[[Measurements], Measurements]] = {
-        "reversed": lambda found: _turned(found, given.reversed),
-        "missing": lambda found: _left_out(found, given.missing),
-        "baseline": lambda found: _straightened(found, given.baseline),
-        "channels": lambda found: found.select(given.channels),
-    }
+    measured = dataset.measurements if dataset else job.located("measurements", _read_columns, path, given, channels)
+    steps = {"reversed": _turned, "missing": _left_out, "baseline": _straightened, "channels": Measurements.select}
+    asked = {key: getattr(given, key) for key in steps if getattr(given, key)}
     if record is not None and dataset is None:
-        steps["zero"] = lambda found: within(found, record)
-    for key, step in steps.items():
-        if key == "zero" or getattr(given, key):
-            try:
-                measured = step(measured)
-            except ValueError as error:
-                raise ValueError(f"{job.where('measurements')} {key}: {error}") from error
+        asked["zero"] = record
+    for key, value in asked.items():
+        try:
+            measured = steps.get(key, _within)(measured, value)
+        except ValueError as error:
+            raise ValueError(f"{job.where('measurements')} {key}: {error}") from error
     return measured
 
 
@@ -140,13 +110,12 @@ def _read_columns(path: Path, given: Measured, channels: Sequence[Channel]) -> M
     by_name = {channel.name: channel for channel in channels}
     columns, units = given.columns or {name: name for name in by_name}, given.units or {}
     for key, names, known in (("columns", columns, tuple(by_name)), ("units", units, tuple(columns))):
-        for name in names:
-            if name not in known:
-                raise ValueError(f"{key}: unknown channel {name!r}; {did_you_mean(name, known)}")
-    if missing := [name for name in by_name if name not in columns]:
+        if unknown := [name for name in names if name not in known]:
+            raise ValueError(f"{key}: unknown channel {unknown[0]!r}; {did_you_mean(unknown[0], known)}")
+    if lacking := [name for name in by_name if name not in columns]:
         raise ValueError(
             f"columns: expected a column for each channel of the model, {', '.join(by_name)}; there is none for "
-            f"{', '.join(missing)}"
+            f"{', '.join(lacking)}"
         )
     options = given.given("zero", *given.READING)
     marks = [each for each in given.missing or () if not isinstance(each, list)]
@@ -164,11 +133,20 @@ def _read_columns(path: Path, given: Measured, channels: Sequence[Channel]) -> M
     )
 
 
+def _changed(measured: Measurements, values: np.ndarray, what: str) -> Measurements:
+    return replace(measured, values=values, description=f"{measured.description}, {what}")
+
+
+def _turned(measured: Measurements, names: Sequence[str]) -> Measurements:
+    """Measurements with the channels `names` multiplied by -1."""
+    turned = measured.select(names).channels
+    signs = np.array([[-1.0 if channel in turned else 1.0] for channel in measured.channels])
+    return _changed(measured, signs * measured.values, f"reversed: {', '.join(names)}")
+
+
 def _left_out(measured: Measurements, missing: Sequence[Any]) -> Measurements:
     """Measurements without the samples at the times that `missing` lists, for one channel or all."""
     spans = [each for each in missing if isinstance(each, list)]
-    if not spans:
-        return measured
     values, names = measured.values.copy(), [channel.name for channel in measured.channels]
     for *name, first, last in spans:
         for channel in measured.select(name or names).channels:
@@ -177,7 +155,7 @@ def _left_out(measured: Measurements, missing: Sequence[Any]) -> Measurements:
             values[row, (times >= first - margin) & (times <= last + margin)] = np.nan
     counts = (np.isfinite(measured.values) & np.isnan(values)).sum(axis=1)
     text = ", ".join(f"{count} of {name}" for name, count in zip(names, counts, strict=True) if count)
-    return replace(measured, values=values, description=f"{measured.description}, samples left out: {text or 'none'}")
+    return _changed(measured, values, f"samples left out: {text or 'none'}") if spans else measured
 
 
 def _straightened(measured: Measurements, points: Mapping[str, Any]) -> Measurements:
@@ -188,21 +166,10 @@ def _straightened(measured: Measurements, points: Mapping[str, Any]) -> Measurem
         levels = [read_quantity(level, channel.dimension) for level in levels]
         line = np.polynomial.Polynomial.fit(times, levels, len(levels) - 1)
         values[names.index(channel.name)] -= line(measured.times(channel.name))
-    return replace(measured, values=values, description=f"{measured.description}, less a baseline: {', '.join(points)}")
+    return _changed(measured, values, f"less a baseline: {', '.join(points)}")
 
 
-def _turned(measured: Measurements, names: Sequence[str]) -> Measurements:
-    """Measurements with the channels `names` multiplied by -1."""
-    turned = measured.select(names).channels
-    signs = np.array([[-1.0 if channel in turned else 1.0] for channel in measured.channels])
-    text = f"{measured.description}, reversed: {', '.join(names)}"
-    return replace(measured, values=signs * measured.values, description=text)
-
-
-FEWEST_SAMPLES = 10  # of a channel, where others lie outside the record
-
-
-def within(measurements: Measurements, record: Record) -> Measurements:
+def _within(measured: Measurements, record: Record) -> Measurements:
     """The samples between the first and the last one of a record, with NaN where the measurements are shorter.
 
     The description says how many samples were left out, with a caution where these are more than half of them, and how
@@ -210,29 +177,29 @@ def within(measurements: Measurements, record: Record) -> Measurements:
     while others were left out.
     """
     end, rows, starts, notes = record.time[-1], [], [], []
-    for channel, values, step in zip(measurements.channels, measurements.values, measurements.steps, strict=True):
-        times = measurements.times(channel.name)
+    check = "check time_unit and zero in [measurements], and the record"
+    for channel, values, step in zip(measured.channels, measured.values, measured.steps, strict=True):
+        times, name = measured.times(channel.name), channel.name
         inside = np.flatnonzero((times >= -1e-6 * step) & (times <= end + 1e-6 * step))
         found, used = np.isfinite(values).sum(), np.isfinite(values[inside]).sum()
         outside = found - used
-        if not np.isfinite(values[inside]).any():
+        if not used:
             raise ValueError(
-                f"channel {channel.name!r} was measured from {times[0]:g} to {times[-1]:g} s and has no sample within "
-                f"the record, 0 to {end:g} s; set zero in [measurements] to the time in the file at which the base "
-                'motion begins (a clock time such as "10:32:07" where the file has clock times)'
+                f"channel {name!r} was measured from {times[0]:g} to {times[-1]:g} s and has no sample within the "
+                f"record, 0 to {end:g} s; set zero in [measurements] to the time in the file at which the base motion "
+                'begins (a clock time such as "10:32:07" where the file has clock times)'
             )
-        share = f"{used} of {found} samples of {channel.name} lie within the record"
+        share = f"{used} of {found} samples of {name} lie within the record"
         if outside and used < FEWEST_SAMPLES:
             raise ValueError(
                 f"{share}, 0 to {end:g} s; expected {FEWEST_SAMPLES} or more. They were measured from {times[0]:g} to "
-                f"{times[-1]:g} s: check time_unit and zero in [measurements], and the record"
+                f"{times[-1]:g} s: {check}"
             )
         missing = int((end - times[inside[-1]]) / step + 1e-6)
         rows.append(np.append(values[inside], np.full(missing, np.nan)))
         starts.append(0.0 if abs(times[inside[0]]) <= 1e-6 * step else float(times[inside[0]]))
-        notes += [f"without {outside} samples of {channel.name} before or after the record"] if outside else []
-        if outside > used:
-            notes.append(f"CAUTION: only {share}: check time_unit and zero in [measurements], and the record")
-        notes += [f"{channel.name} ends {missing * step:.3g} s before the record"] if missing else []
-    text = ", ".join([measurements.description, *notes])
-    return Measurements(measurements.channels, measurements.steps, rows, text, starts)
+        notes += [f"without {outside} samples of {name} before or after the record"] if outside else []
+        notes += [f"CAUTION: only {share}: {check}"] if outside > used else []
+        notes += [f"{name} ends {missing * step:.3g} s before the record"] if missing else []
+    text = ", ".join([measured.description, *notes])
+    return Measurements(measured.channels, measured.steps, rows, text, starts)

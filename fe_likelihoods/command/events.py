@@ -53,8 +53,6 @@ def _read_event(job: Job, problem: Problem, name: str) -> Event:
     where, model = own.where("record"), _histories_of(problem)[0].model
     if not hasattr(model, "with_record"):
         raise ValueError(f"{where} a model of kind {job.kind} without [record] has one excitation: leave this out")
-    if given.file is None:
-        raise ValueError(f"{where} file: this key is missing; it is the base motion of the event")
     record = read_base_motion(own)
     try:
         measured = None if own.measurements is None else read_measured(own, model.channels, record)
@@ -73,13 +71,10 @@ def predict_quietly(job: Job, problem: Problem, samples: np.ndarray, **options: 
     from ..prediction.propagation import propagate
 
     likelihood, part = _histories_of(problem)
-    usual = {
-        "noise": bool(job.prediction.noise),
-        "seed": job.sampler.seed,
-    }
+    usual = {"noise": bool(job.prediction.noise), "seed": job.sampler.seed, "cache": likelihood.simulator.cache}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FindingWarning)
-        return propagate(problem.posterior, samples, cache=likelihood.simulator.cache, **usual | part | options)
+        return propagate(problem.posterior, samples, **usual | part | options)
 
 
 def predict_events(
@@ -96,8 +91,7 @@ def predict_events(
     for event in events if len(samples) else ():
         try:
             found[event.name] = job.located(
-                f"events.{event.name}",
-                lambda event=event: _predict_event(job, event, problem, samples, progress),
+                f"events.{event.name}", _predict_event, job, event, problem, samples, progress
             )
         except SimulationFailed as error:
             logger.warning("event %s is left out: %s", event.name, error)
@@ -110,17 +104,14 @@ def _predict_event(
 ) -> dict[str, Prediction]:
     from ..prediction.quantities import peak
 
-    likelihood, _ = _histories_of(problem)
+    likelihood, wanted = _histories_of(problem)[0], job.prediction.noise
+    noise: Any = event.measured is not None if wanted is None else wanted  # measurements contain noise
+    options = event.options | {"record": event.record, "progress": progress}
     quantities = {"histories": None, "peaks": [peak(channel.name) for channel in likelihood.model.channels]}
-    wanted = job.prediction.noise
-    wanted = event.measured is not None if wanted is None else wanted  # measurements contain noise
-    noises: dict[str, Any] = dict.fromkeys(quantities, wanted)
-    if wanted and follows_response(likelihood.noise):
-        noises["peaks"] = "model"  # errors that are independent from sample to sample raise the largest value
+    if not (noise and follows_response(likelihood.noise)):
+        return predict_quietly(job, problem, samples, quantity=quantities, noise=noise, **options)
     found: dict[str, Prediction] = {}
-    # The second kind finds all responses in the cache; with `[budget] cache = false` it simulates them again.
-    for noise in dict.fromkeys(noises.values()):
-        some = {name: quantities[name] for name in quantities if noises[name] == noise}
-        more = event.options | {"record": event.record, "quantity": some, "noise": noise, "progress": progress}
-        found |= predict_quietly(job, problem, samples, **more)
+    # the second kind finds all responses in the cache; with `[budget] cache = false` it simulates them again
+    for kind, (name, quantity) in zip((noise, "model"), quantities.items(), strict=True):
+        found |= predict_quietly(job, problem, samples, quantity={name: quantity}, noise=kind, **options)
     return found

@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from . import sections
-from .keys import Key, did_you_mean, keys_of, read_keys
+from .keys import did_you_mean, keys_of, read_keys
 from .sections import FREE_SECTIONS, MODEL_KINDS, SECTIONS, USER_MODELS, model_keys, part_keys
 
-__all__ = ["Job", "parse_job", "read_job"]
+__all__ = ["HDF5", "Job", "parse_job", "read_job"]
 
+HDF5 = (".h5", ".hdf5")
 DATA = "measurements", "modes", "load_test"  # sections of data sets; each may have its own model, [modes.model]
 
 
@@ -45,10 +46,10 @@ class Job:
         section = self.model_section if section == "model" else section
         return f"{self.file.name}: [{f'events.{self.event}' if own else section}]"
 
-    def located(self, section: str, make: Any) -> Any:
-        """What ``make()`` returns; its errors have file and section before them."""
+    def located(self, section: str, make: Any, *arguments: Any, **options: Any) -> Any:
+        """What ``make(...)`` returns; its errors have file and section before them."""
         try:
-            return make()
+            return make(*arguments, **options)
         except ValueError as error:
             known = str(error).startswith(f"{self.file.name}:")
             raise (error if known else ValueError(f"{self.where(section)} {error}")) from error
@@ -80,12 +81,14 @@ class Job:
         """The same update with record and measurements of one event; `measurements` is None without them."""
         event, measured = self.events[name], None
         if event.measured is not None:
-            usual = {} if self.measurements is None else self.measurements.given()
-            if event.measured.lower().endswith((".h5", ".hdf5")):
-                usual = {}
-            kept = {key: value for key, value in usual.items() if key != "baseline"}
-            if "missing" in kept:  # times are those of the other file
-                kept["missing"] = [each for each in kept["missing"] if not isinstance(each, list)]
+            alike = self.measurements is not None and not event.measured.lower().endswith(HDF5)
+            kept = self.measurements.given() if alike else {}
+            kept.pop("baseline", None)  # times are those of the other file
+            kept |= (
+                {"missing": [each for each in kept["missing"] if not isinstance(each, list)]}
+                if "missing" in kept
+                else {}
+            )
             measured = sections.Measured(**kept | event.given("zero") | {"file": event.measured})
         return replace(self, record=event, measurements=measured, event=name)
 
@@ -131,43 +134,42 @@ def parse_job(text: str, file: Path, folder: Path) -> Job:
     if "model" not in content:
         raise ValueError(f"{file.name}: [model]: this section is missing; it says what the structure is")
     data = [name for name in DATA if name in content]
-    given = {name: own for name in data if isinstance(own := content[name].pop("model", None), dict)}
+    for name, what in (
+        ("record", "modes and load tests have no [record]"),
+        ("events", "an event is predicted with the model of [measurements]"),
+    ):
+        if name in content and data and "measurements" not in data:
+            raise ValueError(f"{file.name}: [{name}]: {what}, and the section [measurements] is missing")
     base = content["model"]
-    shared = () if base.get("kind") not in USER_MODELS else tuple(name for name in given if "kind" not in given[name])
-    own = {name: _read_model(base | given[name], f"{file.name}: [{name}.model") for name in given if name in shared}
-    own |= {name: _read_model(given[name], f"{file.name}: [{name}.model") for name in given if name not in shared}
-    kind, model = (
-        next(iter(own.values())) if shared and len(own) == len(data) else (_read_model(base, f"{file.name}: [model"))
-    )
+    given = {name: own for name in data if isinstance(own := content[name].pop("model", None), dict)}
+    shared = tuple(name for name in given if "kind" not in given[name] and base.get("kind") in USER_MODELS)
+    own = {
+        name: _read_model(base | each if name in shared else each, f"{file.name}: [{name}.model")
+        for name, each in given.items()
+    }
+    whole = shared and len(own) == len(data)
+    kind, model = own[shared[0]] if whole else _read_model(base, f"{file.name}: [model")
     values: dict[str, Any] = {
         name: section(**read_keys(content[name], keys_of(section), f"{file.name}: [{name}]"))
         for name, section in SECTIONS.items()
         if name in content
     }
-    if data and "measurements" not in data and "record" in content:
-        raise ValueError(f"{file.name}: [record]: modes and load tests have no [record]; it belongs to [measurements]")
-    if data and "measurements" not in data and "events" in content:
-        raise ValueError(
-            f"{file.name}: [events]: an event is predicted with the model of [measurements], which is missing"
-        )
-    values |= {"kind": kind, "model": model, "own_models": own, "shared": shared}
-    events = _read_events(content.get("events", {}), file.name)
-    return Job(file=file, text=text, folder=folder, priors=content.get("priors", {}), events=events, **values)
+    values |= {"kind": kind, "model": model, "own_models": own, "shared": shared, "priors": content.get("priors", {})}
+    events = {name: _read_event(name, keys, file.name) for name, keys in content.get("events", {}).items()}
+    return Job(file=file, text=text, folder=folder, events=events, **values)
 
 
-def _read_events(given: dict[str, Any], file: str) -> dict[str, sections.Event]:
-    events = {}
-    for name, keys in given.items():
-        if not isinstance(keys, dict):
-            raise ValueError(f"{file}: [events] {name}: expected a section [events.{name}]; got {keys!r}")
-        where = f"{file}: [events.{name}]"
-        if not re.fullmatch(r"[\w-]+", name):
-            raise ValueError(f"{where}: expected a name of letters, digits, - and _, for names of files")
-        events[name] = sections.Event(**read_keys(keys, keys_of(sections.Event), where))
-        for key, needed in (("zero", "measured"), ("rest", "from_state")):
-            if key in keys and needed not in keys:
-                raise ValueError(f"{where} {key}: this key has no effect without {needed}")
-    return events
+def _read_event(name: str, keys: Any, file: str) -> sections.Event:
+    where = f"{file}: [events.{name}]"
+    if not isinstance(keys, dict):
+        raise ValueError(f"{file}: [events] {name}: expected a section [events.{name}]; got {keys!r}")
+    if not re.fullmatch(r"[\w-]+", name):
+        raise ValueError(f"{where}: expected a name of letters, digits, - and _, for names of files")
+    event = sections.Event(**read_keys(keys, keys_of(sections.Event), where))
+    for key, needed in (("zero", "measured"), ("rest", "from_state")):
+        if key in keys and needed not in keys:
+            raise ValueError(f"{where} {key}: this key has no effect without {needed}")
+    return event
 
 
 def _read_model(given: dict[str, Any], where: str) -> tuple[str, dict[str, Any]]:
@@ -175,17 +177,14 @@ def _read_model(given: dict[str, Any], where: str) -> tuple[str, dict[str, Any]]
     if kind not in MODEL_KINDS:
         known = did_you_mean(kind, MODEL_KINDS) if isinstance(kind, str) else f"known are {', '.join(MODEL_KINDS)}"
         raise ValueError(f"{where}] kind: expected the kind of the structure; got {kind!r}; {known}")
-    parts = part_keys(kind)
-    keys = (*model_keys(kind), Key("kind", "text", "Kind of the structure", True))
+    keys, parts = model_keys(kind), part_keys(kind)
     known = (*(key.name for key in keys), *parts)  # the names of parts are proposed as well
-    plain = {name: value for name, value in given.items() if name not in parts}
-    if unknown := [name for name in plain if name not in known]:
+    if unknown := [name for name in given if name not in (*known, "kind")]:
         raise ValueError(f"{where}] {unknown[0]}: unknown key of kind {kind}; {did_you_mean(unknown[0], known)}")
-    values = read_keys(plain, keys, f"{where}]")
+    values = read_keys({name: given[name] for name in given if name not in (*parts, "kind")}, keys, f"{where}]")
     for name in given.keys() & parts.keys():
         if not isinstance(given[name], dict):
             section = f"{where.partition(': ')[2]}.{name}]"
             raise ValueError(f"{where}] {name}: expected a section {section}; got {given[name]!r}")
         values[name] = read_keys(given[name], parts[name], f"{where}.{name}]")
-    values.pop("kind")
     return kind, values

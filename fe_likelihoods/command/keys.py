@@ -1,13 +1,13 @@
 """Keys of the TOML file and their values: kinds, checks, quantities with units, priors, and the reading of one section.
 
-A key is a `Key`, or a field of a frozen dataclass that `key` makes. Messages name the file, the section and the key,
-and propose the nearest known key for an unknown one.
+Messages name the file, the section and the key, and propose the nearest known key for an unknown one.
 """
 
 import dataclasses
 import datetime
 import difflib
 import functools
+import json
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -20,10 +20,10 @@ from ..units import DIMENSIONS, to_si
 __all__ = [
     "FORMS",
     "Key",
-    "check_of",
     "did_you_mean",
     "key",
     "keys_of",
+    "keys_of_structure",
     "parse_prior",
     "read_by_channel",
     "read_keys",
@@ -37,7 +37,7 @@ CLOCK = "time or clock time"
 class Key(NamedTuple):
     """One key of a section.
 
-    Its kind is one of `check_of`; a dimension of `fe_likelihoods.units.DIMENSIONS`, for a text with number and unit
+    Its kind is one of `_check_of`; a dimension of `fe_likelihoods.units.DIMENSIONS`, for a text with number and unit
     (``"1.22 m"``) or a number in SI units; "one of " and choices; or "time or clock time".
     """
 
@@ -59,23 +59,43 @@ def keys_of(section: type) -> tuple[Key, ...]:
     found = []
     for each in sorted(dataclasses.fields(section), key=lambda each: each.name in getattr(section, "READING", ())):
         required = each.default is dataclasses.MISSING
-        given = "" if required or each.default is None else f" ({_as_toml(each.default)})"
+        given = "" if required or each.default is None else f" ({json.dumps(each.default)})"
         found.append(Key(each.name, each.metadata["kind"], each.metadata["meaning"] + given, required))
     return tuple(found)
 
 
-def _as_toml(value: Any) -> str:
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    return f'"{value}"' if isinstance(value, str) else str(value)
+_KINDS_OF_TYPES = {
+    "float": "number",
+    "int": "whole number",
+    "bool": "yes or no",
+    "str": "text",
+    "tuple[str, ...]": "list of text",
+    "Sequence[int]": "list of whole number",
+    "Sequence[float]": "list of number",
+}
+
+
+@functools.cache
+def keys_of_structure(owner: type, without: str = "", optional: bool = False) -> tuple[Key, ...]:
+    """Keys of the described fields of a structure or of one of its parts, but of names that blanks separate.
+
+    They may all be left out where they have the values of a built-in structure (`optional`).
+    """
+    found = []
+    for each in dataclasses.fields(owner):
+        about, unit = each.metadata, each.metadata["unit"]
+        kind = about["kind"] or next((name for name, si in DIMENSIONS.items() if si == unit), "")
+        meaning, mark, rest = about["meaning"].partition("; ")
+        meaning += f" [{unit}]" if unit and not kind else ""
+        kind = kind or _KINDS_OF_TYPES.get(each.type.removesuffix(" | None"), "")
+        required = each.default is dataclasses.MISSING and not optional
+        if kind and each.name not in without.split():
+            found.append(Key(each.name, kind, meaning + mark + rest, required))
+    return tuple(found)
 
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _is_whole(value: Any, least: float = -math.inf) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= least
 
 
 def _is_text(value: Any) -> bool:
@@ -96,13 +116,17 @@ def _are_points(value: Any) -> bool:
     return bool(value) and right and len({time for time, _ in value}) == len(value)
 
 
+def _whole(least: float) -> Callable[[Any], bool]:
+    return lambda value: isinstance(value, int) and not isinstance(value, bool) and value >= least
+
+
 _Check = tuple[Callable[[Any], bool], str, str]
 _ONE: dict[str, _Check] = {
     "text": (_is_text, "text in quotes", '"abc"'),
     "number": (_is_number, "number", "1.0"),
-    "whole number": (_is_whole, "whole number", "1"),
-    "whole number >= 0": (lambda value: _is_whole(value, 0), "whole number of 0 or more", "1"),
-    "whole number >= 1": (lambda value: _is_whole(value, 1), "whole number of 1 or more", "1"),
+    "whole number": (_whole(-math.inf), "whole number", "1"),
+    "whole number >= 0": (_whole(0), "whole number of 0 or more", "1"),
+    "whole number >= 1": (_whole(1), "whole number of 1 or more", "1"),
     "yes or no": (lambda value: isinstance(value, bool), "value true or false", "true"),
     "quantity": (lambda value: _is_number(value) or _is_text(value), "number with unit", '"0.01 g"'),
     "points": (_are_points, "list of points of time and value", '[[0.0, "0.01 g"], [40.0, "0.03 g"]]'),
@@ -111,27 +135,26 @@ _ONE: dict[str, _Check] = {
 """Check of a value, what a message says was expected, and an example, of the kinds that others are made of."""
 
 
-def check_of(kind: str) -> _Check:
+def _check_of(kind: str) -> _Check:
     """The same for kinds such as "list of number", "table of text or number" (by name), and "text, or list of text"."""
     if kind in _ONE:
         return _ONE[kind]
     first, _, second = kind.partition(", or ")
-    if not second and kind.startswith("list of "):
-        fits, expected, example = check_of(kind.removeprefix("list of "))
-        return (
-            lambda value: isinstance(value, list) and all(map(fits, value)),
-            f"list, each a {expected}",
-            f"[{example}]",
-        )
-    if not second and kind.startswith("table of "):
-        fits, expected, example = check_of(kind.removeprefix("table of "))
-        return (
-            lambda value: isinstance(value, dict) and bool(value) and all(map(fits, value.values())),
-            f"table by name, each a {expected}",
-            f"{{top = {example}}}",
-        )
+    if not second and kind.startswith(("list of ", "table of ")):
+        fits, expected, example = _check_of(kind.partition(" of ")[2])
+        if kind.startswith("list of "):
+            return (
+                lambda value: isinstance(value, list) and all(map(fits, value)),
+                f"list, each a {expected}",
+                f"[{example}]",
+            )
+
+        def is_table(value: Any) -> bool:
+            return isinstance(value, dict) and bool(value) and all(map(fits, value.values()))
+
+        return is_table, f"table by name, each a {expected}", f"{{top = {example}}}"
     first, second = (first, second) if second else kind.split(" or ", 1)
-    (fits, expected, _), (other, further, example) = check_of(first), check_of(second)
+    (fits, expected, _), (other, further, example) = _check_of(first), _check_of(second)
     return lambda value: fits(value) or other(value), f"{expected}, or a {further}", example
 
 
@@ -232,7 +255,7 @@ def _read_value(value: Any, kind: str, where: str) -> Any:
             return value
         near = difflib.get_close_matches(value, choices, n=1, cutoff=0.55) if isinstance(value, str) else []
         raise ValueError(f"{where}: expected {kind}; got {value!r}{f'; did you mean {near[0]}?' if near else ''}")
-    fits, expected, example = check_of(kind)
+    fits, expected, example = _check_of(kind)
     if not fits(value):
         raise ValueError(f"{where}: expected a {expected}, such as {example}; got {value!r}")
     return value

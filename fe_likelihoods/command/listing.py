@@ -8,11 +8,11 @@ from typing import NamedTuple
 import numpy as np
 
 from ..checks.finding import NOTE
-from ..checks.screening import Screened, check_data, check_sensors, repair_lines, screen, screen_motion
+from ..checks.screening import Screened, check_data, check_sensors, repair_lines, screen
 from ..checks.sensor_faults import find_sensor_faults
 from ..modal.modal_readers import read_modal_data
 from ..signals.datasets import read_dataset
-from ..signals.read import read_record, recognise_format
+from ..signals.read import recognise_format
 from ..signals.strong_motion import find_channels
 from ..signals.tables import (
     Statements,
@@ -35,14 +35,13 @@ from ..units import from_si, to_si
 __all__ = ["describe_data"]
 
 _MOST_TEXTS = 3  # that stand for missing samples; a column with more is no column of numbers
-_HEAD = ("samples", "step [s]", "duration [s]", "peak [g]")
 
 
 class _Lines(NamedTuple):
     """Text about a file, and lines of sections such as ``[record]`` and ``[measurements]``."""
 
     text: list[str]
-    sections: dict[str, list[str]] = {}
+    sections: dict[str, list[str]]
 
 
 def describe_data(path: Path) -> str:
@@ -54,35 +53,24 @@ def describe_data(path: Path) -> str:
         found = _dataset(path)
     else:
         form = recognise_format(path)
-        single = _table if form is None else _single
-        found = _several(path, form) if form in ("v2", "geonet") else single(path)
+        found = _table(path) if form is None else _motions(path, form)
     lines = [f"{path}: {found.text[0]}", *found.text[1:], "", "# lines for the TOML file"]
     for section, given in found.sections.items():
-        lines += [f"[{section}]", f"file = {_quoted(str(path))}", *given]
+        lines += [f"[{section}]", f"file = {_toml(str(path))}", *given]
     return "\n".join(lines)
 
 
-def _quoted(text: str) -> str:
-    return json.dumps(text, ensure_ascii=False)
+def _toml(value: object) -> str:
+    """A text, number or list as TOML writes it, and a mapping as an inline table."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{name} = {_toml(each)}" for name, each in value.items()) + "}"
+    return json.dumps(value, ensure_ascii=False)
 
 
-def _cells(values: np.ndarray, step: float) -> tuple[str, ...]:
-    """Cells below `_HEAD`, of accelerations [m/s²]."""
-    peak = number(from_si(np.abs(values).max(), "g"))
-    return str(values.size), f"{step:g}", number((values.size - 1) * step, 4), peak
-
-
-def _name_of_channel(text: str, taken: set[str]) -> str:
+def _name_of_channel(text: str, taken: dict[str, object]) -> str:
     """A name for a channel, from the name of its column without the unit."""
     base = re.sub(r"[^A-Za-z0-9_]+", "_", re.sub(r"[\[(].*$", "", text)).strip("_").lower() or "channel"
-    name = next(name for k in range(1, len(taken) + 2) if (name := base if k == 1 else f"{base}_{k}") not in taken)
-    taken.add(name)
-    return name
-
-
-def _inline(pairs: list[tuple[str, str | int]]) -> str:
-    """An inline table of TOML."""
-    return "{" + ", ".join(f"{name} = {_quoted(v) if isinstance(v, str) else v}" for name, v in pairs) + "}"
+    return next(name for k in range(1, len(taken) + 2) if (name := base if k == 1 else f"{base}_{k}") not in taken)
 
 
 def _screen(name: str, values: np.ndarray, unit: str, step: float, start: float = 0.0) -> list[Screened]:
@@ -91,65 +79,60 @@ def _screen(name: str, values: np.ndarray, unit: str, step: float, start: float 
     return [Screened(name, unit, step, start, faults)] if faults else []
 
 
-def _texts(channels: list[Screened]) -> list[str]:
+def _cautions(channels: list[Screened]) -> list[str]:
     return [f"CAUTION: {each.kind}: {each.text}" for each in check_sensors(channels)]
 
 
-def _several(path: Path, form: str) -> _Lines:
-    """Several accelerations, which readers know by numbers or names."""
-    channels, taken = find_channels(path, form), set[str]()
+def _motions(path: Path, form: str) -> _Lines:
+    """Accelerations in a format of networks, which readers know by numbers or names if there are several."""
+    channels = find_channels(path, form)
     files = [each.file.removeprefix(f"{path}/") if each.file != str(path) else path.name for each in channels]
     numbers = [each.channel for each in channels]
     given = [  # a V2 file without a number of its own is known by its name
         each.channel if form != "v2" or (each.channel is not None and numbers.count(each.channel) == 1) else file
         for each, file in zip(channels, files, strict=True)
     ]
-    rows, columns, refused, screened = [("channel", *_HEAD, "label", "file")], [], [], list[Screened]()
+    rows = [("channel", "samples", "step [s]", "duration [s]", "peak [g]", "label", "file")]
+    columns, said, screened, base = dict[str, object](), list[str](), list[Screened](), list[str]()
     for each, column, file in zip(channels, given, files, strict=True):
         try:
             parsed = each.parse()
-            values, times = to_si(parsed.values, parsed.unit, "acceleration"), parsed.times
-            step = parsed.dt if times is None else uniform_times(times, None, str(column)).step
+            step = parsed.dt if parsed.times is None else uniform_times(parsed.times, None, str(column or path)).step
         except ValueError as error:
-            refused.append(f"not read: {error}")
+            if column is None:
+                raise
+            said.append(f"not read: {error}")
             continue
-        rows.append((str(each.channel or "-"), *_cells(values, step), each.label, file))
-        if times is not None:
-            refused.append(f"uneven times in channel {column}: give resample = {step:.6g}")
+        values = from_si(to_si(parsed.values, parsed.unit or "g", "acceleration"), "g")
+        peak, duration = number(np.abs(values).max()), number((values.size - 1) * step, 4)
+        rows.append((str(each.channel or "-"), str(values.size), f"{step:g}", duration, peak, each.label, file))
+        if parsed.unit is None:
+            said.append("The unit is not stated: the peak is that of samples in g.")
+            base.append('units = "?"    # write it: the file does not state it')
+        if parsed.times is not None:
+            said.append(f"uneven times in channel {column or 1}: give resample = {step:.6g}")
+            base += [f"resample = {step:.6g}"] if column is None else []
         if (count := given.count(column)) > 1:
-            refused.append(f"{column!r} is there {count} times, and no number tells them apart")
+            said.append(f"{column!r} is there {count} times, and no number tells them apart")
             continue
-        columns.append((_name_of_channel(f"ch{column}" if isinstance(column, int) else column, taken), column))
-        screened += _screen(columns[-1][0], from_si(values, "g"), "g", step) if times is None else []
-    text = [f"{len(columns)} channels of acceleration", text_table(rows), *dict.fromkeys(refused), *_texts(screened)]
+        name = _name_of_channel(f"ch{column}" if isinstance(column, int) else column or "motion", columns)
+        columns[name] = column
+        screened += _screen(name, values, "g", step) if parsed.times is None else []
     if len({row[1:3] for row in rows[1:]}) > 1:
-        text.append(
+        said.append(
             "The channels differ in samples or step: they may be of several recorders, whose clocks may differ."
         )
-    if not columns:
-        return _Lines(text)
-    first = columns[0][1]
-    line = f"channel = {first}" if isinstance(first, int) else f"column = {_quoted(first)}"
-    measured = [f"columns = {_inline(columns)}    # channel of the model = channel of the file"]
-    return _Lines(text, {"record": [f"{line}    # the base motion"], "measurements": measured + repair_lines(screened)})
-
-
-def _single(path: Path) -> _Lines:
-    """A ground motion in a file of its own."""
-    given, lines = {}, []
-    try:
-        record = read_record(path)
-    except ValueError as error:
-        if found := re.search(r"resample=(\S+)$", str(error)):
-            given, lines = {"resample": float(found[1])}, [f"resample = {found[1]}"]
-        elif "does not state the unit" in str(error):
-            given, lines = {"units": "g"}, ['units = "?"    # write it: the file does not state it']
-        else:
-            raise
-        record = read_record(path, **given)
-    note = ["The unit is not stated: the peak is that of samples in g."] if "units" in given else []
-    note += _texts(screen_motion(record))
-    return _Lines(["a ground motion", str(record), record.source, *note], {"record": lines})
+    text = [f"{len(columns)} channel(s) of acceleration", text_table(rows), *dict.fromkeys(said), *_cautions(screened)]
+    if given == [None]:
+        return _Lines(text, {"record": base})
+    sections = {}
+    if columns:
+        first = next(iter(columns.values()))
+        key = "channel" if isinstance(first, int) else "column"
+        measured = [f"columns = {_toml(columns)}    # channel of the model = channel of the file"]
+        sections = {"record": [f"{key} = {_toml(first)}    # the base motion"]}
+        sections["measurements"] = measured + repair_lines(screened)
+    return _Lines(text, sections)
 
 
 def _dataset(path: Path) -> _Lines:
@@ -189,8 +172,7 @@ def _table(path: Path) -> _Lines:
     options, remarks, step = _sampling(table)
     remarks += said
     rows: list[tuple[str, ...]] = [("column", "unit", "numbers", "missing", "smallest", "largest")]
-    columns, unstated, marks, screened = [], [], set(), list[Screened]()
-    taken: set[str] = set()
+    columns, unstated, marks, screened = dict[str, object](), dict[str, str](), set[float](), list[Screened]()
     names = [column.name for column in table.columns]
     for k in value_columns(table):
         name, values = names[k], table.columns[k].values
@@ -206,40 +188,37 @@ def _table(path: Path) -> _Lines:
         if names.count(name) > 1:
             remarks.append(f"the name {name!r} is that of several columns: rename them")
             continue
-        columns.append((_name_of_channel(name if table.named else f"column {name}", taken), name))
+        channel = _name_of_channel(name if table.named else f"column {name}", columns)
+        columns[channel] = name
         if step is not None:
             values = np.where(np.isin(values, list(marks)), np.nan, values)
             if any(each.startswith("resample") for each in options):
                 values = uniform_times(row_times(table), None, table.file).interpolate(values)
             start = table_start(table, step, 0.0 if table.clock is None else clock_text(table.clock))
-            screened += _screen(columns[-1][0], values, unit or "", step, start)
+            screened += _screen(channel, values, unit or "", step, start)
         if unit is None or dimension_of(unit) is None:
-            unstated.append((columns[-1][0], "?"))
-    text = [f"a table of {len(table.lines)} rows", text_table(rows), *remarks, *_texts(screened)]
+            unstated[channel] = "?"
+    text = [f"a table of {len(table.lines)} rows", text_table(rows), *remarks, *_cautions(screened)]
+    missing = [f"missing = {_toml([*texts, *sorted(marks)])}"] if texts or marks else []
     repairs = repair_lines(screened, {"missing": [*texts, *sorted(marks)]})
-    if (texts or marks) and not any(each.startswith("missing") for each in repairs):
-        repairs.append(f"missing = [{', '.join([*map(_quoted, texts), *(f'{mark:g}' for mark in sorted(marks))])}]")
-    measured = [f"columns = {_inline(columns)}    # channel of the model = column", *options]
-    if unstated:
-        measured.append(f"units = {_inline(unstated)}    # write them: the file does not state them")
-    if table.clock is not None:
-        measured.append(
-            f'zero = "{clock_text(table.clock)}"    # or when the base motion begins, if it is in another file'
-        )
+    repairs = ([] if any(each.startswith("missing") for each in repairs) else missing) + repairs
     if not columns:
-        return _Lines(text)
+        return _Lines(text, {})
     places = re.search(r"case|load|truck|position|place", names[0], re.IGNORECASE)
-    if table.time is None and len(names) > 1 and (table.columns[0].kind == "text" or places):
-        own = [pair for pair in columns if pair[1] != names[0]]
-        lines = [f"columns = {_inline(own)}    # channel of the model = column"]
-        if unknown := [pair for pair in unstated if pair[0] in dict(own)]:
-            lines.append(f"units = {_inline(unknown)}    # write them: the file does not state them")
-        return _Lines([*text, "a line for each load case"], {"load_test": lines})
-    base = [f"column = {_quoted(columns[0][1])}    # the base motion, if it is in this file"]
-    if texts:
-        base.append(f"missing = [{', '.join(map(_quoted, texts))}]")
-    if unstated and columns[0][0] == unstated[0][0]:
-        base.append('units = "?"    # write it: the file does not state it')
+    cases = table.time is None and len(names) > 1 and (table.columns[0].kind == "text" or places)
+    columns = {name: column for name, column in columns.items() if not cases or column != names[0]}
+    measured = [f"columns = {_toml(columns)}    # channel of the model = column", *([] if cases else options)]
+    if unknown := {name: unit for name, unit in unstated.items() if name in columns}:
+        measured.append(f"units = {_toml(unknown)}    # write them: the file does not state them")
+    if cases:
+        return _Lines([*text, "a line for each load case"], {"load_test": measured})
+    if table.clock is not None:
+        zero = _toml(clock_text(table.clock))
+        measured.append(f"zero = {zero}    # or when the base motion begins, if it is in another file")
+    first = next(iter(columns))
+    base = [f"column = {_toml(columns[first])}    # the base motion, if it is in this file"]
+    base += [f"missing = {_toml(texts)}"] if texts else []
+    base += ['units = "?"    # write it: the file does not state it'] if first in unstated else []
     return _Lines(text, {"record": [*base, *options], "measurements": measured + repairs})
 
 
@@ -250,11 +229,12 @@ def _sampling(table: Table) -> tuple[list[str], list[str], float | None]:
     except ValueError as error:
         if table.time is None:
             return ['dt = "? s"    # write it: the file has no times'], ["no column of times"], None
+        said = [f"times: {error}"]
         try:
             step = table_step(table._replace(stated=Statements()))
             above = table.lines[0] - 1 - table.named - any(column.below for column in table.columns)
             lines = [f"skip = {above}    # the step of the times, without the text above the table"] if above else []
-            return lines, [f"times: {error}"], step if above else None
+            return lines, said, step if above else None
         except ValueError:
             pass
         try:
@@ -262,8 +242,7 @@ def _sampling(table: Table) -> tuple[list[str], list[str], float | None]:
             even = uniform_times(times, None, table.file)
         except ValueError:
             unknown = "give time_unit=" in str(error)
-            lines = ['time_unit = "?"    # write it: the file does not state it'] if unknown else []
-            return lines, [f"times: {error}"], None
+            return ['time_unit = "?"    # write it: the file does not state it'] if unknown else [], said, None
         steps = np.diff(times)
         text = f"times: uneven, steps of {steps.min():.4g} to {steps.max():.4g} s"
         if even.gaps.size:

@@ -14,7 +14,7 @@ from ..likelihood.joint import JointLikelihood
 from ..likelihood.likelihood import FELikelihood
 from ..likelihood.parameters import channels_of_deviations
 from ..likelihood.posterior import Posterior
-from ..modal.load_cases import LoadTest, read_load_test
+from ..modal.load_cases import read_load_test
 from ..modal.modal_data import ModalData
 from ..modal.modal_likelihood import ModalLikelihood
 from ..modal.modal_readers import read_modal_data
@@ -37,12 +37,8 @@ from .structure import built_in, linear_parts, load_function, user_channels, use
 __all__ = ["Problem", "make_problem", "noise_channels_of", "runs_code_of_user"]
 
 ERRORS_OF_MODES = {"frequency_error": 0.01, "shape_error": 0.03}  # medians of log-normal priors without one (assumed)
-TEMPERATURE_SLOPE = (
-    2e-3  # [1/K], its standard deviation without a prior (assumed): -1e-4 to -5e-4 in concrete, more if frozen
-)
+TEMPERATURE_SLOPE = 2e-3  # [1/K], its sd without a prior (assumed): -1e-4 to -5e-4 in concrete, more if frozen
 NOISE_SCALE = 0.3  # half-normal prior of a sigma without one in the file, in root mean squares of the channel (assumed)
-
-
 STRUCTURES = "frame", "bridge deck"  # built-in ones that have modes
 
 
@@ -67,49 +63,39 @@ class _DataSet(NamedTuple):
 
 def make_problem(job: Job, cache: SimulationCache | None = None) -> Problem:
     """Read the data, make the model and the posterior; ValueError, which names section and key, for any fault."""
-    sets = {name: _read(each, cache) for name, each in job.data_sets().items()}
+    jobs = job.data_sets()
+    for each in jobs.values():
+        if each.budget.workers is not None and each.kind not in USER_MODELS and not each.has_no_time:
+            raise ValueError(
+                f"{job.where('budget')} workers: a built-in model uses all cores by itself; leave this key out"
+            )
+    readers = {"measurements": _histories, "modes": _modes, "load_test": _load_test}
+    sets = {name: each.located(name, readers[name], each, cache) for name, each in jobs.items()}
     models = _of_one_run(job, {name: sets[name] for name in job.shared})
     made, known, record = {}, {}, None
     for name, each in sets.items():
         model = models[name] if name in models else each.job.located("model", each.make_model)
-        made[name] = each.job.located(
-            name, lambda data=each, model=model: data.make_likelihood(model, _workers(data.job))
-        )
+        made[name] = each.job.located(name, each.make_likelihood, model, job.budget.workers)
         known, record = known | dict(each.known), each.record or record
     if twice := [name for name in known if name in job.priors]:
         raise ValueError(
             f"{job.where('priors')} {twice[0]}: this error is known from [load_test]: leave one of them out"
         )
-    likelihood = made.popitem()[1] if len(made) == 1 else job.located("model", lambda: JointLikelihood(made))
+    likelihood = made.popitem()[1] if len(made) == 1 else job.located("model", JointLikelihood, made)
     priors, assumed = _make_priors(job, likelihood, known)
     posterior = Posterior(likelihood, priors)
     posterior = job.located("noise", posterior.marginal) if job.marginal else posterior
     return Problem(posterior, record, assumed)
 
 
-def _workers(job: Job) -> int | None:
-    if job.budget.workers is not None and job.kind not in USER_MODELS and not job.has_no_time:
-        raise ValueError(
-            f"{job.where('budget')} workers: a built-in model uses all cores by itself; leave this key out"
-        )
-    return job.budget.workers
-
-
-def _read(job: Job, cache: SimulationCache | None) -> _DataSet:
-    section = "modes" if job.modes else "load_test" if job.load_test else "measurements"
-    return job.located(section, lambda: {"modes": _modes, "load_test": _load_test}.get(section, _histories)(job, cache))
-
-
 def _histories(job: Job, cache: SimulationCache | None) -> _DataSet:
-    record = read_base_motion(job)
-    own = job.kind in USER_MODELS
-    if is_dataset(job, "measurements"):
-        channels: tuple[Channel, ...] = ()  # the data set has its channels
-    elif own:
+    record, own = read_base_motion(job), job.kind in USER_MODELS
+    channels: tuple[Channel, ...] = ()  # a data set has its channels
+    if own and not is_dataset(job, "measurements"):
         channels = user_channels(job)
-    else:
+    elif not is_dataset(job, "measurements"):
         names = tuple((job.measurements and job.measurements.columns) or ()) or None
-        channels = job.located("model", lambda: built_in(job, record, names).channels)
+        channels = job.located("model", built_in, job, record, names).channels
     record, measured = reduce_data(job, record, read_measured(job, channels, record))
 
     def make_model() -> Model:
@@ -118,12 +104,11 @@ def _histories(job: Job, cache: SimulationCache | None) -> _DataSet:
         return built_in(job, record, tuple(channel.name for channel in measured.channels), measured)
 
     def make_likelihood(model: Model, pool: Any) -> FELikelihood:
-        sensed = job.located("priors", lambda: _with_sensors(job, model))
-        noise = job.located("noise", lambda: _make_noise(job, sensed.channels))
+        sensed = job.located("priors", _with_sensors, job, model)
+        noise = job.located("noise", _make_noise, job, sensed.channels)
         return FELikelihood(sensed, measured, noise, pool=pool, cache=cache)
 
-    step = job.model.get("dt", measured.steps[0])
-    size = job.model.get("n_steps", measured.values.shape[1])
+    step, size = job.model.get("dt", measured.steps[0]), job.model.get("n_steps", measured.values.shape[1])
     return _DataSet(job, make_model, make_likelihood, (channels, step, size), record=record)
 
 
@@ -137,34 +122,29 @@ def _modes(job: Job, cache: SimulationCache | None) -> _DataSet:
     if job.noise is not None:
         raise ValueError(f"{job.where('noise')} modes have no such errors: give frequency_cv and others in [modes]")
     data, held_out = _read_modes(job)
-    numbers = (data.n_modes, *data.mode_numbers, *(held_out.mode_numbers if held_out else ()))
-    make, channels, n_modes = _modes_of_user(job, numbers) if job.kind in USER_MODELS else (None, (), 0)
+    unknown, options = job.modes.unknown_errors, job.modes.given("close", "student_t")
+    make, channels, n_modes = None, (), 0
+    if job.kind in USER_MODELS:
+        sensors = job.model.get("sensors")
+        if sensors is None or "channels" in job.model:
+            raise ValueError(
+                f"{job.where('model')} sensors: with [modes], give sensors = {{top = 0}} with the rows of the matrices "
+                "that the function returns, or a list of names, and no channels"
+            )
+        numbers = (data.n_modes, *data.mode_numbers, *(held_out.mode_numbers if held_out else ()))
+        channels, n_modes = modal_channels(tuple(sensors)), job.modes.n_modes or 2 * max(numbers)
+        if job.kind == "function":
+            make = lambda function, names, _, **more: FunctionModes(function, names, sensors, n_modes, **more)  # noqa: E731
 
     def make_model() -> Any:
         if job.kind in STRUCTURES:
             return linear_parts(job)
-        steps = {} if make else {"dt": 1.0, "n_steps": n_modes}
-        return user_model(job, channels, make=make, **steps)
+        return user_model(job, channels, make=make, **({} if make else {"dt": 1.0, "n_steps": n_modes}))
 
-    def make_likelihood(model: Model, pool: Any) -> FELikelihood:
-        return _modal_likelihood(job, model, data, held_out, pool, cache)
+    def make_likelihood(model: Model, pool: Any) -> ModalLikelihood:
+        return ModalLikelihood(model, data, unknown, unknown, pool, cache=cache, held_out=held_out, **options)
 
     return _DataSet(job, make_model, make_likelihood, (channels, 1.0, n_modes))
-
-
-def _load_test(job: Job, cache: SimulationCache | None) -> _DataSet:
-    _check_kind(job, "load_test", ())
-    channels = user_channels(job)
-    test = _read_load_cases(job, channels)
-    response = channels, 1.0, len(test.cases)
-
-    def make_likelihood(model: Model, pool: Any) -> FELikelihood:
-        noise = None if job.noise is None else job.located("noise", lambda: _make_noise(job, channels))
-        return FELikelihood(model, test.measurements, noise, pool, cache=cache)
-
-    return _DataSet(
-        job, lambda: user_model(job, channels, dt=1.0, n_steps=response[2]), make_likelihood, response, test.known
-    )
 
 
 def _read_modes(job: Job) -> tuple[ModalData, ModalData | None]:
@@ -194,42 +174,25 @@ def _read_modes(job: Job) -> tuple[ModalData, ModalData | None]:
     return replace(data.select(compared), **errors), held_out
 
 
-def _modes_of_user(job: Job, numbers: tuple[int, ...]) -> tuple[Callable | None, tuple[Channel, ...], int]:
-    """What makes the model of a function (None for others), channels of the response, and its number of modes.
-
-    `numbers` are those of the measured modes.
-    """
-    sensors = job.model.get("sensors")
-    if sensors is None or "channels" in job.model:
-        raise ValueError(
-            f"{job.where('model')} sensors: with [modes], give sensors = {{top = 0}} with the rows of the matrices "
-            "that the function returns, or a list of names, and no channels"
-        )
-    n_modes = job.modes.n_modes or 2 * max(numbers)
-
-    def modes_of(function: Callable, names: Any, _: Any, **options: Any) -> FunctionModes:
-        return FunctionModes(function, names, sensors, n_modes, **options)
-
-    return modes_of if job.kind == "function" else None, modal_channels(tuple(sensors)), n_modes
-
-
-def _modal_likelihood(
-    job: Job, model: Any, data: ModalData, held_out: ModalData | None, pool: Any, cache: SimulationCache | None
-) -> ModalLikelihood:
-    """The likelihood of ``[modes]``."""
-    unknown, options = job.modes.unknown_errors, job.modes.given("close", "student_t")
-    return ModalLikelihood(model, data, unknown, unknown, pool, cache=cache, held_out=held_out, **options)
-
-
-def _read_load_cases(job: Job, channels: tuple[Channel, ...]) -> LoadTest:
-    """The data of ``[load_test]``."""
-    errors = read_by_channel(job.load_test.errors or {}, channels, "errors")
-    path = job.path("load_test", "file", job.load_test.file)
-    test = read_load_test(path, channels, errors=errors, **job.load_test.given("columns", "units", "cases"))
-    for key, value in (("dt", 1.0), ("n_steps", n := len(test.cases))):
+def _load_test(job: Job, cache: SimulationCache | None) -> _DataSet:
+    _check_kind(job, "load_test", ())
+    channels, given = user_channels(job), job.load_test
+    errors = read_by_channel(given.errors or {}, channels, "errors")
+    path = job.path("load_test", "file", given.file)
+    test = read_load_test(path, channels, errors=errors, **given.given("columns", "units", "cases"))
+    size = len(test.cases)
+    for key, value in (("dt", 1.0), ("n_steps", size)):
         if job.model.get(key, value) != value:
-            raise ValueError(f"{job.where('model')} {key}: a load test has {n} load cases and no time: leave it out")
-    return test
+            raise ValueError(f"{job.where('model')} {key}: a load test has {size} load cases and no time: leave it out")
+
+    def make_likelihood(model: Model, pool: Any) -> FELikelihood:
+        noise = None if job.noise is None else job.located("noise", _make_noise, job, channels)
+        return FELikelihood(model, test.measurements, noise, pool, cache=cache)
+
+    def make_model() -> Model:
+        return user_model(job, channels, dt=1.0, n_steps=size)
+
+    return _DataSet(job, make_model, make_likelihood, (channels, 1.0, size), test.known)
 
 
 def _make_noise(job: Job, channels: tuple[Channel, ...]) -> Any:
@@ -255,20 +218,17 @@ def _of_one_run(job: Job, sets: Mapping[str, _DataSet]) -> Mapping[str, Any]:
     """Models of the data sets that one run of a user's function or program answers, by section."""
     if not sets:
         return {}
-    jobs = {name: each.job for name, each in sets.items()}
-    first = next(iter(jobs.values()))
+    first = next(iter(sets.values())).job
     if job.record is not None and "measurements" in sets:
         raise ValueError(f"{job.where('record')} one run for several data sets reads its motion itself: leave this out")
-    output: Any = (
-        {name: each.model["output"] for name, each in jobs.items()}
-        if first.kind == "executable"
-        else load_function(first, first.model["function"])
-    )
+    output: Any = {name: each.job.model.get("output") for name, each in sets.items()}
+    if first.kind != "executable":
+        output = load_function(first, first.model["function"])
 
     def make(joined: Any, channels: Any, **steps: Any) -> Model:
         return user_model(first, tuple(channels), output=joined, **steps)
 
-    return first.located("model", lambda: one_run({name: each.response for name, each in sets.items()}, output, make))
+    return first.located("model", one_run, {name: each.response for name, each in sets.items()}, output, make)
 
 
 def runs_code_of_user(job: Job) -> bool:
@@ -284,41 +244,31 @@ def _with_sensors(job: Job, model: Model) -> Model:
         known = place in names or re.fullmatch(r"support_\d+", place)
         if kind in ("gain", "lag") and known and name not in model.parameter_names:
             sensors[place][kind] = parse_prior(text, "time" if kind == "lag" else None)
-    made = {place: Sensor(**priors) for place, priors in sensors.items()}
-    outputs = {place: sensor for place, sensor in made.items() if place in names}
-    inputs = {int(place.partition("_")[2]): sensor for place, sensor in made.items() if place not in names}
-    return SensedModel(model, outputs, inputs) if made else model
+    outputs = {place: Sensor(**priors) for place, priors in sensors.items() if place in names}
+    inputs = {int(place[8:]): Sensor(**priors) for place, priors in sensors.items() if place not in names}
+    return SensedModel(model, outputs, inputs) if sensors else model
 
 
 def _make_priors(
     job: Job, likelihood: FELikelihood | JointLikelihood, known: Mapping[str, float]
 ) -> tuple[dict[str, Any], dict[str, Distribution]]:
     """The priors of all parameters, numbers for `known` ones, and the assumed ones, which the file does not give."""
-    names, parts = likelihood.parameter_names, [part for part, _ in likelihood.parts()]
-    structural = dict.fromkeys(name for part in parts for name in part.model.parameter_names)
+    names, parts, where = likelihood.parameter_names, [part for part, _ in likelihood.parts()], job.where("priors")
     channels = {name: channel for part in parts for name, channel in noise_channels_of(part).items()}
     measured = {channel.name: part.measurements for part in parts for channel in part.model.channels}
-    for name in job.priors:
-        if name not in names:
-            raise ValueError(
-                f"{job.where('priors')} {name}: the model has no such parameter; {did_you_mean(name, names)}"
-            )
     given = {}
     for name, text in job.priors.items():
+        if name not in names:
+            raise ValueError(f"{where} {name}: the model has no such parameter; {did_you_mean(name, names)}")
         try:
             given[name] = parse_prior(text, channels[name].dimension if name in channels else None)
         except ValueError as error:
-            raise ValueError(f"{job.where('priors')} {name}: {error}") from None
-    if missing := [name for name in structural if name not in given and name != SLOPE]:
-        raise ValueError(
-            f"{job.where('priors')} {missing[0]}: this prior is missing; write for example "
-            f'{missing[0]} = "normal(1, 0.3)"'
-        )
-    assumed = {
-        name: _default_prior(name, channels.get(name), measured)
-        for name in names
-        if name not in given and name not in known
-    }
+            raise ValueError(f"{where} {name}: {error}") from None
+    for name in (name for part in parts for name in part.model.parameter_names if name != SLOPE):
+        if name not in given:
+            raise ValueError(f'{where} {name}: this prior is missing; write for example {name} = "normal(1, 0.3)"')
+    free = [name for name in names if name not in given and name not in known]
+    assumed = {name: _default_prior(name, channels.get(name), measured) for name in free}
     return {name: (given | assumed | dict(known))[name] for name in names}, assumed
 
 

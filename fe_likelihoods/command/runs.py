@@ -4,13 +4,11 @@ A folder has the run itself (``run.h5`` and its record of evaluations), the cach
 file, and the results. A run that was killed goes on from the record, with the results of an uninterrupted run.
 """
 
-import contextlib
 import json
 import logging
 import shlex
 import shutil
 import tomllib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,7 +19,6 @@ from ..checks.finding import NOTE, grouped
 from ..checks.rehearsal import refuse_chance
 from ..checks.result import judge_run
 from ..checks.run import read_run
-from ..prediction.prediction import Prediction
 from ..reporting.other_events import describe_event
 from .events import Event, predict_events, predict_quietly, read_events
 from .job import Job, parse_job, read_job
@@ -30,7 +27,7 @@ from .results import write_events, write_samples, write_tables
 
 __all__ = ["CACHE", "Outcome", "default_folder", "is_free", "make_sampler", "report_run", "run_job"]
 
-SETTINGS, ORIGIN, CHAIN = "settings.toml", "origin.json", "run.h5"
+SETTINGS, ORIGIN, CHAIN, PAGE = "settings.toml", "origin.json", "run.h5", "report.html"
 CACHE = "simulations.sqlite"
 CHANGEABLE = ("budget", "events", "prediction")  # sections that do not change what a run has computed so far
 
@@ -65,8 +62,7 @@ def make_sampler(job: Job, problem: Problem, backend: Any = None, chain: int = 0
     """
     import samplers
 
-    given, where, posterior = job.sampler, job.where("sampler"), problem.posterior
-    settings = given.given("recycle", "ess_ratio", "min_moves", "max_moves", "max_failure_share")
+    given, posterior = job.sampler, problem.posterior
     try:
         return {"smc": samplers.SMCSampler, "tmcmc": samplers.TMCMCSampler}[given.kind](
             given.walkers,
@@ -77,10 +73,10 @@ def make_sampler(job: Job, problem: Problem, backend: Any = None, chain: int = 0
             seed=given.seed + chain,
             guide=posterior.guide() if given.guide else None,
             max_simulations=job.budget.max_simulations,
-            **settings,
+            **given.given("recycle", "ess_ratio", "min_moves", "max_moves", "max_failure_share"),
         )
     except (ValueError, TypeError) as error:
-        raise ValueError(f"{where} {error}") from error
+        raise ValueError(f"{job.where('sampler')} {error}") from error
 
 
 def run_job(file: Path, folder: Path | None = None, overwrite: bool = False, progress: bool = True) -> Outcome:
@@ -102,7 +98,7 @@ def run_job(file: Path, folder: Path | None = None, overwrite: bool = False, pro
     for sampler in samplers:
         # the annealing of a stored run is made again from its record, also where no step is missing
         sampler.run_mcmc(None, max(job.sampler.steps - sampler.iteration, 0), progress=progress)
-    return Outcome(folder, samplers[0], problem, *_write(folder, job, job.file, samplers, problem, events, progress))
+    return _write(folder, job, _command(job.file, folder), samplers, problem, events, progress)
 
 
 def report_run(path: Path, runs_code: bool = False) -> Outcome:
@@ -124,22 +120,19 @@ def report_run(path: Path, runs_code: bool = False) -> Outcome:
             f"the model of {folder} is a Python file or program that its settings name, and nothing was run: give "
             "--run-code if you trust this code"
         )
-    cache = SimulationCache(folder / CACHE) if (folder / CACHE).is_file() else None
-    problem = make_problem(job, cache)
-    samplers = _stored_samplers(job, problem, folder)
+    problem = make_problem(job, SimulationCache(folder / CACHE) if (folder / CACHE).is_file() else None)
+    samplers, again = _stored_samplers(job, problem, folder), _command(Path(origin["file"]), folder)
     if not all(sampler.iteration for sampler in samplers):
-        raise ValueError(
-            f"the run in {folder} has no samples yet; continue it with: fe-likelihoods run {origin['file']} --out "
-            f"{folder}"
-        )
+        raise ValueError(f"the run in {folder} has no samples yet; continue it with: {again}")
+    logger = logging.getLogger("samplers.tempered")
+    level = logger.level
+    logger.setLevel(logging.ERROR)  # a report need not say that a run continues or is complete
     for sampler in samplers:
         if sampler.iteration >= job.sampler.steps:
             # the annealing is made again without an evaluation; the chain alone has lost which walkers are copies
-            with _without_messages("samplers.tempered"):
-                sampler.run_mcmc(None, 0, progress=False)
-    file = Path(origin["file"])
-    events = read_events(job, problem)
-    return Outcome(folder, samplers[0], problem, *_write(folder, job, file, samplers, problem, events, False))
+            sampler.run_mcmc(None, 0, progress=False)
+    logger.setLevel(level)
+    return _write(folder, job, again, samplers, problem, read_events(job, problem), False)
 
 
 def _command(file: Path, folder: Path) -> str:
@@ -159,11 +152,9 @@ def _origin(folder: Path) -> dict[str, Any]:
     """Where a run comes from; ValueError if its file is missing or damaged."""
     try:
         found = json.loads((folder / ORIGIN).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        return {"file": found["file"], "folder": found["folder"]} | found
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise _damaged(folder / ORIGIN, error) from error
-    if not isinstance(found, dict) or not {"file", "folder"} <= set(found):
-        raise _damaged(folder / ORIGIN, "file or folder is missing in it")
-    return found
 
 
 def _stored_samplers(job: Job, problem: Problem, folder: Path) -> list[Any]:
@@ -175,45 +166,33 @@ def _stored_samplers(job: Job, problem: Problem, folder: Path) -> list[Any]:
     return [make_sampler(job, problem, backend, chain) for chain, backend in enumerate(backends)]
 
 
-@contextlib.contextmanager
-def _without_messages(name: str) -> Iterator[None]:
-    """Silence a logger's warnings: a report need not say that a run continues or is complete."""
-    logger = logging.getLogger(name)
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        logger.setLevel(level)
-
-
 def _write(
-    folder: Path, job: Job, file: Path, samplers: list[Any], problem: Problem, events: tuple[Event, ...], progress: bool
-) -> tuple[tuple[str, ...], tuple[str, ...], bool]:
-    """Write tables, predictions, samples and report; return the last members of the `Outcome`.
+    folder: Path, job: Job, again: str, samplers: list[Any], problem: Problem, events: tuple[Event, ...], progress: bool
+) -> Outcome:
+    """Write tables, predictions, samples and report; `again` is the command that makes the run.
 
     Predictions are made here; their responses are in the cache if they were made before.
     """
     from ..reporting.report import write_page
 
-    sampler = samplers[0]
-    run = read_run(sampler, problem.posterior)
-    drawn = _drawn(job, problem, sampler)
-    prediction = _predict(job, problem, drawn, progress)
+    run = read_run(samplers[0], problem.posterior)
+    drawn, prediction = _drawn(job, problem, samplers[0]), None
+    if len(drawn) and not job.modes and not (job.load_test and job.measurements):  # the report has a figure of each fit
+        prediction = job.located("prediction", predict_quietly, job, problem, drawn, progress=progress)
     predicted = predict_events(job, events, problem, drawn, progress)
     measured = {event.name: event.measured for event in events if event.name in predicted and event.measured}
     described = [describe_event(name, each, measured.get(name)) for name, each in predicted.items()]
     judged = judge_run(run)
     judgement = judged.judgement
     samples, agreement = write_samples(folder, run, samplers, prediction, job.prediction.draws, judgement)
-    page = folder / "report.html"
-    write_page(page, run, prediction, judged, events=predicted, measured=measured, repeat=_command(file, folder))
+    write_page(folder / PAGE, run, prediction, judged, events=predicted, measured=measured, repeat=again)
     tables = write_tables(folder, run, judged, agreement)  # last: they say how many simulations there are
     sources = {f"{title.lower()}: " if title else "": found for title, found in grouped(judgement.findings).items()}
     sources["prediction: "] = () if prediction is None else prediction.findings
     sources |= {f"event {each.name}: ": each.findings for each in described}
     said = tuple(f"{title}{each}" for title, found in sources.items() for each in found if each.severity != NOTE)
-    return (page.name, *tables, samples, *write_events(folder, described)), said, judgement.status != "do not use"
+    files = (PAGE, *tables, samples, *write_events(folder, described))
+    return Outcome(folder, samplers[0], problem, files, said, judgement.status != "do not use")
 
 
 def _prepare(job: Job, folder: Path, fingerprint: str | None, overwrite: bool) -> None:
@@ -226,16 +205,15 @@ def _prepare(job: Job, folder: Path, fingerprint: str | None, overwrite: bool) -
             changed = _changes(settings.read_text(encoding="utf-8"), job.text)
         except ValueError as error:  # also of tomllib
             raise _damaged(settings, error) from error
+        stored, other = _origin(folder), ""
         if changed:
+            other = f"other settings: {', '.join(changed)} differ from {job.file.name}"
+        elif stored.get("posterior", fingerprint) != fingerprint:
+            other = f"other data or another model, of {stored['file']}"
+        if other:
             raise ValueError(
-                f"{folder} contains a run with other settings: {', '.join(changed)} differ from {job.file.name}. Give "
-                "another folder with --out, or delete that run with --overwrite"
-            )
-        stored = _origin(folder)
-        if stored.get("posterior", fingerprint) != fingerprint:
-            raise ValueError(
-                f"{folder} contains a run with other data or another model, of {stored['file']}. Give another folder "
-                "with --out, or delete that run with --overwrite"
+                f"{folder} contains a run with {other}. Give another folder with --out, or delete that run with "
+                "--overwrite"
             )
     elif not is_free(folder):
         raise ValueError(f"{folder} exists and is not the folder of a run; give another one with --out")
@@ -264,9 +242,3 @@ def _drawn(job: Job, problem: Problem, sampler: Any) -> np.ndarray:
     samples = chain.swapaxes(0, 1).reshape(-1, sampler.ndim)
     rows = np.unique(np.linspace(0, len(samples) - 1, min(n, len(samples))).round().astype(int))
     return problem.posterior.draw_noise(samples[rows], job.sampler.seed) if job.marginal else samples[rows]
-
-
-def _predict(job: Job, problem: Problem, drawn: np.ndarray, progress: bool) -> Prediction | None:
-    if not len(drawn) or job.modes or job.load_test and job.measurements:  # the report has a figure of each fit
-        return None
-    return job.located("prediction", lambda: predict_quietly(job, problem, drawn, progress=progress))

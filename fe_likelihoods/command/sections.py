@@ -1,25 +1,14 @@
 """Sections of the TOML file that describes an update: frozen dataclasses, whose fields are the keys.
 
-`fe_likelihoods.command.keys.key` states kind, meaning and default of each.
-Keys that are arguments of a class or function have the type, unit and meaning that its docstring states, read from its
-source, so that they are there with the option -OO of Python too.
+`fe_likelihoods.command.keys.key` states kind, meaning and default of each; those of built-in structures are the
+described fields of their classes.
 """
 
-import ast
-import functools
 import importlib
-import inspect
-import re
-import textwrap
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
-from ..models.executable import ExecutableModel
-from ..models.function import FunctionModel
-from ..noise.gaussian import GaussianNoise
-from ..signals.read import read_record
-from ..units import DIMENSIONS
-from .keys import CLOCK, Key, key
+from .keys import CLOCK, Key, key, keys_of_structure
 
 __all__ = [
     "FREE_SECTIONS",
@@ -38,64 +27,6 @@ __all__ = [
 ]
 
 
-@functools.cache
-def _documented(owner: Any) -> dict[str, Key]:
-    """Keys for the arguments of a class or function, from its numpydoc section "Parameters" or "Attributes".
-
-    A float with a unit in its description, such as ``[m]``, is a quantity of this dimension. The meaning is the first
-    sentence of a description, and the sentence that begins with "Default".
-    """
-    tree = ast.parse(textwrap.dedent(inspect.getsource(owner)))
-    text = ast.get_docstring(tree.body[0])
-    section = re.search(r"^(?:Parameters|Attributes)\n-+\n(.*?)(?=^\w[^\n]*\n-+$|\Z)", text, re.M | re.S)
-    found = {}
-    for group, form, text in re.findall(r"^(\w[\w, ]*) : (.+)\n((?:    .*\n?)+)", section[1], re.M):
-        first, *others = re.split(r"(?<=\.) (?=[A-Z])", " ".join(text.split()))
-        kind = _kind(form, first)
-        unit = f" [{DIMENSIONS[kind]}]".replace("2", "²") if kind in DIMENSIONS else ""
-        choices = form.removesuffix(", optional").replace("{", "").replace("}", "") + ": " if "{" in form else ""
-        default = next((f"; d{each[1:]}" for each in others if each.startswith("Default")), "")
-        first = first[0].lower() + first[1:] if choices else first
-        meaning = f"{choices}{first.removesuffix('.').replace(unit, '')}{default.removesuffix('.')}"
-        found |= {name: Key(name, kind, meaning) for name in group.split(", ")}
-    return found
-
-
-_KINDS_OF_TYPES = {
-    "int": "whole number",
-    "bool": "yes or no",
-    "str": "text",
-    "tuple of str": "list of text",
-    "sequence of str": "list of text",
-    "sequence of int": "list of whole number",
-    "sequence of float": "list of number",
-}
-
-
-def _kind(form: str, meaning: str) -> str:
-    """Kind of a key from the type and the unit that a docstring states; empty if no kind fits."""
-    form = re.split(r" or |, optional", form)[0]
-    if form == "float":
-        unit = next((unit for unit in re.findall(r"\[([^\];]+)[\];]", meaning)), "")
-        return next((name for name, si in DIMENSIONS.items() if si == unit.replace("²", "2")), "number")
-    return "text" if form.startswith("{") else _KINDS_OF_TYPES.get(form, "")
-
-
-def _arguments(owner: Any, names: str = "", *, without: str = "", required: str = "", **kinds: str) -> tuple[Key, ...]:
-    """Keys for arguments of a class or function; names, all by default, are separated by blanks."""
-    found = _documented(owner)
-    return tuple(
-        found[name]._replace(kind=kinds.get(name) or found[name].kind, required=name in required.split())
-        for name in names.split() or found
-        if name not in without.split()
-    )
-
-
-def _argument(owner: Any, name: str, kind: str) -> Any:
-    """A field of a section that is an argument of a class or function."""
-    return key(kind, _documented(owner)[name].meaning)
-
-
 @dataclass(frozen=True, kw_only=True)
 class Section:
     """Values of one section; None stands for a key that is left out."""
@@ -112,11 +43,11 @@ class Table(Section):
 
     READING: ClassVar = ("time", "time_unit", "dt", "skip", "resample")
 
-    time: Any = _argument(read_record, "time", "text")
-    time_unit: Any = _argument(read_record, "time_unit", "text")
-    dt: Any = _argument(read_record, "dt", "time")
-    skip: Any = _argument(read_record, "skip", "whole number >= 0")
-    resample: Any = _argument(read_record, "resample", "time")
+    time: Any = key("text", "Name or number of the column of times, if it is not found")
+    time_unit: Any = key("text", "Unit of the times, if the column name does not end with it")
+    dt: Any = key("time", "Time step, needed for a file without times")
+    skip: Any = key("whole number >= 0", "Number of lines above the table, if they are not found")
+    resample: Any = key("time", "Nominal step of uneven times, to which the samples are interpolated linearly")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -244,11 +175,21 @@ class Noise(Section):
         "Autoregressive: each error depends on the one before, with a correlation per channel; takes sensor only",
         "gaussian",
     )
-    groups: Any = _argument(GaussianNoise, "groups", "text, or list of number")
-    level: Any = _argument(GaussianNoise, "level", "text")
-    sensor: Any = _argument(GaussianNoise, "sensor", "table of quantity")
-    window: Any = _argument(GaussianNoise, "window", "time")
-    local: Any = _argument(GaussianNoise, "local", "number")
+    groups: Any = key(
+        "text, or list of number",
+        'What has a level: each "channel"; "all" together; each in each "event" of several; or each in each frequency '
+        "band, between ascending frequencies [Hz]: [1, 5] makes the bands below 1 Hz, from 1 to 5 Hz, and above",
+    )
+    level: Any = key(
+        "text",
+        'What a level is: a standard deviation in the "si" unit of the channel; a share of the "measured" root mean '
+        'square, in predictions of the simulated one; or a share of the simulated "response" level',
+    )
+    sensor: Any = key(
+        "table of quantity", "Channel = known standard deviation of its sensor noise; zero for names that are left out"
+    )
+    window: Any = key("time", "Length of the moving window for the root mean square of the response")
+    local: Any = key("number", 'For "response": weight of the response envelope in the variance, from 0 to 1 (0.25)')
     marginal: Any = key("yes or no", "Integrate the levels out; for levels in SI units without bands and sensor", False)
 
 
@@ -309,6 +250,7 @@ FREE_SECTIONS = {
 }
 
 
+_LIMIT = Key("time_limit", "time", "Longest duration of a run; a longer run is stopped and counts as failed")
 USER = (
     Key("parameters", "list of text", "Names of the structural parameters, in the order of theta", True),
     Key("channels", "table of text", 'Channels of the response: name = "quantity [unit]", in order'),
@@ -318,7 +260,9 @@ USER = (
         "With [modes], instead of channels: sensor = row of the matrices, from 0, that a function returns; a list of "
         "names for other models",
     ),
-    *_arguments(FunctionModel, "dt n_steps time_limit", n_steps="whole number >= 1"),
+    Key("dt", "time", "Time step of the response; with a record a whole multiple of its step, by default that step"),
+    Key("n_steps", "whole number >= 1", "Number of response samples; with a record it follows from dt"),
+    _LIMIT,
     Key("depends_on", "list of text", "Files that the response depends on besides the code"),
     Key("version", "text", "Text that stands for the code in the cache; change it when the results change"),
 )
@@ -326,57 +270,51 @@ USER = (
 
 _FUNCTION = Key("function", "text", 'The function, as "file.py:name"', True)
 _OWN = {
-    "function": (_FUNCTION, *USER, *_arguments(FunctionModel, "isolated")),
+    "function": (_FUNCTION, *USER, Key("isolated", "yes or no", "Run the function in a separate process")),
     "opensees": (_FUNCTION, *USER),
     "executable": (
-        *_arguments(ExecutableModel, "command", required="command"),
+        Key("command", "list of text", "Program and its arguments", True),
         Key("templates", "table of text", "Input files: name in the folder of the run = template"),
         Key("output", "text", "Name of the file with the response", True),
-        *_arguments(ExecutableModel, "columns output_units record_file", output_units="table of text"),
+        Key("columns", "list of whole number", "Columns of the output file that are the channels, counted from 0"),
+        Key("output_units", "table of text", "Channel = its unit in the output file; default: SI units"),
+        Key("record_file", "text", "Name of the file with the base motion [m/s²]; default: record.txt"),
         Key("files", "table of text", "Further files: name in the folder of the run = file"),
-        *(each._replace(required=each.required or each.name == "time_limit") for each in USER),
+        *(each._replace(required=each.required or each == _LIMIT) for each in USER),
     ),
 }
+_OSCILLATOR = (
+    Key("period", "time", "Nominal undamped period, above 0", True),
+    Key("damping_ratio", "number", "Nominal fraction of critical damping, between 0 and 1"),
+)
 _COLUMN_PARTS = dict(concrete="Concrete", steel="Steel", bars="Bars", hoops="Hoops", fatigue="LowCycleFatigue")
 _BRIDGE_PARTS = {f"{name.lower()}_{i}": name for name in ("Pier", "Bearing", "Damper") for i in (1, 2)}
-_STOREYS: dict[str, Any] = dict(
-    names="floors masses stiffnesses groups", required="floors masses stiffnesses", floors="table of whole number"
-)
-_BUILT_IN: dict[str, tuple[str, dict[str, Any]]] = {
-    "column": (
-        "rc_column.RCColumn",
-        dict(without=f"loading outputs max_increment {' '.join(_COLUMN_PARTS)}", units="table of text"),
-    ),
-    "bridge": (
-        "isolated_bridge.IsolatedBridge",
-        dict(without="record piers bearings dampers rubber outputs every vertical"),
-    ),
-    "oscillator": ("linear_oscillator.LinearOscillator", dict(without="record", required="period")),
-    "frame": ("linear_structure_parts.ShearFrame", _STOREYS),
-    "bridge deck": ("linear_structure_parts.BridgeDeck", {}),
+_BUILT_IN = {  # modules, classes, and fields that are no keys
+    "column": ("rc_column", "RCColumn", "outputs max_increment"),
+    "bridge": ("isolated_bridge", "IsolatedBridge", "outputs every"),
+    "frame": ("linear_structure_parts", "ShearFrame", ""),
+    "bridge deck": ("linear_structure_parts", "BridgeDeck", ""),
 }
-_PARTS = {"column": ("rc_column_parts", _COLUMN_PARTS), "bridge": ("isolated_bridge_parts", _BRIDGE_PARTS)}
-MODEL_KINDS = (*_BUILT_IN, *_OWN)
+_PARTS = {"column": _COLUMN_PARTS, "bridge": _BRIDGE_PARTS}
+MODEL_KINDS = (*_BUILT_IN, "oscillator", *_OWN)
 """Kinds of ``[model]``."""
 USER_MODELS = tuple(_OWN)
 """Those that run a function or a program of the user."""
 
 
-def _in_models(name: str) -> Any:
-    """A class of `fe_likelihoods.models`, imported where a file needs it: some import numba."""
-    module, _, name = name.partition(".")
-    return getattr(importlib.import_module(f"fe_likelihoods.models.{module}"), name)
+def _keys_of(module: str, name: str, without: str, optional: bool) -> tuple[Key, ...]:
+    """Keys of a class of `fe_likelihoods.models`, imported where a file needs it: some import numba."""
+    owner = getattr(importlib.import_module(f"fe_likelihoods.models.{module}"), name)
+    return keys_of_structure(owner, without, optional)
 
 
 def model_keys(kind: str) -> tuple[Key, ...]:
     """Keys of ``[model]`` for one of `MODEL_KINDS`."""
-    if kind in _OWN:
-        return _OWN[kind]
-    name, options = _BUILT_IN[kind]
-    return _arguments(_in_models(name), **options)
+    own = _OWN | {"oscillator": _OSCILLATOR}
+    return own[kind] if kind in own else _keys_of(*_BUILT_IN[kind], kind in _PARTS)
 
 
 def part_keys(kind: str) -> dict[str, tuple[Key, ...]]:
     """Keys of the tables below ``[model]`` by name; a key that is left out has the value of the built-in structure."""
-    module, names = _PARTS.get(kind, ("", {}))
-    return {part: _arguments(_in_models(f"{module}.{name}")) for part, name in names.items()}
+    names, module = _PARTS.get(kind, {}), f"{_BUILT_IN[kind][0]}_parts" if kind in _PARTS else ""
+    return {part: _keys_of(module, name, "", True) for part, name in names.items()}

@@ -38,21 +38,20 @@ def built_in(job: Job, record: Record, names: tuple[str, ...] | None, measured: 
 
         usual = IsolatedBridge(record)
         for part in ("pier", "bearing", "damper"):
-            places = [f"{part}_{i}" for i in (1, 2)]
-            pair = zip(places, getattr(usual, f"{part}s"), strict=True)
-            values[f"{part}s"] = tuple(_changed(job, place, one, values.pop(place, {})) for place, one in pair)
-        if measured is not None:
-            values["every"] = max(1, round(measured.dt / record.dt))
-        return IsolatedBridge(record, **values, outputs=names)
+            both = enumerate(getattr(usual, f"{part}s"), 1)
+            values[f"{part}s"] = tuple(
+                _changed(job, f"{part}_{i}", one, values.pop(f"{part}_{i}", {})) for i, one in both
+            )
+        every = {} if measured is None else {"every": max(1, round(measured.dt / record.dt))}
+        return IsolatedBridge(record, **values, **every, outputs=names)
     if job.kind == "oscillator":
         from ..models.linear_oscillator import LinearOscillator
 
         return LinearOscillator(record, **values)
     from ..models.linear_structure import LinearStructure
 
-    motion = record
-    if job.kind == "bridge deck":
-        motion = [reduce_data(job, each, None)[0] for each in read_supports(job)]
+    deck = job.kind == "bridge deck"
+    motion = [reduce_data(job, each, None)[0] for each in read_supports(job)] if deck else record
     return LinearStructure(linear_parts(job), motion, outputs=names)
 
 
@@ -61,7 +60,7 @@ def linear_parts(job: Job) -> Any:
     from ..models.linear_structure_parts import BridgeDeck, ShearFrame
 
     kind = ShearFrame if job.kind == "frame" else BridgeDeck
-    return job.located("model", lambda: kind(**job.model))
+    return job.located("model", kind, **job.model)
 
 
 def _changed(job: Job, part: str, usual: Any, changes: Mapping[str, Any]) -> Any:
@@ -76,20 +75,21 @@ def _changed(job: Job, part: str, usual: Any, changes: Mapping[str, Any]) -> Any
 
 def user_channels(job: Job) -> tuple[Channel, ...]:
     """Channels of a model of the user; ValueError, which names the channel, for a wrong quantity or unit."""
+    where = f"{job.where('model')} channels:"
     if "channels" not in job.model or "sensors" in job.model:
         raise ValueError(
-            f"{job.where('model')} channels: give the channels of the response, such as "
-            '{top = "relative displacement [mm]"}; sensors are for [modes]'
+            f'{where} give the channels of the response, such as {{top = "relative displacement [mm]"}}; sensors are '
+            "for [modes]"
         )
     channels = []
     for name, text in job.model["channels"].items():
         match = re.fullmatch(r"\s*(.+?)\s*\[(.+)\]\s*", text)
+        if match is None:
+            raise ValueError(f'{where} {name}: expected quantity and unit, such as "displacement [mm]"; got {text!r}')
         try:
-            if match is None:
-                raise ValueError(f'expected quantity and unit, such as "displacement [mm]"; got {text!r}')
             channels.append(Channel(name, match[1], match[2].strip()))
         except ValueError as error:
-            raise ValueError(f"{job.where('model')} channels: {name}: {error}") from None
+            raise ValueError(f"{where} {name}: {error}") from None
     return tuple(channels)
 
 
@@ -108,20 +108,18 @@ def user_model(job: Job, channels: tuple[Channel, ...], record: Record | None = 
 
         for key in given.keys() & {"templates", "files"}:
             given[key] = {name: job.path("model", key, file) for name, file in given[key].items()}
-        words = [
-            str(path.resolve()) if (path := job.folder / word).is_file() else word for word in given.pop("command")
-        ]
+        paths = [(word, job.folder / word) for word in given.pop("command")]
+        words = [str(path.resolve()) if path.is_file() else word for word, path in paths]
         file = given.pop("output")
         return ExecutableModel(words, given.pop("templates", {}), output or file, names, channels, **given)
     from ..models.function import FunctionModel
 
-    function = output or load_function(job, given["function"])
-    del given["function"]
+    text = given.pop("function")
     if job.kind == "opensees":
         from ..models.opensees import OpenSeesModel
 
         make = OpenSeesModel
-    return (make or FunctionModel)(function, names, channels, **given)
+    return (make or FunctionModel)(output or load_function(job, text), names, channels, **given)
 
 
 def load_function(job: Job, text: str) -> Callable:

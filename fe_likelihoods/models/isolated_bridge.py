@@ -32,11 +32,13 @@ from .isolated_bridge_system import (
     run_bridge,
 )
 from .validation import (
-    check_fields,
+    check_described,
     check_integer,
     check_names,
     check_nominal,
+    described,
     invalid,
+    structure,
 )
 
 __all__ = ["PARAMETERS", "IsolatedBridge"]
@@ -50,36 +52,10 @@ _NOMINAL_UNITS = {
 _LONGEST_STEP = 0.25e-3  # of the default [s]
 
 
+@structure
 @dataclass(frozen=True, eq=False)
 class IsolatedBridge(BuiltInModel):
     """Isolated bridge on a shake table; theta holds multiples of the nominal parameters.
-
-    Parameters
-    ----------
-    record : Record
-        Table acceleration, linear between its samples, at the scale of the model: for a quarter-scale model the time of
-        a prototype record is halved.
-    deck_mass : float
-        Mass of the deck [kg].
-    piers, bearings, dampers : pairs of Pier, Bearing, Damper
-        The parts, one for each pier.
-    rubber : Rubber
-        Rubber devices, the same at both piers; they have no parameters in theta.
-    outputs : tuple of str or None
-        Names of the channels (see the notes). None: all twelve channels that are not means.
-    parameters : tuple of str
-        Names of the parameters that make up theta, in this order (`IsolatedBridge` lists them).
-    friction : str
-        "bouc-wen" (regularised, the default), or "coulomb" (exact stick and slip, whose instants are located within a
-        step).
-    step : float, optional
-        Integration step [s]; it divides the step of the record. Default: the longest such step up to 0.25 ms (accuracy:
-        ``docs/theory/time_integration.rst``).
-    every : int
-        The response has one sample per `every` samples of the record.
-    vertical : Record or None
-        Vertical table acceleration, positive upwards [m/s²], at the samples of the record and linear between them. It
-        multiplies the load on the bearings by 1 + a_v/g, or by zero while this factor is negative.
 
     Raises
     ------
@@ -124,19 +100,50 @@ class IsolatedBridge(BuiltInModel):
     (2, 1991)
     """
 
-    record: Record
-    deck_mass: float = 140e3 / 9.81
-    piers: tuple[Pier, Pier] = (Pier(), Pier())
-    bearings: tuple[Bearing, Bearing] = (Bearing(), Bearing(f_min=0.050, df=0.070, a=28.0))
-    dampers: tuple[Damper, Damper] = (Damper(), Damper(2700e3, 14.80e3))
-    rubber: Rubber = Rubber()
-    outputs: tuple[str, ...] | None = None
-    parameters: tuple[str, ...] = PARAMETERS
+    record: Record = described(
+        "",
+        "Table acceleration, linear between its samples, at the scale of the model: for a quarter-scale model the time "
+        "of a prototype record is halved",
+    )
+    deck_mass: float = described("kg", "Mass of the deck", "positive", 140e3 / 9.81)
+    piers: tuple[Pier, Pier] = described("", "The piers", default=(Pier(), Pier()))
+    bearings: tuple[Bearing, Bearing] = described(
+        "", "The bearings on the piers", default=(Bearing(), Bearing(f_min=0.050, df=0.070, a=28.0))
+    )
+    dampers: tuple[Damper, Damper] = described(
+        "", "The dampers at the piers", default=(Damper(), Damper(2700e3, 14.80e3))
+    )
+    rubber: Rubber = described(
+        "", "Rubber devices, the same at both piers; they have no parameters in theta", default=Rubber()
+    )
+    outputs: tuple[str, ...] | None = described(
+        "", "Names of the channels (see the notes); default: all twelve that are not means", default=None
+    )
+    parameters: tuple[str, ...] = described(
+        "",
+        "Names of the parameters that make up theta, in this order (``IsolatedBridge`` lists them)",
+        default=PARAMETERS,
+    )
     nominal_units: ClassVar[dict[str, str]] = _NOMINAL_UNITS
-    friction: str = "bouc-wen"
-    step: float | None = None
-    every: int = 1
-    vertical: Record | None = None
+    friction: str = described(
+        "",
+        '"bouc-wen" (regularised), or "coulomb" (exact stick and slip, whose instants are located within a step)',
+        default="bouc-wen",
+    )
+    step: float | None = described(
+        "s",
+        "Integration step; it divides the step of the record; default: the longest such step up to 0.25 ms (accuracy: "
+        "``docs/theory/time_integration.rst``)",
+        "positive",
+        None,
+    )
+    every: int = described("", "The response has one sample per ``every`` samples of the record", default=1)
+    vertical: Record | None = described(
+        "",
+        "Vertical table acceleration, positive upwards, at the samples of the record and linear between them",
+        default=None,
+        more="It multiplies the load on the bearings by 1 + a_v/g, or by zero while this factor is negative.",
+    )
 
     def __post_init__(self) -> None:
         if self.outputs is None:
@@ -276,7 +283,7 @@ class IsolatedBridge(BuiltInModel):
 
     def _check_integration(self) -> None:
         """Raise ValueError for settings of the integration that are out of range."""
-        check_fields(self, positive=("deck_mass", "step"), optional=("step",))
+        check_described(self)
         check_integer("every", self.every, 1, max(1, self.record.n_steps - 1))
         if self.friction not in FORMS:
             raise invalid(f"friction out of {tuple(FORMS)}", self.friction, 'the default is "bouc-wen"')

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..signals.channels import Channel
-from .validation import check_fields, check_integer, check_number, invalid
+from .validation import check_described, check_integer, check_number, described, invalid, structure
 
 __all__ = [
     "ALL_CHANNELS",
@@ -26,42 +26,27 @@ __all__ = [
 ]
 
 
+@structure
 @dataclass(frozen=True)
 class Pier:
-    """Massless cantilever, fixed to the table, with a rigid block at its tip that carries the isolators.
+    """Massless cantilever, fixed to the table, with a rigid block at its tip that carries the isolators."""
 
-    Attributes
-    ----------
-    modulus : float
-        Elastic modulus of the cantilever [Pa].
-    inertia : float
-        Second moment of area of the cantilever [m⁴].
-    length : float
-        Length of the cantilever [m].
-    height : float
-        Height of the block [m]; the isolators are on its top.
-    center : float
-        Height of the block's centre of mass above its bottom [m].
-    mass : float
-        Mass of the block [kg].
-    rotary_inertia : float
-        Rotary inertia of the block about its centre of mass [kg m²].
-    damping_ratio : float
-        Damping ratio of the pier alone in its first mode; damping is proportional to the stiffness.
-    """
-
-    modulus: float = 200e9
-    inertia: float = 3.02e-5
-    length: float = 1.60
-    height: float = 0.30
-    center: float = 0.15
-    mass: float = 907.0
-    rotary_inertia: float = 34.0
-    damping_ratio: float = 0.02
+    modulus: float = described("Pa", "Elastic modulus of the cantilever", "positive", 200e9)
+    inertia: float = described("m⁴", "Second moment of area of the cantilever", "positive", 3.02e-5)
+    length: float = described("m", "Length of the cantilever", "positive", 1.60)
+    height: float = described("m", "Height of the block; the isolators are on its top", "zero or positive", 0.30)
+    center: float = described("m", "Height of the block's centre of mass above its bottom", "zero or positive", 0.15)
+    mass: float = described("kg", "Mass of the block", "positive", 907.0)
+    rotary_inertia: float = described("kg m²", "Rotary inertia of the block about its centre of mass", "positive", 34.0)
+    damping_ratio: float = described(
+        "",
+        "Damping ratio of the pier alone in its first mode; damping is proportional to the stiffness",
+        "zero or positive",
+        0.02,
+    )
 
     def __post_init__(self) -> None:
-        positive = ("modulus", "inertia", "length", "mass", "rotary_inertia")
-        check_fields(self, positive=positive, non_negative=("height", "center", "damping_ratio"), of="of a pier")
+        check_described(self, "of a pier")
 
     @property
     def stiffness(self) -> np.ndarray:
@@ -87,25 +72,10 @@ class Pier:
         return 2.0 * self.damping_ratio / lowest * self.stiffness
 
 
+@structure
 @dataclass(frozen=True)
 class Bearing:
     """Flat sliding bearing with the friction coefficient ``mu(v) = f_min + df (1 - exp(-a |v|))``.
-
-    Attributes
-    ----------
-    load : float
-        Weight on the bearing [N].
-    f_min : float
-        Friction coefficient at rest.
-    df : float
-        Increase of the friction coefficient at high velocity.
-    a : float
-        Rate of this increase with velocity [s/m].
-    yield_displacement : float
-        Displacement over which the regularised laws reverse the friction force [m]. It is a physical property, not a
-        numerical setting: peak pier accelerations differ by a third between 0.13 mm and zero.
-    gamma : float
-        Constant of the Bouc-Wen law with A = 1, exponent 2 and beta = 1 - gamma; above 0.5, at most 1.
 
     Examples
     --------
@@ -114,32 +84,35 @@ class Bearing:
     >>> bridge = IsolatedBridge(record.resample(0.005), bearings=(rough, rough))
     """
 
-    load: float = 70e3
-    f_min: float = 0.055
-    df: float = 0.065
-    a: float = 24.0
-    yield_displacement: float = 0.13e-3
-    gamma: float = 0.9
+    load: float = described("N", "Weight on the bearing", "positive", 70e3)
+    f_min: float = described("", "Friction coefficient at rest", "positive", 0.055)
+    df: float = described("", "Increase of the friction coefficient at high velocity", "zero or positive", 0.065)
+    a: float = described("s/m", "Rate of this increase with velocity", "zero or positive", 24.0)
+    yield_displacement: float = described(
+        "m",
+        "Displacement over which the regularised laws reverse the friction force",
+        "positive",
+        0.13e-3,
+        "It is a physical property, not a numerical setting: peak pier accelerations differ by a third between 0.13 mm "
+        "and zero.",
+    )
+    gamma: float = described(
+        "",
+        "Constant of the Bouc-Wen law with A = 1, exponent 2 and beta = 1 - gamma; above 0.5, at most 1",
+        "positive",
+        0.9,
+    )
 
     def __post_init__(self) -> None:
-        positive = ("load", "f_min", "yield_displacement", "gamma")
-        check_fields(self, positive=positive, non_negative=("df", "a"), of="of a bearing")
+        check_described(self, "of a bearing")
         if not 0.5 < self.gamma <= 1.0:
             raise invalid("a gamma of a bearing above 0.5, at most 1", self.gamma, "the default is 0.9")
 
 
+@structure
 @dataclass(frozen=True)
 class Damper:
     """Linear fluid dampers at a pier, each a spring and a dashpot in series (Maxwell element).
-
-    Attributes
-    ----------
-    stiffness : float
-        Spring stiffness of one damper [N/m].
-    viscosity : float
-        Dashpot coefficient of one damper [N s/m].
-    count : int
-        Number of dampers at the pier.
 
     Examples
     --------
@@ -148,36 +121,35 @@ class Damper:
     >>> bridge = IsolatedBridge(record.resample(0.005), dampers=(softer, softer))
     """
 
-    stiffness: float = 2575e3
-    viscosity: float = 15.45e3
-    count: int = 2
+    stiffness: float = described("N/m", "Spring stiffness of one damper", "positive", 2575e3)
+    viscosity: float = described("N s/m", "Dashpot coefficient of one damper", "positive", 15.45e3)
+    count: int = described("", "Number of dampers at the pier", default=2)
 
     def __post_init__(self) -> None:
-        check_fields(self, positive=("stiffness", "viscosity"), of="of a damper")
+        check_described(self, "of a damper")
         check_integer("count of dampers", self.count, 1, 1000)
 
 
+@structure
 @dataclass(frozen=True)
 class Rubber:
-    """Rubber restoring-force device, the same at both piers, with s = displacement / scale.
+    """Rubber restoring-force device, the same at both piers, with s = displacement / scale."""
 
-    Attributes
-    ----------
-    skeleton : tuple of 6 floats
-        Coefficients A_1, A_3, ..., A_11 [N] of the skeleton curve, sum of A_n s^n.
-    half_loop : tuple of 3 floats
-        Coefficients B_0, B_2, B_4 [N] of half the difference between the loading and unloading branches, sum of B_m
-        s^m.
-    scale : float
-        Displacement at s = 1 [m].
-    limit : float
-        Value of abs(s) beyond which the skeleton curve continues along its tangent.
-    """
-
-    skeleton: tuple[float, ...] = (8500.0, 250.0, 100.0, 150.0, 1500.0, 7500.0)
-    half_loop: tuple[float, ...] = (450.0, 100.0, 250.0)
-    scale: float = 0.050
-    limit: float = 1.2
+    skeleton: tuple[float, ...] = described(
+        "N",
+        "The 6 coefficients A_1, A_3, ..., A_11 of the skeleton curve, sum of A_n s^n",
+        default=(8500.0, 250.0, 100.0, 150.0, 1500.0, 7500.0),
+    )
+    half_loop: tuple[float, ...] = described(
+        "N",
+        "The 3 coefficients B_0, B_2, B_4 of half the difference between the loading and unloading branches, sum of "
+        "B_m s^m",
+        default=(450.0, 100.0, 250.0),
+    )
+    scale: float = described("m", "Displacement at s = 1", "positive", 0.050)
+    limit: float = described(
+        "", "Value of abs(s) beyond which the skeleton curve continues along its tangent", "positive", 1.2
+    )
 
     def __post_init__(self) -> None:
         for name, given, count in (("skeleton", self.skeleton, 6), ("half_loop", self.half_loop, 3)):
@@ -187,7 +159,7 @@ class Rubber:
             for value in values:
                 check_number("finite", f"coefficient of the {name} of rubber", value)
             object.__setattr__(self, name, values)
-        check_fields(self, positive=("scale", "limit"), of="of rubber")
+        check_described(self, "of rubber")
         s = np.linspace(0.0, self.limit, 200)
         tangent = sum(a * n * s ** (n - 1) for a, n in zip(self.skeleton, range(1, 12, 2), strict=True))
         if tangent.min() < 0.0:

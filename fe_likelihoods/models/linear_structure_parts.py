@@ -5,6 +5,8 @@ because accelerations of supports identify only the ratio of stiffness to mass. 
 ``docs/theory/tall_buildings.rst``.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +16,7 @@ import numpy as np
 from scipy.linalg import eigh
 
 from ..simulation.model import SimulationFailed
-from .validation import check_integer, check_number
+from .validation import check_integer, check_number, described, structure
 
 __all__ = ["BridgeDeck", "LinearSystem", "ModalModel", "Parts", "ShearFrame"]
 
@@ -71,6 +73,7 @@ def _modal_damping(mass: np.ndarray, stiffness: np.ndarray, ratios: np.ndarray) 
     return mass @ (modes * (2.0 * np.asarray(ratios) * np.sqrt(squares))) @ modes.T @ mass
 
 
+@structure
 @dataclass(frozen=True)
 class BridgeDeck:
     """Transverse vibration of a two-span deck in one shape, on a column in the middle and on its two ends.
@@ -88,15 +91,6 @@ class BridgeDeck:
     The supports are the base of the column, the first end and the second end. The parameters are ``frequency``
     omega / 2 pi [Hz], ``damping`` zeta, and ``share`` w and ``shape`` s unless they are given here.
 
-    Parameters
-    ----------
-    middle : str
-        Name of the channel in the middle, or "" if there is none.
-    first_span, second_span : str
-        Names of the channels in the spans, or "" if there is none.
-    share, shape : float, optional
-        Fixed values, from 0 to 1. With share=1 the deck is supported by its ends only, with share=0 by its column only.
-
     Raises
     ------
     ValueError
@@ -112,11 +106,15 @@ class BridgeDeck:
     (1, 200)
     """
 
-    middle: str = "middle"
-    first_span: str = ""
-    second_span: str = ""
-    share: float | None = None
-    shape: float | None = None
+    middle: str = described("", 'Name of the channel in the middle, or "" if there is none', default="middle")
+    first_span: str = described("", 'Name of the channel in the first span, or "" if there is none', default="")
+    second_span: str = described("", 'Name of the channel in the second span, or "" if there is none', default="")
+    share: float | None = described(
+        "",
+        "Fixed share of the ends in the stiffness, from 0 (on the column only) to 1 (on the ends only)",
+        default=None,
+    )
+    shape: float | None = described("", "Fixed value s of the shape in the spans, from 0 to 1", default=None)
 
     n_supports = 3
 
@@ -170,6 +168,7 @@ class BridgeDeck:
         )
 
 
+@structure
 @dataclass(frozen=True)
 class ShearFrame:
     """Frame with rigid floors, each connected to the storey below and the storey above.
@@ -179,18 +178,6 @@ class ShearFrame:
     multiples of the nominal stiffnesses; and ``damping_1``, ``damping_2``, ..., ratios [-]. With `groups`, the storeys
     of a group share a multiple, and all modes the ratio ``damping``. Masses are known, because accelerations identify
     only the ratios of stiffness to mass.
-
-    Parameters
-    ----------
-    floors : dict of str to int, or sequence of pairs
-        Names of the channels, and the floors they are on, counted from 1.
-    masses : sequence of float
-        Nominal mass of each floor, in any unit; relative masses are sufficient.
-    stiffnesses : sequence of float
-        Nominal stiffness of each storey, in the unit of the masses times 1/s² (N/m if the masses are in kg).
-    groups : sequence of int, optional
-        Group of each storey, from the lowest one: 1 to the number of groups, each of which has a storey. Groups usually
-        end where the section of the columns changes.
 
     Raises
     ------
@@ -208,10 +195,20 @@ class ShearFrame:
     ('stiffness_1', 'stiffness_2', 'damping')
     """
 
-    floors: Mapping[str, int] | Sequence[tuple[str, int]]
-    masses: Sequence[float]
-    stiffnesses: Sequence[float]
-    groups: Sequence[int] | None = None
+    floors: Mapping[str, int] | Sequence[tuple[str, int]] = described(
+        "", "Names of the channels, and the floors they are on, counted from 1", kind="table of whole number"
+    )
+    masses: Sequence[float] = described("", "Nominal mass of each floor, in any unit; relative masses are sufficient")
+    stiffnesses: Sequence[float] = described(
+        "",
+        "Nominal stiffness of each storey, in the unit of the masses times 1/s² (N/m if the masses are in kg)",
+    )
+    groups: Sequence[int] | None = described(
+        "",
+        "Group of each storey, from the lowest one: 1 to the number of groups, each of which has a storey",
+        default=None,
+        more="Groups usually end where the section of the columns changes.",
+    )
 
     n_supports = 1
 
@@ -279,6 +276,7 @@ class ShearFrame:
         )
 
 
+@structure
 @dataclass(frozen=True)
 class ModalModel:
     """A building on one support as a sum of modes, whose properties at the sensors are the parameters.
@@ -290,13 +288,6 @@ class ModalModel:
 
     The parameters are ``frequency_1``, ... [Hz], in ascending order; ``damping_1``, ...; and ``shape_<channel>_1``, ...
     for each channel.
-
-    Parameters
-    ----------
-    channels : sequence of str
-        Names of the channels.
-    n_modes : int
-        Number of modes.
 
     Raises
     ------
@@ -312,8 +303,8 @@ class ModalModel:
     (2, 200)
     """
 
-    channels: Sequence[str]
-    n_modes: int
+    channels: Sequence[str] = described("", "Names of the channels")
+    n_modes: int = described("", "Number of modes")
 
     n_supports = 1
 

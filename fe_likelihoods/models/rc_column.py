@@ -49,12 +49,14 @@ from .rc_column_parts import (
     gauss_lobatto,
 )
 from .validation import (
-    check_fields,
+    check_described,
     check_integer,
     check_names,
     check_nominal,
     check_theta,
+    described,
     invalid,
+    structure,
 )
 
 __all__ = ["PARAMETERS", "RCColumn"]
@@ -68,74 +70,10 @@ _NOMINAL_UNITS = {
 PARAMETERS = (*_NOMINAL_UNITS, *_OF_FATIGUE)
 
 
+@structure
 @dataclass(frozen=True, eq=False)
 class RCColumn(BuiltInModel):
     """Circular reinforced-concrete column; theta holds multiples of the nominal parameters.
-
-    Parameters
-    ----------
-    loading : Record or DisplacementHistory
-        Base acceleration, or lateral displacement of the top.
-    diameter : float
-        Diameter of the section [m].
-    height : float
-        Height from the fixed base to the mass [m].
-    cover : float
-        Clear cover, measured to the outside of the hoops [m].
-    concrete : Concrete
-        Unconfined concrete; the confinement of the core follows from the hoops.
-    steel : Steel
-        Longitudinal steel.
-    bars : Bars
-        Longitudinal reinforcement.
-    hoops : Hoops
-        Transverse reinforcement.
-    mass : float
-        Mass at the top [kg].
-    axial_load : float, optional
-        Gravity load at the top, positive downwards [N]. Default: the weight of `mass`.
-    rotational_inertia : float
-        Rotational inertia of the mass [kg m²]. The default is zero.
-    column_mass : float
-        Mass of the column itself [kg], with its weight. Half of each element's share is at either end, so that the
-        nodes below the top have velocities and accelerations. The default is zero: a column without a mass and weight.
-    a0 : float
-        Rayleigh damping: factor of the mass [1/s].
-    a1 : float
-        Rayleigh damping: factor of the tangent stiffness of the last converged step [s].
-    penetration : float
-        Length of strain penetration below the base [m]. The deformations of the base section continue over this
-        length, because the bars slip out of the foundation, and the rotation and elongation over this length are added
-        to the column deformations. Zero is a rigid anchorage. A common estimate is 0.022 fy d [MPa, m] (Priestley,
-        Seible & Calvi, Seismic Design and Retrofit of Bridges, 1996). With 2 elements of 3 points, this estimate
-        completes the plastic hinge, 0.08 height + 0.022 fy d, because the end section of such an element represents
-        height/12.
-    fatigue : LowCycleFatigue or None
-        Low-cycle fatigue of the bars. None: bars neither lose strength nor fracture.
-    collapse_drift : float
-        Displacement of the top by the height at which a column under a `Record` has collapsed, and the simulation ends
-        with the reason "collapse". Tested columns have lost their strength at 0.05 to 0.15. Without a limit, columns
-        whose bars do not fracture would come back from any drift.
-    parameters : tuple of str
-        Names of the parameters that make up theta, in this order (`RCColumn` lists them).
-    n_elements : int
-        Number of elements.
-    n_points : int
-        Number of Gauss-Lobatto points per element, 2 to 7.
-    mesh : int
-        Number of strips of the section (even).
-    geometry : str
-        "corotational" or "linear".
-    substeps : int
-        Integration steps per step of the record, which is linear between its samples.
-    max_increment : float or None
-        Largest increment of an imposed displacement [m]; larger ones are divided. None: height/5000.
-    outputs : tuple of str or None
-        Names of the channels, that is, of the sensors (see the notes). None: the default channels at the top.
-    units : dict or tuple of pairs
-        Display units of the channels, by name or by the part of the name before the ``@``.
-    tolerance : float
-        Norm of the last Newton correction [m and rad].
 
     Raises
     ------
@@ -199,34 +137,91 @@ class RCColumn(BuiltInModel):
     >>> strains = RCColumn.lhpost(record, outputs=("displacement", "strain@0.1:0.5"))
     """
 
-    loading: Record | DisplacementHistory
-    diameter: float
-    height: float
-    cover: float
-    concrete: Concrete
-    steel: Steel
-    bars: Bars
-    hoops: Hoops
-    mass: float
-    axial_load: float | None = None
-    rotational_inertia: float = 0.0
-    column_mass: float = 0.0
-    a0: float = 0.0
-    a1: float = 0.0
-    penetration: float = 0.0
-    fatigue: LowCycleFatigue | None = None
-    collapse_drift: float = 0.2
-    parameters: tuple[str, ...] = ("Ec", "Es", "a0", "a1", "ft")
-    n_elements: int = 2
-    n_points: int = 3
-    mesh: int = 40
-    geometry: str = "corotational"
-    substeps: int = 1
-    max_increment: float | None = None
-    outputs: tuple[str, ...] | None = None
-    units: tuple[tuple[str, str], ...] = ()
+    loading: Record | DisplacementHistory = described("", "Base acceleration, or lateral displacement of the top")
+    diameter: float = described("m", "Diameter of the section", "positive")
+    height: float = described("m", "Height from the fixed base to the mass", "positive")
+    cover: float = described("m", "Clear cover, measured to the outside of the hoops", "zero or positive")
+    concrete: Concrete = described("", "Unconfined concrete; the confinement of the core follows from the hoops")
+    steel: Steel = described("", "Longitudinal steel")
+    bars: Bars = described("", "Longitudinal reinforcement")
+    hoops: Hoops = described("", "Transverse reinforcement")
+    mass: float = described("kg", "Mass at the top", "positive")
+    axial_load: float | None = described(
+        "N",
+        "Gravity load at the top, positive downwards; default: the weight of ``mass``",
+        "finite",
+        None,
+    )
+    rotational_inertia: float = described("kg m²", "Rotational inertia of the mass", "zero or positive", 0.0)
+    column_mass: float = described(
+        "kg",
+        "Mass of the column itself, with its weight",
+        "zero or positive",
+        0.0,
+        "Half of each element's share is at either end, so that the nodes below the top have velocities and "
+        "accelerations.",
+    )
+    a0: float = described("1/s", "Rayleigh damping: factor of the mass", "zero or positive", 0.0)
+    a1: float = described(
+        "s",
+        "Rayleigh damping: factor of the tangent stiffness of the last converged step",
+        "zero or positive",
+        0.0,
+    )
+    penetration: float = described(
+        "m",
+        "Length of strain penetration below the base",
+        "zero or positive",
+        0.0,
+        "The deformations of the base section continue over this length, because the bars slip out of the foundation, "
+        "and the rotation and elongation over this length are added to the column deformations. A common estimate is "
+        "0.022 fy d [MPa, m] (Priestley, Seible & Calvi, Seismic Design and Retrofit of Bridges, 1996). With 2 "
+        "elements of 3 points, this estimate completes the plastic hinge, 0.08 height + 0.022 fy d, because the end "
+        "section of such an element represents height/12.",
+    )
+    fatigue: LowCycleFatigue | None = described(
+        "", "Low-cycle fatigue of the bars; default: bars neither lose strength nor fracture", default=None
+    )
+    collapse_drift: float = described(
+        "",
+        "Displacement of the top by the height at which a column under a ``Record`` has collapsed, and the simulation "
+        'ends with the reason "collapse"',
+        "positive",
+        0.2,
+        "Tested columns have lost their strength at 0.05 to 0.15. Without a limit, columns whose bars do not fracture "
+        "would come back from any drift.",
+    )
+    parameters: tuple[str, ...] = described(
+        "",
+        "Names of the parameters that make up theta, in this order (``RCColumn`` lists them)",
+        default=("Ec", "Es", "a0", "a1", "ft"),
+    )
+    n_elements: int = described("", "Number of elements", default=2)
+    n_points: int = described("", "Number of Gauss-Lobatto points per element, 2 to 7", default=3)
+    mesh: int = described("", "Number of strips of the section (even)", default=40)
+    geometry: str = described("", '"corotational" or "linear"', default="corotational")
+    substeps: int = described(
+        "", "Integration steps per step of the record, which is linear between its samples", default=1
+    )
+    max_increment: float | None = described(
+        "m",
+        "Largest increment of an imposed displacement; larger ones are divided; default: height/5000",
+        "positive",
+        None,
+    )
+    outputs: tuple[str, ...] | None = described(
+        "",
+        "Names of the channels, that is, of the sensors (see the notes); default: those at the top",
+        default=None,
+    )
+    units: tuple[tuple[str, str], ...] = described(
+        "",
+        "Display units of the channels, by name or by the part of the name before the ``@``",
+        default=(),
+        kind="table of text",
+    )
     nominal_units: ClassVar[dict[str, str]] = _NOMINAL_UNITS
-    tolerance: float = 1e-8
+    tolerance: float = described("m and rad", "Norm of the last Newton correction", "positive", 1e-8)
 
     @classmethod
     def lhpost(cls, loading: Record | DisplacementHistory, **changes) -> RCColumn:
@@ -422,13 +417,7 @@ class RCColumn(BuiltInModel):
             part = getattr(self, name)
             if not isinstance(part, kind) and (part is not None or name in parts):
                 raise invalid(f"{kind.__name__}(...) as {name}", part, "import it from fe_likelihoods")
-        check_fields(
-            self,
-            positive=(*("diameter", "height", "mass", "tolerance", "max_increment", "collapse_drift"),),
-            non_negative=("cover", "rotational_inertia", "column_mass", "a0", "a1", "penetration"),
-            finite=("axial_load",),
-            optional=("max_increment", "axial_load"),
-        )
+        check_described(self)
         check_loading(self.loading, self.height)
         check_integer("n_elements", self.n_elements, 1, 50)
         check_integer("n_points", self.n_points, 2, 7)

@@ -24,7 +24,7 @@ import numpy as np
 
 from ..kernels import reinforcing_steel
 from ..priors.distributions import LogNormal
-from .validation import check_fields, invalid
+from .validation import check_described, described, invalid, structure
 
 __all__ = [
     "Bars",
@@ -41,28 +41,10 @@ __all__ = [
 _MEDIAN_CF, _LOG_SD_CF = 0.20, 0.34  # of a new column, by study `failing_columns` of docs/results.rst
 
 
+@structure
 @dataclass(frozen=True)
 class Concrete:
     """Unconfined concrete: Popovics envelope in compression, exponential softening in tension.
-
-    Attributes
-    ----------
-    fc : float
-        Compressive strength [Pa], positive.
-    ec : float
-        Initial modulus [Pa].
-    ft : float
-        Tensile strength [Pa].
-    peak_strain : float, optional
-        Strain at `fc`, positive. Default: 2 fc/Ec, which follows an updated Ec. With a fixed strain below fc/Ec the
-        envelope does not depend on Ec.
-    ultimate_strain : float
-        Strain beyond which the cover carries no stress (positive). The model uses at least 1.5 times the peak strain.
-    softening_strain : float
-        Length of the softening branch in tension: strain from cracking (ft/Ec) to the point where the stress has
-        decreased to `softening_ratio` ft and drops to zero.
-    softening_ratio : float
-        Ratio of the stress at the end of the softening branch to ft.
 
     Examples
     --------
@@ -72,21 +54,36 @@ class Concrete:
     30000000000.0
     """
 
-    fc: float
-    ec: float
-    ft: float
-    peak_strain: float | None = None
-    ultimate_strain: float = 0.006
-    softening_strain: float = 0.001
-    softening_ratio: float = 0.1
+    fc: float = described("Pa", "Compressive strength, positive", "positive")
+    ec: float = described("Pa", "Initial modulus", "positive")
+    ft: float = described("Pa", "Tensile strength", "finite")
+    peak_strain: float | None = described(
+        "",
+        "Strain at ``fc``, positive; default: 2 fc/Ec, which follows an updated Ec",
+        "positive",
+        None,
+        "With a fixed strain below fc/Ec the envelope does not depend on Ec.",
+    )
+    ultimate_strain: float = described(
+        "",
+        "Strain beyond which the cover carries no stress (positive)",
+        "positive",
+        0.006,
+        "The model uses at least 1.5 times the peak strain.",
+    )
+    softening_strain: float = described(
+        "",
+        "Length of the softening branch in tension: strain from cracking (ft/Ec) to the point where the stress has "
+        "decreased to ``softening_ratio`` ft and drops to zero",
+        "positive",
+        0.001,
+    )
+    softening_ratio: float = described(
+        "", "Ratio of the stress at the end of the softening branch to ft", "positive", 0.1
+    )
 
     def __post_init__(self) -> None:
-        check_fields(
-            self,
-            positive=("fc", "ec", "ultimate_strain", "softening_strain", "peak_strain", "softening_ratio"),
-            finite=("ft",),
-            optional=("peak_strain",),
-        )
+        check_described(self)
         if not 0.0 <= self.ft < self.fc:
             raise invalid("a tensile strength between 0 and fc", self.ft, "give both as positive values in Pa")
         if self.ec <= self.fc:
@@ -95,24 +92,10 @@ class Concrete:
             raise invalid("a softening_ratio below 1", self.softening_ratio, "the default is 0.1")
 
 
+@structure
 @dataclass(frozen=True)
 class Steel:
     """Longitudinal reinforcing steel.
-
-    Attributes
-    ----------
-    fy : float
-        Yield strength [Pa].
-    fu : float
-        Ultimate strength [Pa].
-    es : float
-        Elastic modulus [Pa].
-    esh : float
-        Modulus at the onset of hardening [Pa].
-    hardening_strain : float
-        Strain at the onset of hardening.
-    ultimate_strain : float
-        Strain at `fu`.
 
     Examples
     --------
@@ -120,15 +103,15 @@ class Steel:
     >>> stronger = RCColumn.lhpost(record, steel=steel)
     """
 
-    fy: float
-    fu: float
-    es: float
-    esh: float
-    hardening_strain: float
-    ultimate_strain: float
+    fy: float = described("Pa", "Yield strength", "positive")
+    fu: float = described("Pa", "Ultimate strength", "positive")
+    es: float = described("Pa", "Elastic modulus", "positive")
+    esh: float = described("Pa", "Modulus at the onset of hardening", "positive")
+    hardening_strain: float = described("", "Strain at the onset of hardening", "positive")
+    ultimate_strain: float = described("", "Strain at ``fu``", "positive")
 
     def __post_init__(self) -> None:
-        check_fields(self, positive=("fy", "fu", "es", "esh", "hardening_strain", "ultimate_strain"))
+        check_described(self)
         if not self.fy / self.es < self.hardening_strain < self.ultimate_strain or self.fu <= self.fy:
             raise invalid(
                 "fy/es < hardening_strain < ultimate_strain and fy < fu", self, "check the units of the steel"
@@ -165,6 +148,7 @@ def hardening_fault(fy: float, fu: float, es: float, esh: float, eps_sh: float, 
     return ""
 
 
+@structure
 @dataclass(frozen=True)
 class LowCycleFatigue:
     """Low-cycle fatigue of bars: loss of strength from cycle to cycle, and fracture.
@@ -173,17 +157,6 @@ class LowCycleFatigue:
     one. The strength decreases by (cf/cd)^(1/alpha) times the sum. ``docs/theory/reinforcing_steel.rst`` has the
     equations.
 
-    Attributes
-    ----------
-    cf : float
-        Coefficient of Coffin and Manson: plastic strain of a half cycle, from one reversal to the next, that breaks a
-        bar. The defaults are the starting values that OpenSees documents for its material ReinforcingSteel, from tests
-        of Brown & Kunnath (2000) with bars whose slenderness was 6.
-    alpha : float
-        Exponent of Coffin and Manson, at most 1.
-    cd : float
-        Coefficient of strength loss, at least `cf`; a large coefficient means no loss before fracture.
-
     Examples
     --------
     >>> fatigue = LowCycleFatigue(cf=0.26)
@@ -191,12 +164,25 @@ class LowCycleFatigue:
     ('Ec', 'Cf')
     """
 
-    cf: float = 0.26
-    alpha: float = 0.506
-    cd: float = 0.389
+    cf: float = described(
+        "",
+        "Coefficient of Coffin and Manson: plastic strain of a half cycle, from one reversal to the next, that breaks "
+        "a bar",
+        "positive",
+        0.26,
+        "The defaults are the starting values that OpenSees documents for its material ReinforcingSteel, from tests of "
+        "Brown & Kunnath (2000) with bars whose slenderness was 6.",
+    )
+    alpha: float = described("", "Exponent of Coffin and Manson, at most 1", "positive", 0.506)
+    cd: float = described(
+        "",
+        "Coefficient of strength loss, at least ``cf``; a large coefficient means no loss before fracture",
+        "positive",
+        0.389,
+    )
 
     def __post_init__(self) -> None:
-        check_fields(self, positive=("cf", "alpha", "cd"), of="of fatigue")
+        check_described(self, "of fatigue")
         if self.alpha > 1.0:
             raise invalid("an exponent alpha of at most 1", self.alpha, "tests of bars give 0.4 to 0.6")
         if self.cd < self.cf:
@@ -225,21 +211,10 @@ class LowCycleFatigue:
         return {"Cf": LogNormal(_MEDIAN_CF / self.cf, _LOG_SD_CF)}
 
 
+@structure
 @dataclass(frozen=True)
 class Bars:
     """Longitudinal bars, evenly spaced on a circle.
-
-    Attributes
-    ----------
-    number : int
-        Number of bars, at least 3.
-    diameter : float
-        Diameter of one bar [m].
-    area : float, optional
-        Area of one bar [m²]. Default: from `diameter`.
-    first_angle : float
-        Angle between the direction of negative displacements and the first bar [rad]. It matters only where the bars
-        are not symmetric to the axis of bending, such as an odd number of bars.
 
     Examples
     --------
@@ -248,15 +223,21 @@ class Bars:
     0.0181
     """
 
-    number: int
-    diameter: float
-    area: float | None = None
-    first_angle: float = 0.0
+    number: int = described("", "Number of bars, at least 3")
+    diameter: float = described("m", "Diameter of one bar", "positive")
+    area: float | None = described("m²", "Area of one bar; default: from ``diameter``", "positive", None)
+    first_angle: float = described(
+        "rad",
+        "Angle between the direction of negative displacements and the first bar",
+        "finite",
+        0.0,
+        "It matters only where the bars are not symmetric to the axis of bending, such as an odd number of bars.",
+    )
 
     def __post_init__(self) -> None:
         if not isinstance(self.number, Integral) or isinstance(self.number, bool) or self.number < 3:
             raise invalid("an integer number of at least three bars", self.number, "bars stand on a whole circle")
-        check_fields(self, positive=("diameter", "area"), finite=("first_angle",), optional=("area",), of="of bars")
+        check_described(self, "of bars")
 
     @property
     def area_each(self) -> float:
@@ -264,24 +245,10 @@ class Bars:
         return self.area if self.area is not None else 0.25 * math.pi * self.diameter**2
 
 
+@structure
 @dataclass(frozen=True)
 class Hoops:
     """Transverse reinforcement: hoops or a spiral.
-
-    Attributes
-    ----------
-    diameter : float
-        Diameter of the hoop bar [m].
-    spacing : float
-        Distance between the centres of adjacent sets [m].
-    fy : float
-        Yield strength [Pa].
-    area : float, optional
-        Area of one set [m²]; bundled hoops have more than one bar. Default: one bar, from `diameter`.
-    ultimate_strain : float
-        Strain at fracture.
-    spiral : bool
-        Whether the reinforcement is a spiral.
 
     Examples
     --------
@@ -289,16 +256,20 @@ class Hoops:
     >>> stirrups = RCColumn.lhpost(record, hoops=hoops)
     """
 
-    diameter: float
-    spacing: float
-    fy: float
-    area: float | None = None
-    ultimate_strain: float = 0.12
-    spiral: bool = False
+    diameter: float = described("m", "Diameter of the hoop bar", "positive")
+    spacing: float = described("m", "Distance between the centres of adjacent sets", "positive")
+    fy: float = described("Pa", "Yield strength", "positive")
+    area: float | None = described(
+        "m²",
+        "Area of one set; bundled hoops have more than one bar; default: one bar, from ``diameter``",
+        "positive",
+        None,
+    )
+    ultimate_strain: float = described("", "Strain at fracture", "positive", 0.12)
+    spiral: bool = described("", "Whether the reinforcement is a spiral", default=False)
 
     def __post_init__(self) -> None:
-        positive = ("diameter", "spacing", "fy", "ultimate_strain", "area")
-        check_fields(self, positive=positive, optional=("area",), of="of hoops")
+        check_described(self, "of hoops")
         if self.spacing <= self.diameter:
             raise invalid(
                 "a spacing of hoops larger than their diameter", self.spacing, "give it between centres, in m"

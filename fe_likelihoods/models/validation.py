@@ -8,7 +8,10 @@ propose them.
 from __future__ import annotations
 
 import math
+import re
+import textwrap
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import field, fields
 from numbers import Integral, Real
 from typing import Any
 
@@ -17,7 +20,7 @@ import numpy as np
 from ..simulation.model import SimulationFailed
 
 __all__ = [
-    "check_fields",
+    "check_described",
     "check_integer",
     "check_names",
     "check_nominal",
@@ -25,8 +28,10 @@ __all__ = [
     "check_theta",
     "check_thetas",
     "check_values",
+    "described",
     "invalid",
     "positive_float",
+    "structure",
 ]
 
 _ADVICE = "give one number in SI units"
@@ -54,25 +59,40 @@ def check_integer(name: str, value: object, low: int, high: int) -> None:
         raise invalid(f"{name} between {low} and {high}, an integer", value, "see the documentation of the model")
 
 
-def check_fields(
-    instance: Any,
-    *,
-    positive: Sequence[str] = (),
-    non_negative: Sequence[str] = (),
-    finite: Sequence[str] = (),
-    optional: Sequence[str] = (),
-    of: str = "",
-) -> None:
-    """Check numeric fields of a dataclass instance by `check_number`.
+def described(unit: str, meaning: str, sign: str = "", default: Any = ..., more: str = "", kind: str = "") -> Any:
+    """A field of a `structure`: SI unit, meaning, and further sentences for the docstring alone.
 
-    Fields named in `optional` may be None; `of`, such as ``"of a pier"``, is appended to the names in messages of
-    ValueError.
+    The `sign` is a kind of `check_number` that `check_described` asks for; `kind` that of the key of a TOML file, if it
+    does not follow from unit and type.
     """
-    for kind, names in (("positive", positive), ("zero or positive", non_negative), ("finite", finite)):
-        for name in names:
-            value = getattr(instance, name)
-            if value is not None or name not in optional:
-                check_number(kind, f"{name} {of}".rstrip(), value)
+    metadata = {"unit": unit, "meaning": meaning, "sign": sign, "more": more, "kind": kind}
+    return field(metadata=metadata, **({} if default is ... else {"default": default}))
+
+
+def structure(kind: type) -> type:
+    """A class with its described fields as the section "Parameters" of its docstring, before other sections."""
+    lines = ["Parameters", "----------"]
+    for each in fields(kind) if kind.__doc__ else ():  # there are no docstrings with the option -OO of Python
+        form = re.sub(r"(\w+)\[(\w+)(, \.\.\.)?\]", r"\1 of \2", each.type)
+        optional = each.default is None and form.endswith(" | None")
+        about, unit = each.metadata, f" [{each.metadata['unit']}]" if each.metadata["unit"] else ""
+        first, mark, rest = about["meaning"].partition("; ")
+        lines.append(f"{each.name} : {form.removesuffix(' | None') + ', optional' if optional else form}")
+        lines += [f"    {line}" for line in textwrap.wrap(f"{first}{unit}{mark}{rest}. {about['more']}", 112)]
+    head, mark, rest = re.split(r"(\n    (?=(?:Raises|Notes|Examples)\n)|$)", kind.__doc__ or "", maxsplit=1)
+    kind.__doc__ = head + "".join(f"\n    {line}" for line in lines) + "\n" + mark + rest if kind.__doc__ else None
+    return kind
+
+
+def check_described(instance: Any, of: str = "") -> None:
+    """Check the described fields of an instance by `check_number`; those with the default None may be None.
+
+    `of`, such as ``"of a pier"``, is appended to the names in messages of ValueError.
+    """
+    for each in fields(instance):
+        value = getattr(instance, each.name)
+        if each.metadata.get("sign") and (value is not None or each.default is not None):
+            check_number(each.metadata["sign"], f"{each.name} {of}".rstrip(), value)
 
 
 def positive_float(value: Any, name: str, unit: str) -> float:

@@ -104,13 +104,11 @@ def read_series(
 
     ValueError if there are several, which lists them. A text for V2 files is a number too, or the end of a file's name.
     """
+    if form in _SINGLE:
+        series = _SINGLE[form](read_text(path), str(path))
+        return series._replace(name=Path(path).name) if form == "knet" else series  # the ending is the direction
     if form == "obspy":
         return parse_obspy(path, channel, inventory)
-    if form not in ("v2", "geonet"):
-        series = {"at2": parse_at2, "smc": parse_smc, "knet": parse_knet, "esm": parse_esm}[form](
-            read_text(path), str(path)
-        )
-        return series._replace(name=Path(path).name) if form == "knet" else series  # the ending is the direction
     if form == "v2" and isinstance(channel, str):
         channel, member = (int(channel), member) if channel.isdecimal() else (None, channel)
     candidates = find_channels(path, form, member)
@@ -373,7 +371,9 @@ _ZIP_DAMAGE = (zipfile.BadZipFile, RuntimeError, NotImplementedError, OSError, E
 
 
 def find_channels(path: str | Path, form: str, member: str | None = None) -> list[Found]:
-    """The accelerations in a GeoNet file, a V1 or V2 file, or the V2, else V1 files of an archive."""
+    """The accelerations in a file, or in the V2, else V1 files of an archive; numbers and names only of several."""
+    if form in _SINGLE or form == "obspy":
+        return [Found(None, Path(path).name, str(path), lambda: read_series(path, form, None, None, None))]
     if form == "geonet":
         return parse_geonet(read_text(path), str(path))
     content = read_bytes(path)
@@ -767,3 +767,7 @@ def parse_obspy(path: str | Path, channel: str | None, inventory: str | Path | N
     dt = 1.0 / rate if rate and abs(rate * trace.stats.delta - 1.0) < 1e-6 else trace.stats.delta
     unit = None if inventory is None else "m/s2"
     return Series(trace.id, float(dt), unit, np.asarray(trace.data, dtype=np.float64), name=trace.id)
+
+
+_SINGLE = {"at2": parse_at2, "smc": parse_smc, "knet": parse_knet, "esm": parse_esm}
+"""Parsers of formats with one acceleration."""
