@@ -13,7 +13,6 @@ from ..checks.finding import NOTE, labelled
 from ..checks.rehearsal import ModelCheck, check_model
 from ..checks.screening import repair_lines, screen
 from ..information.identifiability import identifiability
-from ..likelihood.posterior import Posterior
 from ..signals.error_measures import rrmse
 from ..units import from_si
 from .events import read_events
@@ -33,40 +32,38 @@ def check_job(file: Path, picture: Path, say: Callable[[str], None], progress: b
     """
     if not picture.resolve().parent.is_dir():
         raise ValueError(f"cannot write {picture}: there is no folder {picture.parent}; give another file with --out")
-    job = read_job(file)
-    problem = make_problem(job, _cache_of_the_run(job, default_folder(file)))
+    job, folder = read_job(file), default_folder(file)
+    cache = None
+    if job.budget.cache and is_free(folder):
+        with suppress(OSError):  # the run will say so
+            folder.mkdir(parents=True, exist_ok=True)
+            cache = SimulationCache(folder / CACHE)
+    problem = make_problem(job, cache)
     sampler = make_sampler(job, problem)
     events = read_events(job, problem)
     _say_data(problem, say)
     checked = _say_simulation(problem, say, progress)
-    parts = [part for part, _ in problem.posterior.likelihood.parts()]
     given = {} if job.measurements is None else job.measurements.given()
-    repairs = [line for part in parts for line in repair_lines(screen(part.measurements), given)]
+    parts = [part for part, _ in problem.posterior.likelihood.parts()]
+    repairs = [f"  {line}" for part in parts for line in repair_lines(screen(part.measurements), given)]
     if repairs and given:
         say("Lines of [measurements] that deal with the sensors, instead of lines with the same keys:")
-        for line in repairs:
-            say(f"  {line}")
+        say("\n".join(repairs))
     for event in events:
         compared = "without measurements" if event.measured is None else "compared with measurements"
         say(f"Event {event.name}: {event.record}, {compared}")
-    uncached = make_problem(job).posterior
-    _say_cost(uncached, job, sampler, say)
+    timed = _say_cost(job, sampler, say)
     names = ", ".join(map(str, _draw(problem, checked, picture)))
     say(f"{names}: the measurements should lie within the band of the simulations at draws of the prior")
-    made, cache = checked.simulations + uncached.report()["simulations"], parts[0].simulator.cache
-    stored = (
-        "" if cache is None else f", those of the calibrated model are stored in {default_folder(file)}/ for the run"
-    )
-    say(f"This check made {made} simulations{stored}")
-    say(f"Next: fe-likelihoods run {file} (writes to {default_folder(file)}/)")
+    stored = "" if cache is None else f", those of the calibrated model are stored in {folder}/ for the run"
+    say(f"This check made {checked.simulations + timed} simulations{stored}")
+    say(f"Next: fe-likelihoods run {file} (writes to {folder}/)")
 
 
 def _say_data(problem: Problem, say: Callable[[str], None]) -> None:
     posterior, record = problem.posterior, problem.record
     if record is not None:
-        say(f"Record: {record}")
-        if record.source:
-            say(f"  from {record.source}")
+        say(f"Record: {record}" + (f"\n  from {record.source}" if record.source else ""))
     for likelihood, _ in posterior.likelihood.parts():
         measured, model, modal = likelihood.measurements, likelihood.model, likelihood.is_modal
         say(f"Measurements: {measured.description or 'without a description'}")
@@ -82,21 +79,9 @@ def _say_data(problem: Problem, say: Callable[[str], None]) -> None:
     say(f"{posterior.ndim} parameters with the noise:")
     width = max(len(parameter.label) for parameter in posterior.parameters)
     for parameter in posterior.parameters:
-        prior = posterior.prior.distributions[parameter.name]
-        mean, sd = (parameter.shown(value) for value in prior.moments)
+        mean, sd = (parameter.shown(value) for value in posterior.prior.distributions[parameter.name].moments)
         note = " (assumed: not in the file)" if parameter.name in problem.assumed else ""
         say(f"  {parameter.label:<{width}}  prior mean {mean:.3g}, standard deviation {sd:.3g}{note}")
-
-
-def _cache_of_the_run(job: Job, folder: Path) -> SimulationCache | None:
-    """The cache that a run in this folder will use; None if it uses none, or cannot use the folder."""
-    if not job.budget.cache or not is_free(folder):
-        return None
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:  # the run will say so
-        return None
-    return SimulationCache(folder / CACHE)
 
 
 def _say_simulation(problem: Problem, say: Callable[[str], None], progress: bool) -> ModelCheck:
@@ -109,14 +94,11 @@ def _say_simulation(problem: Problem, say: Callable[[str], None], progress: bool
         if part.is_modal:
             say(f"At the mean of the prior:\n{part.predict_modes(theta)}")
             continue
-        response = part.simulate(theta).response[0]
-        errors = rrmse(measured.values - part.residuals_of(response), measured.values)
+        errors = rrmse(measured.values - part.residuals_of(part.simulate(theta).response[0]), measured.values)
         fit = ", ".join(f"{c.name} {100 * e:.0f} %" for c, e in zip(measured.channels, errors, strict=True))
         say(f"At the mean of the prior the error of the response (RRMSE) is {fit}")
-    for line in labelled(checked.findings):
+    for line in (*labelled(checked.findings), *(f"{name}: {how}" for name, how in checked.steps.items())):
         say(line)
-    for name, how in checked.steps.items():
-        say(f"{name}: {how}")
     most = min(MOST_SEARCHED, SEARCH_SECONDS / max(checked.seconds, 1e-6))
     # of wrong data, nothing is known
     if most > 10 * posterior.ndim and all(each.severity == NOTE for each in checked.findings):
@@ -127,26 +109,27 @@ def _say_simulation(problem: Problem, say: Callable[[str], None], progress: bool
     return checked
 
 
-def _say_cost(posterior: Posterior, job: Job, sampler: Any, say: Callable[[str], None]) -> None:
-    """Estimate the cost with a posterior whose simulations are not cached."""
+def _say_cost(job: Job, sampler: Any, say: Callable[[str], None]) -> int:
+    """Estimate the cost with simulations that are not cached; returns their number."""
     from samplers import estimate_cost
 
-    guided, most = job.sampler.guide, job.budget.max_simulations
+    posterior, most = make_problem(job).posterior, job.budget.max_simulations
     estimate = estimate_cost(posterior, sampler.nwalkers, type(sampler), seed=1)
-    if guided:
+    if job.sampler.guide:
         say(
-            f"The run uses a guide: how many simulations it needs is not predicted; 500 take "
-            f"{estimate.time_of(500)}, to which the guide adds its own computations, half a minute for 7 parameters"
+            f"The run uses a guide: how many simulations it needs is not predicted; 500 take {estimate.time_of(500)}, "
+            "to which the guide adds its own computations, half a minute for 7 parameters"
         )
     else:
         say(f"Estimated cost until beta = 1:\n{estimate}")
     if most is not None:
         say(f"The run stops at {most} simulations (max_simulations)")
-        if not guided and most < estimate.fewest:
+        if not job.sampler.guide and most < estimate.fewest:
             say(
-                f"CAUTION: it needs about {estimate.fewest:.3g} or more, and will probably end before "
-                "beta = 1; a larger max_simulations continues it"
+                f"CAUTION: it needs about {estimate.fewest:.3g} or more, and will probably end before beta = 1; a "
+                "larger max_simulations continues it"
             )
+    return posterior.report()["simulations"]
 
 
 def _draw(problem: Problem, checked: ModelCheck, picture: Path) -> list[Path]:
@@ -159,17 +142,18 @@ def _draw(problem: Problem, checked: ModelCheck, picture: Path) -> list[Path]:
     posterior, files = problem.posterior, []
     points, modes = draws_to_compare(posterior, checked.seconds), {fit.title: fit.modal for fit in checked.fits}
     for key, part, columns in data_sets_of(posterior):
-        if part.is_modal and modes[key].draws is None:  # the log says why
-            continue
-        files.append(picture.with_name(f"{picture.stem}-{key}{picture.suffix}") if key else picture)
+        measured = part.measurements
         if part.is_modal:
             drawn = modes[key].draws
+            if drawn is None:  # the log says why
+                continue
             figure = plot_modes(drawn, label=f"{len(drawn.frequencies)} draws of the prior, 90 %")
         else:
-            draws, measured = points[:, columns[: len(part.model.parameter_names)]], part.measurements
+            draws = points[:, columns[: len(part.model.parameter_names)]]
             options = {"quantiles": (0.05, 0.95), "cache": part.simulator, "progress": False}
             drawn = propagate(part.model, draws, **options)
             figure = plot_bands(drawn, measured) if measured.is_history else plot_points(measured, prediction=drawn)
             figure.suptitle(f"{drawn.n_samples} draws of the prior and the measurements")
+        files.append(picture.with_name(f"{picture.stem}-{key}{picture.suffix}") if key else picture)
         save_picture(figure, files[-1])
     return files

@@ -176,9 +176,7 @@ class Noise(Section):
         "gaussian",
     )
     groups: Any = key(
-        "text, or list of number",
-        'What has a level: each "channel"; "all" together; each in each "event" of several; or each in each frequency '
-        "band, between ascending frequencies [Hz]: [1, 5] makes the bands below 1 Hz, from 1 to 5 Hz, and above",
+        "one of channel, all, event", "What has a level: each channel, all together, or each in each of several events"
     )
     level: Any = key(
         "text",
@@ -190,7 +188,7 @@ class Noise(Section):
     )
     window: Any = key("time", "Length of the moving window for the root mean square of the response")
     local: Any = key("number", 'For "response": weight of the response envelope in the variance, from 0 to 1 (0.25)')
-    marginal: Any = key("yes or no", "Integrate the levels out; for levels in SI units without bands and sensor", False)
+    marginal: Any = key("yes or no", "Integrate the levels out; for levels in SI units without sensor", False)
 
 
 @dataclass(frozen=True, kw_only=True)

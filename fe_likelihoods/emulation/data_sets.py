@@ -191,8 +191,8 @@ def _statistic_of(likelihood: Any) -> Callable[[np.ndarray], np.ndarray]:
     if needs_response(statistic):
         raise ValueError(
             f"the level of {noise_title(likelihood.noise)} depends on the response, so the posterior cannot be "
-            'emulated from residuals: sample without a guide, or use GaussianNoise with level="si", with bands of '
-            "frequency or without, or AutoregressiveNoise"
+            'emulated from residuals: sample without a guide, or use GaussianNoise with level="si", or '
+            "AutoregressiveNoise"
         )
     if isinstance(measured, Comparison) and statistic is not sums_of_squares:
         return _WithoutMissing(statistic, measured.missing)

@@ -180,11 +180,8 @@ def describe_blocks(seconds: float, chosen: bool, noise: Noise) -> str:
         f"One observation is one block of time with the samples of all channels. Blocks are at most {seconds:.4g} s "
         f"long, {how}. Shorter blocks would not be independent. Compare models with equal blocks only."
     )
-    if not isinstance(noise, GaussianNoise):
-        return text + " The term of a block is conditional on the blocks before it."
-    if noise.n_bands == 1:
-        return text
-    return text + (
-        " The term of a block is the density of its whitened residuals, with an equal part of the determinant for each "
-        "sample."
+    return (
+        text
+        if isinstance(noise, GaussianNoise)
+        else text + " The term of a block is conditional on the blocks before it."
     )

@@ -61,24 +61,9 @@ class StructuralModel:
     path_dependent: bool = True
 
     def simulate(self, theta: ArrayLike) -> np.ndarray:
-        """Simulate the structure for one set of parameters.
+        """Response (n_channels, n_steps) [SI] at the parameters `theta` (n_parameters,).
 
-        Parameters
-        ----------
-        theta : ndarray[n_parameters]
-            Values of `parameter_names`, in this order.
-
-        Returns
-        -------
-        ndarray[n_channels, n_steps]
-            Response [SI].
-
-        Raises
-        ------
-        SimulationFailed
-            If the parameters describe no structure, or the solution does not converge.
-        ValueError
-            If `theta` has another shape.
+        SimulationFailed if they describe no structure, or the solution does not converge; ValueError for another shape.
         """
         return self._respond(check_theta(theta, self.parameter_names))
 

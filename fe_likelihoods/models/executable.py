@@ -60,14 +60,8 @@ class ExecutableModel(UserModel):
         Name of the file in the run folder that contains the response [SI]: one column per channel, separated by blanks
         or commas; text after # is ignored. Or a function that takes the folder (a Path) and returns the response
         (n_channels, n_steps).
-    parameter_names : sequence of str
-        Names of the structural parameters, in the order of theta.
-    channels : sequence of Channel
-        Channels of the response, in the order of its rows.
-    dt : float, optional
-        Time step of the response [s]; with a record a whole multiple of its step, by default that step.
-    n_steps : int, optional
-        Number of response samples; with a record it follows from `dt`.
+    parameter_names, channels, dt, n_steps, path_dependent, depends_on
+        As for `FunctionModel`.
     time_limit : float
         Longest duration of a run [s]; a longer run is stopped and counts as failed.
     columns : sequence of int, optional
@@ -77,21 +71,14 @@ class ExecutableModel(UserModel):
         Units of channels in the output file, by name of the channel. Default: SI units.
     record : Record, optional
         Excitation. Its samples [m/s²] are written into the file `record_file` in the run folder, one per line, and
-        ``$record_dt`` [s] and ``$record_n_steps`` may stand in templates and arguments. The model can then be simulated
-        under other records (`with_record`, ``propagate(..., record=)``, `fragility`).
+        ``$record_dt`` [s] and ``$record_n_steps`` may stand in templates and arguments.
     record_file : str
-        Name of the file with the base motion in the run folder [m/s²]. Default: record.txt.
-    path_dependent : bool
-        Whether the response to an excitation depends on earlier ones. False for a linear structure: predictions under
-        another record then need no `from_state`.
+        Name of the file with the base motion in the run folder.
     files : mapping of str to Path, optional
         Further files, copied into the run folder under the given names.
     version : str, optional
         Text that enters the fingerprint; change it whenever the program computes something else for a reason that the
         files do not show. If `output` is a function, it replaces the code of the function.
-    depends_on : sequence, optional
-        Other files and values that the response depends on, such as a library or a material table that the program
-        reads; see `FunctionModel`.
 
     Raises
     ------

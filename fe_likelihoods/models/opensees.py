@@ -173,31 +173,11 @@ class OpenSeesModel(FunctionModel):
         Function of the wiped module ``openseespy.opensees``, of theta (n_parameters,), and of the record if one is
         given, that returns the response (n_channels, n_steps) in SI units. It must be defined at the top level of a
         module. With an argument ``n_steps`` the model can be shortened; see `FunctionModel`.
-    parameter_names : sequence of str
-        Names of the structural parameters, in the order of theta.
-    channels : sequence of Channel
-        Channels of the response, in the order of its rows.
-    dt : float, optional
-        Time step of the response [s]; with a record a whole multiple of its step, by default that step.
-    n_steps : int, optional
-        Number of response samples; with a record it follows from `dt`.
-    record : Record, optional
-        Excitation, which the function receives as its third argument. The model can then be simulated under other
-        records (`with_record`, ``propagate(..., record=)``, `fragility`).
-    path_dependent : bool
-        Whether the response to an excitation depends on earlier excitations. False for a linear structure: predictions
-        under another record then need no `from_state`.
-    time_limit : float, optional
-        Longest duration of a run [s]; a longer run is stopped and counts as failed.
-    memory_limit : int, optional
-        Largest address space of the process [bytes]. Allocations beyond it fail.
+    parameter_names, channels, dt, n_steps, record, path_dependent, time_limit, memory_limit, version, depends_on
+        As for `FunctionModel`; the function receives a record as its third argument.
     runs_per_process : int or None
         Number of runs after which the process is replaced by a new one; None for never. OpenSees leaks memory: in
         version 3.7.1, ``ops.eigen`` leaks about 14 kB per run of a model with 90 degrees of freedom.
-    version : str, optional
-        Text that replaces the code in the fingerprint; see `FunctionModel`.
-    depends_on : sequence, optional
-        Other files and values that the response depends on, such as ``Path("record.txt")``; see `FunctionModel`.
 
     Raises
     ------

@@ -50,19 +50,12 @@ def material_curves(
 
     Parameters
     ----------
-    column : RCColumn
-        The column.
-    theta : ndarray[n_parameters]
-        Multiples of its nominal parameters.
+    column, theta
+        The column, and multiples (n_parameters,) of its nominal parameters.
     strains : sequence of float, optional
         Strains at which the loading reverses, in order; it starts at zero and is linear between them. Default: cycles
         of the concrete to 0.25, 0.5, 1 and 1.5 times the strain at the confined strength, with cracks between them, and
         of the steel to 0.4, 1, 2 and 3 times the strain at the onset of hardening.
-
-    Returns
-    -------
-    tuple of MaterialCurve
-        Curves of core concrete, cover concrete and steel.
 
     Raises
     ------
@@ -110,18 +103,12 @@ def moment_curvature(
 
     Parameters
     ----------
-    column : RCColumn
-        The column.
-    theta : ndarray[n_parameters]
-        Multiples of its nominal parameters.
+    column, theta
+        The column, and multiples (n_parameters,) of its nominal parameters.
     curvature : ndarray[n]
         Curvatures, in order, after the axial force has been applied [1/m].
     axial_force : float, optional
         Constant axial force, positive in tension [N]. Default: the gravity load of the column, in compression.
-
-    Returns
-    -------
-    MomentCurvature
 
     Raises
     ------

@@ -16,15 +16,13 @@ class SampleNoise(NamedTuple):
 
     A noise that depends on the response has its parameters (n, n_noise) as `deviations`. `of_response` takes the
     parameters (n_noise,) and the response (n_channels, n_steps) of a sample and returns standard deviations of this
-    shape [SI]; `errors_of_response`, for errors correlated in time, also takes standard normal numbers of this shape
-    and returns errors [SI].
+    shape [SI].
     """
 
     deviations: np.ndarray  # (n, n_channels) or (n, n_events, n_channels) [SI]
     lag_one: np.ndarray | None  # (n, n_channels) correlation of successive errors, None for white noise
     events: tuple[slice, ...] = ()  # steps of each event, for standard deviations per event
     of_response: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
-    errors_of_response: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray] | None = None
 
     def over_time(self, levels: np.ndarray, n_steps: int) -> np.ndarray:
         """Values at all steps, shape (n_channels, n_steps) or (n_channels, 1), from the levels of one sample."""
@@ -44,8 +42,6 @@ class SampleNoise(NamedTuple):
         """
         n_channels = self.deviations.shape[-1] if response is None else len(response)
         errors = rng.standard_normal((n_channels, n_steps))
-        if self.errors_of_response is not None:
-            return self.errors_of_response(self.deviations[sample], response, errors)
         if self.lag_one is not None:
             from scipy.signal import lfilter  # imported here because it is slow to import and rarely needed
 
@@ -79,10 +75,8 @@ def sample_noise(
             f"channels; got shape {deviations.shape}, smallest {deviations.min(initial=np.inf)}"
         )
     if dt is not None and hasattr(noise, "response_deviations"):
-        step = None if at_samples else dt
-        errors = partial(noise.response_errors, dt=step) if hasattr(noise, "response_errors") else None
-        deviations_of = partial(noise.response_deviations, dt=step)
-        return SampleNoise(parameters, None, of_response=deviations_of, errors_of_response=errors)
+        deviations_of = partial(noise.response_deviations, dt=None if at_samples else dt)
+        return SampleNoise(parameters, None, of_response=deviations_of)
     if not hasattr(noise, "lag_one_correlations"):
         return SampleNoise(deviations, None)
     lag_one = np.asarray(noise.lag_one_correlations(parameters), dtype=float)

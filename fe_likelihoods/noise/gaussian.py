@@ -1,9 +1,9 @@
-r"""Gaussian noise: levels per channel, event or frequency band, in SI units or as shares of a signal.
+r"""Gaussian noise: levels per channel or event, in SI units or as shares of a signal.
 
 The errors, differences between a measured and a simulated response, are Gaussian and independent between channels. The
 likelihood then needs only a few sums of the residuals per channel (sufficient statistics,
 `fe_likelihoods.noise.groups`) instead of the response, so a changed noise parameter needs no simulation. The variance
-of a sample (or, with frequency bands, of a cosine transform coefficient) is
+of a sample is
 
 .. math:: \sigma^2 = s^2 + (a\, l)^2
 
@@ -27,12 +27,11 @@ import numpy as np
 
 from ..signals.channels import Channel, Measurements
 from ..signals.events import EventWindow, events_of, find_events
-from .groups import BandSums, EventSums, GroupSums, Layout, PartSums, split_sums, stretches
+from .groups import EventSums, GroupSums, Layout, PartSums, split_sums
 from .options import (
     PerChannel,
     as_number,
     checked_channels,
-    numbers,
     only_if,
     per_channel,
     sensor_levels,
@@ -48,29 +47,27 @@ HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 _PARTS = 3  # parts of a window; the window moves by one part
 _ROUND_OFF = 1e-6  # of a step
 _LOCAL = 0.25  # see docs/theory/noise.rst
-_RESPONSE = 'level="response" without bands'
-_SHARES = 'level="measured" or "response", without bands'
+_RESPONSE, _SHARES = 'level="response"', 'level="measured" or "response"'
 
 
 @dataclass(frozen=True, repr=False)
 class GaussianNoise:
-    r"""Gaussian noise with one unknown level per channel, or per channel and event or frequency band.
+    r"""Gaussian noise with one unknown level per channel, or per channel and event.
 
     Parameters
     ----------
     channels : sequence of Channel
         The measured channels, in the order of the model.
-    groups : {"channel", "all", "event"} or sequence of float
-        What has a level: each channel; all channels together; each channel in each event, for a model whose excitation
-        is `fe_likelihoods.Events`; or each channel in each frequency band, between ascending frequencies [Hz]. ``(1,
-        5)`` makes the bands below 1 Hz, from 1 to 5 Hz, and above.
+    groups : {"channel", "all", "event"}
+        What has a level: each channel; all channels together; or each channel in each event, for a model whose
+        excitation is `fe_likelihoods.Events`.
     level : {"si", "measured", "response"}
         What a level is: a standard deviation in the SI unit of the channel; a share of the measured root mean square,
         in predictions of the simulated one; or a share of the simulated response level.
     window : float, optional
         Length of the moving window for the root mean square of the response [s; steps in a test without time]. Longer
-        than a period of the response, shorter than the strong part of the motion. Needed for ``level="response"``
-        without bands. For ``level="measured"`` it is used in predictions only, by default the whole motion.
+        than a period of the response, shorter than the strong part of the motion. Needed for ``level="response"``. For
+        ``level="measured"`` it is used in predictions only, by default the whole motion.
     local : float, optional
         For ``level="response"``: weight of the response envelope in the variance, from 0 to 1 (0.25). The rest is the
         weight of the mean square over the whole response.
@@ -102,8 +99,6 @@ class GaussianNoise:
     "channel"   "measured"     ``share_<channel>``         predictions of weaker or stronger motions
     "channel"   "response"     ``share_<channel>``         the same, and evidences: a normalised density
     "all"       as "channel"   ``share``                   one share for all channels
-    (1, 5)      "si"           ``sigma_<channel>_band1``   errors that are correlated in time
-    (1, 5)      "response"     ``share_<channel>_band1``   the same, for predictions of other motions
     =========== ============== =========================== =======================================================
 
     Equations and sources are on the page ``docs/theory/noise.rst``.
@@ -121,9 +116,6 @@ class GaussianNoise:
     large, because it permits larger errors. Compare the RRMSE of the fit with ``level="si"``. The
     statistics are not quadratic in the residuals, so samplers cannot use a guide.
 
-    Missing samples divide a channel into independent stretches for frequency bands; stretches shorter than a period of
-    the lowest edge are refused.
-
     Examples
     --------
     >>> GaussianNoise(model.channels).parameter_names
@@ -138,7 +130,7 @@ class GaussianNoise:
 
     channels: Sequence[Channel]
     _: KW_ONLY
-    groups: Literal["channel", "all", "event"] | Sequence[float] = "channel"
+    groups: Literal["channel", "all", "event"] = "channel"
     level: Literal["si", "measured", "response"] = "si"
     window: float | None = None
     local: float | None = None
@@ -152,45 +144,23 @@ class GaussianNoise:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "channels", checked_channels(self, self.channels))
-        object.__setattr__(self, "groups", self._checked_groups())
-        if self.level not in ("si", "measured", "response"):
-            raise ValueError(f'GaussianNoise: level must be "si", "measured" or "response"; got {self.level!r}')
-        possible = {"measured": ("channel", "all"), "response": ("channel", "all", "bands")}
-        if self._kind not in possible.get(self.level, (self._kind,)):
-            raise ValueError(
-                f"GaussianNoise: groups={self.groups!r} cannot have level={self.level!r}; possible are levels in SI "
-                'units with all groups, "measured" and "response" with "channel" and "all", and "response" with bands'
-            )
+        for name, known in (("groups", ("channel", "all", "event")), ("level", ("si", "measured", "response"))):
+            if getattr(self, name) not in known:
+                raise ValueError(f"GaussianNoise: {name} must be one of {known}; got {getattr(self, name)!r}")
+        if self.groups == "event" and self.level != "si":
+            raise ValueError('GaussianNoise: groups="event" has levels in SI units, level="si", alone')
         self._check_options()
-
-    def _checked_groups(self) -> str | tuple[float, ...]:
-        """The groups, or the edges of the bands as a tuple of numbers."""
-        if isinstance(self.groups, str):
-            if self.groups not in ("channel", "all", "event"):
-                raise ValueError(
-                    'GaussianNoise: groups must be "channel", "all", "event", or the frequencies between bands [Hz], '
-                    f"such as (1.0, 5.0); got {self.groups!r}"
-                )
-            return self.groups
-        edges = numbers(self, "groups", self.groups, "in Hz")
-        ascending = all(low < high for low, high in zip((0.0, *edges), edges, strict=False))
-        if not edges or not ascending or not edges[-1] < math.inf:
-            raise ValueError(
-                "GaussianNoise expects ascending positive frequencies between the bands [Hz], such as (1.0, 5.0); got "
-                f'{self.groups!r}. For one band use groups="channel"'
-            )
-        return edges
 
     def _check_options(self) -> None:
         """Set options as floats, with their defaults; ValueError if one is missing or has no meaning here."""
         positive, local = lambda x: 0.0 < x < math.inf, "from 0 (one level for the motion) to 1 (the envelope)"
         for name, means, default, where, meaning, possible in (
-            ("window", self._in_parts or self.level == "measured", None, _SHARES, "a positive length [s]", positive),
-            ("local", self._in_parts, _LOCAL, _RESPONSE, local, lambda x: 0.0 <= x <= 1.0),
+            ("window", self.level != "si", None, _SHARES, "a positive length [s]", positive),
+            ("local", self.level == "response", _LOCAL, _RESPONSE, local, lambda x: 0.0 <= x <= 1.0),
         ):
             if (value := self._option(name, means, where, default)) is not None:
                 object.__setattr__(self, name, as_number(self, name, value, meaning, possible))
-        if self._in_parts and self.window is None:
+        if self.level == "response" and self.window is None:
             raise ValueError(
                 'GaussianNoise: level="response" needs window=, a length [s] in which the level of the response is '
                 "taken: longer than a period of the response, shorter than the strong part of the motion"
@@ -199,7 +169,7 @@ class GaussianNoise:
         if self.level == "response" and not all(level > 0.0 for level in self.sensor or (0.0,)):
             raise ValueError(
                 'GaussianNoise: level="response" needs the noise of the sensor of each channel, a positive standard '
-                f"deviation in SI units, for parts or bands in which the response is zero; got {self.sensor!r}. Take "
+                f"deviation in SI units, for parts in which the response is zero; got {self.sensor!r}. Take "
                 "it from the quiet part before the motion, or from the resolution of the sensor, or use levels in SI "
                 "units"
             )
@@ -224,33 +194,19 @@ class GaussianNoise:
     # ------------------------------------------------------------------ kind and names
 
     @cached_property
-    def _kind(self) -> str:
-        return self.groups if isinstance(self.groups, str) else "bands"
-
-    @cached_property
     def _whole(self) -> bool:
         """Whether the sums of squares over all samples are sufficient."""
-        return self._kind in ("channel", "all") and self.level != "response"
-
-    @cached_property
-    def _in_parts(self) -> bool:
-        """Whether levels follow the response over time."""
-        return self.level == "response" and self._kind != "bands"
+        return self.groups != "event" and self.level != "response"
 
     @cached_property
     def _scaled(self) -> bool:
         """Whether parameters are multiples of channel scales."""
-        return self.level == "measured" or (self.level == "si" and self._kind == "all")
+        return self.level == "measured" or (self.level == "si" and self.groups == "all")
 
     @cached_property
     def white(self) -> bool:
         """Whether errors are white, with levels in SI units for the whole measurements."""
         return self._whole and self.level == "si"
-
-    @cached_property
-    def n_bands(self) -> int:
-        """Number of frequency bands; one without bands."""
-        return 1 if isinstance(self.groups, str) else len(self.groups) + 1
 
     @property
     def title(self) -> str:
@@ -272,31 +228,22 @@ class GaussianNoise:
     def parameter_names(self) -> tuple[str, ...]:
         """``sigma_...`` [SI unit of the channel] or ``share_...`` [-], see the table of the class.
 
-        With bands: channel by channel, bands from low to high.
-
-        Raises
-        ------
-        ValueError
-            For ``groups="event"``, before the likelihood has set the events.
+        Levels per event are known when the likelihood has set the events; ValueError before.
         """
         kind, names = "sigma" if self.level == "si" else "share", [channel.name for channel in self.channels]
-        if self._kind == "all":
+        if self.groups == "all":
             return (kind,)
-        if self._kind == "event":
+        if self.groups == "event":
             self._bound(self.events)
             return tuple(f"{kind}_{names[row]}_{self.events[event].name}" for event, row in self.measured)
-        if self._kind == "bands":
-            return tuple(f"{kind}_{name}_band{band}" for name in names for band in range(1, self.n_bands + 1))
         return tuple(f"{kind}_{name}" for name in names)
 
     @property
     def parameter_channels(self) -> dict[str, Channel]:
         """Channels by the names of parameters that are standard deviations in the channel's unit."""
-        if self.level != "si" or self._kind == "all":
+        if self.level != "si" or self.groups == "all":
             return {}
-        rows = [row for _, row in self.measured]
-        if self._kind != "event":
-            rows = np.repeat(np.arange(len(self.channels)), self.n_bands).tolist()
+        rows = [row for _, row in self.measured] if self.groups == "event" else range(len(self.channels))
         return {name: self.channels[row] for name, row in zip(self.parameter_names, rows, strict=True)}
 
     @property
@@ -311,9 +258,7 @@ class GaussianNoise:
             layout = Layout(steps, (0.0,) * len(steps), ())
         else:
             layout = self._bound(self.layout)
-        if self._kind == "bands":
-            return BandSums(self.groups, layout.steps, self.level == "response")
-        if self._kind == "event":
+        if self.groups == "event":
             step = layout.steps[0]
             return EventSums(
                 tuple(
@@ -342,9 +287,9 @@ class GaussianNoise:
             If the noise has levels per event and the excitation is not `fe_likelihoods.Events`; if the window is
             shorter than three time steps of the model or longer than an event.
         """
-        if self._kind == "event" and not self.events:
+        if self.groups == "event" and not self.events:
             return replace(self, events=events_of(model).windows)
-        if not self._in_parts:
+        if self.level != "response":
             return self
         self._check_step(model.dt)
         events = find_events(model)
@@ -362,9 +307,8 @@ class GaussianNoise:
         Raises
         ------
         ValueError
-            If the channels are different; the window is shorter than three time steps; a band is above half the
-            sampling frequency; gaps leave a stretch that is shorter than a period of the lowest edge; or with events,
-            if channels have different times or a sample is outside of every event.
+            If the channels are different; the window is shorter than three time steps; or with events, if channels have
+            different times or a sample is outside of every event.
         """
         names, got = ([channel.name for channel in each.channels] for each in (self, measurements))
         if names != got:
@@ -378,14 +322,13 @@ class GaussianNoise:
         layout = Layout(tuple(measurements.steps), tuple(measurements.starts), ())
         placed, there = replace(self, layout=layout), ~np.isnan(measurements.values)
         sums = placed._sums()
-        check = {"bands": self._check_bands, "event": self._check_events}.get(self._kind)
-        if check is None:
-            self._check_step(max(layout.steps))
+        if self.groups == "event":
+            self._check_events(measurements, there, sums)
         else:
-            check(measurements, there, sums)
+            self._check_step(max(layout.steps))
         counts = sums.counts(there)
         measured = self.measured
-        if self._kind == "event":
+        if self.groups == "event":
             found = tuple(zip(*(each.tolist() for each in np.nonzero(counts)), strict=True))
             measured = measured or found
             if unknown := [self.channels[row].name for event, row in found if (event, row) not in measured]:
@@ -420,31 +363,13 @@ class GaussianNoise:
                 "or use a noise for all samples"
             )
 
-    def _check_bands(self, measurements: Measurements, there: np.ndarray, sums: BandSums) -> None:
-        for channel, step, row in zip(measurements.channels, sums.steps, there, strict=True):
-            if not sums.edges[-1] < 0.5 / step:
-                raise ValueError(
-                    f"GaussianNoise: channel {channel.name!r} has a step of {step:g} s and contains frequencies below "
-                    f"{0.5 / step:g} Hz; the last band begins at {sums.edges[-1]:g} Hz: leave that edge out"
-                )
-            found = list(stretches(row))
-            short = [each for each in found if (each.stop - each.start) * step * sums.edges[0] < 1.0]
-            if len(found) > 1 and short:
-                place = short[0]
-                raise ValueError(
-                    f"GaussianNoise: gaps divide channel {channel.name!r} into {len(found)} stretches, of which "
-                    f"{len(short)} are shorter than a period of the lowest edge, {sums.edges[0]:g} Hz; the first has "
-                    f"{place.stop - place.start} samples from {measurements.times(channel.name)[place.start]:g} s on. "
-                    "Replace short stretches by NaN, fill short gaps, or use AutoregressiveNoise, which bridges gaps"
-                )
-
     def gap_shares(self) -> dict[str, float]:
         """Share of the samples that are missing within the measured motion, by channel [-].
 
         Empty for a noise whose levels do not follow the response over time, without measurements, and for ``local=1``.
         An event without any sample of a channel is no gap, since mean squares are computed per event.
         """
-        if not self._in_parts or self.layout is None or self.local == 1.0:
+        if self.level != "response" or self.layout is None or self.local == 1.0:
             return {}
         shares, counts, events = {}, np.array(self.layout.counts), self.of_parts
         for channel, step, row in zip(self.channels, self.layout.steps, counts.T, strict=True):
@@ -471,8 +396,8 @@ class GaussianNoise:
             effective_samples=None,
             layout=None,
         )
-        if self._kind != "event":
-            return others, np.eye(1) if self._kind == "all" else np.kron(weights, np.eye(self.n_bands))
+        if self.groups != "event":
+            return others, np.eye(1) if self.groups == "all" else np.asarray(weights, dtype=float)
         measured, rows = [], []
         for event in range(len(self.events)):
             known = np.array([row if number == event else -1 for number, row in self.measured])
@@ -528,14 +453,7 @@ class GaussianNoise:
             return np.where(values >= 0.0, values, np.nan)  # the usual noise takes the short way
         if self._scaled:
             levels = self._scales
-        elif self._kind == "bands":
-            n_stretches = len(counts) // self.n_bands
-            values = np.tile(values, (1, n_stretches, 1))
-            if power is None:
-                samples = counts.reshape(n_stretches, self.n_bands, -1).sum(axis=1)
-                power = np.repeat(samples, self.n_bands, axis=0)[None]
-            levels = np.sqrt(power / np.maximum(counts, 1))
-        elif self._in_parts:
+        elif self.level == "response":
             with np.errstate(invalid="ignore"):
                 levels = np.sqrt(squared_levels(power, counts, self.local, self.of_parts))
         return self._with_sensor(values, levels)
@@ -547,15 +465,14 @@ class GaussianNoise:
             return np.where(impossible, np.nan, np.hypot(self._floor, values * levels))
 
     def _values(self, parameters: np.ndarray, unknown: float) -> np.ndarray:
-        """Parameters (n, n_noise) by group and channel, (n, events or bands or 1, n_channels or 1)."""
+        """Parameters (n, n_noise) by group and channel, (n, events or 1, n_channels or 1)."""
         parameters = np.asarray(parameters, dtype=float)
-        if self._kind == "event":
-            values = np.full((len(parameters), len(self.events), len(self.channels)), unknown)
-            for column, (event, row) in enumerate(self.measured):
-                values[:, event, row] = parameters[:, column]
-            return values
-        n_channels = 1 if self._kind == "all" else len(self.channels)
-        return parameters.reshape(len(parameters), n_channels, self.n_bands).transpose(0, 2, 1)
+        if self.groups != "event":
+            return parameters[:, None, :]
+        values = np.full((len(parameters), len(self.events), len(self.channels)), unknown)
+        for column, (event, row) in enumerate(self.measured):
+            values[:, event, row] = parameters[:, column]
+        return values
 
     @cached_property
     def _floor(self) -> np.ndarray:
@@ -567,7 +484,7 @@ class GaussianNoise:
 
     # ------------------------------------------------------------------ predictions and checks
 
-    @only_if(lambda noise: noise._kind != "event")
+    @only_if(lambda noise: noise.groups != "event")
     def standard_deviations(self, parameters: np.ndarray) -> np.ndarray:
         """Standard deviations (n, n_channels) [SI] of the errors, sensor noise included; NaN for impossible parameters.
 
@@ -578,13 +495,9 @@ class GaussianNoise:
             levels = np.zeros(1)
         elif self._scaled:
             levels = self._scales
-        found = self._with_sensor(values, levels)
-        if self._kind != "bands":
-            return found[:, 0]
-        total = np.hypot(np.sqrt(np.square(values * levels).sum(axis=1)), self._floor)
-        return np.where(np.isnan(found).any(axis=1), np.nan, total)
+        return self._with_sensor(values, levels)[:, 0]
 
-    @only_if(lambda noise: noise._kind == "event")
+    @only_if(lambda noise: noise.groups == "event")
     def deviations_per_event(self, parameters: np.ndarray) -> np.ndarray:
         """Standard deviations (n, n_events, n_channels) of the errors [SI]; NaN where there is no level.
 
@@ -593,7 +506,7 @@ class GaussianNoise:
         values = self._values(parameters, np.nan)
         return np.where(values < 0.0, values, np.hypot(self._floor, values))
 
-    @only_if(lambda noise: noise.level != "si" or noise._kind == "bands")
+    @only_if(lambda noise: noise.level != "si")
     def response_deviations(
         self, parameters: np.ndarray, response: np.ndarray, dt: float | Sequence[float] | None = None
     ) -> np.ndarray:
@@ -615,42 +528,22 @@ class GaussianNoise:
     ) -> tuple[Any, np.ndarray]:
         """The groups of a response, and the standard deviations (n_groups, n_channels) of one sample."""
         sums, there = self._sums(dt), ~np.isnan(response)
-        power = sums.powers(response, there)[None] if self.level == "response" else None
+        power = sums.powers(response, there)[None]
         return sums, self._deviations(np.asarray(parameters, dtype=float)[None], sums.counts(there), power)[0]
 
-    @only_if(lambda noise: noise._kind == "bands")
-    def response_errors(
-        self,
-        parameters: np.ndarray,
-        response: np.ndarray,
-        normal: np.ndarray,
-        dt: float | Sequence[float] | None = None,
-        sensor: bool = True,
-    ) -> np.ndarray:
-        """Errors (n_channels, n_steps) [SI] of a simulated response, from standard normal numbers of this shape.
-
-        `dt` as for `response_deviations`. Without the sensor noise, they are model errors.
-        """
-        response = np.asarray(response, dtype=float)
-        sums, deviations = self._of_response(parameters, response, dt)
-        if not sensor:  # sensor noise is white: the same variance in each coefficient
-            deviations = np.sqrt(np.maximum(np.square(deviations) - np.square(self._floor), 0.0))
-        return sums.errors(normal, deviations, ~np.isnan(response))
-
-    @only_if(lambda noise: noise.level == "response" or noise._kind == "bands")
+    @only_if(lambda noise: noise.level == "response")
     def whitened(self, residuals: np.ndarray, response: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        """Residuals (n_channels, n_samples) by their standard deviations, with bands those of their coefficients.
+        """Residuals (n_channels, n_samples) by their standard deviations.
 
         They are white, with a standard deviation of one, if the noise fits. All at the measured samples [SI].
         """
         return self._whitened(residuals, response, parameters)[0]
 
-    @only_if(lambda noise: noise.level == "response" or noise._kind == "bands")
+    @only_if(lambda noise: noise.level == "response")
     def log_densities(self, residuals: np.ndarray, response: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         """Terms (n_channels, n_samples) of the log-likelihood, one per sample; zero where a sample is missing.
 
-        Arguments as for `whitened`. With bands, a term is the log-density of the whitened residual minus the mean
-        logarithm of the coefficients' standard deviations.
+        Arguments as for `whitened`.
         """
         white, logarithms = self._whitened(residuals, response, parameters)
         return np.nan_to_num(-HALF_LOG_TWO_PI - logarithms - 0.5 * np.square(white), nan=0.0)
@@ -658,6 +551,6 @@ class GaussianNoise:
     def _whitened(
         self, residuals: np.ndarray, response: np.ndarray, parameters: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Whitened residuals, and the mean logarithm of the standard deviations at each sample."""
+        """Whitened residuals, and the logarithm of the standard deviations at each sample."""
         sums, deviations = self._of_response(parameters, np.where(np.isnan(residuals), np.nan, response), None)
         return sums.whitened(residuals, deviations)

@@ -1,27 +1,23 @@
-"""Squared residuals summed in groups of orthonormal coordinates: sufficient statistics of Gaussian noise.
+"""Squared residuals summed in groups of samples, which are events or parts of the time: statistics of Gaussian noise.
 
-Errors are independent in the coordinates, with one variance per group. Coordinates are samples (groups are events, or
-parts of the time) or coefficients of an orthonormal cosine transform (frequency bands), which preserves sums of squares
-and densities. The statistics of a group are the number of coordinates, the sum of squared residuals and, for a variance
-that depends on the response, the sum of squared response coordinates.
+Errors have one variance per group. The statistics of a group are the number of samples, the sum of squared residuals
+and, for a variance that depends on the response, the sum of squared samples of the response.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-__all__ = ["BandSums", "EventSums", "GroupSums", "Layout", "PartSums", "split_sums", "stretches"]
+__all__ = ["EventSums", "GroupSums", "Layout", "PartSums", "split_sums"]
 
 _ROUND_OFF = 1e-6  # of a part
-_ROUND_OFF_OF_FREQUENCY = 1e-9
 
 
 class Layout(NamedTuple):
-    """Times of the measured samples, and the number of coordinates in each group."""
+    """Times of the measured samples, and the number of samples in each group."""
 
     steps: tuple[float, ...]  # time step per channel [s]
     starts: tuple[float, ...]  # first sample time per channel [s]
@@ -29,7 +25,7 @@ class Layout(NamedTuple):
 
 
 class GroupSums(ABC):
-    """Statistic of the residuals, and of the response if `of_response`: sums of squares in groups of coordinates."""
+    """Statistic of the residuals, and of the response if `of_response`: sums of squares in groups of samples."""
 
     of_response: bool
 
@@ -46,11 +42,11 @@ class GroupSums(ABC):
 
     @abstractmethod
     def powers(self, histories: np.ndarray, there: np.ndarray) -> np.ndarray:
-        """Sums of squared coordinates (n_groups, n_channels) for histories (n_channels, n_steps)."""
+        """Sums of squared samples (n_groups, n_channels) for histories (n_channels, n_steps)."""
 
     @abstractmethod
     def counts(self, there: np.ndarray) -> np.ndarray:
-        """Number of coordinates (n_groups, n_channels), from whether samples are present (n_channels, n_steps)."""
+        """Number of samples (n_groups, n_channels), from whether samples are present (n_channels, n_steps)."""
 
 
 @dataclass(frozen=True)
@@ -112,105 +108,6 @@ def _places(sums: PartSums, n_steps: int) -> np.ndarray:
     places = np.maximum(np.floor(times / sums.part + _ROUND_OFF).astype(int), 0)
     places.flags.writeable = False
     return places
-
-
-@dataclass(frozen=True)
-class BandSums(GroupSums):
-    """Groups are coefficients of the orthonormal cosine transform (DCT-II) in frequency bands.
-
-    A stretch is a run of samples without a gap; each stretch is transformed separately. Groups are the bands of the
-    first stretch from low to high, then the bands of the next one.
-    """
-
-    edges: tuple[float, ...]  # frequencies between the bands [Hz]
-    steps: tuple[float, ...]  # time step per channel [s]
-    of_response: bool  # sums of the response are needed too
-
-    def powers(self, histories: np.ndarray, there: np.ndarray) -> np.ndarray:
-        """See `GroupSums`."""
-        from scipy.fft import dct  # imported here because it is slow to import and rarely needed
-
-        return self._collect(there, lambda c, samples: np.square(dct(histories[c, samples], norm="ortho")))
-
-    def counts(self, there: np.ndarray) -> np.ndarray:
-        """See `GroupSums`."""
-        return self._collect(there, lambda c, samples: np.ones(samples.stop - samples.start)).astype(int)
-
-    def _collect(self, there: np.ndarray, values_of: Callable[[int, slice], np.ndarray]) -> np.ndarray:
-        n_bands = len(self.edges) + 1
-        sums = np.zeros((max(len(list(stretches(row))) for row in there), n_bands, len(there)))
-        for c, k, samples, bands in self._stretches(there):
-            sums[k, :, c] = np.bincount(bands, values_of(c, samples), minlength=n_bands)
-        return sums.reshape(-1, len(there))
-
-    def in_time(self, deviations: np.ndarray, there: np.ndarray) -> np.ndarray:
-        """Standard deviations of samples (n_channels, n_steps) from group deviations; NaN where a sample is missing."""
-        return self._filled(there, deviations, lambda c, samples, spectrum: np.sqrt(_variances_in_time(spectrum**2)))
-
-    def errors(self, normal: np.ndarray, deviations: np.ndarray, there: np.ndarray) -> np.ndarray:
-        """Errors (n_channels, n_steps) from standard normal numbers; NaN where a sample is missing."""
-        from scipy.fft import idct
-
-        return self._filled(
-            there, deviations, lambda c, samples, spectrum: idct(spectrum * normal[c, samples], norm="ortho")
-        )
-
-    def whitened(self, residuals: np.ndarray, deviations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Whitened residuals, and the mean log standard deviation of the coefficients, at each sample.
-
-        Multiplication with the symmetric inverse square root of the covariance gives whitened residuals without delay.
-        """
-        from scipy.fft import dct, idct
-
-        there = ~np.isnan(residuals)
-        white = self._filled(
-            there,
-            deviations,
-            lambda c, samples, spectrum: idct(dct(residuals[c, samples], norm="ortho") / spectrum, norm="ortho"),
-        )
-        return white, self._filled(there, deviations, lambda c, samples, spectrum: np.log(spectrum).mean())
-
-    def _filled(
-        self, there: np.ndarray, deviations: np.ndarray, values_of: Callable[[int, slice, np.ndarray], np.ndarray]
-    ) -> np.ndarray:
-        """Values (n_channels, n_steps), computed stretch by stretch from the coefficients' standard deviations."""
-        found, deviations = np.full(there.shape, np.nan), deviations.reshape(-1, len(self.edges) + 1, len(there))
-        for c, k, samples, bands in self._stretches(there):
-            found[c, samples] = values_of(c, samples, deviations[k, bands, c])
-        return found
-
-    def _stretches(self, there: np.ndarray) -> Iterator[tuple[int, int, slice, np.ndarray]]:
-        """Channel, number and samples of each stretch, and the bands of its coefficients."""
-        for c, row in enumerate(there):
-            for k, samples in enumerate(stretches(row)):
-                yield c, k, samples, _bands(self.edges, samples.stop - samples.start, self.steps[c])
-
-
-@lru_cache(maxsize=64)  # the same for every simulation
-def _bands(edges: tuple[float, ...], n: int, dt: float) -> np.ndarray:
-    """Band of each coefficient (n,) of n samples: coefficient k has the frequency k / (2 n dt)."""
-    frequencies = np.arange(n) / (2.0 * n * dt)
-    bands = np.searchsorted(edges, frequencies * (1.0 + _ROUND_OFF_OF_FREQUENCY), side="right")
-    bands.flags.writeable = False
-    return bands
-
-
-def _variances_in_time(spectrum: np.ndarray) -> np.ndarray:
-    """Variances (n,) of samples whose DCT-II coefficients are independent, with the variances `spectrum` (n,).
-
-    The squared basis functions are (1 + cos(2 pi k (t + 1/2) / n)) / n for k > 0, and 1 / n for k = 0.
-    """
-    n = len(spectrum)
-    shifted = spectrum * np.exp(1j * np.pi * np.arange(n) / n)
-    shifted[0] = 0.0
-    return spectrum.mean() + np.fft.ifft(shifted).real
-
-
-def stretches(there: np.ndarray) -> Iterator[slice]:
-    """Samples of each stretch without a gap, from whether each sample is present (n_steps,)."""
-    edges = np.flatnonzero(np.diff(there, prepend=False, append=False))
-    for first, stop in zip(edges[::2], edges[1::2], strict=True):
-        yield slice(int(first), int(stop))
 
 
 def split_sums(statistics: np.ndarray, n_channels: int, n_groups: int) -> list[np.ndarray]:

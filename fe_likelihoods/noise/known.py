@@ -19,7 +19,6 @@ _METHODS = {
     "deviations_per_event": 0,
     "lag_one_correlations": 0,
     "response_deviations": 0,
-    "response_errors": 0,
     "whitened": 2,
     "log_densities": 2,
 }

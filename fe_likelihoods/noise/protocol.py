@@ -36,9 +36,6 @@ class Noise(Protocol):
     * ``response_deviations(parameters, response, dt)`` with the parameters (n_noise,) of one sample, which returns the
       standard deviations (n_channels, n_steps) of the errors, given a simulated response; used in predictions instead
       of ``standard_deviations`` where the noise depends on the response.
-    * ``response_errors(parameters, response, normal, dt, sensor)``, which returns the errors (n_channels, n_steps)
-      computed from standard normal numbers ``normal`` of the same shape, without sensor noise if ``sensor=False``; for
-      errors that are correlated in time and depend on the response.
     * ``whitened(residuals, response, parameters)`` and ``log_densities(residuals, response, parameters)`` at the
       measured samples, for checks of residuals and for the log-likelihood in blocks of time.
     * ``under(model, first)``, which returns the noise under the excitation of a model whose response begins at the step

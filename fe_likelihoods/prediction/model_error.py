@@ -4,8 +4,7 @@ A noise whose standard deviation follows the response (`GaussianNoise` with ``le
 two parts, the sensor noise, which is no motion of the structure, and the model error: :math:`\sigma^2 = s^2 +
 \sigma_m^2`. The likelihood takes both as white, but the largest of many independent errors adds to each peak, while
 model errors change as slowly as the response. A draw of the model error therefore has the Fourier amplitudes of the
-response, random phases, and the standard deviation :math:`\sigma_m` at each step. A noise that has a spectrum itself
-(frequency bands) keeps it, and the white sensor noise is subtracted per frequency.
+response, random phases, and the standard deviation :math:`\sigma_m` at each step.
 """
 
 from typing import Any, NamedTuple
@@ -35,8 +34,6 @@ class ModelError(NamedTuple):
     def draw(self, sample: int, n_steps: int, rng: np.random.Generator, response: np.ndarray) -> np.ndarray:
         """Draw the error of one sample, shape (n_channels, n_steps) [SI]."""
         parameters, normal = self.deviations[sample], rng.standard_normal(response.shape)
-        if hasattr(self.noise, "response_errors"):  # the noise has a spectrum of its own
-            return self.noise.response_errors(parameters, response, normal, dt=self.dt, sensor=False)
         level = np.sqrt(np.sum(np.square(response), axis=1, keepdims=True))
         spectrum = np.abs(np.fft.rfft(response, axis=1)) / np.where(level > 0.0, level, 1.0)  # of mean square 1
         deviations = self.of_response(parameters, response)

@@ -108,9 +108,9 @@ def propagate(
         mean and variance are exact in the noise (the law of total variance adds the mean variance of the noise), and
         quantiles use one draw of the noise per sample. For other quantities, one draw per sample is added to the
         response. "model" predicts the response of the structure with the model error and without the sensor noise, for
-        a noise that follows the response (`GaussianNoise` with shares); the errors have the spectrum of the response or
-        of the noise's bands, because white errors make peaks too large. A noise with levels per event has in each event
-        the levels of that event; under another `record`, give the name of the event whose levels hold for it.
+        a noise that follows the response (`GaussianNoise` with shares); the errors have the spectrum of the
+        response, because white errors make peaks too large. A noise with levels per event has in each event the levels
+        of that event; under another `record`, give the name of the event whose levels hold for it.
     quantiles : sequence of float
         Probabilities of the quantiles, between 0 and 1. An empty sequence for none.
     effective_sample_size : float, optional

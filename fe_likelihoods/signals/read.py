@@ -195,7 +195,7 @@ def _table_series(
     table = read_table(path, skip, time_unit, time, column == "rows", missing)
     rows = column == "rows" and "rows" not in [each.name for each in table.columns]
     wanted = (None if rows else column, "acceleration", units, table.file)
-    ((values, unit),) = table_values(table, [wanted], missing, stacklevel=3)
+    ((values, unit, _),) = table_values(table, [wanted], missing, stacklevel=3)
     absent = np.flatnonzero(np.isnan(values))
     if absent.size:
         raise ValueError(

@@ -4,37 +4,23 @@ Each parser returns plain numbers with the unit, the step and the title that the
 stated number of samples and the stated peak are compared with the samples, so that a file with another layout is
 refused instead of misread. Fortran columns have no separators: they are split by width, never at blanks.
 
-PEER AT2
-    Header lines with NPTS and DT, then free-format samples.
-CSMIP V2
-    Per channel 25 lines of text, an integer header, a real header (100 numbers in columns of 10), and blocks of
-    acceleration, velocity and displacement. Each block starts with a line such as
-    ``3000 POINTS OF ACCEL DATA EQUALLY SPACED AT  .020 SEC.  (UNITS: CM/SEC/SEC)``, each channel ends with ``/&``.
-CSMIP V1
-    Per channel 13 lines of text, an integer header (100 numbers in columns of 5), and a real header (50 numbers in
-    columns of 10; the third is the length [s], the seventh the peak [g]). Then follow ``13200 Accelerogram points at
-    200 pts/sec in units of g.  Format: (8f9.6)`` and samples, or pairs of a time [s] and a sample in columns of 7, with
-    the unit in the text.
-COSMOS V1 and V2 (format 1.20)
-    Headers that state their length and Fortran format, then
-    ``42000 acceleration pts, approx  210 secs, units=cm/sec2(04),Format=(1E15.6)``.
-USGS SMC
-    11 lines of text, 48 integers in columns of 10, 50 reals in columns of 15, comment lines with ``|``, samples in
-    columns of 10 [cm/s²]; times [s] alternate with samples where the number of samples per second is missing.
-    Format description: U.S. Geological Survey, National Strong-Motion Program, "SMC-format data files",
-    ``smcfmt.html``.
-GeoNet V1A, V2A
-    Per component 16 lines of text, 40 integers and 60 reals in columns of 8, then accelerations [mm/s²], and in V2A
-    velocities and displacements, in columns of 8. Format description: W. J. Cousins (2008), "GNS accelerogram data
-    files, standard format"; GeoNet, "Strong motion file formats".
-K-NET, KiK-net
-    17 lines of names and values, then counts, which are multiplied by the stated scale factor. The mean is subtracted,
-    as in the stated peak. Format description: National Research Institute for Earth Science and Disaster Resilience,
-    "About K-NET ASCII format".
-ESM, ITACA (DYNA 1.x)
-    Lines ``NAME: value``, then one sample per line. Format description: ITACA development team, "DYNA 1.0".
-miniSEED, SAC, GSE2
-    Read by the package obspy.
+* PEER AT2: header lines with NPTS and DT, then free-format samples.
+* CSMIP V2: per channel 25 lines of text, integers, 100 reals in columns of 10, and blocks of acceleration, velocity and
+  displacement, each after a line ``3000 POINTS OF ACCEL DATA EQUALLY SPACED AT  .020 SEC.  (UNITS: CM/SEC/SEC)``.
+* CSMIP V1: per channel 13 lines of text, 100 integers in columns of 5, 50 reals in columns of 10 (the third is the
+  length [s], the seventh the peak [g]), then ``13200 Accelerogram points at 200 pts/sec in units of g.  Format:
+  (8f9.6)`` and samples, or pairs of a time [s] and a sample in columns of 7, with the unit in the text.
+* COSMOS V1 and V2 (1.20): headers that state their length and Fortran format, then
+  ``42000 acceleration pts, approx  210 secs, units=cm/sec2(04),Format=(1E15.6)``. All three end a channel with ``/&``.
+* USGS SMC (U.S. Geological Survey, "SMC-format data files", ``smcfmt.html``): 11 lines of text, 48 integers in columns
+  of 10, 50 reals in columns of 15, comments with ``|``, samples in columns of 10 [cm/s²]; times [s] alternate with
+  samples where the number of samples per second is missing.
+* GeoNet V1A, V2A (W. J. Cousins, 2008, "GNS accelerogram data files, standard format"): per component 16 lines of text,
+  40 integers, 60 reals, accelerations [mm/s²], and in V2A velocities and displacements, all in columns of 8.
+* K-NET, KiK-net (NIED, "About K-NET ASCII format"): 17 lines of names and values, then counts, which are multiplied by
+  the stated factor. The mean is subtracted, as in the stated peak.
+* ESM, ITACA (DYNA 1.x): lines ``NAME: value``, then one sample per line.
+* miniSEED, SAC, GSE2: read by the package obspy.
 """
 
 import codecs
@@ -65,11 +51,9 @@ from .tables import (
     is_clock,
     is_number,
     number_cells,
-    parse_count,
     parse_number,
     read_bytes,
     read_statements,
-    read_text,
 )
 
 __all__ = ["Found", "Series", "find_channels", "read_series", "recognise"]
@@ -91,7 +75,7 @@ class Series(NamedTuple):
 class Found(NamedTuple):
     """One acceleration in a file that may hold several."""
 
-    channel: int | str | None  # number at the station, or direction
+    channel: int | str | None  # number at the station, or direction; None for the only one
     label: str
     file: str  # with the archive
     parse: Callable[[], Series]
@@ -105,10 +89,10 @@ def read_series(
     ValueError if there are several, which lists them. A text for V2 files is a number too, or the end of a file's name.
     """
     if form in _SINGLE:
-        series = _SINGLE[form](read_text(path), str(path))
+        series = _SINGLE[form](_text(path), str(path))
         return series._replace(name=Path(path).name) if form == "knet" else series  # the ending is the direction
     if form == "obspy":
-        return parse_obspy(path, channel, inventory)
+        return _parse_obspy(path, channel, inventory)
     if form == "v2" and isinstance(channel, str):
         channel, member = (int(channel), member) if channel.isdecimal() else (None, channel)
     candidates = find_channels(path, form, member)
@@ -125,6 +109,10 @@ def read_series(
     return series._replace(name=series.title, file=file, source=source)
 
 
+def _text(path: str | Path) -> str:
+    return decode_text(read_bytes(path)).rstrip("\0\x1a")
+
+
 # which format ---------------------------------------------------------------------------------------------------------
 
 _LOOK = 40  # lines in which a format is recognised
@@ -135,12 +123,10 @@ def recognise(path: str | Path) -> tuple[str, str | None]:
     content, encoding = read_bytes(path), "latin-1"  # of binary files, one letter per byte
     if zipfile.is_zipfile(io.BytesIO(content)):
         return "zip", "v2"
-    for mark, name in (
-        (codecs.BOM_UTF8, "utf-8-sig"),
-        (codecs.BOM_UTF16_LE, "utf-16"),
-        (codecs.BOM_UTF16_BE, "utf-16"),
-    ):
-        encoding = name if content.startswith(mark) else encoding
+    if content.startswith(codecs.BOM_UTF8):
+        encoding = "utf-8-sig"
+    elif content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        encoding = "utf-16"
     text = content[:8000].decode(encoding, errors="replace")
     lines = LINE_END.sub("\n", text).splitlines()
     return ("", None) if _is_table(lines) else _form_of(lines[:_LOOK], text)
@@ -196,6 +182,9 @@ def _form_of(lines: list[str], text: str) -> tuple[str, str | None]:
 
 # numbers in Fortran columns -------------------------------------------------------------------------------------------
 
+_FORMAT = re.compile(r"\(\s*(\d*)\s*[a-z](\d+)\.\d+[^)]*\)$", re.IGNORECASE)
+_WIDEST = 1000
+
 
 class Block(NamedTuple):
     """Lines of a file, or of one channel in it. The form of a block of columns is (numbers per line, width)."""
@@ -246,21 +235,17 @@ class Block(NamedTuple):
             raise ValueError(f"{self.where(start)}: the file announces {count} samples but has more after them")
         return np.array(values)
 
-    def form_at_the_end_of(self, place: int) -> tuple[int, int] | None:
-        """The Fortran format at the end of a line; None without one."""
-        stated = _FORMAT.search(self.lines[place].rstrip()[-100:])
-        if stated is None:
-            return None
-        form = parse_count(stated[1] or "1", self.where(place)), parse_count(stated[2], self.where(place))
+    def form_at_the_end_of(self, place: int) -> tuple[int, int]:
+        """The Fortran format at the end of a line; ValueError without one."""
+        line = self.lines[place].rstrip()
+        stated = _FORMAT.search(line[-100:])
+        form = (int(stated[1][:9] or 1), int(stated[2][:9])) if stated else (0, 0)
         if not all(0 < each <= _WIDEST for each in form):
             raise ValueError(
-                f"{self.where(place)}: expected a format of 1 to {_WIDEST} numbers and columns, got {stated[0]!r}"
+                f"{self.where(place)}: expected a Format such as (8F10.5) of 1 to {_WIDEST} numbers and columns, got "
+                f"{line!r}"
             )
         return form
-
-
-_FORMAT = re.compile(r"\(\s*(\d*)\s*[a-z](\d+)\.\d+[^)]*\)$", re.IGNORECASE)
-_WIDEST = 1000
 
 
 def _check_peak(found: float, stated: float, tolerance: float, where: str) -> None:
@@ -270,6 +255,15 @@ def _check_peak(found: float, stated: float, tolerance: float, where: str) -> No
             f"{where}: the header states a peak of {stated:g}, the samples have {found:g}; the file is damaged, or of "
             "another form than the one that is read here"
         )
+
+
+def _check_step(dt: float, where: str, stated: str | None = None) -> float:
+    """The step [s] in a header; ValueError if it is not positive, or the text `stated` another one."""
+    if not dt > 0.0:
+        raise ValueError(f"{where}: expected the time step [s] in the header, got {dt:g}")
+    if stated is not None and abs(dt - float(stated)) > 0.51e-3:  # texts have three decimals
+        raise ValueError(f"{where}: the step is {stated} s in the text but {dt:g} s in the header; the file is damaged")
+    return dt
 
 
 def _whole(number: float, file: str, what: str) -> int:
@@ -283,17 +277,15 @@ def _largest(values: NDArray[np.float64]) -> float:
     return float(np.abs(values).max())
 
 
-def _without_repeated_times(
-    times: NDArray[np.float64], values: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], str]:
-    """Times and samples of a digitised record with the mean of the samples of equal times, and what was done.
+def _uneven(title: str, unit: str, times: NDArray[np.float64], values: NDArray[np.float64]) -> Series:
+    """A digitised record with the mean of the samples of equal times.
 
     Such samples are closer to each other than the printed digits of their times show. Times that decrease stay.
     """
     first = np.concatenate([[True], np.diff(times) != 0.0])
     number = np.cumsum(first) - 1
-    note = "" if first.all() else f", mean of samples of equal times ({int((~first).sum())})"
-    return times[first], np.bincount(number, weights=values) / np.bincount(number), note
+    title += "" if first.all() else f", mean of samples of equal times ({int((~first).sum())})"
+    return Series(title, math.nan, unit, np.bincount(number, weights=values) / np.bincount(number), times[first])
 
 
 # PEER -----------------------------------------------------------------------------------------------------------------
@@ -306,7 +298,7 @@ _SECONDS = frozenset({"", "s", "sec", "secs", "second", "seconds"})
 _UNITS_OF = re.compile(r"UNITS?\s*(?:OF|ARE|IS|:|=)\s*[(\[]?\s*([^\s,;()\[\]]+?)[)\]]?[.]?(?=[\s,;]|$)", re.IGNORECASE)
 
 
-def parse_at2(text: str, file: str) -> Series:
+def _parse_at2(text: str, file: str) -> Series:
     """The samples of a PEER AT2 file, in the new or old form of its header."""
     lines = text.splitlines()
     index, stated = next(((i, found) for i, line in enumerate(lines) if (found := _at2_header(line))), (None, None))
@@ -319,10 +311,8 @@ def parse_at2(text: str, file: str) -> Series:
     rows = [(number, row) for number, row in enumerate(lines[index + 1 :], index + 2) if row.strip()]
     while rows and re.search("[A-Za-z]{3}", rows[-1][1]) and not any(map(is_number, rows[-1][1].split())):
         rows.pop()  # a closing remark in any words: the number of samples is stated
-    cells = [(f"{file}, line {number}", cell) for number, row in rows for cell in number_cells(row)]
-    values = [parse_number(cell, where) for where, cell in cells]
-    where = f"{file}: NPTS in line {index + 1}"
-    check_count(len(values), parse_count(stated[0], where), where)
+    values = [parse_number(cell, f"{file}, line {number}") for number, row in rows for cell in number_cells(row)]
+    check_count(len(values), stated[0], f"{file}: NPTS in line {index + 1}")
     if stated[2].lower() not in _SECONDS:
         raise ValueError(
             f"{file}, line {index + 1}: expected DT in seconds, such as 'DT= .0100 SEC', got {stated[1]} {stated[2]}; "
@@ -342,14 +332,15 @@ def _at2_header(line: str) -> tuple[str, str, str] | None:
 
 # CSMIP and COSMOS -----------------------------------------------------------------------------------------------------
 
-_CSMIP_DATA = re.compile(rf"^\s*(\d+)\s+points\s+of\s+accel\s+data\s+equally\s+spaced\s+at\s*({NUMBER})", re.IGNORECASE)
+_COUNT = r"^\s*(\d{1,12})\s+"
+_CSMIP_DATA = re.compile(rf"{_COUNT}points\s+of\s+accel\s+data\s+equally\s+spaced\s+at\s*({NUMBER})", re.IGNORECASE)
 _CSMIP_UNITS = re.compile(r"units:\s*([^\s)]+)|\bin\s+([^\s.,]+)", re.IGNORECASE)
-_COSMOS_DATA = re.compile(r"^\s*(\d+)\s+acceleration\s+pts\b.*?units\s*=\s*([^\s,(]+)", re.IGNORECASE)
-_COSMOS_REALS = re.compile(r"^\s*(\d+)\s+real-header\s+values\s+follow\s+on\s+(\d+)\s+lines", re.IGNORECASE)
+_COSMOS_DATA = re.compile(rf"{_COUNT}acceleration\s+pts\b.*?units\s*=\s*([^\s,(]+)", re.IGNORECASE)
+_COSMOS_REALS = re.compile(rf"{_COUNT}real-header\s+values\s+follow\s+on\s+(\d+)\s+lines", re.IGNORECASE)
 _END = re.compile(r"^\s*(/&|end-of-data)", re.IGNORECASE)
 _V1_FIRST = re.compile(r"\s*uncorrected accelerogram", re.IGNORECASE)
 _V1_DATA = re.compile(
-    rf"^\s*(\d+)\s+accelerogram\s+points\s+at\s*({NUMBER})\s*pts/sec\s+in\s+units\s+of\s+(\S+?)\s*\.", re.IGNORECASE
+    rf"{_COUNT}accelerogram\s+points\s+at\s*({NUMBER})\s*pts/sec\s+in\s+units\s+of\s+(\S+?)\s*\.", re.IGNORECASE
 )
 _V1_UNITS = re.compile(r"units\s+of\s+uncor\s+\w+\s+are\s+sec\s+and\s+(g/10|g)\b", re.IGNORECASE)
 _V1_TEXT, _V1_INTEGERS, _V1_REALS, _V1_PAIRS = 13, (16, 5), (8, 10), (10, 7)  # lines; forms of blocks
@@ -371,24 +362,23 @@ _ZIP_DAMAGE = (zipfile.BadZipFile, RuntimeError, NotImplementedError, OSError, E
 
 
 def find_channels(path: str | Path, form: str, member: str | None = None) -> list[Found]:
-    """The accelerations in a file, or in the V2, else V1 files of an archive; numbers and names only of several."""
+    """The accelerations in a file, or in the V2, else V1 files of an archive."""
     if form in _SINGLE or form == "obspy":
-        return [Found(None, Path(path).name, str(path), lambda: read_series(path, form, None, None, None))]
+        return [Found(None, Path(path).name, str(path), partial(read_series, path, form, None, None, None))]
     if form == "geonet":
-        return parse_geonet(read_text(path), str(path))
+        return _parse_geonet(_text(path), str(path))
     content = read_bytes(path)
     files = [(str(path), content)]
     if zipfile.is_zipfile(io.BytesIO(content)):
         files = list(dict.fromkeys(_unzip(content, str(path), str(path), [_MOST_FILES, _LARGEST_CONTENT])))
+
+    def ending(*ends: str) -> list[tuple[str, bytes]]:
+        return [(name, data) for name, data in files if name.lower().endswith(ends)]
+
     if member is not None:
-        exact = [(name, data) for name, data in files if name == f"{path}/{member}"]
-        files = exact or [(name, data) for name, data in files if name.lower().endswith(member.lower())]
+        files = [each for each in files if each[0] == f"{path}/{member}"] or ending(member.lower())
     elif len(files) > 1:  # corrected acceleration, if there is any
-        corrected, raw = (
-            [(name, data) for name, data in files if name.lower().endswith(ends)]
-            for ends in ((".v2", ".v2c"), (".v1", ".v1c"))
-        )
-        files = corrected or raw
+        files = ending(".v2", ".v2c") or ending(".v1", ".v1c")
     channels = [channel for name, data in files for channel in _split_v2(decode_text(data), name)]
     if not channels:
         raise ValueError(
@@ -396,7 +386,7 @@ def find_channels(path: str | Path, form: str, member: str | None = None) -> lis
             f"...', 'N acceleration pts ...' or 'Uncorrected accelerogram', found none in {len(files)} file(s)"
             + (f" named {member!r}" if member else "")
         )
-    found = [Found(each.channel, each.label, each.file, partial(parse_v2, each)) for each in channels]
+    found = [Found(each.channel, each.label, each.file, partial(_parse_v2, each)) for each in channels]
     return sorted(found, key=lambda each: (each.channel is None, each.channel or 0))
 
 
@@ -440,12 +430,12 @@ def _split_v2(text: str, file: str) -> list[Block]:
         block = lines[first : index + (not end)]
         if _is_v1(block) or any(_CSMIP_DATA.match(each) or _COSMOS_DATA.match(each) for each in block):
             head = "\n".join(block[:25])
-            number = re.search(r"STA CHN:\s*(\d+)", head, re.IGNORECASE)
-            label = re.search(r"^\s*(?:STA )?CHAN\s*(\d+|\?)\s*:[^\n]*", head, re.IGNORECASE | re.MULTILINE)
+            number = re.search(r"STA CHN:\s*(\d{1,12})", head, re.IGNORECASE)
+            label = re.search(r"^\s*(?:STA )?CHAN\s*(\d{1,12}|\?)\s*:[^\n]*", head, re.IGNORECASE | re.MULTILINE)
             if number is None and label is not None and label[1] != "?":
                 number = label
             title = re.sub(r"\s+", " ", label[0]).strip() if label else Path(file).name
-            channels.append(Block(file, block, first + 1, parse_count(number[1], file) if number else None, title))
+            channels.append(Block(file, block, first + 1, int(number[1]) if number else None, title))
         first = index + 1
     return channels
 
@@ -456,69 +446,51 @@ def _is_v1(lines: list[str]) -> bool:
     return first and not any(map(_CSMIP_DATA.match, lines))
 
 
-def parse_v2(block: Block) -> Series:
+def _parse_v2(block: Block) -> Series:
     """The acceleration of one channel."""
-    where, lines = block.file, block.lines
+    lines = block.lines
     if _is_v1(lines):
         return _parse_v1(block)
     index = next(i for i, line in enumerate(lines) if _CSMIP_DATA.match(line) or _COSMOS_DATA.match(line))
-    line = lines[index]
-    if re.match(r"\s*raw", lines[0], re.IGNORECASE):
+    line, where = lines[index], block.where(index)
+    if re.match(r"\s*raw", lines[0], re.IGNORECASE) or _V1_FIRST.match(lines[0]):
         raise ValueError(
-            f"{where}: expected acceleration, got {lines[0].strip()!r}, counts of a recorder; take V1 or V2"
+            f"{block.file}: expected acceleration in the form of V2, got {lines[0].strip()!r}; counts of a recorder "
+            "are not read: take V1 or V2"
         )
-    if _V1_FIRST.match(lines[0]):
-        raise ValueError(f"{where}: expected corrected acceleration in this form, got {lines[0].strip()!r}")
-    form = block.form_at_the_end_of(index)
     if csmip := _CSMIP_DATA.match(line):
         units = _CSMIP_UNITS.search(line, csmip.end())
-        unit, form = units and (units[1] or units[2]), form or _CSMIP_FORM
-        dt = _header_step(block, index - math.ceil(_CSMIP_REALS / _CSMIP_FORM[0]), _CSMIP_FORM, _CSMIP_DT)
-        # The data line has the step with three decimals only, the real header may have more.
-        if abs(dt - float(csmip[2])) > 0.51e-3:
-            raise ValueError(
-                f"{block.where(index)}: the step is {csmip[2]} s here but {dt} s in the real header; correct one"
-            )
-        if unit is None:
-            raise ValueError(f"{block.where(index)}: expected the unit of acceleration in {line.strip()!r}")
+        if units is None:
+            raise ValueError(f"{where}: expected the unit of acceleration in {line.strip()!r}")
+        unit, form = (
+            units[1] or units[2],
+            block.form_at_the_end_of(index) if _FORMAT.search(line.rstrip()) else _CSMIP_FORM,
+        )
+        start = index - math.ceil(_CSMIP_REALS / _CSMIP_FORM[0])
+        # the data line has the step with three decimals only, the real header may have more
+        dt = _check_step(float(block.field(start, _CSMIP_FORM, _CSMIP_DT)), where, csmip[2])
     else:
-        unit = _COSMOS_DATA.match(line)[2]
+        unit, form = _COSMOS_DATA.match(line)[2], block.form_at_the_end_of(index)
         header = next((i for i in range(index) if _COSMOS_REALS.match(lines[i])), None)
-        header_form = block.form_at_the_end_of(header) if header is not None else None
-        if header_form is None:
+        if header is None:
             raise ValueError(f"{where}: expected a line 'N Real-header values follow on N lines, Format= (5F15.6)'")
-        if form is None:
-            raise ValueError(f"{block.where(index)}: expected a Format such as (8F10.5) in {line!r}")
-        dt = _header_step(block, header + 1, header_form, _COSMOS_DT)
-    count = parse_count((csmip or _COSMOS_DATA.match(line))[1], block.where(index))
-    values = block.samples(index + 1, count, form)
+        dt = _check_step(float(block.field(header + 1, block.form_at_the_end_of(header), _COSMOS_DT)), where)
+    values = block.samples(index + 1, int((csmip or _COSMOS_DATA.match(line))[1]), form)
     if csmip:
         decimals = decimals_of(lines[index + 1][: form[1]].strip())
-        check_peaks(read_statements(lines[:_V2_TEXT]).peaks, ("",), 0, values, decimals, unit, where)
+        check_peaks(read_statements(lines[:_V2_TEXT]).peaks, ("",), 0, values, decimals, unit, block.file)
     uncorrected = ", uncorrected" if re.match(r"\s*uncorrected", lines[0], re.IGNORECASE) else ""
     return Series(block.label + uncorrected, dt, unit, values)
 
 
-def _header_step(block: Block, start: int, form: tuple[int, int], place: int) -> float:
-    """The time step at a position, from 0, of a real header."""
-    value = float(block.field(start, form, place))
-    if not value > 0:
-        raise ValueError(
-            f"{block.where(start)}: number {place + 1} of the real header must be the time step [s], got {value}"
-        )
-    return value
-
-
 def _parse_v1(block: Block) -> Series:
     """The uncorrected acceleration of one channel: at a constant rate, or with times."""
-    where, line = block.file, block.lines[_V1_HEADER]
+    where, line, times = block.file, block.lines[_V1_HEADER], None
     length, peak = (block.field(_V1_REAL_START, _V1_REALS, place) for place in (_V1_LENGTH, _V1_PEAK))
-    times, note = None, ""
     if match := _V1_DATA.match(line):
-        dt, unit, form = 1.0 / float(match[2]), match[3], block.form_at_the_end_of(_V1_HEADER)
-        if form is None or not 0.0 < dt < math.inf:
-            raise ValueError(f"{block.where(_V1_HEADER)}: expected a rate and a Format in {line!r}")
-        count = parse_count(match[1], where)
+        unit, rate, count = match[3], float(match[2]), int(match[1])
+        dt = _check_step(1.0 / rate if rate else 0.0, block.where(_V1_HEADER))
+        form = block.form_at_the_end_of(_V1_HEADER)
         values = block.samples(_V1_HEADER + 1, count, form)
         if abs(count * dt - float(length)) > 2.0 * dt:
             raise ValueError(
@@ -530,7 +502,7 @@ def _parse_v1(block: Block) -> Series:
         if found is None:
             raise ValueError(f"{where}: expected 'Units of uncor data are sec and g' or 'g/10' in {_V1_TEXT} lines")
         unit, width = found[1], _V1_PAIRS[1]
-        count = parse_count(block.field(_V1_TEXT, _V1_INTEGERS, _V1_COUNT), where)
+        count = _whole(float(block.field(_V1_TEXT, _V1_INTEGERS, _V1_COUNT)), where, "samples")
         pairs = block.samples(_V1_HEADER, 2 * count, _V1_PAIRS)
         times, values, printed = pairs[::2], pairs[1::2], line[width : 2 * width]
         dt, digit = float(times[-1] - times[0]) / max(count - 1, 1), 10.0 ** -decimals_of(line[:width].strip())
@@ -542,31 +514,28 @@ def _parse_v1(block: Block) -> Series:
         unit = "g" if scale == 0.1 else unit
         rounding = 0.505 * (scale * 10.0 ** -decimals_of(printed.strip()) + 10.0 ** -decimals_of(peak))
         _check_peak(scale * _largest(values), abs(float(peak)), rounding, where)
-    if times is not None:
-        dt, (times, values, note) = math.nan, _without_repeated_times(times, values)
-    return Series(f"{block.label}, uncorrected{note}", dt, unit, scale * values, times)
+    title = f"{block.label}, uncorrected"
+    return Series(title, dt, unit, scale * values) if times is None else _uneven(title, unit, times, scale * values)
 
 
 # USGS and GeoNet ------------------------------------------------------------------------------------------------------
 
 _SMC_NULL = 1.6e38  # larger reals stand for missing values
-_SMC_TYPES = {"1": "UNCORRECTED ACCELEROGRAM", "2": "CORRECTED ACCELEROGRAM"}
+_SMC_TYPES = ("1 UNCORRECTED ACCELEROGRAM", "2 CORRECTED ACCELEROGRAM")
 _SMC_TEXT, _SMC_INTEGERS, _SMC_REALS, _SMC_DATA = 11, (8, 10), (5, 15), (8, 10)
-_GEONET_TEXT, _GEONET_HEADERS, _GEONET_DATA, _MOST_COMPONENTS = 16, (10, 8), (10, 8), 100
+_GEONET_TEXT, _GEONET_FORM, _MOST_COMPONENTS = 16, (10, 8), 100
 _GEONET_PEAK = re.compile(rf"Acceleration:\s*peak\s*({NUMBER})\s*mm/s/s", re.IGNORECASE)
 _GEONET_STEP = re.compile(rf"\bat\s+(?:intervals\s+of\s+)?({NUMBER})\s*s", re.IGNORECASE)
 _GEONET_UNIT = re.compile(rf"in\s+units\s+of\s+({NUMBER})\s*mm/s/s", re.IGNORECASE)
 
 
-def parse_smc(text: str, file: str) -> Series:
+def _parse_smc(text: str, file: str) -> Series:
     """The samples of a USGS SMC file, uncorrected or corrected."""
     block = Block(file, text.splitlines())
-    title = block.lines[0].strip() if block.lines else ""
-    number, _, kind = title.partition(" ")
-    if _SMC_TYPES.get(number) != kind.strip():
+    title = " ".join(block.lines[0].split(maxsplit=1)) if block.lines else ""
+    if title.strip() not in _SMC_TYPES:
         raise ValueError(
-            f"{file}: expected the first line '1 UNCORRECTED ACCELEROGRAM' or '2 CORRECTED ACCELEROGRAM' of an SMC "
-            f"file, got {title[:80]!r}"
+            f"{file}: expected the first line of an SMC file, {' or '.join(_SMC_TYPES)}; got {title[:80]!r}"
         )
     integers, start = block.header(_SMC_TEXT, 48, _SMC_INTEGERS)
     reals, start = block.header(start, 50, _SMC_REALS)
@@ -580,19 +549,17 @@ def parse_smc(text: str, file: str) -> Series:
         )
     if not all(line.startswith("|") for line in block.lines[start : start + comments]):
         raise ValueError(f"{file}: expected {comments} comment lines that start with '|'; the file is damaged")
-    values, times, note = block.samples(start + comments, count, _SMC_DATA), None, ""
-    if uneven:
-        times, values = values[::2], values[1::2]
+    numbers = block.samples(start + comments, count, _SMC_DATA)
+    values = numbers[1::2] if uneven else numbers
     for stated, found in ((highest, values.max()), (lowest, values.min())):
         if abs(stated) < _SMC_NULL:
             _check_peak(found, stated, 2e-4 * _largest(values), file)
-    if uneven:
-        times, values, note = _without_repeated_times(times, values)
     station = next((line.strip() for line in block.lines[2:_SMC_TEXT] if line.startswith("station")), title)
-    return Series(re.sub(r"\s+", " ", station) + note, math.nan if uneven else 1.0 / rate, "cm/s2", values, times)
+    station = re.sub(r"\s+", " ", station)
+    return _uneven(station, "cm/s2", numbers[::2], values) if uneven else Series(station, 1.0 / rate, "cm/s2", values)
 
 
-def parse_geonet(text: str, file: str) -> list[Found]:
+def _parse_geonet(text: str, file: str) -> list[Found]:
     """The components of a GeoNet V1A or V2A file, with directions such as ``"S16W"`` or ``"Up"``."""
     block, place, found = Block(file, text.splitlines()), 0, []
     while any(line.strip() for line in block.lines[place : place + 3]):
@@ -609,30 +576,27 @@ def _geonet_component(block: Block, place: int) -> tuple[str, Series, int]:
     """Direction and samples of one component, and the line after it."""
     lines, where = block.lines, block.where(place)
     head = "\n".join(lines[place : place + _GEONET_TEXT])
-    if not re.match(r"\s*(un)?corrected accelerogram", head, re.IGNORECASE):
-        raise ValueError(
-            f"{where}: expected 'Corrected accelerogram' or 'Uncorrected accelerogram', the first line of a component "
-            f"of a GeoNet file, got {lines[place][:80]!r}"
-        )
+    first = re.match(r"\s*(un)?corrected accelerogram", head, re.IGNORECASE)
     peak, component = _GEONET_PEAK.search(head), re.search(r"^Component\s+(\S+)", head, re.MULTILINE)
     step = next((match for line in head.splitlines()[10:12] if (match := _GEONET_STEP.search(line))), None)
-    if peak is None or component is None or step is None:
-        raise ValueError(f"{where}: expected the component, the step and the peak acceleration in {_GEONET_TEXT} lines")
-    integers, start = block.header(place + _GEONET_TEXT, 40, _GEONET_HEADERS)
-    reals, start = block.header(start, 60, _GEONET_HEADERS)
-    counts, dt = [_whole(number, block.file, "samples") for number in integers[33:36]], reals[25]
-    if not dt > 0.0 or abs(dt - float(step[1])) > 0.51e-3:
+    if first is None or peak is None or component is None or step is None:
         raise ValueError(
-            f"{where}: the step is {step[1]} s in the text but {dt:g} s in the header; the file is damaged"
+            f"{where}: expected 'Corrected accelerogram' or 'Uncorrected accelerogram', the first line of a component "
+            f"of a GeoNet file, and component, step and peak acceleration in {_GEONET_TEXT} lines; got "
+            f"{lines[place][:80]!r}"
         )
+    integers, start = block.header(place + _GEONET_TEXT, 40, _GEONET_FORM)
+    reals, start = block.header(start, 60, _GEONET_FORM)
+    counts, dt = [_whole(number, block.file, "samples") for number in integers[33:36]], reals[25]
+    _check_step(dt, where, step[1])
     unit = _GEONET_UNIT.search(head)
     scale = float(unit[1]) if unit else 1.0
-    values = scale * block.samples(start, counts[0], _GEONET_DATA, last=False)
+    values = scale * block.samples(start, counts[0], _GEONET_FORM, last=False)
     # the peak is rounded to the digits that are printed; the samples are rounded or cut
-    printed = block.field(start, _GEONET_DATA, int(np.argmax(np.abs(values))))
+    printed = block.field(start, _GEONET_FORM, int(np.argmax(np.abs(values))))
     resolution = 1.01 * scale * 10.0 ** -decimals_of(printed) + 0.505 * 10.0 ** -decimals_of(peak[1])
     _check_peak(_largest(values), abs(float(peak[1])), resolution, where)
-    end = start + sum(math.ceil(count / _GEONET_DATA[0]) for count in counts)
+    end = start + sum(math.ceil(count / _GEONET_FORM[0]) for count in counts)
     if end > len(lines):
         raise ValueError(f"{where}: expected {sum(counts)} numbers up to line {end}; the file is truncated")
     site = re.search(r"^Site\s+(\S+)", head, re.MULTILINE)
@@ -660,12 +624,12 @@ def _samples_below(lines: list[str], start: int, file: str) -> NDArray[np.float6
     return np.array([parse_number(field, f"{file}, line {k}") for k, field in fields])
 
 
-def parse_knet(text: str, file: str) -> Series:
+def _parse_knet(text: str, file: str) -> Series:
     """The samples of a K-NET or KiK-net file, without their mean."""
     lines = text.splitlines()
-    header = {line[:_KNET_NAME].strip().rstrip("."): line[_KNET_NAME:].strip() for line in lines[:_KNET_TEXT]}
-    names = ("Station Code", "Sampling Freq(Hz)", "Duration Time(s)", "Dir", "Scale Factor")
-    station, frequency, duration, direction, factor = _stated(header, names, file, "a K-NET")
+    header = {line[:_KNET_NAME].replace(".", "").strip(): line[_KNET_NAME:].strip() for line in lines[:_KNET_TEXT]}
+    names = ("Station Code", "Sampling Freq(Hz)", "Duration Time(s)", "Dir", "Scale Factor", "Max Acc (gal)")
+    station, frequency, duration, direction, factor, peak = _stated(header, names, file, "a K-NET")
     rate = parse_number(re.sub(r"\s*hz$", "", frequency, flags=re.IGNORECASE), f"{file}, Sampling Freq")
     scale = _KNET_SCALE.match(factor)
     if scale is None or not float(scale[2]) > 0.0 or not rate > 0.0:
@@ -678,17 +642,12 @@ def parse_knet(text: str, file: str) -> Series:
     check_count(counts.size, expected, f"{file}: frequency times duration")
     # "(gal)/1048.2" means 1 gal; the stated peak is compared below
     values = (counts - counts.mean()) * (float(scale[1] or 1.0) / float(scale[2]))
-    stated = next(
-        (header[name] for name in ("Max. Acc. (gal)", "Max Acc. (gal)", "Max. Acc (gal)") if name in header), None
-    )
-    if stated is None:
-        raise ValueError(f"{file}: expected a header line 'Max. Acc. (gal)'")
-    peak = parse_number(stated, f"{file}, Max. Acc.")
-    _check_peak(_largest(values), peak, 2e-3 * abs(peak) + 2e-3, file)
+    stated = parse_number(peak, f"{file}, Max. Acc.")
+    _check_peak(_largest(values), stated, 2e-3 * abs(stated) + 2e-3, file)
     return Series(f"{station}, channel {direction}, mean subtracted", 1.0 / rate, "gal", values)
 
 
-def parse_esm(text: str, file: str) -> Series:
+def _parse_esm(text: str, file: str) -> Series:
     """The samples of an ESM or ITACA file."""
     lines, header = text.splitlines(), {}
     for line in lines[:_ESM_TEXT]:
@@ -700,9 +659,7 @@ def parse_esm(text: str, file: str) -> Series:
     interval, count, unit, kind, station, stream = _stated(header, names, file, "an ESM or ITACA")
     if kind.upper() != "ACCELERATION":
         raise ValueError(f"{file}: expected acceleration, got DATA_TYPE {kind!r}; take the ACC file")
-    dt = parse_number(interval, f"{file}, SAMPLING_INTERVAL_S")
-    if not dt > 0.0:
-        raise ValueError(f"{file}: expected a positive SAMPLING_INTERVAL_S, got {dt:g}")
+    dt = _check_step(parse_number(interval, f"{file}, SAMPLING_INTERVAL_S"), f"{file}, SAMPLING_INTERVAL_S")
     values, where = _samples_below(lines, len(header), file), f"{file}: NDATA"
     check_count(values.size, _whole(parse_number(count, where), file, "samples"), where)
     if (stated := header.get("PGA_CM/S^2")) and values.size:
@@ -712,12 +669,15 @@ def parse_esm(text: str, file: str) -> Series:
     return Series(f"{header.get('NETWORK', '')}.{station} {stream}", dt, unit, values)
 
 
+_SINGLE = {"at2": _parse_at2, "smc": _parse_smc, "knet": _parse_knet, "esm": _parse_esm}
+"""Parsers of formats with one acceleration."""
+
 # seismology -----------------------------------------------------------------------------------------------------------
 
 _NO_ACCELERATION = {6: "displacement", 7: "velocity"}  # IDEP in a SAC header
 
 
-def parse_obspy(path: str | Path, channel: str | None, inventory: str | Path | None = None) -> Series:
+def _parse_obspy(path: str | Path, channel: str | None, inventory: str | Path | None = None) -> Series:
     """The samples of one trace in a miniSEED, SAC or GSE2 file, in m/s2 with the `inventory` of its recorder."""
     try:
         import obspy
@@ -767,7 +727,3 @@ def parse_obspy(path: str | Path, channel: str | None, inventory: str | Path | N
     dt = 1.0 / rate if rate and abs(rate * trace.stats.delta - 1.0) < 1e-6 else trace.stats.delta
     unit = None if inventory is None else "m/s2"
     return Series(trace.id, float(dt), unit, np.asarray(trace.data, dtype=np.float64), name=trace.id)
-
-
-_SINGLE = {"at2": parse_at2, "smc": parse_smc, "knet": parse_knet, "esm": parse_esm}
-"""Parsers of formats with one acceleration."""

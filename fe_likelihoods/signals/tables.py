@@ -48,12 +48,10 @@ __all__ = [
     "is_clock",
     "is_number",
     "number_cells",
-    "parse_count",
     "parse_number",
     "read_bytes",
     "read_statements",
     "read_table",
-    "read_text",
     "row_times",
     "stated_unit",
     "table_start",
@@ -62,7 +60,6 @@ __all__ = [
     "text_unit",
     "uniform_times",
     "unit_in_name",
-    "value_column",
     "value_columns",
 ]
 
@@ -75,7 +72,6 @@ LINE_END = re.compile(r"\r+\n|\r")
 """Regular expression for the end of a line with a carriage return, or two in a text that was transferred twice."""
 
 _LARGEST_FILE = 256 * 2**20  # bytes of a text file or an archive; long records have some MiB
-_UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 # What editors and transfers add after the last line: blank lines, ^Z (the end of a text in DOS), zero bytes as padding
 _PADDING = " \t\n\f\0\x1a"
 _CLOSING = re.compile(r"[^\d,;\t]{0,80}(?<![A-Za-z])(?:end|eof)[^\d,;\t]{0,80}", re.IGNORECASE)  # *** End data ***
@@ -100,8 +96,9 @@ def decode_text(content: bytes) -> str:
     It is UTF-8 or UTF-16 with a byte-order mark, UTF-8 where it is valid, else Latin-1. Zero bytes directly after a
     number are kept, so that this number is refused: a table that a crash has cut may have lost its last digits.
     """
+    wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     try:
-        text = content.decode("utf-8-sig") if not content.startswith(_UTF_16) else content.decode("utf-16", "replace")
+        text = content.decode("utf-16", "replace") if wide else content.decode("utf-8-sig")
     except UnicodeDecodeError:
         text = content.decode("latin-1")
     text = LINE_END.sub("\n", text)
@@ -112,11 +109,6 @@ def decode_text(content: bytes) -> str:
         if not _CLOSING.fullmatch(text, start):
             return text
         text = text[:start]
-
-
-def read_text(path: str | Path) -> str:
-    """The text of a file in a format that states its number of samples; ValueError if it cannot be read."""
-    return decode_text(read_bytes(path)).rstrip("\0\x1a")
 
 
 def number_cells(line: str) -> list[str]:
@@ -165,18 +157,11 @@ def parse_number(field: str, where: str) -> float:
     return value
 
 
-def parse_count(digits: str, where: str) -> int:
-    """A number of samples, channels or columns; ValueError for more than 12 digits."""
-    if len(digits) > 12:
-        raise ValueError(f"{where}: expected a count, got a number with {len(digits)} digits")
-    return int(digits)
-
-
-def check_count(found: int, stated: int, where: str, advice: str = "") -> None:
+def check_count(found: int, stated: str | float, where: str, advice: str = "") -> None:
     """ValueError if a file has another number of samples than it announces."""
-    if found != stated:
+    if found != float(stated):
         raise ValueError(
-            f"{where} announces {stated} samples, the file has {found}; it is truncated or damaged{advice}"
+            f"{where} announces {stated!s:.20} samples, the file has {found}; it is truncated or damaged{advice}"
         )
 
 
@@ -211,7 +196,7 @@ def agree_on_unit(stated: str | None, given: str | None, dimension: str, file: s
         units = [find_unit(name, dimension) for name in names]
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from None
-    if any(unit.factor != units[0].factor for unit in units):
+    if units[0].factor != units[-1].factor:
         raise ValueError(f"{file} states the unit {stated!r} but units = {given!r} was given; correct one of them")
     return units[0].name
 
@@ -281,7 +266,7 @@ class Statements(NamedTuple):
     """What lines state: steps, and the words and values of sample counts, units and peaks."""
 
     steps: tuple[StatedStep, ...] = ()
-    counts: tuple[tuple[str, int], ...] = ()
+    counts: tuple[tuple[str, str], ...] = ()
     units: tuple[tuple[str, str], ...] = ()
     peaks: tuple[StatedPeak, ...] = ()
 
@@ -292,7 +277,7 @@ def read_statements(lines: Sequence[str], decimal_commas: bool = False) -> State
     for line in lines:
         line = re.sub(r"(?<=\d),(?=\d)", ".", line[:_LONGEST]) if decimal_commas else line[:_LONGEST]
         steps += [_stated_step(found, form is _RATE) for form in (_STEP, _RATE) for found in form.finditer(line)]
-        counts += [(found[0], parse_count(found[1] or found[2], found[0][:60])) for found in _COUNT.finditer(line)]
+        counts += [(found[0][:60], found[1] or found[2]) for found in _COUNT.finditer(line)]
         units += [(found[0], found[1]) for found in _UNIT_LINE.finditer(line)]
         units += [(each[0], each[1]) for each in _UNITS_ARE.finditer(line) if dimension_of(each[1]) == "acceleration"]
         peaks += [_stated_peak(found) for found in _PEAK.finditer(line)]
@@ -395,37 +380,30 @@ def clock_text(clock: ClockTime) -> str:
 
 def _parse_clock(cell: str, where: str) -> ClockTime:
     """The clock time in a cell; ValueError for anything else."""
-    found = _CLOCK.fullmatch(cell)
+    found, got = _CLOCK.fullmatch(cell), f"got {cell[:100]!r}"
     if found is None:
-        raise ValueError(
-            f"{where}: expected a clock time such as '03:19:53.010' or '2019-07-06T03:19:53.010', got {cell[:100]!r}"
-        )
+        raise ValueError(f"{where}: expected a clock time such as '03:19:53.010' or '2019-07-06T03:19:53.010', {got}")
     *_, hour, minute, second, fraction, half, zone = found.groups()
     if not (1 <= int(hour) <= 12 if half else int(hour) <= 24):
         hours = "with AM and PM have hours from 1 to 12" if half else "have hours from 0 to 23"
-        raise ValueError(f"{where}: clock times {hours}; got {cell[:100]!r}")
+        raise ValueError(f"{where}: clock times {hours}; {got}")
     hours = int(hour) % 12 + 12 * (half in ("P", "p")) if half else int(hour)
-    whole = _HOUR * hours + 60 * int(minute) + int(second)
     if zone is not None:  # minutes of a time zone such as +02:00; Z and UTC are zero
         zone = 0 if zone.upper() in ("Z", "UTC") else int(f"{zone[0]}1") * (60 * int(zone[1:3]) + int(zone[-2:]))
-    day = None if found["first"] is None else _day_number(found, where)
-    return ClockTime(day, float(f"{whole}.{fraction or 0}"), len(fraction or ""), zone, bool(half))
-
-
-def _day_number(found: re.Match[str], where: str) -> int:
-    """Number of the day in a date with the year first, or last after points."""
-    year, day = found["first"], found["last"]
-    if len(year) != 4:
-        if found["mark"] != "." or len(day) != 4:
+    seconds = float(f"{_HOUR * hours + 60 * int(minute) + int(second)}.{fraction or 0}")
+    year, day, number = found["first"], found["last"], None
+    if year is not None:
+        if len(year) != 4 and (found["mark"] != "." or len(day) != 4):
             raise ValueError(
-                f"{where}: expected a date such as 2019-07-06 or 06.07.2019, got {found[0][:100]!r}, which may begin "
-                "with the day or the month; write the year first"
+                f"{where}: expected a date such as 2019-07-06 or 06.07.2019, {got}, which may begin with the day or "
+                "the month; write the year first"
             )
-        year, day = day, year
-    try:
-        return datetime.date(int(year), int(found["month"]), int(day)).toordinal()
-    except ValueError as error:
-        raise ValueError(f"{where}: expected a date, got {found[0][:100]!r} ({error})") from None
+        year, day = (year, day) if len(year) == 4 else (day, year)
+        try:
+            number = datetime.date(int(year), int(found["month"]), int(day)).toordinal()
+        except ValueError as error:
+            raise ValueError(f"{where}: expected a date, {got} ({error})") from None
+    return ClockTime(number, seconds, len(fraction or ""), zone, bool(half))
 
 
 def _seconds_of(times: list[ClockTime | None], file: str) -> list[float]:
@@ -521,12 +499,9 @@ def read_table(
 ) -> Table:
     """Read columns of numbers from a text file, or from the first sheet of an Excel workbook (needs openpyxl).
 
-    `skip` lines are above the table, None finds them; lines with ``#`` are comments. `time` is the name or number of
-    the column of times, by default found; with `time_unit`, the first column of a file without a header line has them.
-    With `along_rows` the numbers are one column, row after row, and the last row may be shorter. Cells of rows with the
-    texts in `missing` are missing samples. The column `labels` (by its name; "": the first one) is text if not all its
-    cells are numbers. ValueError if the file cannot be read, has no rows or rows of different length, a cell that is no
-    finite number, or states another number of samples.
+    Arguments are those of `read_record`; with `along_rows` the numbers are one column, row after row, and the column
+    `labels` ("": the first one) is text if not all its cells are numbers. ValueError if the file cannot be read, has no
+    rows, rows of different length, a cell that is no finite number, or states another number of samples.
     """
     if skip is not None and (isinstance(skip, bool) or not isinstance(skip, int) or skip < 0):
         raise ValueError(f"skip must be a number of lines, zero or more, got {skip!r}")
@@ -544,21 +519,18 @@ def read_table(
     found_marks = _blank(rows, marks)
     along_rows = along_rows and not any("rows" in row for _, row in rows[:_LAST_LINES])
     announced = None if along_rows or stated else _announced(rows, file)
-    if rows and announced is None:
-        _check_names(rows, separator, along_rows, file)
-    if along_rows:
-        rows = _along_rows(rows, file)
-    elif announced:
+    if announced:
         rows, stated = announced
+    elif rows:
+        _check_names(rows, separator, along_rows, file)
+        rows = _along_rows(rows, file) if along_rows else rows
     names, below, rows = _header(rows, file)
     rows, commas = _with_points(rows, separator, file)
     columns, clock = _columns(names, below, rows, file, marks, labels)
     above = [line for number, line in lines if number < rows[0][0]]
     found = read_statements([*comments, *stated, *above], commas)
-    title = "".join([*comments, *stated][:1])
-    table = Table(
-        file, bool(names), columns, tuple(n for n, _ in rows), title, found, clock, None, time_unit, marks=found_marks
-    )
+    title, numbers = "".join([*comments, *stated][:1]), tuple(number for number, _ in rows)
+    table = Table(file, bool(names), columns, numbers, title, found, clock, None, time_unit, marks=found_marks)
     for words, count in found.counts:
         check_count(len(rows), count, f"{file}: {words!r}", f". {_SKIP}")
     if time is None:
@@ -650,8 +622,8 @@ def _known(cell: str) -> bool:
     """Whether a cell is a number in any spelling, a clock time or a date."""
     if _is_missing(cell):
         return False
-    return (
-        is_number(cell) or bool(_DECIMAL_COMMA.match(cell) or _GROUPED.match(cell)) or is_clock(cell) or _is_date(cell)
+    return bool(
+        is_number(cell) or _DECIMAL_COMMA.match(cell) or _GROUPED.match(cell) or is_clock(cell) or _is_date(cell)
     )
 
 
@@ -665,19 +637,12 @@ def _is_text(cells: Sequence[str]) -> bool:
 
 
 def _along_rows(lines: list[_Line], file: str) -> list[_Line]:
-    """One row per number, below lines of text. All lines of numbers but the last one have the same number of them.
+    """One row per number, below lines of text, which have no more numbers than other cells."""
 
-    A line of words with more numbers than other cells is a damaged row and no text.
-    """
-    rows = [
-        *itertools.dropwhile(
-            lambda line: (
-                any(re.search("[A-Za-z]{2}", cell) for cell in line[1])
-                and 2 * sum(map(_known, line[1])) <= len(line[1])
-            ),
-            lines,
-        )
-    ]
+    def is_text(line: _Line) -> bool:
+        return any(re.search("[A-Za-z]{2}", cell) for cell in line[1]) and 2 * sum(map(_known, line[1])) <= len(line[1])
+
+    rows = [*itertools.dropwhile(is_text, lines)]
     for number, cells in rows:
         width = len(rows[0][1])
         if wrong := [cell for cell in cells if not _known(cell)]:
@@ -702,7 +667,7 @@ def _announced(lines: list[_Line], file: str) -> tuple[list[_Line], list[str]] |
     if not all(_known(cell) for _, cells in lines[place + 1 :] for cell in cells):
         return None
     numbers = _along_rows(lines[place + 1 :], file)
-    check_count(len(numbers), parse_count(head[0], file), f"{file}, line {lines[place][0]}")
+    check_count(len(numbers), head[0], f"{file}, line {lines[place][0]}")
     return numbers, [*(" ".join(cells) for _, cells in lines[: min(place, 1)]), f"dt = {head[1]} s"]
 
 
@@ -738,10 +703,10 @@ def _logger_table(lines: list[_Line], file: str) -> tuple[list[_Line], list[str]
     labels = ["", *tags.get("Y_Unit_Label", []), *[""] * width]
     names = ["time [s]" if name == "X_Value" else name for name in header[:width]]
     units = ["s" if name == "X_Value" else label for name, label in zip(header[:width], labels, strict=False)]
-    for k, (_, cells) in enumerate(rows):
+    for k, (line, cells) in enumerate(rows):
         # the text in the column of comments goes; numbers in it show that a row is damaged
         if len(cells) == width + 1 and not any(map(str.isdigit, cells[-1])):
-            rows[k] = rows[k][0], cells[:width]
+            rows[k] = line, cells[:width]
     table = [(number, names), (number, [f"[{unit}]" if unit else "" for unit in units]), *rows]
     if columns != "No":
         return table, []
@@ -819,15 +784,13 @@ def _names(lines: Sequence[_Line], width: int, spare: bool) -> tuple[list[str], 
 def _are_units(cells: Sequence[str]) -> bool:
     """Whether a line below a header line has units: all cells are units, one is a unit of time, or all are in brackets.
 
-    Cells that are no known unit are refused when their column is read. A capital S may be the direction south. A dash
-    or the format of a date says nothing.
+    Cells that are no known unit are refused when their column is read. A capital S may be the direction south.
     """
     given = [cell for cell in cells if cell]
     units = [cell.strip("[]() ") for cell in given if not _states_nothing(cell)]
-    dimensions = [dimension_of(unit) for unit in units]
-    time = any(unit != "S" and dimension == "time" for unit, dimension in zip(units, dimensions, strict=True))
-    known = bool(units) and all(dimensions)
-    return time or known or all(cell[0] + cell[-1] in ("()", "[]") for cell in given)
+    dimensions = [None if unit == "S" else dimension_of(unit) for unit in units]
+    known = bool(units) and all(map(dimension_of, units))
+    return "time" in dimensions or known or all(cell[0] + cell[-1] in ("()", "[]") for cell in given)
 
 
 def _states_nothing(cell: str) -> bool:
@@ -859,6 +822,7 @@ def _with_points(lines: list[_Line], separator: str, file: str) -> tuple[list[_L
     column has no other decimal comma and integers of three digits: then they are refused.
     """
     rows = [(number, ["" if _is_missing(cell) else cell for cell in cells]) for number, cells in lines]
+    alike = "write all numbers alike, without separators of thousands"
 
     def first(fits):
         return next(((number, cell) for number, row in rows for cell in row if fits(cell)), None)
@@ -873,7 +837,7 @@ def _with_points(lines: list[_Line], separator: str, file: str) -> tuple[list[_L
                 elif mark in cell and _known(cell) and not (is_clock(cell) or _is_date(cell)):
                     raise ValueError(
                         f"{file}: {mark!r} separates thousands in {shown[1]!r}, line {shown[0]}, but not in {cell!r}, "
-                        f"line {number}; write all numbers alike, without separators of thousands"
+                        f"line {number}; {alike}"
                     )
     comma = first(_DECIMAL_COMMA.match)
     if comma is None:
@@ -891,7 +855,7 @@ def _with_points(lines: list[_Line], separator: str, file: str) -> tuple[list[_L
     if point := first(lambda cell: "." in cell and is_number(cell)):
         raise ValueError(
             f"{file}: expected decimal points or decimal commas, got {comma[1]!r} in line {comma[0]} and {point[1]!r} "
-            f"in line {point[0]}; write all numbers alike, without separators of thousands"
+            f"in line {point[0]}; {alike}"
         )
     return [(n, [cell.replace(",", ".") if _known(cell) else cell for cell in row]) for n, row in rows], True
 
@@ -911,20 +875,18 @@ def _columns(
     columns, first, lines = [], None, [f"{file}, line {number}" for number, _ in rows]
     for k, cells in enumerate(zip(*(row for _, row in rows), strict=True)):
         filled = [cell for cell in cells if cell]
-        kind, decimals = "number", 0
-        is_label = labels == names[k] or (labels == "" and k == 0) if names else False
+        kind, decimals, values = "number", 0, [math.nan] * len(cells)
+        is_label = names and labels in (names[k], "" if k == 0 else names[k])
         if is_label and not all(map(is_number, filled)):
-            kind, values = "text", [math.nan] * len(cells)
+            kind = "text"
         elif any(map(is_clock, filled)):
             kind = "clock"
             times = [_parse_clock(cell, where) if cell else None for cell, where in zip(cells, lines, strict=True)]
-            values = _seconds_of(times, file)
-            known = [time for time in times if time is not None]
+            values, known = _seconds_of(times, file), [time for time in times if time is not None]
             first, decimals = first or known[0], max(time.decimals for time in known)
         elif filled and all(_is_date(cell) or _is_word(cell) for cell in filled):
-            kind, values = "text", [math.nan] * len(cells)
+            kind = "text"
         else:
-            values = [math.nan] * len(cells)
             for place, (cell, where) in enumerate(zip(cells, lines, strict=True)):
                 try:
                     values[place] = parse_number(cell, where) if cell else math.nan
@@ -1023,7 +985,7 @@ def _listed_columns(table: Table) -> str:
     return f"the columns have no names: give a number from 1 to {len(table.columns)}. {_POINTS}"
 
 
-def value_column(table: Table, column: int | str | None = None) -> int:
+def _value_column(table: Table, column: int | str | None = None) -> int:
     """The place of the named column, or of the only column that is not the time."""
     places = value_columns(table)
     if column is not None:
@@ -1051,9 +1013,9 @@ def column_values(table: Table, place: int, missing: Sequence[float | str] | Non
     if missing is not None:
         values = np.where(np.isin(values, listed), np.nan, values)
     for sentinel in (*_SENTINELS, *_PLAUSIBLE_SENTINELS) if missing is None or listed.size or marks else ():
-        found = np.flatnonzero(values == sentinel)
+        found, size = np.flatnonzero(values == sentinel), abs(sentinel)
         close = sentinel in _SENTINELS
-        similar = np.abs(values - sentinel) <= 0.01 * abs(sentinel) if close else np.abs(values) >= 0.5 * abs(sentinel)
+        similar = np.abs(values - sentinel) <= 0.01 * size if close else np.abs(values) >= 0.5 * size
         if found.size and np.count_nonzero(similar) == found.size:
             numbers = ", ".join([*map(repr, marks), *(f"{number:g}" for number in (*listed, sentinel))])
             raise ValueError(
@@ -1082,16 +1044,15 @@ def table_values(
     columns: Sequence[tuple[str | int | None, str, str | None, str]],
     missing: Sequence[float | str] | None,
     stacklevel: int,
-) -> list[tuple[NDArray[np.float64], str]]:
-    """Samples of columns (n_rows,) with their units; a column is its name, dimension and unit, and words for messages.
+) -> list[tuple[NDArray[np.float64], str, str]]:
+    """Samples of columns (n_rows,), units and dimensions, of columns' names, dimensions, units and words for messages.
 
     Warns if a number in `missing` is in none of the columns, or a text in no row: the file may write it in another way.
     """
-    found, places = [], []
-    for name, dimension, unit, where in columns:
-        places.append(value_column(table, name))
-        values = column_values(table, places[-1], missing)
-        found.append((values, column_unit(table, places[-1], values, unit, dimension, where)))
+    found, places = [], [_value_column(table, name) for name, *_ in columns]
+    for place, (_, dimension, unit, where) in zip(places, columns, strict=True):
+        values = column_values(table, place, missing)
+        found.append((values, column_unit(table, place, values, unit, dimension, where), dimension))
     listed, marks = _listed(missing)
     absent = [f"{each:g}" for each in listed[~np.isin(listed, [table.columns[place].values for place in places])]]
     absent += [repr(mark) for mark in marks if mark not in table.marks]
@@ -1134,8 +1095,7 @@ def _time_unit(table: Table) -> float:
     stated = stated_unit(table, table.time)
     if stated is None and table.time_unit is None:
         # the unit in which the times are Unix times of this century
-        units = {"s": 1.0, "ms": 1e3, "us": 1e6}
-        unix = next((unit for unit, n in units.items() if _is_unix(column.values[0] / n)), None)
+        unix = next((unit for unit in ("s", "ms", "us") if _is_unix(column.values[0] * find_unit(unit).factor)), None)
         if unix is not None and _UNIX.search(column.name):
             return find_unit(unix).factor
         hint = "" if unix is None else f" (for Unix times {unix!r} would fit the numbers)"
@@ -1147,19 +1107,21 @@ def _time_unit(table: Table) -> float:
 
 def _times(table: Table) -> NDArray[np.float64]:
     """Times of the rows [s]; ValueError if some are missing, or another column has different times."""
-    unit = _time_unit(table)
-    times = table.columns[table.time].values * unit
+    unit, own = _time_unit(table), table.columns[table.time]
+    times = own.values * unit
     if np.isnan(times).any():
         line = table.lines[int(np.argmax(np.isnan(times)))]
         raise ValueError(f"{table.file}, line {line}: expected a time, got an empty cell or NaN; write all times")
-    own = table.columns[table.time]
-    others = [] if table.chosen or not table.named or own.kind == "clock" else table.columns
-    for place, other in enumerate(others):
-        if place == table.time or other.kind != "number" or not (_TIME.match(other.name) or _STAMP.match(other.name)):
+    for place, other in enumerate(() if table.chosen or not table.named or own.kind == "clock" else table.columns):
+        by_name = _TIME.match(other.name)
+        if place == table.time or other.kind != "number" or not (by_name or _STAMP.match(other.name)):
             continue
         stated = stated_unit(table, place)  # T may be a temperature
-        plain = stated is None and _TIME.match(other.name) and not re.match(r"t(\b|_)", other.name, re.IGNORECASE)
-        if not plain and (stated is None or dimension_of(stated) != "time"):
+        if (
+            (not by_name or re.match(r"t(\b|_)", other.name, re.IGNORECASE))
+            if stated is None
+            else dimension_of(stated) != "time"
+        ):
             continue
         others_unit = unit if stated is None else find_unit(stated, "time").factor
         ahead = other.values * others_unit - times
@@ -1182,7 +1144,14 @@ def row_times(table: Table, dt: float | None = None) -> NDArray[np.float64]:
 
 
 def _uniform_step(table: Table) -> tuple[float, float]:
-    """The mean step of the times [s], and the largest error in it that rounding can cause."""
+    """The mean step of the times [s], and the largest error in it that rounding can cause.
+
+    Printed times are rounded, so each may differ from a uniform grid by one unit of its last digit: half a unit because
+    it is rounded, half a unit because the two ends that define the grid are rounded. If this unit is more than half a
+    step, the tolerance would hide a missing sample, and it is not applied. Times that may have been stored as float32
+    may differ by 2e-7 times the largest time, if this is less than a quarter of a step. Other times must be uniform
+    within 1e-4 of a step and round-off.
+    """
     times, column = _times(table), table.columns[table.time]
     if times.size < 2 or not times[-1] > times[0]:
         raise ValueError(
@@ -1220,12 +1189,8 @@ def _uniform_step(table: Table) -> tuple[float, float]:
 def table_step(table: Table, dt: float | None = None) -> float:
     """The time step [s] of a table: from its times, the comment ``dt = ... s`` and the argument, which must agree.
 
-    Printed times are rounded, so each may differ from a uniform grid by one unit of its last digit: half a unit because
-    it is rounded, half a unit because the two ends that define the grid are rounded. If this unit is more than half a
-    step, the tolerance would hide a missing sample, and it is not applied. Times that may have been stored as float32
-    may differ by 2e-7 times the largest time, if this is less than a quarter of a step. Other times must be uniform
-    within 1e-4 of a step and round-off; ValueError otherwise. A whole number of samples per second is used where the
-    mean step corresponds to it within the rounding and a relative 1e-4.
+    A whole number of samples per second is used where the mean step corresponds to it within the rounding of printed
+    times and a relative 1e-4.
     """
     step, tolerance = (None, 0.0) if table.time is None else _uniform_step(table)
     known = [("the argument dt", dt)] if dt is not None else []
@@ -1238,12 +1203,12 @@ def table_step(table: Table, dt: float | None = None) -> float:
             "the column of times, time="
         )
     first, chosen = known[0]
-    if step is not None and dt is None and not abs(step - chosen) <= tolerance + 1e-6 * step:
-        first, chosen = known[-1]  # the times show a step that the text rounds
     if step is not None and not abs(step - chosen) <= tolerance + 1e-6 * step:
-        raise ValueError(
-            f"{table.file}: the step is {chosen} s by {first} but {step} s by the time column; correct one"
-        )
+        if dt is not None:
+            raise ValueError(
+                f"{table.file}: the step is {chosen} s by {first} but {step} s by the time column; correct one"
+            )
+        first, chosen = known[-1]  # the times show a step that the text rounds
     for each in table.stated.steps:
         allowed = tolerance + (each.rounding + 1e-6) * chosen
         if not any(abs(other - chosen) <= allowed for other in each.steps):
@@ -1274,21 +1239,21 @@ def table_start(table: Table, step: float, zero: float | str = 0.0) -> float:
 
 def _clock_zero(table: Table, text: str) -> float:
     """The clock time `zero` in the times of the table [s]; what it does not state is as in the first row."""
-    zero, first = _parse_clock(text, "zero"), table.clock
+    zero, first, file = _parse_clock(text, "zero"), table.clock, table.file
     column = None if table.time is None else table.columns[table.time]
     if column is None or column.kind != "clock":
         if column is None or not _is_unix(column.values[0] * _time_unit(table)):
-            raise ValueError(f"{table.file}: zero={text!r} needs a column of clock times; give zero in seconds")
+            raise ValueError(f"{file}: zero={text!r} needs a column of clock times; give zero in seconds")
         if zero.day is None or zero.zone is None:
             raise ValueError(
-                f"{table.file}: the times are Unix times: give zero={text!r} with date and time zone, as in "
+                f"{file}: the times are Unix times: give zero={text!r} with date and time zone, as in "
                 "'2019-07-06T03:19:53Z'"
             )
         return _DAY * (zero.day - _EPOCH) + zero.seconds - 60 * zero.zone
     if zero.day is not None and first.day is None:
-        raise ValueError(f"{table.file}: the times have no date; give zero={text!r} without one")
+        raise ValueError(f"{file}: the times have no date; give zero={text!r} without one")
     if zero.zone is not None and first.zone is None:
-        raise ValueError(f"{table.file}: the times have no time zone; give zero={text!r} without one, as in the file")
+        raise ValueError(f"{file}: the times have no time zone; give zero={text!r} without one, as in the file")
     days = 0 if zero.day is None else zero.day - first.day
     return _DAY * days + zero.seconds - (0 if zero.zone is None else 60 * (zero.zone - first.zone))
 

@@ -92,20 +92,20 @@ def v2(form="(1E15.6)", count="       3"):
     ("file", "match"),
     [
         *((table("# dt=" + "9" * 100_000 + unit + "\nacc_g\n1\n2\n"), "give dt=") for unit in ("", " s")),
-        (table("# npts = " + "9" * 5000 + "\n# dt = 1 s\nacc_g\n1\n2\n"), "a number with 5000 digits"),
+        (table("# npts = " + "9" * 5000 + "\n# dt = 1 s\nacc_g\n1\n2\n"), "announces 9{20} samples"),
         (table('time_s,acc_g\n0,"' + "1" * 200_000 + '"\n'), "cells separated by ','"),
         (table("time_s,acc_g\n0,1_000\n1,2\n"), "expected a number, got '1_000'"),
         (table("time_s,acc_g\n0e400,1\n1,2\n2,x\n"), "expected a number, got 'x'"),
         (table("time_s,acc" + "_g" * 50_000 + "(" * 50_000 + "\n0,1\n1,2\n"), "unit"),
         (at2("DT " + "NPTS=1 " * 30_000), "expected a header line"),
         (at2("NPTS, DT\n1 1" + " " * 100_000 + "x"), "expected a header line"),
-        (at2("NPTS= " + "9" * 5000 + ", DT= .01"), "a number with 5000 digits"),
+        (at2("NPTS= " + "9" * 5000 + ", DT= .01"), "announces 9{20} samples"),
         (at2("NPTS= 2, DT= 0" + "1" * 100_000 + "e999999"), "positive|finite"),
         *(
-            (v2(form), "expected a (format of 1 to 1000|count)")
+            (v2(form), "expected a Format such as .* of 1 to 1000 numbers")
             for form in ("(1F0.5)", "(0F10.5)", "(1F99999999999999.5)", "(9999F1.1)")
         ),
-        (v2(count="9" * 400), "a number with 400 digits"),
+        (v2(count="9" * 400), "found none in 1 file"),
     ],
     ids=lambda value: value[0] if isinstance(value, tuple) else None,
 )

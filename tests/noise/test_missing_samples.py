@@ -239,9 +239,7 @@ def test_checks_refuse_channels_with_too_few_samples():
 # errors, predictions --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "options", [{}, {"groups": "all"}, {"groups": (6.0, 12.0)}, {"groups": (6.0, 12.0), "level": "response"}]
-)
+@pytest.mark.parametrize("options", [{}, {"groups": "all"}, {"level": "response", "window": 0.5}])
 @pytest.mark.parametrize("gaps", [[(0, 20, 30)], [(1, 20, 30)], [(0, 15, 20), (1, 40, 45)], [(0, 20, 30), (1, 25, 35)]])
 def test_a_gap_in_one_channel_leaves_a_density(options, gaps, rng):
     """A channel without samples in a stretch of time has no level there, and nothing is compared with it."""

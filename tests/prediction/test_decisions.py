@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy import special, stats
-from scipy.fft import dct
 
 from fe_likelihoods.events.hierarchical_posterior import HierarchicalPosterior, Varying
 from fe_likelihoods.events.hierarchy_result import Hierarchy
@@ -195,25 +194,6 @@ def test_error_of_the_model_has_the_level_of_the_noise_and_the_spectrum_of_the_r
     assert medians[True] > 1.15 * plain and 0.98 * plain < medians["model"] < 1.06 * plain
     with pytest.raises(ValueError, match='noise="model" needs a noise that follows the response'):
         propagate(with_noise(wave, "si"), samples, quantity=peak("top"), noise="model")
-
-
-def test_error_of_the_model_with_bands_has_no_noise_of_the_sensor_in_any_band():
-    rng, n, sensor = np.random.default_rng(1), 512, 0.5
-    response = np.sin(2.0 * np.pi * 2.0 * 0.01 * np.arange(n))[None]  # 2 Hz: almost nothing above 5 Hz
-    noise = GaussianNoise(
-        [Channel("top", "displacement", "m")], groups=(1.0, 5.0), level="response", sensor={"top": sensor}
-    )
-    parameters = np.array([[0.3, 0.2, 0.4]])
-    error = model_error(noise, parameters, 0.01)
-    draws = np.stack([error.draw(0, n, rng, response)[0] for _ in range(3000)])
-    hertz = 0.5 / 0.01 * np.arange(n) / n
-    bands = [hertz < 1.0, (hertz >= 1.0) & (hertz < 5.0), hertz >= 5.0]
-    powers = np.square(dct(draws, norm="ortho", axis=1)).mean(axis=0)
-    own = np.square(dct(response[0], norm="ortho"))
-    for band, share in zip(bands, parameters[0], strict=True):
-        count = 3000 * band.sum()
-        assert powers[band].mean() == pytest.approx(share**2 * own[band].mean(), rel=4.0 * np.sqrt(2.0 / count))
-    assert powers[bands[2]].mean() < 1e-3 * sensor**2
 
 
 def test_fragility_has_the_error_of_the_model_where_it_is_known(wave, rng):

@@ -57,10 +57,6 @@ KINDS = {
         channels, level="measured", scales=levels, window=0.4, sensor=sensor
     ),
     "modulated": lambda channels, sensor, levels: GaussianNoise(channels, level="response", window=0.4, sensor=sensor),
-    "bands": lambda channels, sensor, levels: GaussianNoise(
-        channels, groups=(2.0, 8.0), level="response", sensor=sensor
-    ),
-    "bands, SI": lambda channels, sensor, levels: GaussianNoise(channels, groups=(2.0, 8.0), sensor=sensor),
     "autoregressive": lambda channels, sensor, levels: AutoregressiveNoise(channels, sensor=sensor),
 }
 
@@ -101,7 +97,7 @@ def test_the_prediction_is_that_of_a_noise_of_all_channels_with_mean_parameters(
         np.testing.assert_allclose(ours.quantiles, theirs.quantiles, rtol=1e-12, atol=1e-14)
         np.testing.assert_allclose(ours.variance, theirs.variance, rtol=1e-12)
         assert (np.ptp(ours.quantiles[[0, 2]], axis=0) > np.ptp(without.quantiles[[0, 2]], axis=0)).mean() > 0.7
-    if kind in ("relative", "modulated", "bands"):
+    if kind in ("relative", "modulated"):
         assert quiet(likelihood, samples, model=wave(ALL), noise="model", quantity=peak("middle")).noise
 
 

@@ -293,11 +293,11 @@ class TestV2OnRealZips:
                 " 1138 POINTS OF ACCEL", " 1130 POINTS OF ACCEL"
             ): r"line 188: expected 2 numbers of 10 columns after .* samples, got 8",
             text.replace(" 1138 POINTS OF ACCEL", " 1136 POINTS OF ACCEL"): "announces 1136 samples but has more",
-            text.replace(" AT  .020 SEC.  (UNITS", " AT  .010 SEC.  (UNITS"): "step is .010 s here but 0.02 s",
+            text.replace(" AT  .020 SEC.  (UNITS", " AT  .010 SEC.  (UNITS"): "step is .010 s in the text but 0.02 s",
             text.replace("(UNITS: CM/SEC/SEC)", ""): "expected the unit of acceleration",
             text.replace("(UNITS: CM/SEC/SEC)", "(UNITS: CM/SEC)"): "a unit of velocity",
             text.replace("     7.942", "    ******", 1): "expected a number, got",
-            text.replace("CORRECTED", "UNCORRECTED", 1): "expected corrected acceleration",
+            text.replace("CORRECTED", "UNCORRECTED", 1): "expected acceleration in the form of V2",
         }
         for damaged, message in damages.items():
             assert damaged != text
@@ -379,7 +379,7 @@ class TestV2Forms:
         path.write_text("\n".join(good))
         assert read_record(path).n_steps == 9, "a single channel needs no number"
         for lines, message in [
-            (cosmos(1, np.ones(9), -999.0), "must be the time step"),
+            (cosmos(1, np.ones(9), -999.0), "expected the time step .s. in the header, got -999"),
             (cosmos(1, np.ones(9), 0.02, units="counts(50)"), "unknown unit 'counts'"),
             ([line for line in good if "Real-header" not in line], "Real-header values follow"),
             (cosmos(1, np.ones(9), 0.02, form="(free)"), r"expected a Format such as \(8F10.5\)"),
