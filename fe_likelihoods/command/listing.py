@@ -227,29 +227,17 @@ def _sampling(table: Table) -> tuple[list[str], list[str], float | None]:
     try:
         step = table_step(table)
     except ValueError as error:
-        if table.time is None:
-            return ['dt = "? s"    # write it: the file has no times'], ["no column of times"], None
-        said = [f"times: {error}"]
-        try:
-            step = table_step(table._replace(stated=Statements()))
+        advised = re.search(r"give (resample|time_unit|skip|dt)=", str(error))  # what the message asks for is a key
+        key = advised[1] if advised and (advised[1] != "dt" or table.time is None) else ""
+        said, lines, step = [f"times: {error}"], [f'{key} = "?"    # write it: the file does not state it'], None
+        if key == "skip":
             above = table.lines[0] - 1 - table.named - any(column.below for column in table.columns)
             lines = [f"skip = {above}    # the step of the times, without the text above the table"] if above else []
-            return lines, said, step if above else None
-        except ValueError:
-            pass
-        try:
-            times = row_times(table)
-            even = uniform_times(times, None, table.file)
-        except ValueError:
-            unknown = "give time_unit=" in str(error)
-            return ['time_unit = "?"    # write it: the file does not state it'] if unknown else [], said, None
-        steps = np.diff(times)
-        text = f"times: uneven, steps of {steps.min():.4g} to {steps.max():.4g} s"
-        if even.gaps.size:
-            text += f", {even.gaps.size} gap(s), the largest of {steps.max():.4g} s after {times[steps.argmax()]:.6g} s"
-        if not even.kept.all():
-            text += f", {(~even.kept).sum()} row(s) of a repeated time, the first at {times[~even.kept][0]:.6g} s"
-        return [f"resample = {even.step:.6g}"], [text], even.step
+            step = table_step(table._replace(stated=Statements())) if above else None
+        elif key == "resample":
+            even = uniform_times(row_times(table), None, table.file)
+            said, lines, step = [f"times: uneven, to be {even.note}"], [f"resample = {even.step:.6g}"], even.step
+        return lines if key else [], said, step
     column = None if table.time is None else table.columns[table.time]
     start = "" if column is None else f", from {column.values[0]:.10g} in column {column.name!r}"
     start += "" if table.clock is None else f", first clock time {clock_text(table.clock)}"

@@ -486,7 +486,7 @@ def test_outputs_without_a_header_line_are_listed_by_numbers(tmp_path):
     path.write_text("0.01 -1.0 0.65\n0.02 -2.0 3.05\n")
     found = sections(describe_data(path))
     assert found["measurements"]["columns"] == {"column_1": "1", "column_2": "2", "column_3": "3"}
-    assert (found["record"]["column"], found["record"]["dt"]) == ("1", "? s")
+    assert (found["record"]["column"], found["record"]["dt"]) == ("1", "?")
     path.write_text(EQSIG)
     found = sections(describe_data(path))["record"]
     assert read_record(path, column=found["column"], units="g").n_steps == 40 and "dt" not in found
