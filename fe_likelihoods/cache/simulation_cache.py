@@ -24,6 +24,7 @@ from ..simulation.model import Model
 from .file import CacheFile
 from .rows import (
     COLUMNS,
+    LABEL_COLUMNS,
     STORE,
     CachedRows,
     Row,
@@ -264,6 +265,43 @@ class SimulationCache:
                 logger.warning("simulations of this model in %s: %s", self.path, text)
 
     # the file -----------------------------------------------------------------------------------------------------
+
+    def copy(self, path: str | os.PathLike) -> int:
+        """Copy the cache to a new file, for an archive or another machine; returns the number of simulations.
+
+        ValueError if the file exists, or its folder does not; OSError if either file cannot be used.
+        """
+        target = Path(path).resolve()
+        if target.exists() or not target.parent.is_dir():
+            raise ValueError(f"{path}: expected the path of a new file in an existing folder")
+        self.file.insist(lambda connection: connection.execute("VACUUM INTO ?", (str(target),)))
+        return self.info().simulations
+
+    def add(self, path: str | os.PathLike) -> int:
+        """Add the rows of another cache, which no other process uses; rows that are stored already are not changed.
+
+        Returns the number of simulations added. ValueError if the other file is not a cache, OSError if either file
+        cannot be used.
+        """
+        other = SimulationCache(path)
+        if other.path == self.path:
+            raise ValueError(f"{path} is the cache itself; give another file")
+        other.close()
+        before = self.info().simulations
+        tables = ("rows", COLUMNS), ("labels", LABEL_COLUMNS)
+
+        def insert(connection: sqlite3.Connection) -> None:
+            connection.execute("ATTACH ? AS other", (str(other.path),))
+            try:
+                with transaction(connection):
+                    for table, columns in tables:
+                        query = f"INSERT OR IGNORE INTO {table} ({columns}) SELECT {columns} FROM other.{table}"
+                        connection.execute(query)
+            finally:
+                connection.execute("DETACH other")
+
+        self.file.insist(insert)
+        return self.info().simulations - before
 
     def info(self) -> CacheInfo:
         """State of the cache."""
