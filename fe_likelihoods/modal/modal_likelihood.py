@@ -10,13 +10,12 @@ from ..likelihood.likelihood import FELikelihood
 from ..likelihood.simulator import Simulator
 from ..models.linear_structure import LinearStructure
 from ..noise.protocol import Noise
-from ..noise.student import check_degrees
 from ..priors.points import as_points
 from ..signals.channels import Measurements
 from ..simulation.model import Model, SimulationFailed
 from ..text_tables import text_table
 from .modal_data import ModalData
-from .modal_noise import ModalNoise
+from .modal_noise import modal_noise
 from .mode_models import StructureModes
 from .paired_modes import PairedModes, sensor_rows
 
@@ -37,9 +36,8 @@ class ModalLikelihood(FELikelihood):
     Parameters
     ----------
     model : Model, LinearStructure or Parts
-        A model that has modes: a `FunctionModes`; any model whose channels are `modal_channels`, such as an
-        `OpenSeesModel` or an `ExecutableModel`; or a linear structure, such as a `ShearFrame` or a `LinearStructure`.
-        It has the sensors of the data, and may have others.
+        A model that has modes and the sensors of the data: a `FunctionModes`; any model whose channels are
+        `modal_channels`, such as an `OpenSeesModel`; or a linear structure, such as a `ShearFrame`.
     data : ModalData
         The measured modes.
     frequency_error, shape_error : {"common", "mode"}, optional
@@ -49,8 +47,8 @@ class ModalLikelihood(FELikelihood):
     pool : optional
         As for `FELikelihood`.
     student_t : float, optional
-        Degrees of freedom, above 2, of Student-t errors, such as 4: wrong identifications move the parameters little.
-        Errors are then scales. Default: Gaussian errors.
+        Degrees of freedom, above 2, of Student-t errors, such as 4, of which errors are the scales: wrong
+        identifications move the parameters little. Default: Gaussian errors.
     close : float
         Measured frequencies that differ by less than this share are compared by the plane of their shapes, and their
         frequencies by the order in the pair. Zero compares each shape.
@@ -95,10 +93,7 @@ class ModalLikelihood(FELikelihood):
         if not 0.0 <= close < 1.0:
             raise ValueError(f"ModalLikelihood: close must be a share from 0 to 1, such as {_CLOSE}; got {close!r}")
         paired = PairedModes(_with_modes(model), data, close)
-        student = 0.0 if student_t is None else check_degrees("ModalLikelihood: student_t", student_t)
-        if student and data.covariance is not None:
-            raise ValueError("ModalLikelihood: student_t is for independent errors: give frequency_cv, no covariance")
-        noise = _noise(paired, data, frequency_error, shape_error, student)
+        noise = modal_noise(paired, frequency_error, shape_error, student_t)
         self.held_out = held_out
         if held_out is not None:
             sensor_rows(paired.model, held_out)  # refuses what cannot be predicted
@@ -142,8 +137,8 @@ class ModalLikelihood(FELikelihood):
             known = np.zeros(1) if self.model.frequency_cv is None else self.model.frequency_cv
             squares = np.square(self.noise.standard_deviations(parameters)) - np.square(known)
             errors = np.sqrt(np.maximum(squares.mean(axis=1), 0.0))  # of the modes of the data, for any modes
-        batch = self._modes.simulate(paired.of_model(rows))
-        batch.response[:, 0] *= paired.at_mean_temperature(rows)
+        batch = self._modes.simulate(rows[:, : len(paired.model.parameter_names)])
+        batch.response[:, 0] *= paired.factors(rows).mean(axis=1, keepdims=True)
         good = (batch.response[:, 0] > 0.0).all(axis=1)
         if not good.any():
             reason = batch.reasons[0] or "a frequency is not positive"
@@ -155,45 +150,6 @@ def _with_modes(model: Any) -> Model:
     """A model that has modes."""
     model = model.parts if isinstance(model, LinearStructure) else model
     return StructureModes(model) if hasattr(model, "assemble") else model
-
-
-def _noise(paired: PairedModes, data: ModalData, frequency_error: Any, shape_error: Any, student: float) -> ModalNoise:
-    """The errors, from what the data and the arguments say."""
-    sizes = np.ones(data.n_modes, dtype=int)
-    for group in paired.groups:
-        sizes[list(group)] = len(group)
-    freedoms = (data.has_shape * np.maximum(data.n_sensors - sizes, 0)).T
-    if data.covariance is not None and frequency_error is not None:
-        raise ValueError(
-            "ModalLikelihood: an unknown frequency_error cannot be added to the covariance of the data: leave "
-            "frequency_error out (unknown_errors in a TOML file), or give the data frequency_cv and no covariance"
-        )
-    frequency, frequency_known = _error("frequency_error", frequency_error, paired.frequency_cv, data.n_modes)
-    shape, shape_known = _error("shape_error", shape_error, data.shape_error, data.n_modes)
-    return ModalNoise(
-        channels=paired.channels,
-        n_sets=data.n_sets,
-        n_sensors=data.n_sensors,
-        counts=tuple((~np.isnan(data.frequencies)).T.astype(int).ravel().tolist()),
-        freedoms=tuple(freedoms.ravel().tolist()),
-        frequency_known=frequency_known,
-        shape_known=shape_known,
-        frequency=frequency,
-        shape=shape if freedoms.any() else "",
-        student=student,
-    )
-
-
-def _error(what: str, given: Any, known: np.ndarray | None, m: int) -> tuple[str, tuple[float, ...]]:
-    """What is unknown of an error, and its known values (m,)."""
-    if given is None:
-        given = "common" if known is None else ""
-    if given not in ("", "common", "mode"):
-        raise ValueError(
-            f'ModalLikelihood: {what} must be "common" or "mode"; got {given!r}: known errors belong to the data '
-            "(frequency_cv, shape_error), or are numbers in the mapping of priors"
-        )
-    return given, (0.0,) * m if known is None else tuple(known.tolist())
 
 
 class PredictedModes(NamedTuple):
@@ -211,18 +167,14 @@ class PredictedModes(NamedTuple):
     unknown: np.ndarray  # (n,) unknown relative error of a frequency, as of the model; 0 if there is none
 
     @classmethod
-    def of(cls, paired: PairedModes, computed: np.ndarray, unknown: np.ndarray | None = None) -> "PredictedModes":
+    def of(cls, paired: PairedModes, computed: np.ndarray, unknown: np.ndarray | float = 0.0) -> "PredictedModes":
         """Pair computed modes (n, 1 + n_sensors, n_modes) with the measured ones; ValueError if n is zero."""
         found, first = [paired.pair(modes) for modes in computed], paired.data.has_shape.argmax(axis=0)
-        return cls(
-            paired,
-            computed,
-            np.stack([each.frequencies for each in found]),
-            np.stack([each.assurance for each in found]),
-            np.stack([each.columns for each in found]) + 1,
-            np.stack([each.shapes[first, np.arange(len(first))] for each in found]),
-            np.zeros(len(found)) if unknown is None else unknown,
-        )
+        frequencies, assurance = (np.stack([getattr(each, x) for each in found]) for x in ("frequencies", "assurance"))
+        numbers = np.stack([each.columns for each in found]) + 1
+        shapes = np.stack([each.shapes[first, np.arange(len(first))] for each in found])
+        unknown = np.broadcast_to(unknown, len(found))
+        return cls(paired, computed, frequencies, assurance, numbers, shapes, unknown)
 
     @property
     def data(self) -> ModalData:
@@ -236,10 +188,10 @@ class PredictedModes(NamedTuple):
     @property
     def errors(self) -> np.ndarray:
         """Known and unknown relative errors (n, m) of an identified frequency, together."""
-        known = self.data.frequency_cv
+        known = 0.0 if self.data.frequency_cv is None else self.data.frequency_cv
         if self.data.covariance is not None:
             known = np.sqrt(np.diag(self.data.covariance)) / self.data.mean_frequencies
-        return np.hypot(self.unknown[:, None], np.zeros(self.data.n_modes) if known is None else known)
+        return np.hypot(self.unknown[:, None], known) * np.ones(self.data.n_modes)
 
     def interval(self, level: float = 0.9) -> np.ndarray:
         """Central intervals (2, m) of an identified frequency [Hz], with its errors."""

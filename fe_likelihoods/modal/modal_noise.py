@@ -30,10 +30,10 @@ from typing import Any
 import numpy as np
 
 from ..noise.gaussian import HALF_LOG_TWO_PI
-from ..noise.student import student_constant
+from ..noise.student import check_degrees, student_constant
 from ..signals.channels import Channel
 
-__all__ = ["ModalNoise", "ModeSums"]
+__all__ = ["ModalNoise", "ModeSums", "modal_noise"]
 
 
 LEAST_FREQUENCY_ERROR, LEAST_SHAPE_ERROR = 1e-4, 1e-3  # of an identification, known where no error is stated
@@ -96,34 +96,31 @@ class ModalNoise:
     def deviations(self, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Standard deviations of frequencies and of components of shapes, (n, m) each, at parameters (n, n_noise)."""
         m, parameters = len(self.channels), np.asarray(parameters, dtype=float)
+        # an unknown error that is not positive is impossible, also beside a known one
+        variances = np.square(np.where(parameters > 0.0, parameters, np.nan))
         split = {"": 0, "common": 1, "mode": m}[self.frequency]
         found = []
         for known, unknown, least in (
-            (self.frequency_known, parameters[:, :split], LEAST_FREQUENCY_ERROR),
-            (self.shape_known, parameters[:, split:], LEAST_SHAPE_ERROR),
+            (self.frequency_known, variances[:, :split], LEAST_FREQUENCY_ERROR),
+            (self.shape_known, variances[:, split:], LEAST_SHAPE_ERROR),
         ):
-            # an unknown error that is not positive is impossible, also beside a known one
-            unknown = np.where(unknown > 0.0, unknown, np.nan)
-            squares = np.square(unknown) if unknown.shape[1] else np.zeros((len(parameters), 1))
             floor = np.where(np.array(known) > 0.0, 0.0, least)
-            found.append(np.sqrt(np.square(known) + np.square(floor) + squares) * np.ones((len(parameters), m)))
+            more = unknown if unknown.shape[1] else np.zeros((len(parameters), m))
+            found.append(np.sqrt(np.square(known) + np.square(floor) + more))
         return found[0], found[1]
 
     def log_likelihood(self, statistics: np.ndarray, n_samples: Any, parameters: np.ndarray) -> np.ndarray:
         """Log-likelihood (n,) for the statistics (n, m + 2 m n_sets); -inf for impossible errors."""
-        total, m = np.zeros(len(statistics)), len(self.channels)
-        sums = np.split(statistics[:, m:], 2, axis=1)
-        for deviations, squares, counts in zip(
-            self.deviations(parameters), sums, (self.counts, self.freedoms), strict=True
-        ):
+        total, sums = np.zeros(len(statistics)), np.split(statistics[:, len(self.channels) :], 2, axis=1)
+        kinds = zip(self.deviations(parameters), sums, (self.counts, self.freedoms), strict=True)
+        for deviations, squares, counts in kinds:
             used = np.flatnonzero(counts)
             d, spread = np.array(counts)[used], np.repeat(deviations, self.n_sets, axis=1)[:, used]
             with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
                 ratios = squares[:, used] / np.square(spread)
                 if self.student:
-                    logs = 0.5 * (self.student + d) * np.log1p(ratios / self.student) - student_constant(
-                        self.student, d
-                    )
+                    logs = 0.5 * (self.student + d) * np.log1p(ratios / self.student)
+                    logs -= student_constant(self.student, d)
                 else:
                     logs = 0.5 * ratios + d * HALF_LOG_TWO_PI
                 total -= (d * np.log(spread) + logs).sum(axis=1)
@@ -138,3 +135,41 @@ class ModalNoise:
         frequency, shape = (each[0][:, None] for each in self.deviations(np.atleast_2d(parameters)))
         one = np.hstack([frequency, np.repeat(shape, self.n_sensors, axis=1)])
         return np.tile(one, self.n_sets) * (np.asarray(response) != 0.0)
+
+
+def modal_noise(
+    paired: Any, frequency_error: str | None, shape_error: str | None, student_t: float | None
+) -> ModalNoise:
+    """The errors of `PairedModes`, from what their data and the arguments of a `ModalLikelihood` say."""
+    data, m = paired.data, paired.data.n_modes
+    if data.covariance is not None and (frequency_error is not None or student_t is not None):
+        raise ValueError(
+            "ModalLikelihood: beside a covariance of the frequencies, neither an unknown frequency_error nor student_t "
+            "is possible: leave it out, or give the data frequency_cv and no covariance"
+        )
+    known, unknown = {}, {"frequency": frequency_error, "shape": shape_error}
+    for what, stated in (("frequency", paired.frequency_cv), ("shape", data.shape_error)):
+        known[what] = (0.0,) * m if stated is None else tuple(stated.tolist())
+        if unknown[what] is None:
+            unknown[what] = "common" if stated is None else ""
+        if unknown[what] not in ("", "common", "mode"):
+            raise ValueError(
+                f'ModalLikelihood: {what}_error must be "common" or "mode"; got {unknown[what]!r}: known errors belong '
+                "to the data (frequency_cv, shape_error), or are numbers in the mapping of priors"
+            )
+    sizes = np.ones(m, dtype=int)
+    for group in paired.groups:
+        sizes[list(group)] = len(group)
+    freedoms = (data.has_shape * np.maximum(data.n_sensors - sizes, 0)).T
+    return ModalNoise(
+        paired.channels,
+        data.n_sets,
+        data.n_sensors,
+        tuple((~np.isnan(data.frequencies)).T.astype(int).ravel().tolist()),
+        tuple(freedoms.ravel().tolist()),
+        known["frequency"],
+        known["shape"],
+        unknown["frequency"],
+        unknown["shape"] if freedoms.any() else "",
+        0.0 if student_t is None else check_degrees("ModalLikelihood: student_t", student_t),
+    )

@@ -18,8 +18,9 @@ from ..models.validation import check_theta
 from ..signals.channels import Channel
 from ..simulation.model import SimulationFailed
 
-__all__ = ["FunctionModes", "StructureModes", "modal_channels", "modal_response", "opensees_modes"]
+__all__ = ["ABSENT", "FunctionModes", "StructureModes", "modal_channels", "modal_response", "opensees_modes"]
 
+ABSENT = 1e12  # [Hz], from here on modes that a structure does not have, whose shapes are zero
 _DAMPING = 0.05  # of a structure whose undamped modes are computed: without effect
 _STEP = 1e-4  # for central differences of matrices, as a share of a parameter
 
@@ -39,9 +40,9 @@ def modal_channels(sensors: Sequence[str]) -> tuple[Channel, ...]:
 def modal_response(frequencies: Any, shapes: Any, n_modes: int | None = None) -> np.ndarray:
     """Response (1 + n_sensors, n_modes) of a model that has modes.
 
-    Of natural frequencies (n,) [Hz] and mode shapes (n, n_sensors) in any scale, the lowest `n_modes` are kept. Raises
-    SimulationFailed if a frequency is not positive, there are fewer modes, or the numbers of rows and frequencies
-    differ.
+    Of natural frequencies (n,) [Hz] and mode shapes (n, n_sensors) in any scale, the lowest `n_modes` are kept; if
+    there are fewer, frequencies from `ABSENT` on stand for the others. Raises SimulationFailed if a frequency is not
+    positive, or the numbers of rows and frequencies differ.
 
     Examples
     --------
@@ -59,10 +60,10 @@ def modal_response(frequencies: Any, shapes: Any, n_modes: int | None = None) ->
         )
     if not (frequencies > 0.0).all():
         raise SimulationFailed(f"natural frequencies must be positive; they are {frequencies} Hz")
-    if n_modes is not None and len(frequencies) < n_modes:
-        raise SimulationFailed(f"expected {n_modes} modes or more; got {len(frequencies)}")
     order = np.argsort(frequencies, kind="stable")[:n_modes]
-    return np.vstack([frequencies[order], shapes[order].T])
+    absent = np.zeros((1 + shapes.shape[1], max((n_modes or 0) - len(order), 0)))
+    absent[0] = ABSENT * 2.0 ** np.arange(absent.shape[1])
+    return np.hstack([np.vstack([frequencies[order], shapes[order].T]), absent])
 
 
 def opensees_modes(ops: Any, n_modes: int, sensors: Sequence[tuple[int, int]]) -> np.ndarray:
@@ -106,8 +107,8 @@ class FunctionModes(FunctionModel):
     sensors : mapping of str to int, or sequence of str
         Names of the sensors. For matrices, with the row of the matrix, from 0, that each sensor measures.
     n_modes : int
-        Number of modes that are computed, at least the measured ones; twice as many let the pairing pass over local
-        modes.
+        Number of modes that are computed, or as many as there are: twice as many as were measured let the pairing pass
+        over local modes.
     **options
         Of `FunctionModel`: ``version``, ``depends_on``, ``isolated``, ``time_limit``, ``memory_limit``.
 
@@ -126,7 +127,7 @@ class FunctionModes(FunctionModel):
         function: Callable[..., Any],
         parameter_names: Sequence[str],
         sensors: Mapping[str, int] | Sequence[str],
-        n_modes: int,
+        n_modes: int = 10,
         **options: Any,
     ) -> None:
         self.rows = tuple(int(row) for row in sensors.values()) if isinstance(sensors, Mapping) else None
@@ -137,39 +138,35 @@ class FunctionModes(FunctionModel):
         return super().code_parts() | {"rows of the sensors": self.rows}
 
     def _respond(self, theta: np.ndarray) -> np.ndarray:
-        """The response of what the function returns: matrices, or modes."""
         returned = super()._respond(theta)
         if not isinstance(returned, tuple | list) or len(returned) != 2:
             raise SimulationFailed(
                 "expected the function to return (stiffness, mass) or (frequencies, shapes); got "
                 f"{type(returned).__name__}"
             )
-        first, second = returned
-        if len(getattr(first, "shape", np.shape(first))) == 1:
-            return modal_response(first, second, self.n_steps)
-        modes = undamped_modes(first, second, self.n_steps)
+        if np.ndim(returned[0]) == 1:
+            return modal_response(*returned, self.n_steps)
         if self.rows is None:
             raise SimulationFailed("the function returns matrices: give sensors as a mapping of names to rows of these")
-        return modal_response(modes.frequencies, modes.shapes[:, list(self.rows)])
+        mass = returned[1] if hasattr(returned[1], "diagonal") else np.array(returned[1])
+        modes = undamped_modes(*returned, max(1, min(self.n_steps, np.count_nonzero(mass.diagonal()))))
+        return modal_response(modes.frequencies, modes.shapes[:, list(self.rows)], self.n_steps)
 
 
 class StructureModes(ExternalModel):
-    """Modes of a linear structure of this library, such as a `ShearFrame`, as a model with derivatives.
+    """All modes of a linear structure of this library, such as a `ShearFrame`, as a model with derivatives.
 
     Its parameters are those of the structure except dampings, which the undamped modes do not depend on. Its sensors
-    are the channels of the structure. The default of `n_modes` are all; ValueError if the structure has fewer.
+    are the channels of the structure.
     """
 
     path_dependent = False
 
-    def __init__(self, parts: Parts, n_modes: int | None = None) -> None:
-        names = tuple(name for name in parts.parameter_names if not name.startswith("damping"))
-        ascending = dict(zip(names, np.linspace(0.5, 1.0, len(names)), strict=True))  # as frequencies must
-        size = len(parts.assemble(np.array([ascending.get(name, _DAMPING) for name in parts.parameter_names])).mass)
-        if n_modes is not None and n_modes > size:
-            raise ValueError(f"StructureModes: the {type(parts).__name__} has {size} modes; got n_modes={n_modes}")
-        super().__init__(names, modal_channels(parts.channel_names), 1.0, size if n_modes is None else n_modes)
-        self.parts = parts
+    def __init__(self, parts: Parts) -> None:
+        self.parts, names = parts, tuple(name for name in parts.parameter_names if not name.startswith("damping"))
+        self.parameter_names = names
+        size = len(self._system(np.linspace(0.5, 1.0, len(names))).mass)  # ascending, as frequencies must
+        super().__init__(names, modal_channels(parts.channel_names), 1.0, size)
         self.fingerprint = self._digest(repr(parts))
 
     def _system(self, theta: np.ndarray) -> Any:
@@ -182,7 +179,7 @@ class StructureModes(ExternalModel):
 
     def _respond(self, theta: np.ndarray) -> np.ndarray:
         system, modes = self._modes(theta)
-        return modal_response(modes.frequencies, modes.shapes @ system.shape.T, self.n_steps)
+        return modal_response(modes.frequencies, modes.shapes @ system.shape.T)
 
     def jacobian(self, theta: np.ndarray) -> np.ndarray:
         """Derivatives (n_parameters, 1 + n_sensors, n_modes) of the response, exact but for differences of matrices."""
@@ -190,12 +187,15 @@ class StructureModes(ExternalModel):
         system, modes = self._modes(theta)
         steps = _STEP * np.where(theta == 0.0, 1.0, np.abs(theta))
         ends = [[self._system(theta + sign * step) for sign in (1.0, -1.0)] for step in np.diag(steps)]
-        pairs = list(zip(ends, steps, strict=True))
         stiff, heavy, sensors = (
-            np.stack([(getattr(up, what) - getattr(down, what)) / (2.0 * h) for (up, down), h in pairs])
+            np.stack(
+                [
+                    (getattr(up, what) - getattr(down, what)) / (2.0 * h)
+                    for (up, down), h in zip(ends, steps, strict=True)
+                ]
+            )
             for what in ("stiffness", "mass", "shape")
         )
         slopes = mode_derivatives(modes, stiff, heavy)
         shapes = slopes.shapes @ system.shape.T + modes.shapes @ sensors.transpose(0, 2, 1)
-        rows = np.concatenate([slopes.frequencies[:, None, :], shapes.transpose(0, 2, 1)], axis=1)
-        return rows[:, :, : self.n_steps]
+        return np.concatenate([slopes.frequencies[:, None, :], shapes.transpose(0, 2, 1)], axis=1)

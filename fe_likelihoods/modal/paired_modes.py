@@ -19,25 +19,24 @@ from ..signals.sampling import array_digest
 from ..simulation.model import Model, SimulationBatch, SimulationFailed, has_jacobian
 from ..simulation.user_code import is_of_user
 from .modal_data import ModalData
+from .mode_models import ABSENT
 from .pairing import Paired, pair_modes
 
-__all__ = ["REFERENCE_TEMPERATURE", "SLOPE", "PairedModes", "sensor_rows"]
+__all__ = ["SLOPE", "PairedModes", "sensor_rows"]
 
-REFERENCE_TEMPERATURE = 20.0  # [°C], of the frequencies of the model
 SLOPE = "temperature_slope"
-
-_OF_THE_MODEL = "nominal", "nominal_units", "time_limit"
+_REFERENCE_TEMPERATURE = 20.0  # [°C], of the frequencies of the model
 
 
 def sensor_rows(model: Model, data: ModalData) -> list[int]:
     """Rows of a model's response that are the sensors of the data; ValueError if the model has no modes at them."""
-    if [channel.dimension for channel in model.channels[:1]] != ["frequency"]:
+    names = [channel.name for channel in model.channels]
+    if model.channels[0].dimension != "frequency":
         raise ValueError(
             f"expected a model that has modes, whose first channel is a frequency; the channels of "
-            f"{type(model).__name__} are {', '.join(channel.name for channel in model.channels)}: use FunctionModes, "
-            "or modal_channels(sensors) and modal_response (fe_likelihoods.modal.mode_models)"
+            f"{type(model).__name__} are {', '.join(names)}: use FunctionModes, or modal_channels(sensors) and "
+            "modal_response (fe_likelihoods.modal.mode_models)"
         )
-    names = [channel.name for channel in model.channels]
     if unknown := [name for name in data.sensors if name not in names[1:]]:
         raise ValueError(
             f"the model has no sensors {', '.join(unknown)}; its sensors are {', '.join(names[1:]) or 'none'}: rename "
@@ -60,22 +59,22 @@ class PairedModes:
     axis = "frequency, then components of the shape"
 
     def __init__(self, model: Model, data: ModalData, close: float) -> None:
-        self.model, self.data, self.close = model, data, close
-        self._rows = sensor_rows(model, data)
-        self._there = ~np.isnan(data.frequencies)
+        self.model, self.data, self.close, self.groups = model, data, close, data.groups(close)
+        self._rows, self._there = sensor_rows(model, data), ~np.isnan(data.frequencies)
         # frequencies with a covariance are compared in coordinates in which their errors are independent
         self.frequency_cv, self._whitening = data.frequency_cv, np.eye(data.n_modes)
         if data.covariance is not None:
             factor = np.linalg.cholesky(data.covariance / np.outer(data.mean_frequencies, data.mean_frequencies))
             self.frequency_cv = np.diag(factor).copy()
             self._whitening = self.frequency_cv[:, None] * np.linalg.inv(factor)
-        self._warmer = None if data.temperatures is None else data.temperatures - REFERENCE_TEMPERATURE
-        self.parameter_names = (*model.parameter_names, *(() if self._warmer is None else (SLOPE,)))
-        self._n_own = len(model.parameter_names)
+        self._warmer, own = None, {}
+        if data.temperatures is not None:
+            self._warmer, own = data.temperatures - _REFERENCE_TEMPERATURE, {SLOPE: "1/K"}
+        self.parameter_names = (*model.parameter_names, *own)
+        self.parameter_units = dict(getattr(model, "parameter_units", {})) | own
         self.channels = tuple(Channel(f"mode {number}", "dimensionless", "1") for number in data.mode_numbers)
         self.n_steps = data.n_sets * (1 + data.n_sensors)
-        self.groups = data.groups(close)
-        for name in _OF_THE_MODEL:
+        for name in ("nominal", "nominal_units", "time_limit"):
             if hasattr(model, name):
                 setattr(self, name, getattr(model, name))
         if has_jacobian(model):
@@ -92,27 +91,15 @@ class PairedModes:
     @property
     def fingerprint(self) -> str:
         """Digest of the model, the data and the groups of close modes."""
+        arrays = [self._whitening] if self._warmer is None else [self._whitening, self._warmer]
         parts = type(self).__name__, self.model.fingerprint, self.data.fingerprint, repr(self.groups)
-        temperatures = [] if self._warmer is None else [array_digest(self._warmer)]
-        return digest(*parts, array_digest(self._whitening), *temperatures)
+        return digest(*parts, *map(array_digest, arrays))
 
-    @property
-    def parameter_units(self) -> dict[str, str]:
-        """Units of parameters in words."""
-        own = {} if self._warmer is None else {SLOPE: "1/K"}
-        return dict(getattr(self.model, "parameter_units", {})) | own
-
-    def of_model(self, thetas: np.ndarray) -> np.ndarray:
-        """The parameters of the model (..., n) among all (..., n_parameters)."""
-        return np.asarray(thetas, dtype=float)[..., : self._n_own]
-
-    def at_mean_temperature(self, thetas: np.ndarray) -> np.ndarray:
-        """Factors of frequencies (n, 1) at the mean temperature, for parameters (n, n_parameters)."""
-        return np.ones((len(thetas), 1)) if self._warmer is None else 1.0 + thetas[:, [-1]] * self._warmer.mean()
-
-    def _warmed(self, theta: np.ndarray) -> np.ndarray | float:
-        """Factors of frequencies (n_sets, 1) at parameters (n_parameters,)."""
-        return 1.0 if self._warmer is None else 1.0 + theta[-1] * self._warmer[:, None]
+    def factors(self, thetas: np.ndarray) -> np.ndarray:
+        """Factors of frequencies (n, n_sets) by temperature, at parameters (n, n_parameters)."""
+        return 1.0 + (
+            np.zeros((len(thetas), self.data.n_sets)) if self._warmer is None else thetas[:, -1:] * self._warmer
+        )
 
     @property
     def measurements(self) -> Measurements:
@@ -125,29 +112,35 @@ class PairedModes:
 
     def simulate(self, theta: np.ndarray) -> np.ndarray:
         """Response (m, n_sets (1 + n_sensors)) at the parameters (n_parameters,)."""
-        return self._response(self.model.simulate(self.of_model(theta)), theta)
+        theta = np.asarray(theta, dtype=float)
+        return self._response(self.model.simulate(theta[: len(self.model.parameter_names)]), theta)
 
     def _simulate_together(self, thetas: np.ndarray, pool: Any = None) -> SimulationBatch:
         """Responses at parameters (n, n_parameters), from a run that answers other data sets too."""
-        batch = self.model.simulate_together(self.of_model(thetas), pool)
+        batch = self.model.simulate_together(thetas[:, : len(self.model.parameter_names)], pool)
         found, reasons = np.full((len(thetas), len(self.channels), self.n_steps), np.nan), list(batch.reasons)
-        for row, modes in enumerate(batch.response):
-            if not reasons[row]:
-                try:
-                    found[row] = self._response(modes, thetas[row])
-                except SimulationFailed as error:
-                    reasons[row] = error.reason
+        for row in [row for row, reason in enumerate(reasons) if not reason]:
+            try:
+                found[row] = self._response(batch.response[row], thetas[row])
+            except SimulationFailed as error:
+                reasons[row] = error.reason
         return SimulationBatch(found, reasons)
 
     def _response(self, modes: np.ndarray, theta: np.ndarray) -> np.ndarray:
         paired = self.pair(modes)
-        return self._joined(self._ratios(paired.frequencies) * self._warmed(theta), paired.shapes)
+        return self._joined(self._ratios(paired.frequencies) * self.factors(theta[None]).T, paired.shapes)
 
     def pair(self, modes: np.ndarray) -> Paired:
         """Pair modes (1 + n_sensors, n_modes), a response of the model, with the measured ones."""
         if not (modes[0] > 0.0).all():
             raise SimulationFailed(f"natural frequencies must be positive; they are {modes[0]} Hz")
-        return pair_modes(modes[0], modes[self._rows].T, self.data, self.groups)
+        paired = pair_modes(modes[0], modes[self._rows].T, self.data, self.groups)
+        if (paired.frequencies >= ABSENT).any():
+            raise SimulationFailed(
+                f"the model has {np.count_nonzero(modes[0] < ABSENT)} modes, fewer than the measured modes "
+                f"{self.data.mode_numbers} need"
+            )
+        return paired
 
     def _ratios(self, frequencies: np.ndarray) -> np.ndarray:
         """Frequencies (..., m) as multiples (..., n_sets, m) of the measured ones; zero where there is none."""
@@ -155,27 +148,26 @@ class PairedModes:
 
     def _joined(self, ratios: np.ndarray, shapes: np.ndarray) -> np.ndarray:
         """Response (..., m, n_steps) of ratios (..., n_sets, m) and shapes (..., n_sets, m, n_sensors)."""
-        whitened = ratios @ self._whitening.T
-        blocks = np.concatenate([whitened[..., None], shapes], axis=-1)
+        blocks = np.concatenate([(ratios @ self._whitening.T)[..., None], shapes], axis=-1)
         return np.moveaxis(blocks, -3, -2).reshape(*blocks.shape[:-3], len(self.channels), self.n_steps)
 
     def _differentiate(self, theta: np.ndarray) -> np.ndarray:
         """Derivatives (n_parameters, m, n_steps) of the response while the pairing stays."""
-        own = self.of_model(theta)
+        theta = np.asarray(theta, dtype=float)
+        own = theta[: len(self.model.parameter_names)]
         modes, slopes = self.model.simulate(own), np.asarray(self.model.jacobian(own))
         paired = self.pair(modes)
         shapes = np.zeros((len(slopes), *paired.shapes.shape))
         for mode, space in enumerate(paired.spaces):
             basis = modes[np.ix_(self._rows, space)]
-            turned = slopes[:, self._rows][:, :, list(space)]
-            inverse = np.linalg.pinv(basis)
+            turned, inverse = slopes[:, self._rows][:, :, list(space)], np.linalg.pinv(basis)
             for k in np.flatnonzero(self.data.has_shape[:, mode]):
                 target, projected = self.data.shapes[k, mode], paired.shapes[k, mode]
                 # y = B c with c = B+ t: y' = (I - B B+) B' c + (B+)^T B'^T (t - y)
                 moved = turned @ (inverse @ target)
                 moved = moved - moved @ inverse.T @ basis.T
                 shapes[:, k, mode] = moved + (target - projected) @ turned @ inverse
-        ratios = self._ratios(slopes[:, 0, paired.columns]) * self._warmed(theta)
+        ratios = self._ratios(slopes[:, 0, paired.columns]) * self.factors(theta[None]).T
         if self._warmer is not None:
             ratios = np.concatenate([ratios, (self._ratios(paired.frequencies) * self._warmer[:, None])[None]])
             shapes = np.concatenate([shapes, np.zeros((1, *shapes.shape[1:]))])

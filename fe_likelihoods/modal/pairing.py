@@ -22,6 +22,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.linalg import orth
 from scipy.optimize import linear_sum_assignment
 
 __all__ = ["Paired", "close_groups", "pair_modes"]
@@ -29,18 +30,14 @@ __all__ = ["Paired", "close_groups", "pair_modes"]
 _FREQUENCY_WEIGHT = 0.1  # of |log(f / measured f)| beside 1 - MAC: decides only where the shapes hardly do
 _COINCIDENT = 1e-6  # relative difference of computed frequencies whose shapes are any basis of their space
 _SAME = 1e-6  # smallest singular value of shapes that the sensors tell apart, as a share of the largest
-Groups = Sequence[tuple[int, ...]]
 _FORCED = 1e3  # cost of any pairing but the one by number
 
 
 def close_groups(frequencies: Sequence[float], close: float) -> tuple[tuple[int, ...], ...]:
     """Groups of modes whose frequencies follow each other at ratios below 1 + `close`, in ascending order."""
-    order = np.argsort(frequencies, kind="stable")
-    groups = [[int(order[0])]]
-    for before, mode in zip(order, order[1:], strict=False):
-        near = frequencies[mode] < (1.0 + close) * frequencies[before]
-        groups = [*groups[:-1], [*groups[-1], int(mode)]] if near else [*groups, [int(mode)]]
-    return tuple(map(tuple, groups))
+    order, ordered = np.argsort(frequencies, kind="stable"), np.sort(frequencies)
+    starts = np.flatnonzero(ordered[1:] >= (1.0 + close) * ordered[:-1]) + 1
+    return tuple(tuple(each.tolist()) for each in np.split(order, starts))
 
 
 class Paired(NamedTuple):
@@ -53,22 +50,25 @@ class Paired(NamedTuple):
     spaces: tuple[tuple[int, ...], ...]  # computed modes on whose space each measured shape is projected
 
 
-def pair_modes(frequencies: np.ndarray, shapes: np.ndarray, measured: Any, groups: Groups) -> Paired:
+def pair_modes(frequencies: np.ndarray, shapes: np.ndarray, measured: Any, groups: Sequence[tuple[int, ...]]) -> Paired:
     """Pair n computed modes with the m of `ModalData`; frequencies (n,) [Hz], shapes (n, n_sensors) in any scale.
 
     Pairs are assigned so that the sum of 1 - MAC, with a weak term in the frequencies, is least. Modes without a shape
     are paired by their number. `groups` are modes that are close to each other (`ModalData.groups`).
     """
-    clusters = close_groups(frequencies, _COINCIDENT)
+    clusters, counts = close_groups(frequencies, _COINCIDENT), measured.has_shape.sum(axis=0)
     members = {mode: cluster for cluster in clusters for mode in cluster}
-    counts = measured.has_shape.sum(axis=0)
-    normed = _normed(shapes)
+    lengths = np.linalg.norm(shapes, axis=-1, keepdims=True)
+    normed = shapes / np.where(lengths > 0.0, lengths, 1.0)
     cosines = measured.known_shapes @ normed.T
     similar = np.square(cosines)
-    for group in groups:
-        for cluster in clusters:
-            if len(group) + len(cluster) > 2:
-                _compare_spaces(similar, measured, group, cluster, normed)
+    for group in groups:  # the largest MAC between the spaces of close measured and of coincident modes
+        for k, there in enumerate(measured.has_shape):
+            modes = [mode for mode in group if there[mode]]
+            for cluster in clusters if modes else ():
+                if len(group) + len(cluster) > 2 and normed[list(cluster)].any():  # else no sensor sees it
+                    spaces = (orth(each.T, _SAME) for each in (measured.known_shapes[k, modes], normed[list(cluster)]))
+                    similar[np.ix_([k], modes, cluster)] = np.linalg.norm(next(spaces).T @ next(spaces), 2) ** 2
     cost = np.abs(np.log(frequencies / measured.mean_frequencies[:, None])) * _FREQUENCY_WEIGHT
     cost += 1.0 - similar.sum(axis=0) / np.maximum(counts, 1)[:, None]
     for mode in np.flatnonzero(counts == 0):
@@ -90,29 +90,3 @@ def pair_modes(frequencies: np.ndarray, shapes: np.ndarray, measured: Any, group
                 projected[:, mode] = (basis @ np.linalg.lstsq(basis, measured.known_shapes[:, mode].T, rcond=None)[0]).T
     assurance = np.where(counts > 0, np.square(projected).sum(axis=(0, 2)) / np.maximum(counts, 1), np.nan)
     return Paired(columns, assurance, frequencies[columns], projected, tuple(spaces))
-
-
-def _compare_spaces(
-    similar: np.ndarray,
-    measured: Any,
-    group: tuple[int, ...],
-    cluster: tuple[int, ...],
-    shapes: np.ndarray,
-) -> None:
-    """Let `similar` (n_sets, m, n) be the largest MAC between the spaces of close measured and of coincident modes."""
-    for k, there in enumerate(measured.has_shape):
-        if modes := [mode for mode in group if there[mode]]:
-            cosines = _basis(measured.known_shapes[k, modes]).T @ _basis(shapes[list(cluster)])
-            similar[np.ix_([k], modes, cluster)] = np.linalg.norm(cosines, 2) ** 2
-
-
-def _basis(shapes: np.ndarray) -> np.ndarray:
-    """Orthonormal basis (n_sensors, k) of the space of shapes in rows."""
-    left, values, _ = np.linalg.svd(shapes.T, full_matrices=False)
-    return left[:, values > _SAME * values[0]]
-
-
-def _normed(shapes: np.ndarray) -> np.ndarray:
-    """Shapes in rows with unit norm; a shape of zeros stays."""
-    lengths = np.linalg.norm(shapes, axis=-1, keepdims=True)
-    return shapes / np.where(lengths > 0.0, lengths, 1.0)

@@ -131,12 +131,31 @@ def test_wrong_numbers_and_planes_of_modes_are_named():
 
 
 def test_a_mode_that_the_model_lacks_is_no_fault_of_a_sensor():
+    def lowest(theta):
+        response = StructureModes(FRAME).simulate(theta)[:, :3]
+        return response[0], response[1:].T
+
+    model = FunctionModes(lowest, tuple(PRIOR), tuple(FLOORS))
     for seed in range(5):
         data = identified(seed, (1, 2, 4))
         data = ModalData(data.frequencies, data.shapes[0], data.sensors, **KNOWN)
-        (found,) = check_fit(Posterior(ModalLikelihood(StructureModes(FRAME, 3), data), PRIOR))
+        (found,) = check_fit(Posterior(ModalLikelihood(model, data), PRIOR))
         assert found.kind == "A mode has no counterpart"
         assert "measured mode 3" in found.text and "select([1, 2])" in found.action
+
+
+def test_one_wrong_line_among_identifications_is_named_before_a_run():
+    for seed in range(8):
+        one = identified(seed)
+        rng, n = np.random.default_rng(seed), (3, 8)[seed % 2]
+        frequencies = one.frequencies * (1.0 + 0.005 * rng.normal(size=(n, 3)))
+        shapes = one.shapes + 0.02 * rng.normal(size=(n, 3, 4))
+        for wrong in (False, True):
+            frequencies[1, 2] *= 1.15 if wrong else 1.0
+            data = ModalData(frequencies, shapes, one.sensors, **KNOWN)
+            found = [each for each in check_fit(Posterior(ModalLikelihood(FRAME, data), PRIOR)) if " set " in each.text]
+            assert [each.kind for each in found] == ["A value may be wrong"] * wrong
+            assert not wrong or "Mode 3 of set 2 has 1.1" in found[0].text
 
 
 def test_a_pairing_that_changes_in_the_posterior_is_named():

@@ -162,7 +162,11 @@ def test_a_bridge_deck_has_a_mode(tmp_path):
         ("load-test", [("[priors]", "[priors]\nsigma_midspan = 'half-normal(1 mm)'")], "is known from"),
         ("load-test", [("[model.channels]", "sensors = ['a']\n[model.channels]")], "sensors are for"),
         ("load-test", [('midspan = "displacement [mm]"', 'top = "displacement [mm]"')], "unknown channel 'midspan'"),
-        ("load-test", [("[load_test]", "[load_test]\ncolumns = {midspan = 'top'}")], "one column 'top'"),
+        (
+            "load-test",
+            [("[load_test]", "[load_test]\ncolumns = {midspan = 'top'}")],
+            "one column of values named 'top'",
+        ),
     ],
 )
 def test_what_does_not_fit_is_refused(kind, changes, text, tmp_path):

@@ -32,8 +32,8 @@ def test_the_posterior_of_a_flexibility_is_normal():
         ((CHANNELS, CASES[:2], VALUES), "each of 3 samples"),
         ((CHANNELS, ("a", "a", "b"), VALUES), "different names of load cases"),
         ((CHANNELS, CASES, to_si(1.0, "mm")), "shape"),
-        ((CHANNELS, CASES, VALUES, {"top": 1.0}), "standard deviations .* of midspan, bottom; got top"),
-        ((CHANNELS, CASES, VALUES, {"midspan": 0.0}), "got midspan: 0.0"),
+        ((CHANNELS, CASES, VALUES, {"top": 1.0}), "standard deviations .* of midspan, bottom; got .*top"),
+        ((CHANNELS, CASES, VALUES, {"midspan": 0.0}), "'midspan': 0.0"),
     ],
 )
 def test_bad_tests_are_refused(arguments, text):
@@ -57,12 +57,12 @@ def test_a_file_has_a_line_for_each_load_case(tmp_path):
             read_load_test(path, CHANNELS[:1]).cases == names == read_load_test(path, CHANNELS[:1], cases="case").cases
         )
     path.write_text("midspan [mm]\n1.1\n1 mm\n")
-    with pytest.raises(ValueError, match="expected numbers in the column 'midspan .mm.' of midspan"):
+    with pytest.raises(ValueError, match="expected one column of values named 'midspan .mm.'"):
         read_load_test(path, CHANNELS[:1])
     path.write_text("midspan [mm]\n1.1\n2.2\n")
     assert read_load_test(path, CHANNELS[:1]).cases == ("1", "2")
     for options, text in (
-        ({"columns": {"midspan": "top"}}, "one column 'top' of the channel midspan; the columns are midspan"),
+        ({"columns": {"midspan": "top"}}, "one column of values named 'top', the columns are midspan"),
         ({"units": {"midspan": "m"}}, "states the unit .mm. but units = .m. was given"),
         ({"cases": "truck"}, "no column 'truck' of load cases"),
     ):

@@ -25,7 +25,7 @@ def test_modes_and_sensors_can_be_selected():
     np.testing.assert_allclose(data.at(["floor 3"]).shapes[0], [[1.0], [1.0]])
     alone = ModalData([1.0, 3.0]).select([2])
     assert alone.frequencies.tolist() == [[3.0]] and not alone.has_shape.any()
-    for call, text in ((lambda: data.select([1]), r"the modes are \(2, 5\)"), (lambda: data.at(["roof"]), "floor 1")):
+    for call, text in ((lambda: data.select([1]), "the modes are 2, 5"), (lambda: data.at(["roof"]), "floor 1")):
         with pytest.raises(ValueError, match=text):
             call()
 
@@ -66,15 +66,15 @@ def test_complex_shapes_become_real_by_their_mean_phase(rng):
     [
         (([1.0, -2.0],), "frequencies must be positive"),
         (([1.0, np.nan],), "leave out modes that were never identified"),
-        (("high",), r"frequencies must be real numbers of shape \(m,\)"),
+        (("high",), "frequencies must be positive numbers"),
         (([1.0, 3.0], SHAPES, FLOORS[:2]), "the name of each sensor"),
         (([1.0, 3.0], np.transpose(SHAPES), FLOORS), "transpose the shapes"),
         (([1.0, 3.0], SHAPES), "the name of each sensor"),
-        (([1.0, 3.0], None, FLOORS), "given without shapes"),
+        (([1.0, 3.0], None, FLOORS), "a row for each of 2 modes"),
         (([1.0, 3.0], np.multiply(SHAPES, 1 + 0.1j), FLOORS), "real_shapes"),
-        (([1.0, 3.0], [SHAPES[0], [1.0, np.nan, 2.0]], FLOORS), "mode 2 at 'floor 2' is NaN"),
-        (([1.0, 3.0], [SHAPES[0], [0.0, 0.0, 0.0]], FLOORS), "the shape of mode 2 is zero"),
-        (([1.0, 3.0], [SHAPES[0], [1.0, np.inf, 2.0]], FLOORS), "must be finite"),
+        (([1.0, 3.0], [SHAPES[0], [1.0, np.nan, 2.0]], FLOORS), "the shape of mode 2 .* floor 2: nan"),
+        (([1.0, 3.0], [SHAPES[0], [0.0, 0.0, 0.0]], FLOORS), "the shape of mode 2 .* not all zero"),
+        (([1.0, 3.0], [SHAPES[0], [1.0, np.inf, 2.0]], FLOORS), "must be finite numbers"),
         (([1.0, 3.0], SHAPES, ("a", "a", "b")), "sensors must differ"),
         (([3.0, 1.0],), "frequencies must ascend"),
     ],
@@ -96,7 +96,7 @@ def test_bad_data_are_refused_with_what_to_do(arguments, text):
         ({"covariance": np.eye(2), "frequency_cv": 0.01}, "leave one out"),
         ({"mode_numbers": [1, 1]}, "different whole numbers"),
         ({"mode_numbers": [0, 1]}, "from 1 on"),
-        ({"damping": [0.01]}, "damping must be real numbers"),
+        ({"damping": [0.01]}, "damping must be ratios"),
         ({"damping": [-0.02, 0.01]}, "from 0 to below 1"),
         ({"damping": [1.5, 0.01]}, "from 0 to below 1"),
     ],

@@ -192,8 +192,10 @@ def test_frequencies_alone_are_paired_by_number():
     [
         (lambda data: ModalLikelihood(FRAME, "modes"), "expected ModalData"),
         (lambda data: ModalLikelihood(ShearFrame({"roof": 4}, [1] * 4, [1] * 4), data), "has no sensors floor 1"),
-        (lambda data: ModalLikelihood(StructureModes(FRAME, 2), data), "has 2 modes, and 3 were measured"),
-        (lambda data: StructureModes(FRAME, 5), "has 4 modes; got n_modes=5"),
+        (
+            lambda data: ModalLikelihood(FunctionModes(len, ("a",), tuple(FLOORS), 2), data),
+            "has 2 modes, and 3 were measured",
+        ),
         (
             lambda data: ModalLikelihood(FRAME, data, frequency_error="each"),
             'frequency_error must be "common" or "mode"',

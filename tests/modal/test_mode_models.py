@@ -17,7 +17,7 @@ from fe_likelihoods import (
     ShearFrame,
     SimulationFailed,
 )
-from fe_likelihoods.modal.mode_models import StructureModes, modal_channels, modal_response, opensees_modes
+from fe_likelihoods.modal.mode_models import ABSENT, StructureModes, modal_channels, modal_response, opensees_modes
 from tests.opensees_column import require_opensees
 
 FLOORS = {"low": 0, "roof": 2}
@@ -58,7 +58,7 @@ def same(first, second, rtol=1e-9):
 
 
 def test_matrices_and_modes_are_models():
-    expected = StructureModes(FRAME, 2).simulate(THETA)
+    expected = StructureModes(FRAME).simulate(THETA)[:, :2]
     assert expected.shape == (3, 2)
     for function, sensors in ((matrices, FLOORS), (thin, FLOORS), (found_modes, tuple(FLOORS))):
         model = FunctionModes(function, ("a", "b", "c"), sensors, 2)
@@ -71,6 +71,22 @@ def test_matrices_and_modes_are_models():
 def test_shapes_in_descending_order_of_frequency_are_sorted():
     response = modal_response([3.0, 1.0, 2.0], [[3, 3], [1, 1], [2, 2]], 2)
     assert response.tolist() == [[1.0, 2.0], [1.0, 2.0], [1.0, 2.0]]
+
+
+def test_a_structure_has_as_many_modes_as_there_are():
+    """More modes than were measured are asked for by default; those that do not exist are never paired."""
+    model = FunctionModes(matrices, ("a", "b", "c"), FLOORS)
+    response = model.simulate(THETA)
+    same(response[:, :3], StructureModes(FRAME).simulate(THETA))
+    assert model.n_steps > 3 and (response[0, 3:] >= ABSENT).all() and not response[1:, 3:].any()
+    for measured in ([0, 1], [0, 2]):
+        for ratio in (response[0, measured[1]] / response[0, 0], 1.01):  # alone, and as a close pair
+            frequencies = response[0, 0] * np.array([1.0, ratio])
+            data = ModalData(frequencies, response[1:, measured].T, tuple(FLOORS), frequency_cv=0.01, shape_error=0.02)
+            assert ModalLikelihood(model, data).predict_modes([THETA]).numbers.tolist() == [[k + 1 for k in measured]]
+    alone = ModalLikelihood(model, ModalData([0.1, 0.2, 0.3, 0.4], frequency_cv=0.01))
+    with pytest.raises(SimulationFailed, match="the model has 3 modes"):
+        alone.model.simulate(THETA)
 
 
 def test_a_program_writes_a_line_for_each_mode():
@@ -97,7 +113,7 @@ def test_a_program_writes_a_line_for_each_mode():
 def test_opensees_has_the_modes_of_the_frame():
     require_opensees()
     model = OpenSeesModel(chain, ("a", "b", "c"), modal_channels(FLOORS), 1.0, 2)
-    same(model.simulate(THETA), StructureModes(FRAME, 2).simulate(THETA), 1e-8)
+    same(model.simulate(THETA), StructureModes(FRAME).simulate(THETA)[:, :2], 1e-8)
     with pytest.raises(SimulationFailed, match="expected 2 positive ones"):
         model.simulate([-1.0, 1.0, 1.0])
 
@@ -107,7 +123,7 @@ def test_dampings_are_no_parameters_of_modes():
     model = StructureModes(grouped)
     assert model.parameter_names == ("stiffness_1", "stiffness_2") and model.n_steps == 3
     same(model.simulate([1.0, 0.9]), StructureModes(FRAME).simulate([1.0, 1.0, 0.9]), 1e-12)
-    assert StructureModes(FRAME).fingerprint != StructureModes(FRAME, 2).fingerprint != model.fingerprint
+    assert StructureModes(FRAME).fingerprint != model.fingerprint
 
 
 @pytest.mark.parametrize(
@@ -116,7 +132,6 @@ def test_dampings_are_no_parameters_of_modes():
         (np.ones((3, 2)), ["a"], "expected the function to return"),
         ((np.ones(3), np.ones((2, 3))), ["a", "b"], "transpose the shapes"),
         (([1.0, -2.0], np.ones((2, 1))), ["a"], "must be positive"),
-        (([1.0], np.ones((1, 1))), ["a"], "expected 2 modes or more; got 1"),
         (([1.0, 2.0], np.ones((2, 3))), ["a"], "shape"),
         (([1.0, 2.0], np.ones((2, 1)) * 1j), ["a"], "complex"),
         ((np.eye(2), np.eye(2)), ["a"], "give sensors as a mapping"),
