@@ -26,34 +26,17 @@ _LEAST_INFORMATION = 1.0  # of the data about a direction, relative to the prior
 _FEWEST_SAMPLES = 5  # effective ones per stiffness, for their covariance
 _NODES = 8, 12  # of the distributions of the spread and of the factor of the errors
 _PRIOR_DRAWS = 20_000  # for the moments of the priors
-_NUMBERS = 5_000_000  # of matrices at a time
 
 
 class StiffnessLoss(NamedTuple):
-    """Stiffness losses between two states, as draws of their joint posterior; ``str`` gives a table and sentences.
+    """Stiffness losses between two states, as draws of their joint posterior; ``str`` gives a table and sentences."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        The stiffnesses.
-    loss : ndarray[n_draws, n]
-        Losses [-]: one minus the ratio of after to before, without the common factor. Negative for a gain.
-    common : ndarray[n_draws]
-        Factor that all stiffnesses share [-], after to before.
-    count : ndarray[n_draws]
-        Number of damaged stiffnesses.
-    error : ndarray[n_draws]
-        Factor by which the errors of the calibrations exceed the stated ones [-].
-    findings : tuple of Finding
-        What speaks against the result; empty if nothing was found.
-    """
-
-    names: tuple[str, ...]
-    loss: np.ndarray
-    common: np.ndarray
-    count: np.ndarray
-    error: np.ndarray
-    findings: tuple[Finding, ...]
+    names: tuple[str, ...]  # the stiffnesses
+    loss: np.ndarray  # (n_draws, n) one minus the ratio of after to before, without the common factor; < 0 for a gain
+    common: np.ndarray  # (n_draws,) factor that all stiffnesses share, after to before
+    count: np.ndarray  # (n_draws,) number of damaged stiffnesses
+    error: np.ndarray  # (n_draws,) factor by which the errors of the calibrations exceed the stated ones
+    findings: tuple[Finding, ...]  # what speaks against the result
 
     @property
     def status(self) -> str:
@@ -83,12 +66,11 @@ class StiffnessLoss(NamedTuple):
         for name, sure, first, *quantiles in zip(self.names, *columns, strict=True):
             rows.append((name, f"{sure:.2f}", f"{first:.2f}", *(f"{value:+.1%}" for value in quantiles)))
         low, median, high = np.quantile(self.common, (0.05, 0.5, 0.95))
-        lines = [
-            text_table(rows),
+        said = (
             f"Probability of a loss above 10 % anywhere: {self.presence():.2f}; common factor {median:.3f} ({low:.3f} "
-            f"to {high:.3f}); errors of the calibrations as stated times {np.median(self.error):.1f}.",
-        ]
-        return "\n".join([*lines, *labelled(self.findings)])
+            f"to {high:.3f}); errors of the calibrations as stated times {np.median(self.error):.1f}."
+        )
+        return "\n".join([text_table(rows), said, *labelled(self.findings)])
 
     __repr__ = __str__
 
@@ -113,12 +95,12 @@ def stiffness_loss(
     Parameters
     ----------
     before, after : StoredPosterior
-        Calibrations of the same structure with data from before and after the event (`StoredPosterior.from_run`). Their
-        priors must be wide enough for both states; they are taken out.
+        Calibrations of the same structure (`StoredPosterior.from_run`). Their priors must be wide enough for both
+        states; they are taken out.
     names : sequence of str
         The stiffnesses, positive parameters of both. Other parameters, such as damping, may differ between the states.
-    presence : float
-        Prior probability that any stiffness is damaged, between 0 and 1. Each one is equally probable.
+    presence, most : float, int
+        Prior probability that any stiffness is damaged, each one equally probable, and their largest number.
     damaged : LogNormal
         Prior of the ratio after / before of a damaged stiffness, without the common factor.
     spread : Distribution or float
@@ -132,17 +114,8 @@ def stiffness_loss(
     error : Distribution or float
         Factor by which the errors of both calibrations exceed the stated ones: its prior, or a known value. 1 where the
         model is right.
-    most : int
-        Largest number of damaged stiffnesses.
-    n_draws : int
-        Number of draws of the result. The Monte Carlo error of a probability p is sqrt(p (1 - p) / n_draws).
-    seed : int
-        Seed of the draws.
-
-    Returns
-    -------
-    StiffnessLoss
-        With the findings of both calibrations.
+    n_draws, seed : int
+        Number of draws, and their seed. The Monte Carlo error of a probability p is sqrt(p (1 - p) / n_draws).
 
     Raises
     ------
@@ -159,56 +132,50 @@ def stiffness_loss(
     >>> found.probability(0.1).round(1)  # of a loss of 10 % or more, in each storey
     array([0.9, 0. ])
     """
-    names, d = tuple(names), len(tuple(names))
-    for good, text in (
-        (d > 1 and len(set(names)) == d, f"the names of two or more different stiffnesses; got {names}"),
-        (0.0 < presence < 1.0, f"presence between 0 and 1; got {presence}"),
-        (isinstance(damaged, LogNormal), f"damaged as a LogNormal distribution of the ratio; got {damaged!r}"),
-        (0.0 < common < np.inf, f"common as a positive standard deviation; got {common}"),
-        (isinstance(most, int) and most >= 1, f"most of at least 1; got {most}"),
-        (isinstance(n_draws, int) and n_draws >= 100, f"n_draws of at least 100; got {n_draws}"),
-        (
-            all(name in state.covariates for name in slopes for state in (before, after)),
-            f"the covariates {', '.join(slopes)} in both calibrations; got {before.covariates} and {after.covariates}",
-        ),
-    ):
-        if not good:
-            raise ValueError(f"stiffness_loss: expected {text}")
-    first, second = states = [_state(stored, names) for stored in (before, after)]
-    warmer = {name: after.covariates[name] - before.covariates[name] for name in slopes}
-    shift = sum(warmer[name] * each.moments[0] for name, each in slopes.items())
+    names, states, d = tuple(names), (before, after), len(names)
+    if d < 2 or len(set(names)) < d or not all(name in each.covariates for name in slopes for each in states):
+        raise ValueError(
+            f"stiffness_loss: expected two or more different stiffnesses, and the covariates of slopes "
+            f"({', '.join(slopes)}) in both calibrations; got {names}, {before.covariates} and {after.covariates}"
+        )
+    if not (0.0 < presence < 1.0 and common > 0.0 and most >= 1 and isinstance(damaged, LogNormal)):
+        raise ValueError(
+            "stiffness_loss: expected presence between 0 and 1, common as a positive number, most of at least 1 and "
+            f"damaged as a LogNormal; got {presence}, {common}, {most} and {damaged!r}"
+        )
+    first, second = (_state(each, names) for each in states)
+    moved = [(after.covariates[name] - before.covariates[name], each.moments) for name, each in slopes.items()]
+    shift = sum(change * mean for change, (mean, _) in moved)
+    common = float(np.linalg.norm([common, *(change * sd for change, (_, sd) in moved)]))
     second = second._replace(peak=second.peak - shift)
-    common = float(np.hypot(common, np.linalg.norm([warmer[name] * each.moments[1] for name, each in slopes.items()])))
     sets = [np.array([*itertools.combinations(range(d), m)], dtype=int) for m in range(min(most, d) + 1)]
-    damage = np.concatenate([(each[:, :, None] == np.arange(d)).any(axis=1) for each in sets])
+    sizes = np.repeat(np.arange(len(sets)), [len(each) for each in sets])
     share = 1.0 - (1.0 - presence) ** (1.0 / d)  # of each stiffness, independent
-    log_prior = damage.sum(axis=1) * np.log(share / (1.0 - share))
+    log_prior = sizes * np.log(share / (1.0 - share))
     log_prior += np.log(presence) - np.logaddexp.reduce(log_prior[1:])
     log_prior[0] = np.log(1.0 - presence)
     nodes = [
-        _Node(*_change(first, second, factor), scatter, common, damaged, factor)
-        for factor in _nodes(error, _NODES[1], "error")
-        for scatter in _nodes(spread, _NODES[0], "spread")
+        _node(first, second, factor, scatter**2, common**2, damaged)
+        for factor in _quantiles(error, _NODES[1], "error")
+        for scatter in _quantiles(spread, _NODES[0], "spread")
     ]
-    evidence = np.array([log_prior + node.log_evidences(sets) for node in nodes])
+    evidence = np.array([log_prior + np.concatenate([node.log_evidences(each) for each in sets]) for node in nodes])
     rng = np.random.default_rng(seed)
     cumulative = np.cumsum(np.exp(evidence - evidence.max()))
     chosen = np.searchsorted(cumulative / cumulative[-1], (np.arange(n_draws) + rng.random()) / n_draws)
     of_node, of_set = np.unravel_index(np.minimum(chosen, evidence.size - 1), evidence.shape)
-    damage, change = damage[of_set], np.empty((n_draws, d + 1))
-    for k in np.unique(of_node):
-        rows = np.flatnonzero(of_node == k)
-        for part in np.array_split(rows, 1 + len(rows) * (d + 1) ** 2 // _NUMBERS):
-            change[part] = nodes[k].draw(damage[part], rng)
+    change, count, starts = np.empty((n_draws, d + 1)), sizes[of_set], np.searchsorted(sizes, np.arange(len(sets)))
+    for k, m in set(zip(of_node.tolist(), count.tolist(), strict=True)):
+        rows = np.flatnonzero((of_node == k) & (count == m))
+        change[rows] = nodes[k].draw(sets[m][of_set[rows] - starts[m]], rng)
     findings = [
         each._replace(text=f"In the calibration {when}: {each.text}")
-        for when, state in zip(("before", "after"), states, strict=True)
+        for when, state in (("before", first), ("after", second))
         for each in state.findings
     ]
-    count, factors = damage.sum(axis=1), np.array([node.error for node in nodes])[of_node]
-    findings += check_most(count, most, d)
-    common_factor = np.exp(change[:, -1] + shift)
-    return StiffnessLoss(names, -np.expm1(change[:, :-1]), common_factor, count, factors, tuple(findings))
+    factors = np.array([node.error for node in nodes])[of_node]
+    common_factor, findings = np.exp(change[:, -1] + shift), (*findings, *check_most(count, most, d))
+    return StiffnessLoss(names, -np.expm1(change[:, :-1]), common_factor, count, factors, findings)
 
 
 class _State(NamedTuple):
@@ -231,10 +198,11 @@ def _state(stored: StoredPosterior, names: tuple[str, ...]) -> _State:
     mean = weights @ points
     apart = points - mean
     covariance = (weights * apart.T) @ apart
-    if constant := [name for name, each in zip(names, np.diag(covariance), strict=True) if not each > 0.0]:
-        raise ValueError(f"stiffness_loss: all samples have the same value of {', '.join(constant)}")
-    if n < (fewest := _FEWEST_SAMPLES * d):
-        raise ValueError(f"stiffness_loss: {d} stiffnesses need at least {fewest} effective samples; got {n:.0f}")
+    if n < (fewest := _FEWEST_SAMPLES * d) or not (np.diag(covariance) > 0.0).all():
+        raise ValueError(
+            f"stiffness_loss: {d} stiffnesses need at least {fewest} effective samples; got {n:.0f}, with the standard "
+            f"deviations {np.sqrt(np.diag(covariance)).tolist()} of the logarithms"
+        )
     covariance *= (n - 1.0) / (n - d - 2.0)  # so that its inverse is right on average
     z = np.random.default_rng(0).standard_normal((_PRIOR_DRAWS, prior.dim))
     z -= z.mean(axis=0)
@@ -242,84 +210,86 @@ def _state(stored: StoredPosterior, names: tuple[str, ...]) -> _State:
     center, prior_covariance = logs.mean(axis=0), np.cov(logs.T, bias=True)  # exact for lognormal priors
     factor = np.linalg.cholesky(prior_covariance)
     whitened = np.linalg.solve(factor, np.linalg.solve(factor, covariance).T)
-    variances, directions = np.linalg.eigh(_symmetric(whitened))
-    precisions = 1.0 / np.maximum(variances, np.finfo(float).tiny)
-    seen = precisions - 1.0 > _LEAST_INFORMATION
-    gained = precisions[seen] - 1.0
-    offset = directions[:, seen].T @ np.linalg.solve(factor, mean - center)
-    peak = center + factor @ directions[:, seen] @ (offset * precisions[seen] / gained)
-    back = np.linalg.solve(factor.T, directions[:, seen])
+    variances, directions = np.linalg.eigh(0.5 * (whitened + whitened.T))
+    gained = 1.0 / np.maximum(variances, np.finfo(float).tiny) - 1.0
+    seen = gained > _LEAST_INFORMATION
+    gained, directions = gained[seen], directions[:, seen]
+    offset = directions.T @ np.linalg.solve(factor, mean - center)
+    peak = center + factor @ directions @ (offset * (1.0 + gained) / gained)
+    back = np.linalg.solve(factor.T, directions)
     scores = np.column_stack([apart, apart @ back])
     scores /= np.sqrt(weights @ np.square(scores))
-    normal = check_normal(weights @ scores**3, weights @ scores**4 - 3.0)
-    findings = (*stored.findings, *normal)
+    findings = (*stored.findings, *check_normal(weights @ scores**3, weights @ scores**4 - 3.0))
     return _State(peak, back * gained @ back.T, int(seen.sum()), center, prior_covariance, findings)
 
 
 class _Node(NamedTuple):
-    """Likelihood exp(evidence + vector' T - T' matrix T / 2) of the change T (d,), and the parts of the change."""
+    """The change T (d,) of the logarithms, at one factor of the errors and one spread.
+
+    Its likelihood is exp(vector' T - T' matrix T / 2); `reduced` and `pull` are the same with scatter and common factor
+    integrated out, where nothing is damaged, and `evidence` is its integral. T is the damage plus `parts` (d, d + 1)
+    times scatter and common factor, whose precision is `precision`.
+    """
 
     matrix: np.ndarray
     vector: np.ndarray
+    reduced: np.ndarray
+    pull: np.ndarray
     evidence: float
-    scatter: float
-    common: float
+    parts: np.ndarray
+    precision: np.ndarray
     damaged: LogNormal
     error: float
 
-    def log_evidences(self, sets: list[np.ndarray]) -> np.ndarray:
-        """Of all sets of damaged stiffnesses; scatter and common factor are integrated out."""
-        d, mean, variance = len(self.vector), np.log(self.damaged.median), self.damaged.log_sd**2
-        both = np.eye(d) + self.matrix @ (other := self.scatter**2 * np.eye(d) + self.common**2)
-        vector = np.linalg.solve(both, self.vector)
-        matrix = _symmetric(np.linalg.solve(both, self.matrix))
-        none = self.evidence + 0.5 * self.vector @ other @ vector - 0.5 * np.linalg.slogdet(both)[1]
-        found = []
-        for members in sets:
-            m = members.shape[1]
-            for part in np.array_split(members, 1 + members.size * m // _NUMBERS):
-                precision = matrix[part[:, :, None], part[:, None, :]] + np.eye(m) / variance
-                of_part = vector[part] + mean / variance
-                gain = (of_part * np.linalg.solve(precision, of_part[:, :, None])[:, :, 0]).sum(axis=1)
-                found.append(none + 0.5 * (gain - np.linalg.slogdet(precision)[1]))
-                found[-1] -= 0.5 * m * (np.log(variance) + mean**2 / variance)
-        return np.concatenate(found)
+    def _damage(self, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Precision (n, m, m), and times it the mean (n, m), of the damage of sets (n, m)."""
+        variance = self.damaged.log_sd**2
+        precision = self.reduced[members[:, :, None], members[:, None, :]] + np.eye(members.shape[1]) / variance
+        return precision, self.pull[members] + np.log(self.damaged.median) / variance
 
-    def draw(self, damage: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Changes (n, d + 1) of the stiffnesses without the common one, and the common one; damage where (n, d)."""
-        n, d = damage.shape
-        parts = np.column_stack([np.eye(d), np.ones(d)])
-        mean = np.column_stack([np.log(self.damaged.median) * damage, np.zeros(n)])
-        own = self.scatter**2 + self.damaged.log_sd**2 * damage
-        weights = 1.0 / np.column_stack([own, np.full(n, self.common**2)])
-        precision = parts.T @ self.matrix @ parts + weights[:, :, None] * np.eye(d + 1)
-        vector = self.vector @ parts + weights * mean
-        noise = np.linalg.cholesky(precision) @ rng.standard_normal((n, d + 1, 1))  # its covariance is the precision
-        return np.linalg.solve(precision, vector[:, :, None] + noise)[:, :, 0]
+    def log_evidences(self, members: np.ndarray) -> np.ndarray:
+        """Of sets (n, m) of damaged stiffnesses."""
+        precision, vector = self._damage(members)
+        gain = (vector * np.linalg.solve(precision, vector[:, :, None])[:, :, 0]).sum(axis=1)
+        of_prior = 2.0 * np.log(self.damaged.log_sd) + (np.log(self.damaged.median) / self.damaged.log_sd) ** 2
+        return self.evidence + 0.5 * (gain - np.linalg.slogdet(precision)[1] - members.shape[1] * of_prior)
+
+    def draw(self, members: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Changes (n, d + 1) of the stiffnesses without the common one, and the common one, for sets (n, m)."""
+        n, d = len(members), len(self.vector)
+        precision, vector = self._damage(members)
+        noise = np.linalg.cholesky(precision) @ rng.standard_normal((*members.shape, 1))  # its covariance is precision
+        change = np.zeros((n, d + 1))
+        change[np.arange(n)[:, None], members] = np.linalg.solve(precision, vector[:, :, None] + noise)[:, :, 0]
+        left = (self.vector - change[:, :-1] @ self.matrix) @ self.parts
+        noise = np.linalg.cholesky(self.precision) @ rng.standard_normal((d + 1, n))
+        return change + np.linalg.solve(self.precision, left.T + noise).T
 
 
-def _change(before: _State, after: _State, factor: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """Matrix, vector and log-evidence of a node: the stiffnesses before are integrated out."""
+def _node(before: _State, after: _State, factor: float, scatter: float, common: float, damaged: LogNormal) -> _Node:
+    """A node, from the variances of scatter and common factor: the stiffnesses before are integrated out."""
     first, second = before.information / factor**2, after.information / factor**2
-    peak, later = before.peak - before.center, after.peak - before.center
+    peak, later, eye = before.peak - before.center, after.peak - before.center, np.eye(len(before.peak))
     precision = np.linalg.inv(before.covariance) + first
     covariance = np.linalg.inv(precision)
     mean = covariance @ (first @ peak)
     # x_before ~ N(mean, covariance), and the likelihood after of x_before + T
-    spread = np.eye(len(mean)) + second @ covariance
-    matrix = _symmetric(np.linalg.solve(spread, second))
+    spread = eye + second @ covariance
+    matrix = np.linalg.solve(spread, second)
+    matrix = 0.5 * (matrix + matrix.T)
     vector = matrix @ (later - mean)
-    of_before = mean @ precision @ mean - peak @ first @ peak - np.linalg.slogdet(precision)[1]
-    of_after = -np.linalg.slogdet(spread)[1] - (later - mean) @ vector
+    both = eye + matrix @ (other := scatter * eye + common)
+    reduced, pull = np.linalg.solve(both, matrix), np.linalg.solve(both, vector)
+    logs = sum(np.linalg.slogdet(each)[1] for each in (precision, spread, both))
+    squares = mean @ precision @ mean - peak @ first @ peak - (later - mean) @ vector + vector @ other @ pull
     # densities of the peaks, whose errors grow with the factor
-    return matrix, vector, 0.5 * (of_before + of_after) - (before.seen + after.seen) * np.log(factor)
+    evidence = 0.5 * (squares - logs) - (before.seen + after.seen) * np.log(factor)
+    parts = np.column_stack([eye, np.ones(len(eye))])
+    whole = parts.T @ matrix @ parts + np.diag([1.0 / scatter] * len(eye) + [1.0 / common])
+    return _Node(matrix, vector, 0.5 * (reduced + reduced.T), pull, evidence, parts, whole, damaged, factor)
 
 
-def _symmetric(matrix: np.ndarray) -> np.ndarray:
-    return 0.5 * (matrix + matrix.T)
-
-
-def _nodes(value: Distribution | float, n: int, name: str) -> np.ndarray:
+def _quantiles(value: Distribution | float, n: int, name: str) -> np.ndarray:
     """Quantiles of equal weight of a positive quantity with a distribution, or its known value."""
     nodes = value.ppf((np.arange(n) + 0.5) / n) if isinstance(value, Distribution) else np.array([float(value)])
     if not (np.isfinite(nodes).all() and (nodes > 0.0).all()):
