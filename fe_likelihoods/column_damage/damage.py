@@ -9,8 +9,6 @@ The samples contain the uncertainty of the parameters only. The model error, whi
 measured to fitted values (``ratios=``). ``docs/damage.rst`` has the references.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from numbers import Real
 from typing import Any, NamedTuple
@@ -28,23 +26,11 @@ from .measures import DamageMeasures
 
 __all__ = ["Damage", "LimitState", "damage", "limit_states"]
 
-_UNITS = {"dissipated energy": "kJ"}
-"""Units in which measures are printed; the others are numbers."""
+_UNITS = {"dissipated energy": "kJ"}  # in which measures are printed; the others are numbers
 
 
 class LimitState(NamedTuple):
     """Limit state: a damage measure and its limit.
-
-    Attributes
-    ----------
-    name : str
-        Name of the state that is reached when the measure exceeds the limit.
-    measure : str
-        Name of the measure, such as "bar tension" or "residual drift".
-    limit : float or Distribution
-        Limit [SI], or the distribution of limits of such structures.
-    source : str
-        Where the limit comes from.
 
     Examples
     --------
@@ -54,13 +40,13 @@ class LimitState(NamedTuple):
     LogNormal(median=0.015, log_sd=0.3)
     """
 
-    name: str
-    measure: str
-    limit: float | Distribution
-    source: str = ""
+    name: str  # of the state that is reached when the measure exceeds the limit
+    measure: str  # such as "bar tension" or "residual drift"
+    limit: float | Distribution  # [SI], or the distribution of the limits of such structures
+    source: str = ""  # where the limit comes from
 
 
-_ASSUMED = (
+_ASSUMED = (  # from the literature, to hold for any column
     LimitState("cover spalling", "cover compression", 0.004, "Kowalsky (2000), serviceability"),
     LimitState("wide cracks", "bar tension", 0.015, "Kowalsky (2000), serviceability: residual cracks of about 1 mm"),
     LimitState("bar fracture", "bar tension", 0.06, "Kowalsky (2000), damage control; Caltrans (2013), #11 and larger"),
@@ -70,36 +56,23 @@ _ASSUMED = (
     LimitState("beyond repair", "Park-Ang index", 0.4, "Park, Ang & Wen (1985)"),
     LimitState("collapse", "Park-Ang index", 1.0, "Park, Ang & Wen (1985)"),
 )
-"""Limit states from the literature. They are assumed to hold for any column."""
 
 
 class Damage(NamedTuple):
     """Damage of a column after each event, given the data.
 
-    Attributes
-    ----------
-    limits : tuple of LimitState
-        The limit states.
-    presence : dict of str to Exceedance
-        For each limit state, the probability that it is reached anywhere, arrays of shape (n_events,), with its Monte
-        Carlo error and interval. Strains, energy and index count from the start of the response, drifts per event.
-    location : dict of str to Exceedance
-        For each limit state of strains, the probability at each place, arrays of shape (n_events, n_sections, 2).
-    extent : dict of str to ndarray
-        For each measure its quantiles [SI], shape (n_probabilities, n_events), or, for "bar tension" and "cover
-        compression", (n_probabilities, n_events, n_sections, 2). Collapsed structures are left out.
-    uncertainty : str
-        Which uncertainties the probabilities contain.
-    prediction : Prediction
-        The prediction, with the probabilities of the quantiles; its `quantity` are the `DamageMeasures`.
+    Strains, energy and index count from the start of the response, drifts per event. Presence and location are
+    probabilities with their Monte Carlo errors and intervals, by the names of limit states.
     """
 
     limits: tuple[LimitState, ...]
-    presence: dict[str, Exceedance]
-    location: dict[str, Exceedance]
-    extent: dict[str, np.ndarray]
-    uncertainty: str
-    prediction: Prediction
+    presence: dict[str, Exceedance]  # that the limit is reached anywhere, (n_events,)
+    location: dict[str, Exceedance]  # of strains at each place, (n_events, n_sections, 2)
+    extent: dict[
+        str, np.ndarray
+    ]  # quantiles (n_probabilities, n_events) [SI] by measure, of strains (..., n_sections, 2)
+    uncertainty: str  # which uncertainties the probabilities contain
+    prediction: Prediction  # whose `quantity` are the `DamageMeasures`; collapsed structures are in no quantile
 
     @property
     def events(self) -> tuple[str, ...]:
@@ -109,19 +82,18 @@ class Damage(NamedTuple):
     @property
     def failures(self) -> str:
         """How many structures collapsed and how many samples failed, in a sentence; an empty text if none."""
-        collapsed, failed, said = len(self.prediction.collapsed), self.prediction.n_failed, []
+        collapsed, failed = len(self.prediction.collapsed), self.prediction.n_failed
         total = self.prediction.n_samples + failed
-        if collapsed:
-            said.append(f"{collapsed} of {total} structures collapsed and reach every limit state")
+        said = [f"{collapsed} of {total} structures collapsed and reach every limit state"] * (collapsed > 0)
         if failed > collapsed:
-            said.append(f"{failed - collapsed} of {total} samples failed and are not counted: probabilities may be")
-            said[-1] += " too low"
+            lost = f"{failed - collapsed} of {total} samples failed and are not counted"
+            said.append(f"{lost}: probabilities may be too low")
         return "; ".join(said)
 
     def table(self) -> str:
-        """Return the probabilities of the limit states and the quantiles of the measures after each event as text.
+        """Probabilities of the limit states with their intervals, and quantiles of the measures, after each event.
 
-        Probabilities have their intervals. Strains are given for the place with the largest quantile.
+        Strains are given for the place with the largest quantile.
         """
         rows = [("probability of", *self.events)]
         for name, each in self.presence.items():
@@ -144,18 +116,9 @@ class Damage(NamedTuple):
 
 
 def limit_states(measures: DamageMeasures) -> tuple[LimitState, ...]:
-    """Return the default limit states for which there are measures.
+    """Default limit states for which there are measures: yield of a bar at the nominal fy/Es, and limits from papers.
 
-    Parameters
-    ----------
-    measures : DamageMeasures
-        The measures.
-
-    Returns
-    -------
-    tuple of LimitState
-        Yield of a bar at the nominal fy/Es, and limits from the literature, which are **assumed**. Use
-        ``limit._replace(limit=...)`` to change one.
+    All are **assumed**; ``limit._replace(limit=...)`` changes one.
 
     Examples
     --------
@@ -203,25 +166,11 @@ def damage(
     seed : int
         Seed for drawing the ratios.
 
-    Returns
-    -------
-    Damage
-
     Raises
     ------
     ValueError
         If the prediction is of another quantity or contains noise, a limit is not positive or has an unknown measure,
         or ratios are for an unknown measure or several quantities.
-
-    Warns
-    -----
-    UserWarning
-        If limit states have no ratios, so that the model error is left out.
-
-    Notes
-    -----
-    With ``from_state="end"`` the prediction, and therefore the damage, covers the new record only. For the damage that
-    accumulates over several events, propagate a model whose loading is `Events`.
 
     Examples
     --------
@@ -254,9 +203,8 @@ def damage(
             'limits must be a sequence of LimitState, such as [LimitState("cracks", "bar tension", 0.015)]; got '
             f"{limits!r}"
         )
-    names = [state.name for state in states]
-    if len(set(names)) != len(names):
-        raise ValueError(f"limit states need different names; got {', '.join(names)}")
+    if len({state.name for state in states}) != len(states):
+        raise ValueError(f"limit states need different names; got {', '.join(state.name for state in states)}")
     every, effective = outcomes(prediction)
     values = measures.split(every)
     errors = _ratios_of_measures(ratios, tuple(values))
@@ -268,8 +216,10 @@ def damage(
                 "damage_measures(measures=...) chooses them"
             )
         found, limit = values[state.measure], _limits(state, len(every), np.random.default_rng(seed))
-        reported = np.asarray(np.mean(limit))
-        shown = {"threshold": reported, "unit": DIMENSIONS[find_unit(_UNITS.get(state.measure, "1")).dimension]}
+        shown = {
+            "threshold": np.asarray(np.mean(limit)),
+            "unit": DIMENSIONS[find_unit(_UNITS.get(state.measure, "1")).dimension],
+        }
         ratios_of = errors.get(state.measure)
         if found.ndim == 4:
             at_places = estimate(found, limit[:, None, None, None], ratios_of, *settings)
@@ -304,9 +254,9 @@ def _limits(state: LimitState, n: int, rng: np.random.Generator) -> np.ndarray:
 
 def _ratios_of_measures(ratios: Any, measures: tuple[str, ...]) -> dict[str, EventRatios]:
     """Ratios by the names of the measures; ValueError if they cannot be used."""
-    if ratios is None:
-        return {}
-    found = dict(ratios) if isinstance(ratios, Mapping) else dict.fromkeys(measures, ratios)
+    found = (
+        dict(ratios) if isinstance(ratios, Mapping) else dict.fromkeys(measures if ratios is not None else (), ratios)
+    )
     if unknown := sorted(set(found) - set(measures)):
         raise ValueError(f"ratios of {', '.join(unknown)}; the measures are {', '.join(measures)}")
     for name, each in found.items():
@@ -317,12 +267,11 @@ def _ratios_of_measures(ratios: Any, measures: tuple[str, ...]) -> dict[str, Eve
 
 def _contents(states: Sequence[LimitState], errors: Mapping[str, EventRatios]) -> str:
     """Which uncertainties the probabilities contain, in words."""
-    capacity = any(isinstance(state.limit, Distribution) for state in states)
-    said = "the uncertainty of the parameters" + (", the distribution of limits" if capacity else "")
-    without = "" if capacity else " or of the limits"
     measures = list(dict.fromkeys(state.measure for state in states))
     with_error = [name for name in measures if name in errors]
-    if not with_error:
-        return f"{said}, not the error of the model{without}"
+    missing = [] if with_error else ["the error of the model"]
     whose = "" if len(with_error) == len(measures) else f" in {', '.join(with_error)}"
-    return f"{said} and the error of the model{whose}" + ("" if capacity else ", not that of the limits")
+    said = ["the uncertainty of the parameters", *([f"the error of the model{whose}"] if with_error else [])]
+    capacity = any(isinstance(state.limit, Distribution) for state in states)
+    (said if capacity else missing).append("the distribution of limits")
+    return " and ".join(said) + (f", not {' or '.join(missing)}" if missing else "")

@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -27,45 +28,26 @@ if TYPE_CHECKING:
 
 __all__ = ["STRAIN_MEASURES", "DamageMeasures", "damage_measures", "damage_outputs"]
 
+# largest strains at the places of a column: the outermost bar and the surface at each side of a section
 STRAIN_MEASURES = ("bar tension", "cover compression")
-"""Largest strains at the places of a column: the outermost bar and the surface at each side of a section."""
-
-_NEEDED = {
+_NEEDED = {  # measures of the whole structure, and the outputs that they need
     "peak drift": ("displacement",),
     "residual drift": ("displacement",),
     "dissipated energy": ("displacement", "base_shear"),
     "Park-Ang index": ("displacement", "base_shear"),
 }
-"""Measures of the whole structure, and the outputs that they need."""
 
 
 @dataclass(frozen=True, eq=False)
 class DamageMeasures(Sequence):
-    """Quantities of a prediction: measures of damage after each event. Made by `damage_measures`.
+    """Quantities of a prediction: measures of damage after each event. Made by `damage_measures`."""
 
-    Attributes
-    ----------
-    quantities : tuple of ChannelQuantity
-        For each event the measures of the whole structure, then for every section from the base up the largest tensile
-        strain of the bar and compressive strain of the surface at the negative side, and the same at the positive side.
-    events : tuple of str
-        Names of the events.
-    measures : tuple of str
-        Names of the measures of the whole structure. Lengths are divided by `height` ("drift").
-    heights : ndarray, shape (n_sections,)
-        Heights at which strains are known [m].
-    height : float
-        Height to which drifts refer [m].
-    yield_strain : float
-        Nominal yield strain of the bars.
-    """
-
-    quantities: tuple[ChannelQuantity, ...]
+    quantities: tuple[ChannelQuantity, ...]  # for each event: of the structure, then of each place from the base up
     events: tuple[str, ...]
-    measures: tuple[str, ...]
-    heights: np.ndarray
-    height: float
-    yield_strain: float
+    measures: tuple[str, ...]  # of the whole structure; lengths are divided by `height` ("drift")
+    heights: np.ndarray  # (n_sections,) at which strains are known [m]
+    height: float  # to which drifts refer [m]
+    yield_strain: float  # nominal, of the bars
 
     def __len__(self) -> int:
         return len(self.quantities)
@@ -81,12 +63,8 @@ class DamageMeasures(Sequence):
     def split(self, values: np.ndarray) -> dict[str, np.ndarray]:
         """Name the values (..., n_quantities) of a prediction.
 
-        Returns
-        -------
-        dict of str to ndarray
-            Per measure of the structure (..., n_events); for "bar tension" and "cover compression"
-            (..., n_events, n_sections, 2), whose last axis is the side: negative, then positive positions in the
-            direction of loading.
+        Per measure of the structure (..., n_events); for "bar tension" and "cover compression" (..., n_events,
+        n_sections, 2), whose last axis is the side: negative, then positive positions in the direction of loading.
         """
         n, values = len(self.measures), values.reshape(*values.shape[:-1], len(self.events), -1)
         named = {name: values[..., k] for k, name in enumerate(self.measures)}
@@ -98,19 +76,11 @@ class DamageMeasures(Sequence):
 
 
 def damage_outputs(column: RCColumn) -> tuple[str, ...]:
-    """Return the outputs of a column that the measures of damage need.
+    """Outputs of a column that the measures of damage need.
 
-    Parameters
-    ----------
-    column : RCColumn
-        The column.
-
-    Returns
-    -------
-    tuple of str
-        Displacement of the top, base shear, and at every section (`RCColumn.section_heights`) the strains of the
-        outermost bars of each side (at their positions, which differ between the sides for an odd number of bars) and
-        of the surface at both sides.
+    Displacement of the top, base shear, and at every section (`RCColumn.section_heights`) the strains of the outermost
+    bars of each side (at their positions, which differ between the sides for an odd number of bars) and of the surface
+    at both sides.
 
     Examples
     --------
@@ -144,16 +114,10 @@ def damage_measures(
     settle : float
         The residual drift is the mean over this length at the end of an event and of the pause after it [s].
 
-    Returns
-    -------
-    DamageMeasures
-        The `quantity` of `fe_likelihoods.propagate`.
-
     Raises
     ------
     ValueError
-        If a measure is unknown or needs an output that the column lacks, the model is no column under a `Record`, or a
-        setting is out of range.
+        If a measure is unknown or lacks an output, the model is no column under a `Record`, or a setting is impossible.
 
     Examples
     --------
@@ -173,8 +137,8 @@ def damage_measures(
         heights, places = np.zeros(0), ()
     structure = [name for name in _NEEDED if name in chosen]
     needed = dict.fromkeys(output for name in structure for output in _NEEDED[name])
-    names = [channel.name for channel in column.channels]
-    if lacking := [name for name in (*needed, *(name for each in places for name in each)) if name not in names]:
+    names = {channel.name for channel in column.channels}
+    if lacking := [name for name in (*needed, *itertools.chain(*places)) if name not in names]:
         raise ValueError(
             f"the column lacks the outputs {', '.join(lacking)} that {', '.join(chosen)} need; add them, "
             "dataclasses.replace(column, outputs=damage_outputs(column)), or choose other measures="
@@ -214,7 +178,8 @@ def damage_measures(
 
 def _index(displacement: np.ndarray, force: np.ndarray, constants: ParkAng) -> float:
     energy = 0.5 * (force[1:] + force[:-1]) @ np.diff(displacement)
-    return float(constants.index(np.abs(displacement).max(), energy))
+    largest = np.abs(displacement).max() + constants.beta / constants.yield_force * energy
+    return float(largest / constants.ultimate_displacement)
 
 
 def _of_index(channel: Channel) -> Channel:

@@ -16,7 +16,6 @@ from numbers import Real
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ..signals.records import DisplacementHistory
 from ..text_tables import number
@@ -26,31 +25,18 @@ if TYPE_CHECKING:
 
 __all__ = ["ParkAng", "park_ang_constants"]
 
-_DRIFTS = (0.03, 0.06, 0.12, 0.2)
-"""Largest drifts of the static analyses; the next one is run only if the column survives."""
+_DRIFTS = (0.03, 0.06, 0.12, 0.2)  # of the static analyses; the next one is run only if the column survives
 _STEPS = 150
 _LOSS = 0.8  # share of the largest force at which the column has failed
 
 
 class ParkAng(NamedTuple):
-    """Constants of the damage index.
+    """Constants of the damage index."""
 
-    Attributes
-    ----------
-    ultimate_displacement : float
-        Displacement at failure under monotonic loading [m].
-    yield_force : float
-        Force at yield [N].
-    beta : float
-        Factor of the energy [-].
-    source : str
-        How the constants were found.
-    """
-
-    ultimate_displacement: float
-    yield_force: float
-    beta: float = 0.05
-    source: str = ""
+    ultimate_displacement: float  # at failure under monotonic loading [m]
+    yield_force: float  # force at yield [N]
+    beta: float = 0.05  # factor of the energy [-]
+    source: str = ""  # how the constants were found
 
     def __str__(self) -> str:
         said = f" ({self.source})" if self.source else ""
@@ -63,45 +49,23 @@ class ParkAng(NamedTuple):
 
     def check(self) -> None:
         """Raise ValueError if a constant is no positive and finite number; `beta` may be zero."""
-        for name, value in (("ultimate_displacement", self[0]), ("yield_force", self[1])):
-            if not isinstance(value, Real) or not 0.0 < value < math.inf:
+        for name, value in zip(("ultimate_displacement", "yield_force", "beta"), self, strict=False):
+            if not isinstance(value, Real) or not 0.0 <= value < math.inf or (value == 0.0 and name != "beta"):
                 raise ValueError(f"{name} of ParkAng must be positive [SI]; got {value!r}")
-        if not isinstance(self.beta, Real) or not 0.0 <= self.beta < math.inf:
-            raise ValueError(f"beta of ParkAng must be zero or more; got {self.beta!r}")
-
-    def index(self, peak: ArrayLike, energy: ArrayLike) -> np.ndarray:
-        """Compute the index [-] from the largest absolute displacement [m] and the dissipated energy [J]."""
-        share = self.beta / (self.yield_force * self.ultimate_displacement)
-        return np.asarray(peak) / self.ultimate_displacement + share * np.asarray(energy)
 
 
 def park_ang_constants(column: RCColumn, beta: float = 0.05) -> ParkAng:
-    """Find the constants of the damage index by pushing the column to failure.
+    """Find the constants of the damage index by pushing the column, at its nominal values, to failure.
 
     The top is displaced in the positive direction. The yield force is the lateral force at the yield of the outermost
     bar at the negative side, which is in tension. The ultimate displacement is reached at the first of three events:
     this bar, in the base section, reaches the ultimate strain of the steel; the core, at the hoops, reaches the strain
     at which the hoops fracture (`RCColumn.confinement`); or the lateral force has decreased to 80 % of its largest
-    value.
+    value. The factor of the energy `beta` is **assumed**: Park & Ang derive it from axial load and reinforcement; 0.05
+    to 0.15 are usual for columns that fail in flexure.
 
-    Parameters
-    ----------
-    column : RCColumn
-        The column, with its nominal values; its loading is not used.
-    beta : float
-        Factor of the energy. The default, 0.05, is **assumed**. Park & Ang derive it from axial load and reinforcement;
-        0.05 to 0.15 are usual for columns that fail in flexure.
-
-    Returns
-    -------
-    ParkAng
-
-    Raises
-    ------
-    ValueError
-        If no bar yields or none of the three events is reached up to a drift of 20 %.
-    SimulationFailed
-        If the analysis does not converge.
+    Raises ValueError if no bar yields or none of the three events is reached up to a drift of 20 %, SimulationFailed if
+    the analysis does not converge.
 
     Examples
     --------

@@ -283,7 +283,8 @@ def test_a_limit_with_a_distribution_is_integrated_over():
     assert abs(reached.probability[0] - exact) < 4.0 * reached.standard_error[0] < 0.03
     assert abs(np.mean(samples > 0.05) - exact) > 6.0 * reached.standard_error[0]  # control: the median alone
     assert (
-        found.uncertainty == "the uncertainty of the parameters, the distribution of limits, not the error of the model"
+        found.uncertainty
+        == "the uncertainty of the parameters and the distribution of limits, not the error of the model"
     )
 
 
@@ -305,13 +306,16 @@ def test_ratios_add_the_error_of_the_model_to_limit_states_and_extent():
         np.quantile(np.exp(np.log(drift[:, None]) + t.rvs((1, 2000), random_state=1)), (0.05, 0.5, 0.95)),
         rtol=0.12,
     )
-    assert "the error of the model in peak drift, not that of the limits" in found.uncertainty
+    assert "the error of the model in peak drift, not the distribution of limits" in found.uncertainty
     plain = damage(prediction, states, noise=False)
-    assert plain.uncertainty == "the uncertainty of the parameters, not the error of the model or of the limits"
+    assert (
+        plain.uncertainty
+        == "the uncertainty of the parameters, not the error of the model or the distribution of limits"
+    )
     assert plain.presence["stays"].probability[0] == 0.0 == found.presence["stays"].probability[0]
     both = damage(prediction, states, ratios=ratios)
     assert both.presence["stays"].probability[0] == pytest.approx(t.sf(np.log(2.0)), rel=1e-2)  # stays at 0.01
-    assert "and the error of the model, not that of the limits" in both.table()
+    assert "and the error of the model, not the distribution of limits" in both.table()
 
 
 def test_an_error_of_the_model_that_is_left_out_is_told(prediction):
