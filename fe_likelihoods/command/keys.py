@@ -160,9 +160,9 @@ def _check_of(kind: str) -> _Check:
 
 def did_you_mean(given: str, known: Sequence[str]) -> str:
     """The nearest known name as a question, or all known names."""
-    near = difflib.get_close_matches(given.lower(), [name.lower() for name in known], n=1, cutoff=0.55)
-    names = [name for name in known if near and name.lower() == near[0]]
-    return f"did you mean {names[0]}?" if names else f"known are {', '.join(known)}"
+    lower = {name.lower(): name for name in reversed(known)}
+    near = difflib.get_close_matches(given.lower(), [*lower], n=1, cutoff=0.55)
+    return f"did you mean {lower[near[0]]}?" if near else f"known are {', '.join(known)}"
 
 
 def _split_number(text: str) -> tuple[str, str]:
@@ -177,14 +177,12 @@ def _parse(text: str, dimension: str | None, expected: str) -> float:
     number, unit = _split_number(text)
     try:
         value = float(number)
-    except ValueError:
-        value = math.nan
-    if math.isnan(value):
-        raise ValueError(f"expected {expected}; got {text!r}")
-    try:
-        return to_si(value, unit, dimension).item() if unit else value
+        if not math.isnan(value):
+            return to_si(value, unit, dimension).item() if unit else value
     except ValueError as error:
-        raise ValueError(f"expected {expected}; got {text!r}: {error}") from None
+        why = f": {error}" if unit else ""
+        raise ValueError(f"expected {expected}; got {text!r}{why}") from None
+    raise ValueError(f"expected {expected}; got {text!r}")
 
 
 def read_quantity(value: Any, dimension: str) -> float:
@@ -231,9 +229,8 @@ def read_keys(given: Mapping[str, Any], keys: Sequence[Key], where: str) -> dict
     known = {each.name: each for each in keys}
     if unknown := [name for name in given if name not in known]:
         raise ValueError(f"{where} {unknown[0]}: unknown key; {did_you_mean(unknown[0], tuple(known))}")
-    for each in keys:
-        if each.required and each.name not in given:
-            raise ValueError(f"{where} {each.name}: this key is missing: {each.meaning}")
+    if missing := [each for each in keys if each.required and each.name not in given]:
+        raise ValueError(f"{where} {missing[0].name}: this key is missing: {missing[0].meaning}")
     return {name: _read_value(value, known[name].kind, f"{where} {name}") for name, value in given.items()}
 
 
@@ -253,21 +250,21 @@ def _read_value(value: Any, kind: str, where: str) -> Any:
         choices = kind.removeprefix("one of ").split(", ")
         if value in choices:
             return value
-        near = difflib.get_close_matches(value, choices, n=1, cutoff=0.55) if isinstance(value, str) else []
-        raise ValueError(f"{where}: expected {kind}; got {value!r}{f'; did you mean {near[0]}?' if near else ''}")
+        near = did_you_mean(value, choices) if isinstance(value, str) else ""
+        raise ValueError(f"{where}: expected {kind}; got {value!r}{f'; {near}' if near.endswith('?') else ''}")
     fits, expected, example = _check_of(kind)
     if not fits(value):
         raise ValueError(f"{where}: expected a {expected}, such as {example}; got {value!r}")
     return value
 
 
-FORMS = {
-    "normal": ("normal(mean, sd) or normal(mean, sd, lower, upper); without bounds it is positive", (2, 4)),
-    "half-normal": ("half-normal(sd), sd before taking the absolute value", (1,)),
-    "uniform": ("uniform(low, high)", (2,)),
-    "log-normal": ("log-normal(median, sd of the natural logarithm)", (2,)),
+FORMS: dict[str, tuple[type[Distribution], str, tuple[int, ...]]] = {
+    "normal": (TruncatedNormal, "normal(mean, sd) or normal(mean, sd, lower, upper); without bounds positive", (2, 4)),
+    "half-normal": (HalfNormal, "half-normal(sd), sd before taking the absolute value", (1,)),
+    "uniform": (Uniform, "uniform(low, high)", (2,)),
+    "log-normal": (LogNormal, "log-normal(median, sd of the natural logarithm)", (2,)),
 }
-_MAKE = {"normal": TruncatedNormal, "half-normal": HalfNormal, "uniform": Uniform, "log-normal": LogNormal}
+"""Distributions of ``[priors]`` by name: class, how it is written, and numbers of arguments."""
 
 
 def parse_prior(text: str, dimension: str | None = None) -> Distribution:
@@ -276,21 +273,19 @@ def parse_prior(text: str, dimension: str | None = None) -> Distribution:
     Units must have the dimension, a key of `fe_likelihoods.units.DIMENSIONS`. ValueError for an unknown name, another
     number of arguments, or values that the distribution refuses.
     """
-    forms = "; ".join(form for form, _ in FORMS.values())
     match = re.fullmatch(r"\s*([A-Za-z-]+)\s*\(([^()]*)\)\s*", text) if isinstance(text, str) else None
     if match is None or match[1].lower() not in FORMS:
+        forms = "; ".join(form for _, form, _ in FORMS.values())
         raise ValueError(
             f'expected a distribution in quotes, such as "normal(1, 0.3)"; got {text!r}; known are {forms}'
         )
-    name = match[1].lower()
-    arguments = [argument for argument in match[2].split(",") if argument.strip()]
-    form, counts = FORMS[name]
+    make, form, counts = FORMS[name := match[1].lower()]
+    arguments = [argument.strip() for argument in match[2].split(",") if argument.strip()]
     if len(arguments) not in counts:
         raise ValueError(f"expected {form}; got {text!r}")
     if name == "log-normal" and _split_number(arguments[1])[1]:
         raise ValueError(f"expected {form}, which has no unit; got {text!r}")
-    expected = "a number, or a number with a unit such as '0.1 g'"
-    numbers = [_parse(argument.strip(), dimension, expected) for argument in arguments]
+    numbers = [_parse(each, dimension, "a number, or a number with a unit such as '0.1 g'") for each in arguments]
     if name == "normal" and len(numbers) == 2 and numbers[0] <= 0.0:
         raise ValueError(f"expected {form}, so a mean of zero or less needs bounds; got {text!r}")
-    return _MAKE[name](*numbers)
+    return make(*numbers)

@@ -12,8 +12,7 @@ from ..checks.screening import Screened, check_data, check_sensors, repair_lines
 from ..checks.sensor_faults import find_sensor_faults
 from ..modal.modal_readers import read_modal_data
 from ..signals.datasets import read_dataset
-from ..signals.read import recognise_format
-from ..signals.strong_motion import find_channels
+from ..signals.strong_motion import find_channels, recognise
 from ..signals.tables import (
     Statements,
     Table,
@@ -52,7 +51,7 @@ def describe_data(path: Path) -> str:
     if path.suffix.lower() in (".h5", ".hdf5"):
         found = _dataset(path)
     else:
-        form = recognise_format(path)
+        form = recognise(path)
         found = _table(path) if form is None else _motions(path, form)
     lines = [f"{path}: {found.text[0]}", *found.text[1:], "", "# lines for the TOML file"]
     for section, given in found.sections.items():

@@ -27,6 +27,9 @@ __all__ = [
 ]
 
 
+NUMBERS = "number, or list of number"
+
+
 @dataclass(frozen=True, kw_only=True)
 class Section:
     """Values of one section; None stands for a key that is left out."""
@@ -57,16 +60,11 @@ class Motion(Table):
     supports: ClassVar = None
     every: ClassVar = 1
 
-    file: Any = key(
-        "text",
-        "Acceleration of the base: AT2, V1, V2, SMC, GeoNet, K-NET, ESM, miniSEED, SAC, CSV, Excel, a data set (.h5)",
-    )
+    file: Any = key("text", "Base acceleration: CSV, Excel, a data set (.h5), or a format of `read_record`")
     column: Any = key("text", "Column of a CSV file or workbook, component (GeoNet), or file in an archive (V2)")
     channel: Any = key("whole number", "Channel of a V2 file")
     units: Any = key("text", "Unit of the acceleration, if the file does not state it")
-    missing: Any = key(
-        "list of number or text", "Numbers and texts that stand for missing samples, where other columns have some"
-    )
+    missing: Any = key("list of number or text", "What stands for missing samples in other columns")
     scale: Any = key("number", "Factor by which the record is multiplied; -1 for a reversed sensor")
     duration: Any = key("time", "Length of the first part that is used")
 
@@ -77,8 +75,7 @@ class Calibration(Motion):
 
     supports: Any = key(
         "list of text",
-        'Motions of several supports instead of file, as "file.csv" or "file.csv:column"; of a bridge deck the base of '
-        "the column, the first end and the second end",
+        'Instead of file, "file.csv" or "file.csv:column" of column base, first end and second end of a bridge deck',
     )
     every: Any = key("whole number >= 1", "Keep every n-th sample: a faster simulation with a longer step", 1)
 
@@ -98,17 +95,14 @@ class Measured(Table):
     """``[measurements]``."""
 
     file: Any = key("text", "Measured response: CSV, Excel, V2 and other files as in [record], or a data set (.h5)")
-    columns: Any = key(
-        "table of text or whole number", "Channel = name of its column in the file, or number in a V2 file"
-    )
+    columns: Any = key("table of text or whole number", "Channel = name of its column, or number in a V2 file")
     units: Any = key("table of text", "Channel = unit, if the file does not state it")
     reversed: Any = key("list of text", "Channels whose sensor counts the other way round: they are multiplied by -1")
     channels: Any = key("list of text", "Channels to use; by default all")
     zero: Any = key(CLOCK, "Time in the file at which the base motion begins")
     missing: Any = key(
         "list of number or text or time span",
-        'Numbers and texts, such as "OL", that stand for missing samples, and times [first, last] that are left out, '
-        "with the name of a channel before them for this one alone [s after zero]",
+        'What stands for missing samples, such as "OL", and times to leave out, ["channel", first, last]',
     )
     baseline: Any = key("table of points", "Channel = points [time, value] of an offset or a drift that is subtracted")
 
@@ -117,49 +111,31 @@ class Measured(Table):
 class Modes(Section):
     """``[modes]``."""
 
-    file: Any = key(
-        "text", "Identified modes, alone or beside other data: CSV, Excel or MATLAB (`read_modal_data`)", ...
-    )
+    file: Any = key("text", "Identified modes: CSV, Excel or MATLAB (`read_modal_data`)", ...)
     unit: Any = key("text", 'Unit of the frequencies, if the file does not state it: "Hz" or "rad/s"')
     columns: Any = key("table of text", "Sensor of the model = name of its column; by default the column of this name")
     variables: Any = key("table of text", "Of a MATLAB file: frequencies, shapes and damping = names of the variables")
     modes: Any = key("list of whole number", "Numbers of the modes to compare; by default all but those held out")
-    held_out: Any = key(
-        "list of whole number",
-        "Numbers of modes that are not compared, but predicted and shown beside the measured ones",
-    )
+    held_out: Any = key("list of whole number", "Numbers of modes that are predicted instead of compared")
     mean: Any = key("yes or no", "Take the mean of several identifications, and their scatter as the errors", False)
-    frequency_cv: Any = key(
-        "number, or list of number",
-        "Known coefficient of variation of the frequencies, such as 0.005, or one per mode of the file",
-    )
-    covariance: Any = key(
-        "list of list of number", "Known covariance of the compared frequencies [Hz²], instead of frequency_cv"
-    )
-    temperatures: Any = key(
-        "number, or list of number",
-        "Temperature of each identification [°C], if the file does not state it; adds the parameter temperature_slope",
-    )
-    shape_error: Any = key(
-        "number, or list of number", "Known standard deviation of a component of a shape with a norm of 1, such as 0.02"
-    )
+    frequency_cv: Any = key(NUMBERS, "Known coefficient of variation of the frequencies, or one per mode of the file")
+    covariance: Any = key("list of list of number", "Known covariance of the compared frequencies [Hz²] instead")
+    temperatures: Any = key(NUMBERS, "Temperature of each identification [°C]; adds the parameter temperature_slope")
+    shape_error: Any = key(NUMBERS, "Known standard deviation of a component of a shape with a norm of 1")
     unknown_errors: Any = key(
         "one of common, mode",
-        "Parameters frequency_error and shape_error, of all modes or of each, are added to the known errors; by "
-        "default where no error is known",
+        "Parameters frequency_error and shape_error, of all modes or of each; by default where no error is known",
     )
     student_t: Any = key("number", "Degrees of freedom of Student-t errors, such as 4, for wrong identifications")
     n_modes: Any = key("whole number >= 1", "Modes that the model computes (twice as many as were measured)")
-    close: Any = key(
-        "number", "Frequencies that differ by less than this share are compared as a plane of shapes (0.02)"
-    )
+    close: Any = key("number", "Share of a frequency within which modes are compared as a plane of shapes (0.02)")
 
 
 @dataclass(frozen=True, kw_only=True)
 class LoadTest(Section):
     """``[load_test]``."""
 
-    file: Any = key("text", "Load test, alone or beside other data: CSV or Excel with a line for each load case", ...)
+    file: Any = key("text", "Load test: CSV or Excel with a line for each load case", ...)
     columns: Any = key("table of text", "Channel = name of its column; by default the column of this name")
     units: Any = key("table of text", "Channel = unit, if the file does not state it")
     cases: Any = key("text", "Column with the names of the load cases, or with positions; by default the first one")
@@ -170,22 +146,10 @@ class LoadTest(Section):
 class Noise(Section):
     """``[noise]``."""
 
-    kind: Any = key(
-        "one of gaussian, autoregressive",
-        "Autoregressive: each error depends on the one before, with a correlation per channel; takes sensor only",
-        "gaussian",
-    )
-    groups: Any = key(
-        "one of channel, all, event", "What has a level: each channel, all together, or each in each of several events"
-    )
-    level: Any = key(
-        "text",
-        'What a level is: a standard deviation in the "si" unit of the channel; a share of the "measured" root mean '
-        'square, in predictions of the simulated one; or a share of the simulated "response" level',
-    )
-    sensor: Any = key(
-        "table of quantity", "Channel = known standard deviation of its sensor noise; zero for names that are left out"
-    )
+    kind: Any = key("one of gaussian, autoregressive", "Autoregressive noise takes sensor only", "gaussian")
+    groups: Any = key("one of channel, all, event", "What has a level: each channel, all, or each in each event")
+    level: Any = key("one of si, measured, response", "Levels in SI units, or as shares of one of these signals")
+    sensor: Any = key("table of quantity", "Channel = known standard deviation of its sensor noise (zero)")
     window: Any = key("time", "Length of the moving window for the root mean square of the response")
     local: Any = key("number", 'For "response": weight of the response envelope in the variance, from 0 to 1 (0.25)')
     marginal: Any = key("yes or no", "Integrate the levels out; for levels in SI units without sensor", False)
@@ -199,11 +163,7 @@ class Sampler(Section):
     walkers: Any = key("whole number >= 1", "Number of walkers", 500)
     steps: Any = key("whole number >= 1", "Sweeps at beta = 1, each of which stores all walkers", 4)
     seed: Any = key("whole number >= 0", "Seed", 1)
-    chains: Any = key(
-        "whole number >= 1",
-        "Independent runs with successive seeds, which r_hat compares; tables and report are of the first",
-        1,
-    )
+    chains: Any = key("whole number >= 1", "Independent runs with successive seeds; the report is of the first", 1)
     guide: Any = key("yes or no", "Find the posterior from the responses, with hundreds of simulations", False)
     recycle: Any = key("yes or no", "Reuse every evaluated point; by default with 150 walkers or more")
     ess_ratio: Any = key("number", "Share of effective walkers wanted at each stage, without recycling")
@@ -252,12 +212,7 @@ _LIMIT = Key("time_limit", "time", "Longest duration of a run; a longer run is s
 USER = (
     Key("parameters", "list of text", "Names of the structural parameters, in the order of theta", True),
     Key("channels", "table of text", 'Channels of the response: name = "quantity [unit]", in order'),
-    Key(
-        "sensors",
-        "table of whole number, or list of text",
-        "With [modes], instead of channels: sensor = row of the matrices, from 0, that a function returns; a list of "
-        "names for other models",
-    ),
+    Key("sensors", "table of whole number, or list of text", "With [modes]: sensor = row of the matrices, or names"),
     Key("dt", "time", "Time step of the response; with a record a whole multiple of its step, by default that step"),
     Key("n_steps", "whole number >= 1", "Number of response samples; with a record it follows from dt"),
     _LIMIT,

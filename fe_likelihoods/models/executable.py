@@ -41,14 +41,10 @@ class ExecutableModel(UserModel):
 
     ``$name`` or ``${name}`` in the templates and in the arguments of the command is replaced by the value of a
     parameter, with all its digits; ``$$`` is a dollar sign (`string.Template`). The program is started in the folder of
-    the run, without a shell and without standard input.
-
-    After the program has ended or was stopped, all processes in its process group are killed. A program that is stopped
-    is killed with all processes that it waits for, on Linux. Daemons, containers and queued jobs are not found. It has
-    the environment variables of this process: name those that matter in `depends_on`. A run that writes more than 256
-    MiB is stopped. The folders of failed runs are kept where the variable ``FE_LIKELIHOODS_KEEP_FAILURES`` says so. The
-    label contains the program, and files that an argument names by an absolute path, alone or as in
-    ``--script=/path``.
+    the run, without a shell and standard input, with the environment variables of this process: name those that matter
+    in `depends_on`. Afterwards all processes in its process group are killed (not daemons, containers and queued jobs).
+    A run that writes more than 256 MiB is stopped; ``FE_LIKELIHOODS_KEEP_FAILURES`` says where folders of failed runs
+    are kept. The label contains the program, and files that an argument names by an absolute path.
 
     Parameters
     ----------
@@ -77,8 +73,7 @@ class ExecutableModel(UserModel):
     files : mapping of str to Path, optional
         Further files, copied into the run folder under the given names.
     version : str, optional
-        Text that enters the fingerprint; change it whenever the program computes something else for a reason that the
-        files do not show. If `output` is a function, it replaces the code of the function.
+        Text in the fingerprint, for changes that the files do not show; it replaces the code of an `output` function.
 
     Raises
     ------

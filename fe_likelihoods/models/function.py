@@ -73,12 +73,11 @@ class FunctionModel(UserModel):
         Whether the response to an excitation depends on earlier excitations. False for a linear structure: predictions
         under another record then need no `from_state`.
     version : str, optional
-        Text in the fingerprint; cached simulations are used only if their text is the same. Without it, the label of
-        the model (`fe_likelihoods.simulation.label`) notices a change in the code, or in anything that it uses or
-        opens, and stored simulations are used if some of them agree with new simulations.
+        Text in the fingerprint; cached simulations are used only if it is the same. Without it, the label of the model
+        (`fe_likelihoods.simulation.label`) notices a change in the code, or in what it uses or opens.
     depends_on : sequence, optional
         Files and values that affect the response, as part of the fingerprint: a Path stands for the content of a file
-        or of all files in a folder, any other object for its value, such as ``os.environ.get("SOLVER_MODE")``.
+        or folder, any other object for its value, such as ``os.environ.get("SOLVER_MODE")``.
     jacobian : callable, optional
         Function with the arguments of `function` that returns the derivatives (n_parameters, n_channels, n_steps) of
         the response by the parameters, for the search of a guide (`fe_likelihoods.simulation.model.Model`).
@@ -89,8 +88,7 @@ class FunctionModel(UserModel):
     memory_limit : int, optional
         Largest address space of the process [bytes]. Allocations beyond it fail.
     runs_per_process : int, optional
-        Number of runs after which the process is replaced by a new one, which limits the memory that compiled code
-        leaks; never by default.
+        Number of runs after which a new process is started, against memory that compiled code leaks.
 
     Raises
     ------

@@ -100,11 +100,7 @@ class IsolatedBridge(BuiltInModel):
     (2, 1991)
     """
 
-    record: Record = described(
-        "",
-        "Table acceleration, linear between its samples, at the scale of the model: for a quarter-scale model the time "
-        "of a prototype record is halved",
-    )
+    record: Record = described("", "Table acceleration at the scale of the model, linear between its samples")
     deck_mass: float = described("kg", "Mass of the deck", "positive", 140e3 / 9.81)
     piers: tuple[Pier, Pier] = described("", "The piers", default=(Pier(), Pier()))
     bearings: tuple[Bearing, Bearing] = described(
@@ -120,29 +116,19 @@ class IsolatedBridge(BuiltInModel):
         "", "Names of the channels (see the notes); default: all twelve that are not means", default=None
     )
     parameters: tuple[str, ...] = described(
-        "",
-        "Names of the parameters that make up theta, in this order (``IsolatedBridge`` lists them)",
-        default=PARAMETERS,
+        "", "Names of the parameters in theta (``IsolatedBridge`` lists them)", default=PARAMETERS
     )
     nominal_units: ClassVar[dict[str, str]] = _NOMINAL_UNITS
-    friction: str = described(
-        "",
-        '"bouc-wen" (regularised), or "coulomb" (exact stick and slip, whose instants are located within a step)',
-        default="bouc-wen",
-    )
+    friction: str = described("", '"bouc-wen" (regularised), or "coulomb" (exact)', default="bouc-wen")
     step: float | None = described(
-        "s",
-        "Integration step; it divides the step of the record; default: the longest such step up to 0.25 ms (accuracy: "
-        "``docs/theory/time_integration.rst``)",
-        "positive",
-        None,
+        "s", "Integration step, which divides that of the record; default: the longest up to 0.25 ms", "positive", None
     )
     every: int = described("", "The response has one sample per ``every`` samples of the record", default=1)
     vertical: Record | None = described(
         "",
-        "Vertical table acceleration, positive upwards, at the samples of the record and linear between them",
+        "Vertical table acceleration, positive upwards, at the samples of the record",
         default=None,
-        more="It multiplies the load on the bearings by 1 + a_v/g, or by zero while this factor is negative.",
+        more="It multiplies the load on the bearings by 1 + a_v/g, or by zero where that is negative.",
     )
 
     def __post_init__(self) -> None:

@@ -38,12 +38,7 @@ class Pier:
     center: float = described("m", "Height of the block's centre of mass above its bottom", "zero or positive", 0.15)
     mass: float = described("kg", "Mass of the block", "positive", 907.0)
     rotary_inertia: float = described("kg m²", "Rotary inertia of the block about its centre of mass", "positive", 34.0)
-    damping_ratio: float = described(
-        "",
-        "Damping ratio of the pier alone in its first mode; damping is proportional to the stiffness",
-        "zero or positive",
-        0.02,
-    )
+    damping_ratio: float = described("", "Damping ratio of the pier alone in its first mode", "zero or positive", 0.02)
 
     def __post_init__(self) -> None:
         check_described(self, "of a pier")
@@ -97,10 +92,7 @@ class Bearing:
         "and zero.",
     )
     gamma: float = described(
-        "",
-        "Constant of the Bouc-Wen law with A = 1, exponent 2 and beta = 1 - gamma; above 0.5, at most 1",
-        "positive",
-        0.9,
+        "", "Constant of the Bouc-Wen law (A = 1, exponent 2, beta = 1 - gamma); above 0.5, at most 1", "positive", 0.9
     )
 
     def __post_init__(self) -> None:
@@ -142,8 +134,7 @@ class Rubber:
     )
     half_loop: tuple[float, ...] = described(
         "N",
-        "The 3 coefficients B_0, B_2, B_4 of half the difference between the loading and unloading branches, sum of "
-        "B_m s^m",
+        "The 3 coefficients B_0, B_2, B_4 of half the difference of loading and unloading branch, sum of B_m s^m",
         default=(450.0, 100.0, 250.0),
     )
     scale: float = described("m", "Displacement at s = 1", "positive", 0.050)

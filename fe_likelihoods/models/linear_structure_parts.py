@@ -38,22 +38,11 @@ class LinearSystem(NamedTuple):
 
 
 class Parts(Protocol):
-    """Interface of the structures that `LinearStructure` simulates.
+    """Interface of the structures that `LinearStructure` simulates; their ``repr`` enters the fingerprint."""
 
-    The ``repr`` of the object must contain everything that the matrices depend on, because it enters the fingerprint.
-    """
-
-    @property
-    def parameter_names(self) -> tuple[str, ...]:
-        """Names of the parameters."""
-
-    @property
-    def n_supports(self) -> int:
-        """Number of supports."""
-
-    @property
-    def channel_names(self) -> tuple[str, ...]:
-        """Names of the channels, which are absolute accelerations."""
+    parameter_names: tuple[str, ...]
+    n_supports: int
+    channel_names: tuple[str, ...]  # of absolute accelerations
 
     def assemble(self, theta: np.ndarray) -> LinearSystem:
         """Matrices at the parameters (n_parameters,); raises `SimulationFailed` if they describe no structure."""
@@ -83,10 +72,9 @@ class BridgeDeck:
 
         x'' + 2 zeta omega x' + omega^2 x = -[w (a_1 + a_2) / 2 + (1 - w) a_c],    y = -2 zeta omega x' - omega^2 x
 
-    w is the share of the ends in the stiffness that supports the middle: the stiffness of the ends through the deck,
-    divided by the sum of this stiffness and the column stiffness. A point in the first span has the acceleration (1 -
-    s) a_1 + s y, a point in the second span (1 - s) a_2 + s y. At the middle of a span, s = 1/2 if the halves of the
-    deck remain straight, and s = sin(pi / 4) if the deck vibrates as half a sine.
+    w is the share of the ends in the stiffness that supports the middle. A point in the first span has the acceleration
+    (1 - s) a_1 + s y, a point in the second span (1 - s) a_2 + s y. At the middle of a span, s = 1/2 if the halves of
+    the deck remain straight, and s = sin(pi / 4) if the deck vibrates as half a sine.
 
     The supports are the base of the column, the first end and the second end. The parameters are ``frequency``
     omega / 2 pi [Hz], ``damping`` zeta, and ``share`` w and ``shape`` s unless they are given here.
@@ -138,13 +126,7 @@ class BridgeDeck:
         return tuple(name for name in (self.first_span, self.middle, self.second_span) if name)
 
     def assemble(self, theta: np.ndarray) -> LinearSystem:
-        """Compute the matrices at the parameters (n_parameters,).
-
-        Raises
-        ------
-        SimulationFailed
-            If the frequency or the damping is not positive, or share or shape is not between 0 and 1.
-        """
+        """Matrices at the parameters (n_parameters,); SimulationFailed if they are impossible."""
         values = dict(share=self.share, shape=self.shape) | dict(zip(self.parameter_names, theta.tolist(), strict=True))
         frequency, damping, share = (values[name] for name in ("frequency", "damping", "share"))
         shape = 0.0 if values["shape"] is None else values["shape"]
@@ -245,13 +227,7 @@ class ShearFrame:
         return tuple(name for name, _ in self.floors)
 
     def assemble(self, theta: np.ndarray) -> LinearSystem:
-        """Compute the matrices at the parameters (n_parameters,).
-
-        Raises
-        ------
-        SimulationFailed
-            If a stiffness or damping is not positive.
-        """
+        """Matrices at the parameters (n_parameters,); SimulationFailed if one is not positive."""
         if not (theta > 0.0).all():
             bad = [name for name, value in zip(self.parameter_names, theta, strict=True) if not value > 0.0]
             raise SimulationFailed(f"stiffnesses and dampings must be positive; not positive: {', '.join(bad)}")
@@ -327,12 +303,9 @@ class ModalModel:
         return self.channels
 
     def assemble(self, theta: np.ndarray) -> LinearSystem:
-        """Compute the matrices at the parameters (n_parameters,), with the modes as degrees of freedom.
+        """Matrices at the parameters (n_parameters,), with the modes as degrees of freedom.
 
-        Raises
-        ------
-        SimulationFailed
-            If the frequencies are not positive and ascending, or a damping ratio is not positive.
+        SimulationFailed if frequencies are not positive and ascending, or a damping ratio is not positive.
         """
         n = self.n_modes
         frequencies, ratios, shapes = theta[:n], theta[n : 2 * n], theta[2 * n :].reshape(-1, n)

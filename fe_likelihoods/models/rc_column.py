@@ -147,10 +147,7 @@ class RCColumn(BuiltInModel):
     hoops: Hoops = described("", "Transverse reinforcement")
     mass: float = described("kg", "Mass at the top", "positive")
     axial_load: float | None = described(
-        "N",
-        "Gravity load at the top, positive downwards; default: the weight of ``mass``",
-        "finite",
-        None,
+        "N", "Gravity load at the top, positive downwards; default: the weight of ``mass``", "finite", None
     )
     rotational_inertia: float = described("kg m²", "Rotational inertia of the mass", "zero or positive", 0.0)
     column_mass: float = described(
@@ -158,67 +155,46 @@ class RCColumn(BuiltInModel):
         "Mass of the column itself, with its weight",
         "zero or positive",
         0.0,
-        "Half of each element's share is at either end, so that the nodes below the top have velocities and "
-        "accelerations.",
+        "Half of each element's share is at either end: the nodes below the top have velocities and accelerations.",
     )
     a0: float = described("1/s", "Rayleigh damping: factor of the mass", "zero or positive", 0.0)
-    a1: float = described(
-        "s",
-        "Rayleigh damping: factor of the tangent stiffness of the last converged step",
-        "zero or positive",
-        0.0,
-    )
+    a1: float = described("s", "Rayleigh damping: factor of the stiffness in the last step", "zero or positive", 0.0)
     penetration: float = described(
         "m",
         "Length of strain penetration below the base",
         "zero or positive",
         0.0,
-        "The deformations of the base section continue over this length, because the bars slip out of the foundation, "
-        "and the rotation and elongation over this length are added to the column deformations. A common estimate is "
-        "0.022 fy d [MPa, m] (Priestley, Seible & Calvi, Seismic Design and Retrofit of Bridges, 1996). With 2 "
-        "elements of 3 points, this estimate completes the plastic hinge, 0.08 height + 0.022 fy d, because the end "
+        "The deformations of the base section continue over this length, because the bars slip out of the foundation. "
+        "A common estimate is 0.022 fy d [MPa, m] (Priestley, Seible & Calvi, Seismic Design and Retrofit of Bridges, "
+        "1996). With 2 elements of 3 points it completes the plastic hinge, 0.08 height + 0.022 fy d, because the end "
         "section of such an element represents height/12.",
     )
     fatigue: LowCycleFatigue | None = described(
-        "", "Low-cycle fatigue of the bars; default: bars neither lose strength nor fracture", default=None
+        "", "Low-cycle fatigue of the bars; default: they neither lose strength nor fracture", default=None
     )
     collapse_drift: float = described(
         "",
-        "Displacement of the top by the height at which a column under a ``Record`` has collapsed, and the simulation "
-        'ends with the reason "collapse"',
+        'Displacement of the top by the height at which the simulation ends with the reason "collapse"',
         "positive",
         0.2,
-        "Tested columns have lost their strength at 0.05 to 0.15. Without a limit, columns whose bars do not fracture "
-        "would come back from any drift.",
+        "Tested columns have lost their strength at 0.05 to 0.15; bars that do not fracture would come back from more.",
     )
     parameters: tuple[str, ...] = described(
-        "",
-        "Names of the parameters that make up theta, in this order (``RCColumn`` lists them)",
-        default=("Ec", "Es", "a0", "a1", "ft"),
+        "", "Names of the parameters in theta (``RCColumn`` lists them)", default=("Ec", "Es", "a0", "a1", "ft")
     )
     n_elements: int = described("", "Number of elements", default=2)
     n_points: int = described("", "Number of Gauss-Lobatto points per element, 2 to 7", default=3)
     mesh: int = described("", "Number of strips of the section (even)", default=40)
     geometry: str = described("", '"corotational" or "linear"', default="corotational")
-    substeps: int = described(
-        "", "Integration steps per step of the record, which is linear between its samples", default=1
-    )
+    substeps: int = described("", "Integration steps per step of the record", default=1)
     max_increment: float | None = described(
-        "m",
-        "Largest increment of an imposed displacement; larger ones are divided; default: height/5000",
-        "positive",
-        None,
+        "m", "Largest increment of an imposed displacement; default: height/5000", "positive", None
     )
     outputs: tuple[str, ...] | None = described(
-        "",
-        "Names of the channels, that is, of the sensors (see the notes); default: those at the top",
-        default=None,
+        "", "Names of the channels, that is, of the sensors (see the notes); default: those at the top", default=None
     )
     units: tuple[tuple[str, str], ...] = described(
-        "",
-        "Display units of the channels, by name or by the part of the name before the ``@``",
-        default=(),
-        kind="table of text",
+        "", "Channel, or the part of its name before the @, = display unit", default=(), kind="table of text"
     )
     nominal_units: ClassVar[dict[str, str]] = _NOMINAL_UNITS
     tolerance: float = described("m and rad", "Norm of the last Newton correction", "positive", 1e-8)

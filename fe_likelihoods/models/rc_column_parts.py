@@ -73,8 +73,7 @@ class Concrete:
     )
     softening_strain: float = described(
         "",
-        "Length of the softening branch in tension: strain from cracking (ft/Ec) to the point where the stress has "
-        "decreased to ``softening_ratio`` ft and drops to zero",
+        "Strain in tension from cracking (ft/Ec) to where the stress is ``softening_ratio`` ft and drops to zero",
         "positive",
         0.001,
     )
@@ -166,20 +165,14 @@ class LowCycleFatigue:
 
     cf: float = described(
         "",
-        "Coefficient of Coffin and Manson: plastic strain of a half cycle, from one reversal to the next, that breaks "
-        "a bar",
+        "Coefficient of Coffin and Manson: plastic strain of a half cycle that breaks a bar",
         "positive",
         0.26,
         "The defaults are the starting values that OpenSees documents for its material ReinforcingSteel, from tests of "
         "Brown & Kunnath (2000) with bars whose slenderness was 6.",
     )
     alpha: float = described("", "Exponent of Coffin and Manson, at most 1", "positive", 0.506)
-    cd: float = described(
-        "",
-        "Coefficient of strength loss, at least ``cf``; a large coefficient means no loss before fracture",
-        "positive",
-        0.389,
-    )
+    cd: float = described("", "Coefficient of strength loss, at least ``cf``; large: no loss", "positive", 0.389)
 
     def __post_init__(self) -> None:
         check_described(self, "of fatigue")
@@ -259,12 +252,7 @@ class Hoops:
     diameter: float = described("m", "Diameter of the hoop bar", "positive")
     spacing: float = described("m", "Distance between the centres of adjacent sets", "positive")
     fy: float = described("Pa", "Yield strength", "positive")
-    area: float | None = described(
-        "m²",
-        "Area of one set; bundled hoops have more than one bar; default: one bar, from ``diameter``",
-        "positive",
-        None,
-    )
+    area: float | None = described("m²", "Area of one set; default: one bar, from ``diameter``", "positive", None)
     ultimate_strain: float = described("", "Strain at fracture", "positive", 0.12)
     spiral: bool = described("", "Whether the reinforcement is a spiral", default=False)
 

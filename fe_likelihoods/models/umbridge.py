@@ -52,11 +52,6 @@ class UMBridgeModel(ExternalModel):
     retries, retry_wait : int, float
         Further attempts if the server cannot be reached or dies; time until the first [s], doubled each time to 60 s.
 
-    Raises
-    ------
-    ConnectionError, ValueError
-        If the server cannot be reached; if it has no such model, or arguments are wrong or do not fit the model.
-
     Examples
     --------
     A server at this address must run; ``docs/own_model.rst`` starts one.
@@ -170,12 +165,8 @@ def serve(served: Any, *, host: str = "127.0.0.1", port: int = 4242, block: bool
     host, port : str, int
         Where connections are accepted, without passwords; ``"0.0.0.0"`` is all networks, and port 0 a free port.
     block : bool
-        Whether to return only after Ctrl-C.
-
-    Returns
-    -------
-    UMBridgeServer or None
-        Without `block`, the server, in threads of this process. Do not evaluate `served` elsewhere until its `close`.
+        Whether to return only after Ctrl-C; else a `UMBridgeServer` in threads of this process is returned: do not
+        evaluate `served` elsewhere until its `close`.
     """
     if not isinstance(served, Mapping):
         served = {"posterior" if hasattr(served, "log_prob") else "forward": served}

@@ -47,12 +47,8 @@ def undamped_modes(stiffness: Any, mass: Any, n: int | None = None) -> Modes:
 
     The largest eigenvalues 1 / lambda of the inverse problem M phi = (1 / lambda) K phi are the low modes to full
     precision, and degrees of freedom may have no mass. Sparse matrices use the Lanczos method with shift and invert.
-
-    Raises
-    ------
-    SimulationFailed
-        If the matrices are not finite, not symmetric or of different shapes, the structure can move without
-        deformation, or fewer than n degrees of freedom have a positive mass.
+    SimulationFailed if the matrices are not finite, not symmetric or of different shapes, the structure can move
+    without deformation, or fewer than n degrees of freedom have a positive mass.
     """
     in_band = sparse.issparse(stiffness) or sparse.issparse(mass)
     stiffness, mass = (sparse.csc_array(each) if in_band else np.asarray(each, float) for each in (stiffness, mass))

@@ -11,10 +11,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ..units import to_si
-from . import strong_motion
 from .channels import Channel, Measurements
 from .records import DisplacementHistory, Record
-from .strong_motion import Series
+from .strong_motion import OF_OBSPY, Series, read_series, recognise
 from .tables import (
     WORKBOOKS,
     agree_on_unit,
@@ -31,7 +30,6 @@ __all__ = [
     "read_columns",
     "read_imposed_test",
     "read_record",
-    "recognise_format",
 ]
 
 _TABLES = ("", ".csv", ".txt", ".dat", ".tsv", ".lvm", ".out", *WORKBOOKS)
@@ -128,8 +126,8 @@ def read_record(
     if channel is not None and column is not None:
         raise ValueError(f"{path}: give channel= or column=, not both; they name the same")
     channel = column if channel is None else channel
-    form, file = recognise_format(path), str(path)
-    if inventory is not None and form != "obspy":
+    form, file = recognise(path), str(path)
+    if inventory is not None and form not in OF_OBSPY:
         raise ValueError(f"{path}: inventory= is for miniSEED, SAC and GSE2 files; leave it out")
     options = {"time": time, "time_unit": time_unit, "skip": skip, "missing": missing}
     if form is None:
@@ -145,7 +143,7 @@ def read_record(
     elif unused := ", ".join(name for name, option in options.items() if option is not None):
         raise ValueError(f"{path}: a file of format {form} states its times and samples; leave {unused} out")
     else:
-        series = strong_motion.read_series(path, form, channel, member, inventory)
+        series = read_series(path, form, channel, member, inventory)
     unit = agree_on_unit(series.unit, units, "acceleration", series.file or file)
     # The source has the file name without its folder, because it is written into data sets that are shared.
     source = series.source or Path(file).name + (f": {series.title}" if series.title else "")
@@ -164,20 +162,6 @@ def read_record(
             f"{file} states a step of {step:g} s but dt = {dt!r} was given; leave dt out, or correct the file"
         )
     return Record(series.name or Path(path).stem, step, to_si(values, unit, "acceleration"), source)
-
-
-def recognise_format(path: str | Path) -> str | None:
-    """The format of a file or zip archive, such as "v2" or "at2"; None for a table (CSV, Excel).
-
-    ValueError if the file cannot be read, or has a known format that is not read.
-    """
-    name, form = ("", None) if Path(path).suffix.lower() in WORKBOOKS else strong_motion.recognise(path)
-    if name and form is None:
-        article = "an" if name.startswith("HDF5") else "a"
-        raise ValueError(
-            f"{path}: this looks like {article} {name} file, which is not read; take a file of another format"
-        )
-    return form
 
 
 def _table_series(
@@ -285,7 +269,7 @@ def read_columns(
     array([[0.    , 0.0015, 0.002 ]])
     """
     wanted = _wanted(path, channels, columns, units)
-    if (form := recognise_format(path)) is not None:
+    if (form := recognise(path)) is not None:
         if not all(option is None for option in (units, dt, time, time_unit, skip, missing)):
             raise ValueError(
                 f"{path}: a file of format {form} states units and times; leave units, dt, time, time_unit, skip and "

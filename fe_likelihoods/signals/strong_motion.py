@@ -43,6 +43,7 @@ from ..units import to_si
 from .tables import (
     LINE_END,
     NUMBER,
+    WORKBOOKS,
     agree_on_unit,
     check_count,
     check_peaks,
@@ -56,7 +57,7 @@ from .tables import (
     read_statements,
 )
 
-__all__ = ["Found", "Series", "find_channels", "read_series", "recognise"]
+__all__ = ["OF_OBSPY", "Found", "Series", "find_channels", "read_series", "recognise"]
 
 
 class Series(NamedTuple):
@@ -91,8 +92,8 @@ def read_series(
     if form in _SINGLE:
         series = _SINGLE[form](_text(path), str(path))
         return series._replace(name=Path(path).name) if form == "knet" else series  # the ending is the direction
-    if form == "obspy":
-        return _parse_obspy(path, channel, inventory)
+    if form in OF_OBSPY:
+        return _parse_obspy(path, form, channel, inventory)
     if form == "v2" and isinstance(channel, str):
         channel, member = (int(channel), member) if channel.isdecimal() else (None, channel)
     candidates = find_channels(path, form, member)
@@ -116,20 +117,33 @@ def _text(path: str | Path) -> str:
 # which format ---------------------------------------------------------------------------------------------------------
 
 _LOOK = 40  # lines in which a format is recognised
+OF_OBSPY = ("MSEED", "SAC", "GSE2")
+"""Formats that the package obspy reads, by its names."""
 
 
-def recognise(path: str | Path) -> tuple[str, str | None]:
-    """The name of a file's format (empty if unknown), and its kind for `read_series` (None if it is not read)."""
+def recognise(path: str | Path) -> str | None:
+    """The format of a file or zip archive, such as "v2" or "at2"; None for a table (CSV, Excel).
+
+    ValueError if the file cannot be read, or has a known format that is not read.
+    """
     content, encoding = read_bytes(path), "latin-1"  # of binary files, one letter per byte
+    if Path(path).suffix.lower() in WORKBOOKS:
+        return None
     if zipfile.is_zipfile(io.BytesIO(content)):
-        return "zip", "v2"
+        return "v2"
     if content.startswith(codecs.BOM_UTF8):
         encoding = "utf-8-sig"
     elif content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         encoding = "utf-16"
     text = content[:8000].decode(encoding, errors="replace")
     lines = LINE_END.sub("\n", text).splitlines()
-    return ("", None) if _is_table(lines) else _form_of(lines[:_LOOK], text)
+    name, form = ("", None) if _is_table(lines) else _form_of(lines[:_LOOK], text)
+    if name and form is None:
+        article = "an" if name.startswith("HDF5") else "a"
+        raise ValueError(
+            f"{path}: this looks like {article} {name} file, which is not read; take a file of another format"
+        )
+    return form
 
 
 def _is_table(lines: list[str]) -> bool:
@@ -146,6 +160,7 @@ def _is_table(lines: list[str]) -> bool:
 
 
 def _form_of(lines: list[str], text: str) -> tuple[str, str | None]:
+    """Name of a format, empty for another one, and its kind, None if it is not read."""
     first, head = next((line.strip() for line in lines), ""), "\n".join(lines)
     version = text[304:308].encode("latin-1", "replace")  # in the header of SAC, 632 bytes
 
@@ -170,9 +185,9 @@ def _form_of(lines: list[str], text: str) -> tuple[str, str | None]:
         ("PDF", None, text.startswith("%PDF")),
         ("damaged zip", None, text.startswith("PK")),
         ("web page (HTML)", None, begins(r"<(!doctype )?html\b")),
-        ("MSEED", "obspy", re.match(r"\d{6}[DRQM][ \0]|MS\x03", text)),  # the names that obspy gives these three
-        ("GSE2", "obspy", text.startswith("WID2 ")),
-        ("SAC", "obspy", len(text) > 632 and b"\0\0\0" in (version[1:], version[:3]) and 6 in version[::3]),
+        ("miniSEED", "MSEED", re.match(r"\d{6}[DRQM][ \0]|MS\x03", text)),
+        ("GSE2", "GSE2", text.startswith("WID2 ")),
+        ("SAC", "SAC", len(text) > 632 and b"\0\0\0" in (version[1:], version[:3]) and 6 in version[::3]),
         ("PEER AT2", "at2", re.search(r"NPTS\s*(=|,)", head) and "DT" in head and not first.startswith("#")),
         ("Taiwan CWB or SMART", None, first.startswith("#StationCode")),
         ("binary", None, "\0" in text.rstrip("\0\x1a\r\n ")),
@@ -363,7 +378,7 @@ _ZIP_DAMAGE = (zipfile.BadZipFile, RuntimeError, NotImplementedError, OSError, E
 
 def find_channels(path: str | Path, form: str, member: str | None = None) -> list[Found]:
     """The accelerations in a file, or in the V2, else V1 files of an archive."""
-    if form in _SINGLE or form == "obspy":
+    if form in _SINGLE or form in OF_OBSPY:
         return [Found(None, Path(path).name, str(path), partial(read_series, path, form, None, None, None))]
     if form == "geonet":
         return _parse_geonet(_text(path), str(path))
@@ -677,7 +692,7 @@ _SINGLE = {"at2": _parse_at2, "smc": _parse_smc, "knet": _parse_knet, "esm": _pa
 _NO_ACCELERATION = {6: "displacement", 7: "velocity"}  # IDEP in a SAC header
 
 
-def _parse_obspy(path: str | Path, channel: str | None, inventory: str | Path | None = None) -> Series:
+def _parse_obspy(path: str | Path, form: str, channel: str | None, inventory: str | Path | None) -> Series:
     """The samples of one trace in a miniSEED, SAC or GSE2 file, in m/s2 with the `inventory` of its recorder."""
     try:
         import obspy
@@ -685,10 +700,9 @@ def _parse_obspy(path: str | Path, channel: str | None, inventory: str | Path | 
         raise ValueError(
             f"reading {path} needs the package obspy: install it with pip install obspy, or write the record as CSV"
         ) from error
-    content, form = read_bytes(path), recognise(path)[0]
     try:
         # by name: obspy would also find formats such as pickle, which runs code of the file
-        stream = obspy.read(io.BytesIO(content), format=form).merge()
+        stream = obspy.read(io.BytesIO(read_bytes(path)), format=form).merge()
         traces = [trace for trace in stream if channel is None or trace.id.endswith(channel)]
     except Exception as error:  # a damaged file may raise anything
         raise ValueError(f"{path}: obspy cannot read the file ({error}); download it again") from error

@@ -64,7 +64,7 @@ def key_tables() -> str:
     blocks += [_table(f"``[{section}]``", keys_of(each)) for section, each in SECTIONS.items()]
     title = "``[events.NAME]``: the keys of ``[record]`` without ``supports`` and ``every``, and these"
     blocks.append(_table(title, _without(keys_of(Event), keys_of(Motion))))
-    forms = "".join(f"* {form}\n" for form, _ in FORMS.values())
+    forms = "".join(f"* {form}\n" for _, form, _ in FORMS.values())
     blocks.append(f"Distributions of ``[priors]``:\n\n{forms}")
     return "\n".join(blocks)
 
