@@ -79,8 +79,9 @@ def structure(kind: type) -> type:
         first, mark, rest = about["meaning"].partition("; ")
         lines.append(f"{each.name} : {form.removesuffix(' | None') + ', optional' if optional else form}")
         lines += [f"    {line}" for line in textwrap.wrap(f"{first}{unit}{mark}{rest}. {about['more']}", 112)]
-    head, mark, rest = re.split(r"(\n    (?=(?:Raises|Notes|Examples)\n)|$)", kind.__doc__ or "", maxsplit=1)
-    kind.__doc__ = head + "".join(f"\n    {line}" for line in lines) + "\n" + mark + rest if kind.__doc__ else None
+    if kind.__doc__:
+        head, mark, rest = re.split(r"(\n    (?=(?:Raises|Notes|Examples)\n)|$)", kind.__doc__, maxsplit=1)
+        kind.__doc__ = "\n    ".join([f"{head.rstrip()}\n", *lines]) + f"\n{mark}{rest}"
     return kind
 
 
