@@ -103,6 +103,7 @@ class ModalLikelihood(FELikelihood):
         cheap = isinstance(modes, StructureModes)
         self._modes = Simulator(modes, nothing, pool=None if cheap else own.pool, cache=own.cache, responses_only=True)
         self._modes.response_memory = own.response_memory
+        paired.memory = None if cheap else own.response_memory
 
     def with_noise(self, noise: Noise) -> "ModalLikelihood":
         """The same likelihood with other errors, as `FELikelihood.with_noise`."""

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from ..cache.memory import ResponseMemory
 from ..models.base import digest
 from ..signals.channels import Channel, Measurements
 from ..signals.sampling import array_digest
@@ -52,11 +53,12 @@ def sensor_rows(model: Model, data: ModalData) -> list[int]:
 
 
 class PairedModes:
-    """Model of the measured modes: the modes of another model, paired with them."""
+    """Model of the measured modes: the modes of another model, which are kept in `memory`, paired with them."""
 
     dt = 1.0
     path_dependent = False
     axis = "frequency, then components of the shape"
+    memory: ResponseMemory | None = None
 
     def __init__(self, model: Model, data: ModalData, close: float) -> None:
         self.model, self.data, self.close, self.groups = model, data, close, data.groups(close)
@@ -127,6 +129,9 @@ class PairedModes:
         return SimulationBatch(found, reasons)
 
     def _response(self, modes: np.ndarray, theta: np.ndarray) -> np.ndarray:
+        if self.memory is not None:  # for predictions: samples are simulated as modes no second time
+            key = (theta[: len(self.model.parameter_names)] + 0.0).tobytes()
+            self.memory.store([(self.model.fingerprint, key)], [modes])
         paired = self.pair(modes)
         return self._joined(self._ratios(paired.frequencies) * self.factors(theta[None]).T, paired.shapes)
 

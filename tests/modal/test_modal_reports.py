@@ -91,6 +91,12 @@ def test_predicted_modes_are_simulated_once_for_all_reports_also_of_another_proc
         return Posterior(ModalLikelihood(model, data, cache=tmp_path / "cache"), PRIOR)
 
     data, theta = modal_likelihood(rng).model.data, np.exp(0.2 * rng.normal(size=(300, 2)))
+    sampled = posterior()
+    sampled.log_prob(theta)  # as in a run
+    count = len(made)
+    sampled.likelihood.predict_modes(theta)
+    assert len(made) == count
+    made.clear()
     first = posterior()
     found = str(first.likelihood.predict_modes(theta)), [str(each) for each in check_fit(first, theta)]
     count = len(made)
