@@ -100,12 +100,6 @@ def read_load_test(
     the channel (with or without a unit), or the file does not state the unit. `cases` is the column with the names of
     the load cases, or with numbers such as positions; default: the first column, if it is no channel, else numbers from
     1. `errors` are those of `LoadTest`. Raises ValueError if a column is missing, or a unit is unknown or not stated.
-
-    Examples
-    --------
-    >>> from fe_likelihoods.modal.load_cases import read_load_test
-    >>> sensors = [Channel("midspan", "displacement", "mm")]
-    >>> test = read_load_test("truck.csv", sensors, errors={"midspan": 1e-4})  # doctest: +SKIP
     """
     table = read_table(path, labels=cases or "")
     names = [column.name for column in table.columns]

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -45,6 +44,15 @@ class ModalData:
     description : str
         What was measured, where and when.
 
+    Attributes
+    ----------
+    n_sets, n_modes, n_sensors : int
+        Numbers of identifications, modes and sensors.
+    mean_frequencies : (m,) ndarray
+        Mean frequency of each mode [Hz].
+    has_shape, known_shapes : (n_sets, m) and (n_sets, m, n_sensors) ndarray
+        Whether each identification has a shape of each mode, and the shapes, zero where there is none.
+
     Raises
     ------
     ValueError
@@ -85,79 +93,46 @@ class ModalData:
         sensors = tuple(self.sensors)
         if len(set(sensors)) != len(sensors) or not all(isinstance(name, str) and name for name in sensors):
             raise ValueError(f"ModalData: the names of the sensors must differ and not be empty; got {sensors}")
-        values = {"frequencies": frequencies, "sensors": sensors, "mode_numbers": tuple(map(int, numbers.tolist()))}
-        values["shapes"] = _checked_shapes(self.shapes, n_sets, m, sensors, known)
+        shapes, means = _checked_shapes(self.shapes, n_sets, m, sensors, known), np.nanmean(frequencies, axis=0)
+        has_shape = ~np.isnan(shapes).any(axis=2) & (len(sensors) > 0)
+        values = {"frequencies": frequencies, "shapes": shapes, "sensors": sensors, "mean_frequencies": means}
+        values |= {"has_shape": has_shape, "known_shapes": np.where(has_shape[:, :, None], shapes, 0.0)}
+        values |= {"n_sets": n_sets, "n_modes": m, "n_sensors": len(sensors)}
+        values["mode_numbers"] = tuple(int(number) for number in numbers)
         share = f"one number, or one for each of {m} modes, between 0 and {_LARGEST_SHARE}, such as"
         day = f"a number [°C] for each of {n_sets} identifications, from -80 to 80"
-        ratios = (
-            "ratios from 0 to below 1 of the shape of the frequencies, such as 0.015 for 1.5 % (in a file damping_%)"
-        )
+        ratios = "ratios from 0 to below 1, of the shape of frequencies, such as 0.015 for 1.5 % (in a file damping_%)"
         for what, shape, limits, expected in (
             ("frequency_cv", (m,), (_ABOVE_ZERO, _LARGEST_SHARE), f"{share} 0.005 for 0.5 %"),
             ("shape_error", (m,), (_ABOVE_ZERO, _LARGEST_SHARE), f"{share} 0.02, for shapes with a norm of 1"),
             ("temperatures", (n_sets,), (-80.0, 80.0), day),
             ("damping", (n_sets, m), (0.0, 1.0), ratios),
+            ("covariance", (m, m), (-np.inf, np.inf), f"a matrix ({m}, {m}) [Hz²], symmetric positive definite"),
         ):
             if (given := getattr(self, what)) is not None:
                 values[what] = _numbers(what, given, shape, limits, expected)
-        values["covariance"] = self._checked_covariance(frequencies)
+        if (covariance := values.get("covariance")) is not None and (
+            self.frequency_cv is not None
+            or not known.all()
+            or not np.allclose(covariance, covariance.T, rtol=1e-8, atol=0.0)
+            or not np.linalg.eigvalsh(covariance)[0] > 0.0
+            or (np.diag(covariance) >= np.square(_LARGEST_SHARE * means)).any()
+        ):
+            raise ValueError(
+                "ModalData: covariance must be a symmetric positive definite matrix of modes that were never missed, "
+                f"with deviations below {_LARGEST_SHARE} of the frequencies; got {self.covariance}: take the variances "
+                "alone (frequency_cv) if the covariances are poorly known. If covariance and frequency_cv state the "
+                "same errors: leave one out (frequency_cv=None, where a file has them)"
+            )
         for name, value in values.items():
             if isinstance(value, np.ndarray):
                 value.flags.writeable = False
             object.__setattr__(self, name, value)
-        ascending = np.diff(self.mean_frequencies[np.argsort(numbers)]) >= 0.0
-        if not ascending.all() and not self.has_shape.any(axis=0).all():
+        if (np.diff(means[np.argsort(numbers)]) < 0.0).any() and not has_shape.any(axis=0).all():
             raise ValueError(
                 f"ModalData: modes without a shape are found by their number, so frequencies must ascend; got "
-                f"{self.mean_frequencies.tolist()} Hz of the modes {self.mode_numbers}: sort them, or give mode_numbers"
+                f"{means.tolist()} Hz of the modes {self.mode_numbers}: sort them, or give mode_numbers"
             )
-
-    def _checked_covariance(self, frequencies: np.ndarray) -> np.ndarray | None:
-        """The covariance of the frequencies [Hz²]; ValueError if it is none."""
-        if self.covariance is None:
-            return None
-        if self.frequency_cv is not None or np.isnan(frequencies).any():
-            raise ValueError(
-                "ModalData: covariance and frequency_cv state the same errors: leave one out (frequency_cv=None, "
-                "where a file has them); a covariance is for modes that were never missed"
-            )
-        m = frequencies.shape[1]
-        expected = (
-            f"a symmetric positive definite matrix ({m}, {m}) [Hz²], with deviations below {_LARGEST_SHARE} of the "
-            "frequencies: take the variances alone (frequency_cv) if the covariances are poorly known"
-        )
-        covariance = _numbers("covariance", self.covariance, (m, m), (-np.inf, np.inf), expected)
-        fits = np.allclose(covariance, covariance.T, rtol=1e-8, atol=0.0) and np.linalg.eigvalsh(covariance)[0] > 0.0
-        if not fits or (np.diag(covariance) >= np.square(_LARGEST_SHARE * frequencies.mean(axis=0))).any():
-            raise ValueError(f"ModalData: covariance must be {expected}; got {self.covariance}")
-        return covariance
-
-    @property
-    def n_sets(self) -> int:
-        return len(self.frequencies)
-
-    @property
-    def n_modes(self) -> int:
-        return self.frequencies.shape[1]
-
-    @property
-    def n_sensors(self) -> int:
-        return len(self.sensors)
-
-    @cached_property
-    def mean_frequencies(self) -> np.ndarray:
-        """Mean frequency of each mode (m,) [Hz]."""
-        return np.nanmean(self.frequencies, axis=0)
-
-    @cached_property
-    def has_shape(self) -> np.ndarray:
-        """Whether each identification (n_sets, m) has a shape of each mode."""
-        return ~np.isnan(self.shapes).any(axis=2) & (self.n_sensors > 0)
-
-    @cached_property
-    def known_shapes(self) -> np.ndarray:
-        """Shapes (n_sets, m, n_sensors), zero where there is none."""
-        return np.where(self.has_shape[:, :, None], self.shapes, 0.0)
 
     @property
     def fingerprint(self) -> str:
@@ -283,11 +258,10 @@ def _checked_shapes(given: Any, n_sets: int, m: int, sensors: Sequence[str], kno
     shapes = shapes.real.astype(float)
     shapes = shapes[None] if shapes.ndim == 2 else shapes
     if shapes.shape != shape:
-        turned = shapes.shape == (n_sets, len(sensors), m)
+        advice = "transpose them" if shapes.shape == (n_sets, len(sensors), m) else "name each sensor in sensors="
         raise ValueError(
-            f"ModalData: expected shapes with a row for each of {m} modes and a column for each of {len(sensors)} "
-            f"sensors ({', '.join(sensors)}), n_sets = {n_sets}; got shape {shapes.shape}: "
-            + ("transpose the shapes" if turned else "give the name of each sensor in sensors=")
+            f"ModalData: expected shapes (n_sets, modes, sensors) = {shape}, of the sensors {', '.join(sensors)}; got "
+            f"{shapes.shape}: {advice}"
         )
     lengths = np.linalg.norm(shapes, axis=2)
     good = np.isnan(shapes).all(axis=2) | (known & (lengths > 0.0) & (lengths < np.inf))

@@ -157,18 +157,16 @@ def modal_noise(
                 f'ModalLikelihood: {what}_error must be "common" or "mode"; got {unknown[what]!r}: known errors belong '
                 "to the data (frequency_cv, shape_error), or are numbers in the mapping of priors"
             )
-    sizes = np.ones(m, dtype=int)
-    for group in paired.groups:
-        sizes[list(group)] = len(group)
-    freedoms = (data.has_shape * np.maximum(data.n_sensors - sizes, 0)).T
+    sizes = {mode: len(group) for group in paired.groups for mode in group}
+    fitted = np.array([sizes[mode] for mode in range(m)])
+    freedoms = (data.has_shape * np.maximum(data.n_sensors - fitted, 0)).T
     return ModalNoise(
         paired.channels,
         data.n_sets,
         data.n_sensors,
         tuple((~np.isnan(data.frequencies)).T.astype(int).ravel().tolist()),
         tuple(freedoms.ravel().tolist()),
-        known["frequency"],
-        known["shape"],
+        *known.values(),
         unknown["frequency"],
         unknown["shape"] if freedoms.any() else "",
         0.0 if student_t is None else check_degrees("ModalLikelihood: student_t", student_t),

@@ -88,14 +88,11 @@ def read_modal_data(
     of_modes = {place: found for place, each in enumerate(table.columns) if (found := _OF_MODE.fullmatch(each.name))}
     if not of_modes:
         return _of_modes(table, sensors, unit, options)
-    kinds = [_kind(column.name) for column in table.columns]
-    warm = (
-        {"temperatures": _si(table, kinds.index("temperature"), "temperature", "degC")}
-        if "temperature" in kinds
-        else {}
-    )
+    kinds, found = [_kind(column.name) for column in table.columns], {}
+    if "temperature" in kinds:
+        found["temperatures"] = _si(table, kinds.index("temperature"), "temperature", "degC")
     frequencies = np.stack([_in_hertz(table, place, unit) for place in of_modes], axis=1)
-    return ModalData(frequencies, mode_numbers=[int(each[1]) for each in of_modes.values()], **warm | options)
+    return ModalData(frequencies, mode_numbers=[int(each[1]) for each in of_modes.values()], **found | options)
 
 
 def _kind(name: str) -> str:
@@ -126,20 +123,15 @@ def _of_modes(table: Table, sensors: Sequence[str], unit: str | None, options: d
         lines["damping"] = _si(table, at["damping"], "dimensionless", "1")
     day = table.columns[at["set"]] if "set" in at else None
     lines["set"] = 0 if day is None else day.cells if day.kind == "text" else day.values
-    in_order = lines.groupby("set").cumcount() + 1
-    lines["mode"] = table.columns[at["mode"]].values if "mode" in at else in_order
+    lines["mode"] = table.columns[at["mode"]].values if "mode" in at else lines.groupby("set").cumcount() + 1
     if lines.duplicated(["set", "mode"]).any() or (lines["mode"] % 1 != 0).any():
         raise ValueError(
             f"{table.file}: expected a line for each mode, with different whole numbers in the column of modes; got "
             f"{lines['mode'].tolist()}: give a column 'set' with the number of the identification if there are several"
         )
     wide = lines.pivot(index="set", columns="mode")
-    shapes = [wide[k] for k in range(len(columns))]
-    found = {
-        "shapes": np.stack(shapes, axis=-1) if shapes else None,
-        "sensors": [column.name for column in columns],
-        "mode_numbers": [int(number) for number in wide["frequency"].columns],
-    }
+    shapes = np.stack([wide[k] for k in range(len(columns))], axis=-1) if columns else None
+    found = {"shapes": shapes, "sensors": [each.name for each in columns], "mode_numbers": wide["frequency"].columns}
     if "damping" in lines:
         found["damping"] = wide["damping"]
     if "cv" in lines:  # the mean square of several identifications

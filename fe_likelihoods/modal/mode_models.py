@@ -26,14 +26,7 @@ _STEP = 1e-4  # for central differences of matrices, as a share of a parameter
 
 
 def modal_channels(sensors: Sequence[str]) -> tuple[Channel, ...]:
-    """Channels of a model that has modes: ``frequency`` [Hz], and the component of the shapes at each sensor.
-
-    Examples
-    --------
-    >>> from fe_likelihoods.modal.mode_models import modal_channels
-    >>> [channel.name for channel in modal_channels(["floor 1", "roof"])]
-    ['frequency', 'floor 1', 'roof']
-    """
+    """Channels of a model that has modes: ``frequency`` [Hz], and the component of the shapes at each sensor."""
     return Channel("frequency", "frequency", "Hz"), *(Channel(name, "dimensionless", "1") for name in sensors)
 
 
@@ -71,14 +64,7 @@ def opensees_modes(ops: Any, n_modes: int, sensors: Sequence[tuple[int, int]]) -
 
     `ops` is ``openseespy.opensees``, as an `OpenSeesModel` passes it; `n_modes` is less than the number of degrees of
     freedom that have a mass; `sensors` are nodes and degrees of freedom in the order of the channels. Raises
-    SimulationFailed if ``ops.eigen`` fails, or an eigenvalue is not positive.
-
-    Examples
-    --------
-    >>> def frame(ops, theta):
-    ...     ...
-    ...     return opensees_modes(ops, 4, [(2, 1), (3, 1)])
-    >>> model = OpenSeesModel(frame, ("stiffness",), modal_channels(["floor 1", "floor 2"]), 1.0, 4)
+    SimulationFailed if ``ops.eigen`` fails, or an eigenvalue is not positive. (An example is in ``docs/modes.rst``.)
     """
     try:
         squares = np.array(ops.eigen(n_modes) or [], dtype=float)
@@ -99,16 +85,14 @@ class FunctionModes(FunctionModel):
     Parameters
     ----------
     function : callable
-        Function of theta (n_parameters,) that returns the stiffness and the mass matrix, as NumPy arrays or SciPy
-        sparse matrices in consistent units (N/m and kg), or frequencies (n,) [Hz] and shapes (n, n_sensors), a row for
-        each mode.
+        Of theta (n_parameters,). It returns the stiffness and the mass matrix (NumPy arrays or SciPy sparse matrices,
+        in N/m and kg), or frequencies (n,) [Hz] and shapes (n, n_sensors), a row for each mode.
     parameter_names : sequence of str
         Names of the structural parameters, in the order of theta.
     sensors : mapping of str to int, or sequence of str
         Names of the sensors. For matrices, with the row of the matrix, from 0, that each sensor measures.
     n_modes : int
-        Number of modes that are computed, or as many as there are: twice as many as were measured let the pairing pass
-        over local modes.
+        Number of modes that are computed, if there are as many: twice the measured ones, to pass over local modes.
     **options
         Of `FunctionModel`: ``version``, ``depends_on``, ``isolated``, ``time_limit``, ``memory_limit``.
 
@@ -187,15 +171,12 @@ class StructureModes(ExternalModel):
         system, modes = self._modes(theta)
         steps = _STEP * np.where(theta == 0.0, 1.0, np.abs(theta))
         ends = [[self._system(theta + sign * step) for sign in (1.0, -1.0)] for step in np.diag(steps)]
-        stiff, heavy, sensors = (
-            np.stack(
-                [
-                    (getattr(up, what) - getattr(down, what)) / (2.0 * h)
-                    for (up, down), h in zip(ends, steps, strict=True)
-                ]
-            )
-            for what in ("stiffness", "mass", "shape")
-        )
+        pairs = list(zip(steps, ends, strict=True))
+
+        def slopes_of(what: str) -> np.ndarray:
+            return np.stack([(getattr(up, what) - getattr(down, what)) / (2.0 * h) for h, (up, down) in pairs])
+
+        stiff, heavy, sensors = (slopes_of(what) for what in ("stiffness", "mass", "shape"))
         slopes = mode_derivatives(modes, stiff, heavy)
         shapes = slopes.shapes @ system.shape.T + modes.shapes @ sensors.transpose(0, 2, 1)
         return np.concatenate([slopes.frequencies[:, None, :], shapes.transpose(0, 2, 1)], axis=1)

@@ -131,7 +131,7 @@ def test_a_matlab_file(tmp_path):
         with pytest.raises(ValueError, match="the file has f, Phi, xi"):
             read_modal_data(path, unit="Hz", variables=variables)
     savemat(path, {"f": [1.0, 3.0], "Phi": SHAPES})
-    with pytest.raises(ValueError, match="transpose the shapes"):
+    with pytest.raises(ValueError, match="transpose them"):
         read_modal_data(path, ["a", "b", "c"], unit="Hz", variables={"frequencies": "f", "shapes": "Phi"})
 
 
