@@ -4,7 +4,6 @@ Units, labels and nominal values come from ``posterior.parameters``; otherwise l
 or x0, x1, ... matplotlib and corner are imported inside the functions.
 """
 
-import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -27,35 +26,31 @@ COLOURS = (BLUE, ORANGE, "#5b8c5a", "#7b5ea7", "#3aa0a8", "#6b4a2f")  # of sever
 LEVELS = (0.5, 0.9)
 FEW_POINTS = 150  # fewer distinct samples are drawn as points, since a contour through them shows chance
 MOST_PARAMETERS = 12  # of a corner plot without names
-PRIOR_DRAWS = 20_000  # for densities of parameters without a distribution and for the width of a prior
+PRIOR_DRAWS = 20_000  # for densities of parameters without a distribution and for the range of a prior
 LARGEST_PANEL = 2.5  # largest panel width in `plot_marginals`, as a multiple of the range of the samples
 
 
 class _Drawn(NamedTuple):
-    """The k parameters of a figure; all values in the units of the labels, NaN for a value that is not marked.
-
-    `samples` (n, k) by the label of the sampler; `limits` of the panels (k, 2); `densities` are functions of values
-    (m,), none without a prior.
-    """
+    """The k parameters of a figure; all values in the units of the labels, NaN for a value that is not marked."""
 
     labels: list[str]
-    samples: dict[str, np.ndarray]
+    samples: dict[str, np.ndarray]  # (n, k) by the label of the sampler
     truths: np.ndarray
     nominal: np.ndarray
-    densities: list[Callable[[np.ndarray], np.ndarray]]
-    prior_draws: np.ndarray | None
-    limits: np.ndarray
+    densities: list[Callable[[np.ndarray], np.ndarray]]  # of values (m,); none without a prior
+    prior_draws: np.ndarray | None  # (m, k)
+    limits: np.ndarray  # (k, 2) of the panels
     note: str
 
     def shades(self) -> list[tuple[str, str]]:
         """Label and colour of each sampler."""
         return [(label, COLOURS[n % len(COLOURS)]) for n, label in enumerate(self.samples)]
 
-    def fill(self, colour: str) -> dict[str, str]:
+    def histogram(self, colour: str) -> dict[str, Any]:
         """Style of a histogram: filled for one sampler, outlined for several."""
         if len(self.samples) > 1:
-            return {"histtype": "step"}
-        return {"histtype": "stepfilled", "fc": colour + "40", "ec": colour}
+            return {"density": True, "linewidth": 1.2, "histtype": "step"}
+        return {"density": True, "linewidth": 1.2, "histtype": "stepfilled", "fc": colour + "40", "ec": colour}
 
 
 def plot_corner(
@@ -81,8 +76,8 @@ def plot_corner(
         Gives units, labels and nominal values (``posterior.parameters``, as grey dashed lines) and the prior
         (``posterior.prior``). A function of your own may have ``parameter_names`` and ``prior``.
     truths : sequence of float, shape (ndim,), or mapping of str to float, optional
-        True values in the units of the samples, as red lines; NaN for none. The panels are widened by up to half their
-        size to show a true value; otherwise it is written at the edge.
+        True values in the units of the samples, as red lines; NaN for none. The panels are widened to show a true or
+        nominal value if that is near.
     names : sequence of str, optional
         Names of the parameters to draw. Default: all, or the first 12; the figure says how many are left out.
     labels : sequence of str, shape (ndim,), optional
@@ -104,76 +99,40 @@ def plot_corner(
 
     drawn = _choose(samples, posterior, truths, labels, names, MOST_PARAMETERS)
     k, several = len(drawn.labels), len(drawn.samples) > 1
-    panel = float(np.clip(9.0 / k, 1.1, 2.0))  # [in]
-    texts = _wrapped(drawn.labels, int(12.0 * panel))
-    left = 0.7 + 0.14 * max(1 + text.count("\n") for text in texts)
-    right, top = 0.15, 0.35 + (0.25 + 0.17 * title.count("\n") if title else 0.0)
-    width = left + k * panel + right + max(0.0, 3.0 - (k - 1) * panel)  # the legend is beside the first panel
-    height = left + k * panel + top
-    figure = plt.figure(figsize=(width, height))
-    shown_as_points = []
+    size = float(np.clip(1.8 * k + 1.0, 4.5, 15.0))  # [in]
+    figure = plt.figure(figsize=(size, size))
+    points = False
     for label, colour in drawn.shades():
         x = drawn.samples[label]
         few = len(np.unique(x, axis=0)) < FEW_POINTS
-        shown_as_points.append(few)
-        corner.corner(
-            x,
-            bins=_bins(x),
-            range=[tuple(each) for each in drawn.limits],
-            color=colour,
-            labels=[""] * k,
-            fig=figure,
-            max_n_ticks=3,
-            hist_kwargs={"density": True, "linewidth": 1.2} | drawn.fill(colour),
-            levels=LEVELS,
-            smooth=1.0,
-            plot_density=False,
-            plot_datapoints=few,
-            plot_contours=not few,
-            fill_contours=not several,
-            no_fill_contours=several,  # a white interior would hide the samplers drawn before
-            data_kwargs={"ms": 2.5, "alpha": 0.6, "mec": "none"},
-            contour_kwargs={"linewidths": 1.1},
-            quiet=True,
-        )
+        points = points or few
+        with plt.rc_context({"axes.formatter.useoffset": False}):
+            corner.corner(
+                x,
+                bins=_bins(x),
+                range=[tuple(each) for each in drawn.limits],
+                color=colour,
+                labels=drawn.labels,
+                fig=figure,
+                max_n_ticks=4,
+                hist_kwargs=drawn.histogram(colour),
+                levels=LEVELS,
+                smooth=1.0,
+                plot_density=False,
+                plot_datapoints=few,
+                plot_contours=not few,
+                fill_contours=not several,
+                no_fill_contours=several,  # a white interior would hide the samplers drawn before
+                quiet=True,
+            )
     for values, colour, dashes in ((drawn.nominal, GREY, "--"), (drawn.truths, RED, "-")):
-        corner.overplot_lines(
-            figure, [x if np.isfinite(x) else None for x in values], color=colour, linestyle=dashes, linewidth=1.1
-        )
-    end = left + k * panel
-    figure.subplots_adjust(left=left / width, right=end / width, bottom=left / height, top=end / height)
-    axes = np.array(figure.axes).reshape(k, k)
-    size = 7.0 if k > 6 else 8.0
-    for i, text in enumerate(texts):
-        _finish_diagonal(axes[i, i], drawn, i, size)
-        for axis in (*(each.xaxis for each in axes[i:, i]), *(each.yaxis for each in axes[i, :i])):
-            axis.set_ticks(_inner_ticks(drawn.limits[i]))
-        axes[-1, i].set_xlabel(text, fontsize=size + 1.0)
-        axes[-1, i].xaxis.set_label_coords(0.5, -0.5 / panel)
-        _set_digits(axes[-1, i].xaxis, drawn.limits[i], size)
-        if i > 0:
-            axes[i, 0].set_ylabel(text, fontsize=size + 1.0)
-            axes[i, 0].yaxis.set_label_coords(-0.5 / panel, 0.5)
-            _set_digits(axes[i, 0].yaxis, drawn.limits[i], size)
-    notes = {
-        "contours hold 50 and 90 % of the samples": not all(shown_as_points),
-        f"points: fewer than {FEW_POINTS} distinct samples": any(shown_as_points),
-        "titles: mean ± standard deviation": not several,
-        drawn.note: drawn.note,
-    }
-    legend = figure.legend(
-        handles=_legend_handles(drawn),
-        loc="upper right",
-        fontsize=9.0 if k < 7 else 11.0,
-        title="\n".join(text for text, shown in notes.items() if shown),
-        title_fontsize=8.0 if k < 7 else 10.0,
-        frameon=False,
-        alignment="left",
-        bbox_to_anchor=(1.0 - 0.1 / width, 1.0 - (top - 0.2 if title else 0.1) / height),
-    )
-    legend.get_title().set_multialignment("left")
-    if title:
-        figure.suptitle(title, fontsize=11, y=1.0 - 0.12 / height, va="top")
+        marks = [x if np.isfinite(x) else None for x in values]
+        corner.overplot_lines(figure, marks, color=colour, linestyle=dashes, linewidth=1.1)
+    for i, axes in enumerate(np.array(figure.axes).reshape(k, k).diagonal()):
+        _finish_panel(axes, drawn, i)
+    note = f"points: fewer than {FEW_POINTS} samples" if points else "contours hold 50 and 90 % of the samples"
+    title = "\n".join(text for text in (title, note, drawn.note) if text)
+    figure.legend(handles=_legend_handles(drawn), loc="upper right", title=title, frameon=False)
     return figure
 
 
@@ -199,34 +158,28 @@ def plot_marginals(
     import matplotlib.pyplot as plt
 
     drawn = _choose(samples, posterior, truths, labels)
-    k = len(drawn.labels)
-    columns = min(4, k)
-    rows = -(-k // columns)
+    columns = min(4, len(drawn.labels))
+    rows = -(-len(drawn.labels) // columns)
     figure = plt.figure(figsize=(max(2.7 * columns, 4.0), 2.25 * rows + 0.5), layout="constrained")
     for i, label in enumerate(drawn.labels):
-        axes, limits, note = figure.add_subplot(rows, columns, i + 1), drawn.limits[i], ""
-        spread = max(float(x[:, i].std()) for x in drawn.samples.values())
+        axes, note = figure.add_subplot(rows, columns, i + 1, xlabel=label, yticks=[]), ""
+        low, high = drawn.limits[i]
         for name, colour in drawn.shades():
-            x, fill = drawn.samples[name], drawn.fill(colour)
-            axes.hist(x[:, i], _bins(x), range=tuple(limits), density=True, linewidth=1.2, color=colour, **fill)
-        axes.set_ylim(0.0, 1.1 * axes.dataLim.y1)
-        if drawn.prior_draws is not None and spread > 1e-12 * np.abs(limits).max():
-            prior = np.quantile(drawn.prior_draws[:, i], [0.005, 0.995])
-            room = 0.5 * (LARGEST_PANEL - 1.0) * (limits[1] - limits[0])
-            whole = limits[0] - room <= prior[0] and prior[1] <= limits[1] + room
-            note = "" if whole else f"prior {float(f'{drawn.prior_draws[:, i].std() / spread:.2g}'):.0f} times wider"
-            drawn.limits[i] = [
-                min(limits[0], max(prior[0], limits[0] - room)),
-                max(limits[1], min(prior[1], limits[1] + room)),
-            ]
-        axes.set(xlim=tuple(drawn.limits[i]), yticks=[])
+            x = drawn.samples[name]
+            axes.hist(x[:, i], _bins(x), range=(low, high), color=colour, **drawn.histogram(colour))
+        if drawn.prior_draws is not None:
+            draws, spread = drawn.prior_draws[:, i], max(float(x[:, i].std()) for x in drawn.samples.values())
+            room, prior = 0.5 * (LARGEST_PANEL - 1.0) * (high - low), np.quantile(draws, [0.005, 0.995])
+            if (prior[0] < low - room or prior[1] > high + room) and spread > 1e-12 * abs(high):
+                note = f"\nprior {float(f'{draws.std() / spread:.2g}'):.0f} times wider"
+            low, high = min(low, max(prior[0], low - room)), max(high, min(prior[1], high + room))
+        drawn.limits[i] = low, high
         for value, colour, dashes in ((drawn.nominal[i], GREY, "--"), (drawn.truths[i], RED, "-")):
             axes.axvline(value, color=colour, linestyle=dashes, linewidth=1.1)
-        _finish_diagonal(axes, drawn, i, 8.0)
-        axes.set_title("\n".join(text for text in (axes.get_title(), note) if text), fontsize=8.0, pad=4)
-        axes.set_xlabel(label, fontsize=9.5)
-        axes.xaxis.set_major_locator(plt.MaxNLocator(4, prune="both", min_n_ticks=2))
-        _set_digits(axes.xaxis, drawn.limits[i], 8.0)
+        axes.set_xlim(low, high)
+        _finish_panel(axes, drawn, i, note)
+        axes.xaxis.set_major_locator(plt.MaxNLocator(4))
+        axes.ticklabel_format(useOffset=False)
     figure.legend(handles=_legend_handles(drawn), loc="outside lower center", ncols=4, fontsize=9, frameon=False)
     if title:
         figure.suptitle(title, fontsize=11)
@@ -266,15 +219,15 @@ def _choose(
     arrays = {label: x[:, columns] / factors for label, x in arrays.items()}
     nominal = np.array([parameters[i].nominal for i in columns], dtype=float) / factors
     truths = _true_values(truths, known)[columns] / factors
-    densities, draws = _priors(posterior, wanted, columns, factors)
+    densities, prior_draws = _priors(posterior, wanted, columns, factors)
     return _Drawn(
         [parameters[i].label if labels is None else labels[i] for i in columns],
         arrays,
         truths,
         nominal,
         densities,
-        draws,
-        _limits(arrays, truths),
+        prior_draws,
+        _limits(arrays, np.stack([truths, nominal])),
         note,
     )
 
@@ -323,7 +276,7 @@ def _true_values(given: Values | None, known: list[str]) -> np.ndarray:
 
 
 def _priors(posterior: Any, names: Sequence[str], columns: list[int], factors: np.ndarray) -> tuple[list, Any]:
-    """Prior densities of the parameters, estimated from draws if ``prior.distributions`` has none, and draws (n, k)."""
+    """Prior densities of the parameters, from draws if ``prior.distributions`` has none, and draws (n, k)."""
     from scipy.stats import gaussian_kde
 
     prior = getattr(posterior, "prior", None)
@@ -340,13 +293,12 @@ def _priors(posterior: Any, names: Sequence[str], columns: list[int], factors: n
     return [density(i) for i in range(len(columns))], draws
 
 
-def _limits(samples: Mapping[str, np.ndarray], truths: np.ndarray) -> np.ndarray:
-    """Limits (k, 2) of the panels: the range of the samples, widened by up to half its size to show a true value."""
+def _limits(samples: Mapping[str, np.ndarray], marks: np.ndarray) -> np.ndarray:
+    """Limits (k, 2) of the panels: the range of the samples, wider by up to half its size for marks (m, k)."""
     quantiles = np.array([np.quantile(x, [0.002, 0.998], axis=0) for x in samples.values()])
     low, high = quantiles[:, 0].min(axis=0), quantiles[:, 1].max(axis=0)
-    size = high - low
-    near = (truths > low - 0.5 * size) & (truths < high + 0.5 * size)
-    low, high = np.where(near, np.fmin(low, truths), low), np.where(near, np.fmax(high, truths), high)
+    near = np.where((marks > low - 0.5 * (high - low)) & (marks < high + 0.5 * (high - low)), marks, np.nan)
+    low, high = np.fmin(low, np.fmin.reduce(near)), np.fmax(high, np.fmax.reduce(near))
     varies = high - low > 1e-12 * np.maximum(np.abs(low), np.abs(high))
     space = np.where(varies, 0.12 * (high - low), np.maximum(0.05 * np.abs(low), 1e-12))
     return np.column_stack([low - space, high + space])
@@ -357,8 +309,8 @@ def _bins(x: np.ndarray) -> int:
     return int(np.clip(np.sqrt(len(np.unique(x[:, 0]))), 12, 36))
 
 
-def _finish_diagonal(axes: "Axes", drawn: _Drawn, i: int, size: float) -> None:
-    """Prior density, values outside the panel, and mean and standard deviation of one parameter."""
+def _finish_panel(axes: "Axes", drawn: _Drawn, i: int, note: str = "") -> None:
+    """Prior density of one parameter, and a title with mean and standard deviation, or marks outside the panel."""
     low, high = drawn.limits[i]
     highest = 1.1 * max(patch.get_xy()[:, 1].max() for patch in axes.patches)  # corner's limit is of the last sampler
     if drawn.densities:
@@ -366,53 +318,18 @@ def _finish_diagonal(axes: "Axes", drawn: _Drawn, i: int, size: float) -> None:
         density = drawn.densities[i](places)
         axes.plot(places, density, color="0.25", linestyle=":", linewidth=1.4)
         highest = max(highest, min(1.1 * density[np.isfinite(density)].max(initial=0.0), 3.0 * highest))
-    marks = [(drawn.nominal[i], GREY), (drawn.truths[i], RED)]
-    outside = [mark for mark in marks if mark[0] < low or mark[0] > high]
-    axes.set_ylim(0.0, highest * (1.0 + 0.2 * len(outside)))
-    for row, (value, colour) in enumerate(outside):
-        text, side, x = (f"← {value:.4g}", "left", 0.03) if value < low else (f"{value:.4g} →", "right", 0.97)
-        axes.text(x, 0.97 - 0.16 * row, text, ha=side, va="top", fontsize=7, color=colour, transform=axes.transAxes)
-    if len(drawn.samples) > 1:
-        return
-    (x,) = drawn.samples.values()
-    mean, deviation = float(x[:, i].mean()), float(x[:, i].std())
-    if deviation <= 1e-12 * abs(mean):
-        text = f"{mean:.4g}, does not vary"
-    elif 1e-3 <= max(abs(mean), deviation) < 1e5:
-        decimals = max(0, 1 - int(np.floor(np.log10(deviation))))
-        text = f"{mean:.{decimals}f} ± {deviation:.{decimals}f}"
-    else:
-        text = f"{mean:.4g} ± {deviation:.2g}"
-    axes.set_title(text, fontsize=size, pad=3)
-
-
-def _inner_ticks(limits: np.ndarray) -> np.ndarray:
-    """Two or three round values away from the edges of a panel, so that no label meets one of the next panel."""
-    from matplotlib.ticker import MaxNLocator
-
-    low, high = limits + 0.08 * np.array([1.0, -1.0]) * np.ptp(limits)
-    candidates = (MaxNLocator(n).tick_values(low, high) for n in (3, 4, 5, 6, 8))
-    found = [ticks[(ticks >= low) & (ticks <= high)] for ticks in candidates]
-    return next((ticks for ticks in found if len(ticks) > 1), found[-1])
-
-
-def _set_digits(axis: Any, limits: np.ndarray, size: float) -> None:
-    """Write ticks with all digits, instead of an offset in a corner of the axes."""
-    from matplotlib.ticker import StrMethodFormatter
-
-    digits = int(np.clip(np.ceil(np.log10(np.abs(limits).max() / np.ptp(limits))) + 2, 3, 15))
-    axis.set_major_formatter(StrMethodFormatter(f"{{x:.{digits}g}}"))
-    axis.set_tick_params(labelsize=size, length=2.5)
-
-
-def _wrapped(labels: Sequence[str], characters: int) -> list[str]:
-    """Labels in lines of limited length, broken before units and after underscores; formulas are not broken."""
-
-    def wrap(text: str) -> str:
-        lines = text.replace("_", "_ ").replace(" [", "\n[", 1).split("\n")
-        return "\n".join("\n".join(textwrap.wrap(line, characters)) for line in lines).replace("_ ", "_")
-
-    return [text if "$" in text or len(text) <= characters else wrap(text) for text in labels]
+    axes.set_ylim(0.0, highest)
+    for value, name in ((drawn.nominal[i], "nominal"), (drawn.truths[i], "true")):
+        if value < low or value > high:
+            note += f"\n{name}: {value:.4g}"
+    if len(drawn.samples) == 1:
+        (x,) = drawn.samples.values()
+        mean, deviation = float(x[:, i].mean()), float(x[:, i].std())
+        decimals = max(0, 1 - int(np.floor(np.log10(deviation)))) if deviation > 0.0 else 0
+        note = (
+            f"{mean:.{decimals}f} ± {deviation:.{decimals}f}" if decimals < 5 else f"{mean:.4g} ± {deviation:.2g}"
+        ) + note
+    axes.set_title(note.strip(), fontsize=8.0)
 
 
 def _legend_handles(drawn: _Drawn) -> list:

