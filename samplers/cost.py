@@ -120,11 +120,8 @@ def estimate_cost(
     >>> bool(0 < cost.fewest < cost.most)
     True
     """
-    runs = as_whole_number("runs", runs)
-    if runs < 2:
-        raise ValueError(f"runs must be at least 2, since one duration has no spread; got {runs}")
-    if workers is not None and as_whole_number("workers", workers) < 1:
-        raise ValueError(f"workers must be at least 1; got {workers}")
+    if as_whole_number("runs", runs) < 2 or as_whole_number("workers", workers or 1) < 1 or workers == 0:
+        raise ValueError(f"runs must be at least 2, and workers must be at least 1; got {runs} and {workers}")
     if missing := [name for name in ("ndim", "sample_prior") if not hasattr(posterior, name)]:
         raise ValueError(f"estimate_cost needs a posterior with {', '.join(missing)}; got {type(posterior).__name__}")
     ndim = as_whole_number("ndim", posterior.ndim)
@@ -132,19 +129,18 @@ def estimate_cost(
     random = np.random.RandomState(seed)
     draws = np.asarray(posterior.sample_prior(max(nwalkers, runs + 1), random), dtype=float)  # as the sampler's draws
     report = getattr(posterior, "report", dict)
-    before = report().get("simulations")
+    before = report().get("simulations", 0)
     values, seconds = np.empty(runs + 1), np.empty(runs + 1)
     for i, point in enumerate(draws[: runs + 1]):
         start = time.perf_counter()
         values[i], seconds[i] = float(np.ravel(posterior(point))[0]), time.perf_counter() - start
-    failed, cached = int(np.sum(~np.isfinite(values))), 0
+    failed = int(np.sum(~np.isfinite(values)))
     if failed > runs - 1:
         raise ValueError(
             f"{failed} of {runs + 1} draws of the prior have a log-probability of -inf, and the estimate needs two "
             "finite ones: check the model at these points, or time more with runs="
         )
-    if before is not None:
-        cached = max(runs + 1 - (report()["simulations"] - before), 0)
+    cached = max(runs + 1 - (report().get("simulations", runs + 1) - before), 0)
     notes = {"failed": failed, "were cached, and the times include them": cached}
     share = max(ndim / MANY_PARAMETERS, 1.0) ** 2 * nwalkers
     fewest, most = (share * each for each in (RECYCLING if chosen.recycle else MOVES))

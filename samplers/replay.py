@@ -19,7 +19,6 @@ from emcee import State
 from emcee.backends import Backend, HDFBackend
 from emcee.moves import Move
 
-from .blobs import leaves
 from .moves.population_moves import describe
 from .output_file import DAMAGED, run_of_file, whole_file
 from .record import EvaluatedBatch, Record, free_name
@@ -124,21 +123,6 @@ def changes(record: Record, last: State | None, compute: Callable[[np.ndarray], 
         return []
     known = known.rows([int(np.argmax(np.where(np.isfinite(known.log_prob), known.log_prob, -np.inf)))])
     found, (coords,) = compute(known.coords), known.coords
-    if (known.blobs is None) != (found.blobs is None):
-        return ["log_prob_fn returned blobs, and returns none" if found.blobs is None else "it returns blobs now"]
     if not np.isclose(known.log_prob, found.log_prob, **CLOSE).all():
         return [f"log_prob_fn was {known.log_prob[0]:.10g} at {coords}, is {found.log_prob[0]:.10g}"]
-    if known.blobs is not None and not _same_blobs(known.blobs[0], found.blobs[0]):
-        return [f"blobs of log_prob_fn were {known.blobs[0]} at {coords}, are {found.blobs[0]}"]
     return []
-
-
-def _same_blobs(before: Any, after: Any) -> bool:
-    """Whether the blobs of a point agree: numbers up to rounding, and everything else exactly."""
-
-    def same(one: Any, other: Any) -> bool:
-        numbers = isinstance(one, float | complex) and isinstance(other, float | complex)
-        return bool(np.isclose(one, other, **CLOSE, equal_nan=True)) if numbers else one == other
-
-    ours, theirs = list(leaves([before])), list(leaves([after]))
-    return len(ours) == len(theirs) and all(map(same, ours, theirs))

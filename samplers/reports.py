@@ -206,6 +206,15 @@ class AnnealingResult(NamedTuple):
         return float(sum(stage.log_evidence_increment for stage in self.require_finished()))
 
     @property
+    def error_by_resampling(self) -> float:
+        """Standard error of the log-evidence that resampling from stage to stage has carried to the shares of modes.
+
+        0 if the walkers were resampled once, from weighted draws of recycling or of a guide: founders show this error.
+        """
+        earlier = self.ladder[:-1] or self.ladder
+        return self.ladder[-1].log_evidence_error if any(stage.moves for stage in earlier) else 0.0
+
+    @property
     def evidence(self) -> tuple[float, float]:
         """Log-evidence and its standard error, by tempering or by the check, whichever has the smaller error.
 

@@ -33,12 +33,12 @@ def systematic(weights: np.ndarray, random: Random, size: int | None = None) -> 
     return locate(weights, (np.arange(n) + random.uniform()) / n)
 
 
-def multinomial(weights: np.ndarray, random: Random) -> np.ndarray:
-    """Independent draws (n,) of indices, ascending, by weights (n,) with sum 1; other schemes have these arguments."""
-    return locate(weights, np.sort(random.uniform(size=len(weights))))
+def multinomial(weights: np.ndarray, random: Random, size: int | None = None) -> np.ndarray:
+    """Independent draws (size,) of indices, ascending, by weights (n,) with sum 1; `size` is n by default."""
+    return locate(weights, np.sort(random.uniform(size=len(weights) if size is None else size)))
 
 
-RESAMPLING: dict[str, Callable[[np.ndarray, Random], np.ndarray]] = {
+RESAMPLING: dict[str, Callable[..., np.ndarray]] = {
     "multinomial": multinomial,
     "systematic": systematic,
 }

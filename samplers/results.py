@@ -177,7 +177,7 @@ class RunResults:
             errors = errors * student_factor(1.0 / np.sum(shares**2) - 1.0)
         if not self._result.finished:  # a chain that was not annealed
             return errors
-        error = self.ladder[-1].log_evidence_error
+        error = self._result.error_by_resampling
         return np.hypot(errors, error_between_modes(chain, values, self._parents, error))
 
     @property

@@ -102,8 +102,9 @@ class EvidenceError:
         return float(np.sqrt(self._closed + self._sums @ self._sums))
 
     def resample(self, ancestors: np.ndarray) -> None:
-        """Follow a resampling: `ancestors` (n_points,) int is the previous index of each point."""
+        """Follow a resampling: `ancestors` (n,) int is the previous index of each point; n may be another number."""
         self._founder = self._founder[ancestors]
-        if len(np.unique(self._founder)) < self.min_founder_share * self.n_points:
-            self._closed += float(self._sums @ self._sums)
+        few = len(np.unique(self._founder)) < self.min_founder_share * self.n_points
+        if few or len(ancestors) != self.n_points:
+            self._closed, self.n_points = self._closed + float(self._sums @ self._sums), len(ancestors)
             self._start_groups()

@@ -67,6 +67,10 @@ class Evaluator:
         """Whether each of the points (n, ndim) lies in the support of the prior."""
         return self.target.log_prior(coords) > -np.inf
 
+    def more_draws(self, n: int, random: np.random.RandomState) -> np.ndarray:
+        """Draws (m, ndim) of the prior: m is `n`, or 0 if none can be made."""
+        return self.target.more_draws(n, random)
+
     def begin(self) -> Remember:
         """An annealing begins; returns a function that remembers arrays in the record (`Record.remembering`)."""
         return self.record.remembering()

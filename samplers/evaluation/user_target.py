@@ -188,6 +188,12 @@ class Target:
             )
         return np.array(draw(n, random), dtype=float)
 
+    def more_draws(self, n: int, random: np.random.RandomState) -> np.ndarray:
+        """Draws (m, ndim) of the prior: m is `n`, or 0 if the function or its object has no method for this prior."""
+        known = self.log_prior_fn == getattr(self._owner, "log_prior", None)
+        draw = getattr(self._owner, "sample_prior", None)
+        return np.array(draw(n, random), dtype=float) if known and draw is not None else np.empty((0, self.ndim))
+
     def check_start(self, coords: np.ndarray, nwalkers: int, skip_check: bool, is_drawn: bool) -> np.ndarray:
         """Log-prior (n,) of the points (n, ndim) that a run starts from; ValueError if they are no draws of the prior.
 

@@ -51,7 +51,7 @@ def find_clusters(chain: np.ndarray, founders: np.ndarray, parents: np.ndarray, 
     """Modes of a chain (nsteps, nwalkers, ndim), the largest first, with shares whose sum is 1.
 
     `founders` (nwalkers,) are the founder of each walker (`samplers.estimates.genealogy`), and `parents` those by the
-    last resampling alone; `error` is the standard error of the log-evidence of the stages.
+    last resampling alone; `error` is `samplers.reports.AnnealingResult.error_by_resampling`.
     """
     flat = chain.reshape(-1, chain.shape[2])
     belongs = find_members(chain)

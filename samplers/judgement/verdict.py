@@ -140,10 +140,10 @@ class Verdict(_Stored):
     def modes(self) -> tuple[Cluster, ...]:
         """Modes in which the run has points, with shares and their standard errors, the largest first."""
         run = self._run
-        stages = run._result.require_finished()
+        run._result.require_finished()
         if run.iteration == 0:
             raise ValueError("modes are found in a chain, which is empty: call run_mcmc with one step or more")
-        return find_clusters(run.get_chain(), run.founders, run._parents, stages[-1].log_evidence_error)
+        return find_clusters(run.get_chain(), run.founders, run._parents, run._result.error_by_resampling)
 
     @property
     def summary(self) -> str:

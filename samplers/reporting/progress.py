@@ -1,7 +1,7 @@
 """Progress of a run: a bar of tqdm in a terminal or a notebook, and one line per minute elsewhere.
 
 The bar of the annealing counts evaluated points and names the latest stage. The most important figures come first,
-because a narrow terminal cuts off the rest. All counts are whole numbers and start with the bar.
+because a narrow terminal cuts off the rest.
 """
 
 import sys
@@ -67,36 +67,30 @@ def get_progress_bar(display: bool | str, total: int | None, **kwargs: Any) -> A
 class Progress:
     """Shows a run in a bar: a context manager that observes an `Evaluator`.
 
-    `label` describes it outside the phases of a guide. The posterior `function` may have ``report()``, with the keys
-    ``simulations`` and ``failure_count``, and ``when_simulated(callback)``, which announces simulations as they end.
-    The bar counts points, or without `counts_points` the steps of `step`.
+    The posterior `function` may have ``when_simulated(callback)``, which announces simulations as they end. The bar
+    counts points, or without `counts_points` the steps of `step`.
     """
 
     def __init__(self, bar: Any, evaluator: Evaluator, label: str, function: Callable, counts_points: bool = True):
         self._bar, self._evaluator, self._label, self._counts_points = bar, evaluator, label, counts_points
-        self._report: Callable[[], Mapping[str, Any]] = getattr(function, "report", dict)
-        self._announce: Callable | None = getattr(function, "when_simulated", None)
+        self._announce: Callable = getattr(function, "when_simulated", lambda callback: None)
         self._silent = not hasattr(bar, "set_postfix")  # emcee's silent bar has only update
         self._figures: dict[str, Any] = {}
-        self._phase = ""  # of a guide
-        self._of_guide = 0.0  # simulations that the posterior does not count
         self._part = 0.0  # of a point: simulations of a point that has several
         self._drawn = time.perf_counter()
-        self._before = self._counts()
 
     def __enter__(self) -> "Progress":
         self._evaluator.running, self._shown = 0, self._evaluator.done
         if not self._silent:
             self._evaluator.observer = self._draw_now_and_then
-            if self._announce is not None and not self._evaluator.asynchronous:
+            if not self._evaluator.asynchronous:
                 self._announce(self._simulated)
         return self
 
     def __exit__(self, *error: object) -> None:
         if not self._silent:
             self._evaluator.observer = None
-            if self._announce is not None:
-                self._announce(None)
+            self._announce(None)
             self._draw()
 
     def _simulated(self, points: float) -> None:
@@ -111,9 +105,9 @@ class Progress:
         if self._silent or not isinstance(report, Sweep | Stage | GuideTick | Restart):
             return
         effective = f"{population.effective_sample_size:.0f}"
-        self._phase = report.phase if isinstance(report, GuideTick) else ""
+        own = "" if self._label == ANNEALING else f"{self._label}, "  # a label of the user is kept
         if isinstance(report, GuideTick):
-            self._of_guide = report.simulations - self._made().get("simulations", 0)
+            self._bar.set_description_str(f"{own}{report.phase}", refresh=False)
             self._figures = {"simulations": round(report.simulations), "ESS": f"{effective}/{report.target}"}
             if result.rounds:
                 self._figures["log Z"] = f"{result.rounds[-1].log_evidence:.2f}"
@@ -122,12 +116,8 @@ class Progress:
             self._figures = {"beta": f"{population.beta:.3g}", "ESS": effective, "acceptance": acceptance}
             if result.ladder:
                 self._figures["log Z"] = f"{sum(stage.log_evidence_increment for stage in result.ladder):.2f}"
-                own = "" if self._label == ANNEALING else f"{self._label}, "  # a label of the user is kept
                 self._bar.set_description_str(f"{own}stage {len(result.ladder)}", refresh=False)
         self._draw()
-        in_place = getattr(self._bar, "mininterval", SECONDS_BETWEEN_LINES) < SECONDS_BETWEEN_LINES
-        if isinstance(report, GuideTick) and not report.finished and in_place:
-            self._bar.refresh()  # the phase may begin with a batch of minutes
 
     def step(self, steps: int) -> None:
         """Advance a bar that does not count points."""
@@ -136,35 +126,19 @@ class Progress:
         else:
             self._draw(steps)
 
-    # the bar
-
     def _draw_now_and_then(self) -> None:
         if time.perf_counter() - self._drawn >= SECONDS_BETWEEN_FIGURES:
             self._draw()
 
     def _draw(self, steps: int = 0) -> None:
         """Show the figures, and advance the bar by steps, or by the points since the last time."""
-        self._drawn = time.perf_counter()
+        self._drawn, evaluator = time.perf_counter(), self._evaluator
         if self._counts_points:
-            steps, self._shown = self._evaluator.done - self._shown, self._evaluator.done
-        counts = self._made()
-        if self._phase:
-            made = round(self._of_guide + counts.get("simulations", 0))
-            self._bar.set_description_str(f"{self._phase}: simulation {made}", refresh=False)
-        figures = {name: number for name, number in counts.items() if number or name == "simulations"}
-        figures |= self._figures | ({"running": self._evaluator.running} if self._evaluator.running else {})
+            steps, self._shown = evaluator.done - self._shown, evaluator.done
+        counts = {"failures": len(evaluator.record.failed + evaluator.record.counted), "running": evaluator.running}
+        figures = self._figures | {name: number for name, number in counts.items() if number}
         self._bar.set_postfix({name: str(figures[name]) for name in ORDER if name in figures}, refresh=False)
         self._bar.update(steps)
-
-    def _made(self) -> dict[str, int]:
-        """Counts since the bar was made."""
-        return {name: number - self._before[name] for name, number in self._counts().items()}
-
-    def _counts(self) -> dict[str, int]:
-        """Failed evaluations and failed simulations, and simulations of the posterior if it counts them."""
-        reported = self._report()
-        counts = {"failures": len(self._evaluator.record.failed) + reported.get("failure_count", 0)}
-        return counts | ({"simulations": round(reported["simulations"])} if "simulations" in reported else {})
 
 
 def show_sweeps(

@@ -41,35 +41,40 @@ def plot_run(sampler: Any) -> "Figure":
     heights = (0.45, 1, 1, 1, 1)[: 4 + several]
     figure, (top, *ladder, points, evidence, chain) = plt.subplots(4 + several, 1, height_ratios=heights, **size)
     _draw_phases(top, sampler)
-    made, ess, distinct = (
-        np.array([getattr(stage, name) for stage in stages])
-        for name in ("evaluations", "effective_sample_size", "distinct_ancestors")
-    )
+    table = np.array([(s.evaluations, *s[:3], s.distinct_ancestors, *s[5:7]) for s in stages]).T
+    made, beta, ess, share, distinct, increments, errors = table
     ends = np.cumsum(made)
     for axes in ladder:
-        _draw_ladder(axes, sampler, ends)
-    lines = []
-    if several or not rounds:
-        values = np.cumsum([stage.log_evidence_increment for stage in stages])
-        lines.append((ends, ess, values, [stage.log_evidence_error for stage in stages], BLUE, "", "stages"))
+        axes.semilogy(ends, beta, "o-", color=BLUE, markersize=4)
+        axes.set_ylabel(r"exponent $\beta$ [-]", color=BLUE)
+        acceptance = axes.twinx()
+        acceptance.plot(ends, share, "s--", color=ORANGE, markersize=4)
+        acceptance.set_ylim(0, 1)
+        acceptance.set_ylabel("acceptance [-]", color=ORANGE)
+    lines = [(ends, ess, np.cumsum(increments), errors, BLUE, "stages")] if several or not rounds else []
     if rounds:
-        draws, ess, values, errors = np.array([(r.draws, r.effective_sample_size, *r[3:5]) for r in rounds]).T
-        lines.append((np.cumsum(draws), ess, values, errors, ORANGE, ", guide", "rounds of the guide"))
-    for at, ess, values, errors, colour, whose, name in lines:
-        points.plot(at, ess, "o-", color=colour, label=f"effective sample size{whose}", markersize=4, zorder=3)
+        draws, *others = np.array([(r.draws, r.effective_sample_size, *r[3:5]) for r in rounds]).T
+        lines.append((np.cumsum(draws), *others, ORANGE, "rounds of the guide"))
+    for at, effective, values, around, colour, name in lines:
+        points.plot(at, effective, "o-", color=colour, label=f"effective sample size, {name}", markersize=4, zorder=3)
         style = {"fmt": "o-", "color": colour, "markersize": 4, "capsize": 3}
-        evidence.errorbar(at, values, 2.0 * np.array(errors), label=f"{name}, ± 2 standard errors", **style)
+        evidence.errorbar(at, values, 2.0 * around, label=f"{name}, ± 2 standard errors", **style)
     if several or not rounds:
         points.plot(ends, distinct, "s--", color=BLUE, alpha=0.5, label="distinct points", markersize=4)
     points.axhline(sampler.nwalkers, color=GREY, linewidth=1, linestyle=":", label="walkers")
     points.set(ylim=(0.0, 1.3 * points.get_ylim()[1]), ylabel="number of points")
-    points.legend(frameon=False, fontsize="small", ncols=4, loc="upper center")
-    if stages[-1].beta == 1.0:
-        evidence.axhline(sampler.log_evidence, color=GREY, linewidth=1, linestyle=":", label="result of the run")
     evidence.set(xlabel="evaluations of the log-probability", ylabel="log-evidence so far")
     evidence.ticklabel_format(axis="y", useOffset=False)
-    evidence.legend(frameon=False, fontsize="small", loc="best")
-    _draw_chain(chain, sampler)
+    for axes in (points, evidence):
+        axes.legend(frameon=False, fontsize="small", ncols=3)
+    chain.set(xlabel="step at beta = 1", ylabel="log-probability")
+    if sampler.iteration > 0:
+        levels = np.quantile(np.asarray(sampler.get_log_prob(), dtype=float), [0.05, 0.5, 0.95], axis=1)
+        steps = np.arange(1, sampler.iteration + 1)
+        chain.fill_between(steps, levels[0], levels[2], color=BLUE, alpha=0.3, linewidth=0.0)
+        chain.plot(steps, levels[1], "o-" if len(steps) < 40 else "-", color=BLUE, markersize=3)
+        chain.set_title("median and 90 % of the walkers", fontsize="small")
+        chain.xaxis.get_major_locator().set_params(integer=True)
     for axes in (*ladder, points, evidence, chain):
         axes.grid(alpha=0.25)
     for axes in (*ladder, points):
@@ -108,35 +113,3 @@ def _draw_phases(axes: "Axes", sampler: Any) -> None:
     axes.legend(frameon=False, fontsize="small", ncols=4, loc="upper center", borderaxespad=0.0, handlelength=1.0)
     axes.spines[["left", "right", "top"]].set_visible(False)
     axes.set_xlabel("evaluations of the log-probability, by phase")
-
-
-def _draw_ladder(axes: "Axes", sampler: Any, ends: np.ndarray) -> None:
-    """Exponent beta and acceptance of the stages."""
-    beta, share = (np.array([getattr(stage, name) for stage in sampler.ladder]) for name in ("beta", "acceptance"))
-    ended = sampler.ended_at is not None  # then the last stage has all known points, weighted for beta = 1
-    reached = slice(None, -1 if ended else None)
-    axes.semilogy(ends[reached], beta[reached], "o-", color=BLUE, markersize=4)
-    if ended:
-        axes.semilogy(ends[-1], 1.0, "o", color=BLUE, markerfacecolor="white", markersize=5, label="not reached")
-        axes.legend(frameon=False, fontsize="small", loc="lower right")
-    axes.set_ylabel(r"exponent $\beta$ [-]", color=BLUE)
-    axes.set_ylim(min(0.05, 0.5 * beta.min()), 2.0)  # at least a decade, so that decades are labelled
-    acceptance = axes.twinx()
-    acceptance.plot(ends, share, "s--", color=ORANGE, markersize=4)
-    acceptance.set_ylim(0, 1)
-    acceptance.set_ylabel("acceptance [-]", color=ORANGE)
-
-
-def _draw_chain(axes: "Axes", sampler: Any) -> None:
-    """Log-probability of the walkers at beta = 1."""
-    axes.set(xlabel="step at beta = 1", ylabel="log-probability")
-    if sampler.iteration == 0:
-        axes.text(0.5, 0.5, "no steps at beta = 1 were made", transform=axes.transAxes, ha="center", va="center")
-        return
-    low, middle, high = np.quantile(np.asarray(sampler.get_log_prob(), dtype=float), [0.05, 0.5, 0.95], axis=1)
-    steps = np.arange(1, len(middle) + 1)
-    style = {"fmt": "o-" if len(steps) < 40 else "-", "color": BLUE, "markersize": 3, "ecolor": BLUE + "60"}
-    axes.errorbar(steps, middle, [middle - low, high - middle], label="median and 90 % of the walkers", **style)
-    axes.set_xlim(0.5, len(steps) + 0.5)
-    axes.xaxis.get_major_locator().set_params(integer=True)
-    axes.legend(frameon=False, fontsize="small", loc="lower right")

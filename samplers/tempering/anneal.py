@@ -45,7 +45,7 @@ from .early_stop import StoppedEarly
 from .guided import Guidance, draw_rounds, stopped_rounds
 from .mutation import MoveSchedule, Mutated, VisitedPoints, move_together
 from .population import Density, Population
-from .recycling import Recycled, recycle, submit_start
+from .recycling import FEWEST_TO_SEARCH, Recycled, first_draws, recycle, submit_start
 from .smc_moves import anneal_by_moves
 
 __all__ = ["anneal", "check_population"]
@@ -53,6 +53,11 @@ __all__ = ["anneal", "check_population"]
 logger = logging.getLogger(__name__)
 
 Steps = Iterator[tuple[Population, Report]]
+
+# Draws of the prior that annealing by moves starts from, with 250 walkers or more: they reveal narrow modes. In three
+# dimensions, widths 1:6 and 1:8, 250 walkers, TMCMC lost or mis-weighted a mode in 13 of 48 runs, 7 of them without a
+# warning, and in 6 of 64 with these draws, none of them without a warning, with 1.3 to 1.4 times the evaluations.
+FIRST_DRAWS = 1000
 
 
 def anneal(
@@ -73,16 +78,23 @@ def anneal(
         if guidance is not None:
             yield from _from_guide(population, density, random, schedule, guidance)
             return
-        start, recycled = submit_start(population.coords, density, whole=not settings.recycle), None
+        wanted = first_draws(size) if settings.recycle else FIRST_DRAWS if size >= FEWEST_TO_SEARCH else size
+        coords = population.coords
+        if wanted > size and (
+            settings.recycle or schedule.mixtures
+        ):  # walks, as in papers, do not use what they reveal
+            coords = np.concatenate([coords, density.more_draws(wanted - size, random)])
+        start, recycled = submit_start(coords, density, whole=not settings.recycle), None
         if settings.recycle:
-            steps = recycle(start, density, random)
+            steps = recycle(start, size, density, random)
             recycled = yield from _by_recycling(steps, population, size, density, random, schedule, settings)
         if recycled is None or not recycled.reliable:
-            population, visited = population._replace(records=start.arrived_part()[1]), VisitedPoints()
-            visited.add(population.coords, population.records)
+            coords, records = start.arrived_part()
+            population, visited = population._replace(coords=coords, records=records), VisitedPoints()
+            visited.add(coords, records)
             if recycled is not None:
                 visited.add(recycled.coords, recycled.records)
-            moved = yield from anneal_by_moves(population, density, random, schedule, settings, visited)
+            moved = yield from anneal_by_moves(population, size, density, random, schedule, settings, visited)
             yield from _check_moves(*moved, density, random, settings, visited)
     except StoppedEarly as stop:
         yield from _finish_early(stop, size, random, 0.0 if guidance is None else guidance.budget.of_guides)

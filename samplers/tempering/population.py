@@ -40,6 +40,9 @@ class Density(Protocol):
     def wait(self, most: int) -> None:
         """Wait until at most this number of all submitted points is running, and let the others arrive."""
 
+    def more_draws(self, n: int, random: np.random.RandomState) -> np.ndarray:
+        """Draws (m, ndim) of the prior: m is `n`, or 0 if the density cannot be drawn from."""
+
     def inside(self, coords: np.ndarray) -> np.ndarray:
         """Whether each of the points (n, ndim) lies in the support of the prior: (n,) bool."""
 

@@ -50,7 +50,7 @@ from .next_beta import next_beta
 from .pending_points import PendingPoints
 from .population import Density, Population
 
-__all__ = ["Recycled", "most_running", "recycle", "search_draws", "smallest_target", "submit_start"]
+__all__ = ["Recycled", "first_draws", "most_running", "recycle", "smallest_target", "submit_start"]
 
 # Wanted effective sample size at each beta (the target), as a share of the number of starting points. A small target
 # allows large steps of beta; the fresh draws of a round then restore the effective sample size.
@@ -62,11 +62,9 @@ TARGET_SHARE = 0.2
 POINTS_PER_DIMENSION, POINTS_PER_COMPONENT, POINTS_PER_NUMBER = 5.0, 8.0, 0.5
 # Draws of a round, as a multiple of the target.
 DRAWS_PER_TARGET = 3.0
-# Further draws, spread over the stages below beta = 1: they find narrow modes, which hold few points at small beta.
-# They are a multiple of the starting points, from 250 on at least 1500: modes are as narrow for few walkers. In three
-# dimensions, widths 1:5 and 1:8 with 250 walkers, 42 of 104 runs lost a mode with three draws per walker, and 21 with
-# 1500 (and more points for each component). On targets with one mode these take 10 to 17 % more evaluations.
-SEARCH_SHARE, SEARCH_DRAWS, FEWEST_TO_SEARCH = 3.0, 1500.0, 250
+# Draws of the prior over walkers, and their least number from 250 walkers on: they find narrow modes, which hold few
+# points at small beta and are as narrow for few walkers. COUNTS
+FIRST_SHARE, FIRST_DRAWS, FEWEST_TO_SEARCH = 4, 1750, 250
 # A beta is left once the draws made at it have an effective sample size of this share of the target.
 FRESH_SHARE = 0.75
 # More components than in moves, because there are more points.
@@ -86,9 +84,7 @@ LEAST_MASS = 0.01
 MOST_CHECKS = 4
 # Expected share of distinct points among the walkers above which they are as good as independent draws.
 ENOUGH_DISTINCT = 0.9
-# Factor by which beta is expected to grow from stage to stage, for the spread of draws over the stages.
-EXPECTED_GROWTH = 3.0
-# Largest share of the effective sample size that a stage keeps: else beta would hardly grow.
+# Largest target as a share of the number of starting points: else beta would hardly grow.
 LARGEST_SHARE_KEPT = 0.9
 
 
@@ -123,27 +119,26 @@ class Recycled(NamedTuple):
 
 
 def recycle(
-    pending: PendingPoints, density: Density, random: np.random.RandomState
+    pending: PendingPoints, n: int, density: Density, random: np.random.RandomState
 ) -> Generator[tuple[Population, Report], None, Recycled]:
     """Anneal draws of the prior to beta = 1 by adaptive importance sampling.
 
-    Their number is the wanted effective sample size at beta = 1 and the number of draws for the check. Yields all
+    `n` is the wanted effective sample size at beta = 1 and the number of draws for the check. Yields all
     weighted points with a `Stage` for each beta below 1 before its draws are made, then a `Sweep`. Raises StoppedEarly
     at the limit of simulations.
     """
-    n, ndim = pending.coords.shape
-    search, basin_rounds = _Search(search_draws(n)), 0
+    first, ndim = pending.coords.shape
     target = least = smallest_target(n, ndim)
     points, bounds = WeightedPoints(pending), find_support_bounds(density.inside, pending.coords)
-    beta, efficiencies, increments, checks, most = 0.0, [], [], 0, 1
+    beta, efficiencies, increments, checks, basin_rounds, most = 0.0, [], [], 0, 0, 1
     drawn: list[_Drawn] = []  # at the present beta
     if (alive := effective_sample_size(points.log_weights(0.0))) < target:
         density.wait(0)
         points.update()
         alive = effective_sample_size(points.log_weights(0.0))
     if alive < target:
-        reason = f"only {alive:.0f} of {n} starting points have a likelihood above zero"
-        return Recycled(reason, *pending.arrived_part(), np.zeros(n), float("-inf"), float("inf"), None)
+        reason = f"only {alive:.0f} of {first} starting points have a likelihood above zero"
+        return Recycled(reason, *pending.arrived_part(), np.zeros(first), float("-inf"), float("inf"), None)
     while True:
         # choose beta
         points.update()
@@ -155,9 +150,7 @@ def recycle(
                 # otherwise a mode with long evaluations would be left out of every proposal
                 density.wait(points.running() - 1)
                 continue
-            # more draws shall not make larger steps: it is their number per step that finds narrow modes
-            kept = max(target, min(search.increase * target, LARGEST_SHARE_KEPT * effective))
-            following = next_beta(points.log_ratio, beta, kept, log_weights)
+            following = next_beta(points.log_ratio, beta, target, log_weights)
             if following == 1.0 and points.running() > 0:  # the draws at beta = 1 are the result
                 density.wait(0)
                 continue
@@ -170,7 +163,7 @@ def recycle(
         log_evidence, error = _evidence(log_weights, inherited)
         if last_beta < beta < 1.0:
             increments.append(log_evidence - sum(increments))
-            acceptance = efficiencies[-1] if efficiencies else effective / n
+            acceptance = efficiencies[-1] if efficiencies else effective / first
             stage = Stage(beta, effective, acceptance, 0, int(effective), increments[-1], error)
             population = Population(beta, points.coords, points.records, effective, (), log_weights)
             yield population, stage
@@ -192,8 +185,6 @@ def recycle(
         else:
             mixture = with_components(mixture, basins)
             wanted = n if finished else DRAWS_PER_TARGET * target
-        if last_beta < beta < 1.0:
-            wanted = search.enlarge(wanted, beta)
 
         # draw
         new, made = draw_inside(mixture, int(round(wanted)), random, density.inside)
@@ -348,9 +339,9 @@ def smallest_target(size: int, ndim: int) -> float:
     return max(TARGET_SHARE * size, POINTS_PER_DIMENSION * (ndim + 1.0), of_numbers)
 
 
-def search_draws(size: int) -> float:
-    """Number of additional draws that search for narrow modes, for a number of starting points."""
-    return max(SEARCH_SHARE * size, SEARCH_DRAWS if size >= FEWEST_TO_SEARCH else 0.0)
+def first_draws(size: int) -> int:
+    """Number of draws of the prior that recycling starts from, for a number of walkers."""
+    return max(FIRST_SHARE * size, FIRST_DRAWS if size >= FEWEST_TO_SEARCH else 0)
 
 
 def most_running(density: Density, submitted: int) -> int:
@@ -359,23 +350,6 @@ def most_running(density: Density, submitted: int) -> int:
     Half the points that were submitted last must have arrived: fewer would improve a proposal too little.
     """
     return min(density.workers, submitted // 2)
-
-
-class _Search:
-    """Additional draws that search for narrow modes, spread over the stages of an annealing.
-
-    `left` : float, their number. `increase` : float, all draws of the latest stage over the necessary draws.
-    """
-
-    def __init__(self, left: float) -> None:
-        self._left, self.increase = left, 1.0
-
-    def enlarge(self, draws: float, beta: float) -> float:
-        """The draws of a stage, plus additional draws: those left are spread evenly over the stages still expected."""
-        share = self._left / max(-np.log(beta) / np.log(EXPECTED_GROWTH), 1.0)
-        self._left -= share
-        self.increase = 1.0 + share / draws
-        return draws + share
 
 
 def _stopped_at(points: WeightedPoints, beta: float, of_stages: float, inherited: float) -> StoppedEarly:

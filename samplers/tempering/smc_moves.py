@@ -49,6 +49,7 @@ __all__ = ["anneal_by_moves"]
 
 def anneal_by_moves(
     population: Population,
+    n: int,
     density: Density,
     random: np.random.RandomState,
     schedule: MoveSchedule,
@@ -57,17 +58,18 @@ def anneal_by_moves(
 ) -> Generator[tuple[Population, Stage | Sweep | Finding], None, tuple[Population, list[Stage], float]]:
     """Carry evaluated draws of the prior to beta = 1; points that are evaluated here are added to `visited`.
 
-    Yields the points as they are now with a report. Returns the points at beta = 1, all stages, and the correlation of
-    the points with their start after the last moves. Raises StoppedEarly at the limit of simulations.
+    There may be more draws than the `n` points of later stages, to which they are resampled. Yields the points as they
+    are now with a report. Returns the points at beta = 1, all stages, and the correlation of the points with their
+    start after the last moves. Raises StoppedEarly at the limit of simulations.
     """
-    n, ndim = population.coords.shape
-    target, stages, error = float(n), [], EvidenceError(n)
+    m, ndim = population.coords.shape
+    target, stages, error = float(n), [], EvidenceError(m)
     while population.beta < 1.0:
         log_likelihood = population.records["log_prob"] - population.records["log_prior"]
 
         # 1. choose beta
         target = settings.target(target, n)
-        beta = next_beta(log_likelihood, population.beta, target)
+        beta = next_beta(log_likelihood, population.beta, target * (len(log_likelihood) / n))
 
         # 2. weigh
         log_weights = (beta - population.beta) * log_likelihood
@@ -84,7 +86,7 @@ def anneal_by_moves(
             move.cover_basins(coords, log_target - log_evidence)
 
         # 4. resample
-        ancestors = settings.resample(weights, random)
+        ancestors = settings.resample(weights, random, n)
         error.resample(ancestors)
         population = resample(population, ancestors, beta, ess)
         distinct = len(np.unique(population.coords, axis=0))

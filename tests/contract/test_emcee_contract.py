@@ -198,12 +198,11 @@ def test_arviz_from_emcee(Sampler):
 def test_progress_bar(Sampler, capfd):
     pytest.importorskip("tqdm")
     posterior = Gaussian()
-    posterior.report = lambda: {"simulations": 1000 + 7 * posterior.calls}  # 1000 before the run
     Sampler(N, 3, posterior).run_mcmc(start(posterior), 3, progress=True)
     shown = capfd.readouterr().err
     assert "3/3" in shown
     if Sampler is not emcee.EnsembleSampler:
-        for word in ("beta=1", "ESS=", "acceptance=", "simulations="):
+        for word in ("beta=1", "ESS=", "acceptance="):
             assert word in shown, word
     Sampler(N, 3, posterior).run_mcmc(start(posterior), 3)
     assert capfd.readouterr().err == ""

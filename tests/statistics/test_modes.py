@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from samplers import SMCSampler, TMCMCSampler
-from samplers.tempering import recycling
+from samplers.tempering import anneal, recycling
 from tests.statistics import analytic_runs
 
 NDIM = 10
@@ -79,7 +79,7 @@ def test_moves_keep_the_narrow_mode():
 @pytest.mark.parametrize(("rounds", "found"), [(4, True), (0, False)])
 def test_a_mode_that_is_met_at_the_end_is_explored(rounds, found, monkeypatch):
     """One draw of the last round before the check hits the flank of the narrow mode."""
-    monkeypatch.setattr(recycling, "search_draws", lambda size: 0.0)
+    monkeypatch.setattr(anneal, "first_draws", lambda size: size)
     monkeypatch.setattr(recycling, "MOST_BASIN_ROUNDS", rounds)
     result = analytic_runs.run(analytic_runs.Cell("two", 100.0, "SMC", 500), 4, 1, {})
     assert (min(result["shares"]) > 0.15) == found
