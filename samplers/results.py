@@ -10,6 +10,7 @@ from .estimates.genealogy import standard_error_of_mean, student_factor
 from .estimates.importance import EvidenceCheck
 from .evaluation.evaluator import Evaluator
 from .evaluation.user_target import Target
+from .judgement.checks import OF_MEAN
 from .judgement.clusters import error_between_modes
 from .judgement.failures import NearFailures
 from .judgement.verdict import Verdict
@@ -146,7 +147,9 @@ class RunResults:
         True
         """
         chain = self._chain_of("mean_error", discard, thin)
-        return self._error_of_mean(chain, chain)
+        lost = {} if self._verdict is None else self._verdict.lost
+        of_lost = [lost.get(f"{OF_MEAN} {j}", 0.0) for j in range(chain.shape[2])]
+        return np.hypot(self._error_of_mean(chain, chain), of_lost)
 
     def sd_error(self, discard: int = 0, thin: int = 1) -> np.ndarray:
         """Monte Carlo standard errors (ndim,) of the standard deviations over ``get_chain(discard, thin)``.

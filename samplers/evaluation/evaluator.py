@@ -24,7 +24,7 @@ SECONDS_BETWEEN_NOTES = 0.05
 
 
 class Evaluator:
-    """A posterior density that is evaluated and recorded (a `samplers.tempering.population.Density`).
+    """A posterior density that is evaluated and recorded.
 
     Evaluated points are structured arrays with the fields log_prob, log_prior and, if there are any, blobs.
     `evaluations` counts the points that were asked for. With `evaluates_parts`, the first points of a batch that does

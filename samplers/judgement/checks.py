@@ -17,6 +17,9 @@ from ..proposals.mixture import Mixture, log_responsibilities
 from ..reports import Stage
 
 __all__ = [
+    "LOST",
+    "OF_MEAN",
+    "OF_SHARES",
     "check_annealing",
     "check_evidence",
     "check_likelihood",
@@ -47,6 +50,7 @@ ROUNDING = 1e-12
 VOLUME_ERROR = 0.5
 # Smallest difference between two shares of a component that is reported if it is also significant.
 LARGE_SHARE_DIFFERENCE = 0.1
+LOST, OF_SHARES, OF_MEAN = "A mode may be lost", "difference of shares", "difference of mean"  # its numbers are errors
 DIFFERENT = "The two estimates of the evidence differ"
 
 
@@ -220,7 +224,9 @@ def check_shares(
         f"+- {error[worst]:.2f} among weighted draws from all parts that any stage has seen: a mode has been lost or "
         "has a wrong weight."
     )
-    return [Finding("A mode may be lost", CARE, text, "Use more walkers or more moves, and compare two runs.")]
+    numbers = {OF_SHARES: float(difference[worst])}
+    numbers |= {f"{OF_MEAN} {j}": float(x) for j, x in enumerate(np.abs(points.mean(axis=0) - weights @ coords))}
+    return [Finding(LOST, CARE, text, "Use more walkers or more moves, and compare two runs.", numbers)]
 
 
 def find_unreached_part(text: str, severity: str) -> Finding:

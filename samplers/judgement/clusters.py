@@ -47,11 +47,14 @@ class Cluster(NamedTuple):
     sd: np.ndarray
 
 
-def find_clusters(chain: np.ndarray, founders: np.ndarray, parents: np.ndarray, error: float) -> tuple[Cluster, ...]:
+def find_clusters(
+    chain: np.ndarray, founders: np.ndarray, parents: np.ndarray, error: float, lost: float = 0.0
+) -> tuple[Cluster, ...]:
     """Modes of a chain (nsteps, nwalkers, ndim), the largest first, with shares whose sum is 1.
 
     `founders` (nwalkers,) are the founder of each walker (`samplers.estimates.genealogy`), and `parents` those by the
-    last resampling alone; `error` is `samplers.reports.AnnealingResult.error_by_resampling`.
+    last resampling alone; `error` is `samplers.reports.AnnealingResult.error_by_resampling`. By `lost`,
+    shares differ from those of weighted draws.
     """
     flat = chain.reshape(-1, chain.shape[2])
     belongs = find_members(chain)
@@ -59,6 +62,7 @@ def find_clusters(chain: np.ndarray, founders: np.ndarray, parents: np.ndarray, 
     along = belongs.reshape(*chain.shape[:2], -1)
     errors = np.where(shares < 1.0, standard_error_of_mean(along, founders), 0.0)
     errors = np.hypot(errors, _kept(along, parents) * min(error, 1.0) * np.sqrt(shares * (1.0 - shares)))
+    errors = np.hypot(errors, np.where(shares < 1.0, lost, 0.0))
     modes = []
     for weights, share, share_error in zip(belongs.T, shares, errors, strict=True):
         mean = weights @ flat / weights.sum()

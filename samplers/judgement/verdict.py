@@ -20,7 +20,7 @@ from ..estimates.importance import FIRST_ROUND_SHARE, USABLE_SHARE, fewest_point
 from ..estimates.pareto import LARGEST_SHAPE
 from ..finding import CARE, NOTE, WRONG, Finding
 from ..reports import AnnealingResult, EarlyStop, GuidedRound, GuidedStart
-from .checks import find_unreached_part
+from .checks import LOST, OF_SHARES, find_unreached_part
 from .clusters import Cluster, find_clusters
 from .failures import NearFailures, check_failed_region
 from .guides import UNSEEN
@@ -143,7 +143,13 @@ class Verdict(_Stored):
         run._result.require_finished()
         if run.iteration == 0:
             raise ValueError("modes are found in a chain, which is empty: call run_mcmc with one step or more")
-        return find_clusters(run.get_chain(), run.founders, run._parents, run._result.error_by_resampling)
+        lost = self.lost.get(OF_SHARES, 0.0)
+        return find_clusters(run.get_chain(), run.founders, run._parents, run._result.error_by_resampling, lost)
+
+    @property
+    def lost(self) -> dict[str, float]:
+        """How far shares and means of the walkers are from weighted draws, if a mode may be lost; else empty."""
+        return next((each.numbers for each in self.findings if each.kind == LOST), {})
 
     @property
     def summary(self) -> str:

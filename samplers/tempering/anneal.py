@@ -45,7 +45,7 @@ from .early_stop import StoppedEarly
 from .guided import Guidance, draw_rounds, stopped_rounds
 from .mutation import MoveSchedule, Mutated, VisitedPoints, move_together
 from .population import Density, Population
-from .recycling import FEWEST_TO_SEARCH, Recycled, first_draws, recycle, submit_start
+from .recycling import Recycled, first_draws, recycle, submit_start
 from .smc_moves import anneal_by_moves
 
 __all__ = ["anneal", "check_population"]
@@ -53,11 +53,6 @@ __all__ = ["anneal", "check_population"]
 logger = logging.getLogger(__name__)
 
 Steps = Iterator[tuple[Population, Report]]
-
-# Draws of the prior that annealing by moves starts from, with 250 walkers or more: they reveal narrow modes. In three
-# dimensions, widths 1:6 and 1:8, 250 walkers, TMCMC lost or mis-weighted a mode in 13 of 48 runs, 7 of them without a
-# warning, and in 6 of 64 with these draws, none of them without a warning, with 1.3 to 1.4 times the evaluations.
-FIRST_DRAWS = 1000
 
 
 def anneal(
@@ -78,12 +73,9 @@ def anneal(
         if guidance is not None:
             yield from _from_guide(population, density, random, schedule, guidance)
             return
-        wanted = first_draws(size) if settings.recycle else FIRST_DRAWS if size >= FEWEST_TO_SEARCH else size
-        coords = population.coords
-        if wanted > size and (
-            settings.recycle or schedule.mixtures
-        ):  # walks, as in papers, do not use what they reveal
-            coords = np.concatenate([coords, density.more_draws(wanted - size, random)])
+        coords, more = population.coords, first_draws(size) - size
+        if more > 0 and (settings.recycle or schedule.mixtures):  # walks, as in papers, do not use what they reveal
+            coords = np.concatenate([coords, density.more_draws(more, random)])
         start, recycled = submit_start(coords, density, whole=not settings.recycle), None
         if settings.recycle:
             steps = recycle(start, size, density, random)

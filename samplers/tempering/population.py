@@ -1,50 +1,13 @@
-"""Populations, and the posterior density as the annealing evaluates it."""
+"""Populations of points at one beta."""
 
-from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
-
-from .pending_points import PendingPoints
 
 __all__ = ["Density", "Population", "check_size"]
 
 
-class Density(Protocol):
-    """A posterior density with its prior, as annealing evaluates it.
-
-    `map` is ``map`` or ``pool.map``, for emcee moves that evaluate points by themselves.
-    """
-
-    evaluations: int  # number of points evaluated so far
-    workers: int  # number of points that are evaluated at once, if `submit` returns without waiting; else 0
-
-    @property
-    def map(self) -> Callable: ...
-
-    def evaluate(
-        self, coords: np.ndarray, observe: Callable[[np.ndarray], None] | None = None, then: Callable | None = None
-    ) -> np.ndarray:
-        """Records (n,) of points (n, ndim), with the fields log_prob, log_prior and, where there are any, blobs.
-
-        `observe` is called with the points directly before they are evaluated, for a guide with a method `observe`. If
-        `then` is given, ``then(coords, records)`` is returned.
-        """
-
-    def submit(self, coords: np.ndarray, observe: Callable[[np.ndarray], None] | None = None) -> PendingPoints:
-        """Begin to evaluate points (n, ndim); a synchronous density returns when all are evaluated.
-
-        With a limit of simulations, the first points that fit are submitted.
-        """
-
-    def wait(self, most: int) -> None:
-        """Wait until at most this number of all submitted points is running, and let the others arrive."""
-
-    def more_draws(self, n: int, random: np.random.RandomState) -> np.ndarray:
-        """Draws (m, ndim) of the prior: m is `n`, or 0 if the density cannot be drawn from."""
-
-    def inside(self, coords: np.ndarray) -> np.ndarray:
-        """Whether each of the points (n, ndim) lies in the support of the prior: (n,) bool."""
+Density = Any  # a `samplers.evaluation.evaluator.Evaluator`, which imports this package
 
 
 class Population(NamedTuple):

@@ -50,7 +50,7 @@ from .next_beta import next_beta
 from .pending_points import PendingPoints
 from .population import Density, Population
 
-__all__ = ["Recycled", "first_draws", "most_running", "recycle", "smallest_target", "submit_start"]
+__all__ = ["Recycled", "first_draws", "most_running", "recycle", "search_draws", "smallest_target", "submit_start"]
 
 # Wanted effective sample size at each beta (the target), as a share of the number of starting points. A small target
 # allows large steps of beta; the fresh draws of a round then restore the effective sample size.
@@ -62,9 +62,14 @@ TARGET_SHARE = 0.2
 POINTS_PER_DIMENSION, POINTS_PER_COMPONENT, POINTS_PER_NUMBER = 5.0, 8.0, 0.5
 # Draws of a round, as a multiple of the target.
 DRAWS_PER_TARGET = 3.0
-# Draws of the prior over walkers, and their least number from 250 walkers on: they find narrow modes, which hold few
-# points at small beta and are as narrow for few walkers. COUNTS
-FIRST_SHARE, FIRST_DRAWS, FEWEST_TO_SEARCH = 4, 1750, 250
+# Draws that find narrow modes, which hold few points at small beta: draws of the prior, and further draws, spread over
+# the stages below beta = 1. They are a multiple of the walkers; from 250 on, at least 1000 of each kind: modes are as
+# narrow for few walkers. Widths 1:6 and 1:8 in three dimensions and 1:3 in five, 250 walkers: recycling lost a mode in
+# 21 of 72 runs with 250 and 1500, in 2 of 96 with 1000 and 1000 (7 % more evaluations);
+# of four modes in eight dimensions, one in none and in 2 of 32.
+# TMCMC lost or mis-weighted one in 13 of 48 runs of the first two, 7 without a warning, and in 6 of 64, none without a
+# warning, with 1.3 to 1.4 times the evaluations.
+DRAWS_SHARE, LEAST_DRAWS, FEWEST_TO_SEARCH = 4, 1000, 250
 # A beta is left once the draws made at it have an effective sample size of this share of the target.
 FRESH_SHARE = 0.75
 # More components than in moves, because there are more points.
@@ -84,7 +89,9 @@ LEAST_MASS = 0.01
 MOST_CHECKS = 4
 # Expected share of distinct points among the walkers above which they are as good as independent draws.
 ENOUGH_DISTINCT = 0.9
-# Largest target as a share of the number of starting points: else beta would hardly grow.
+# Factor by which beta is expected to grow from stage to stage, for the spread of draws over the stages.
+EXPECTED_GROWTH = 3.0
+# Largest share of the effective sample size that a stage keeps: else beta would hardly grow.
 LARGEST_SHARE_KEPT = 0.9
 
 
@@ -128,9 +135,10 @@ def recycle(
     at the limit of simulations.
     """
     first, ndim = pending.coords.shape
+    search, basin_rounds = _Search(search_draws(n)), 0
     target = least = smallest_target(n, ndim)
     points, bounds = WeightedPoints(pending), find_support_bounds(density.inside, pending.coords)
-    beta, efficiencies, increments, checks, basin_rounds, most = 0.0, [], [], 0, 0, 1
+    beta, efficiencies, increments, checks, most = 0.0, [], [], 0, 1
     drawn: list[_Drawn] = []  # at the present beta
     if (alive := effective_sample_size(points.log_weights(0.0))) < target:
         density.wait(0)
@@ -150,7 +158,9 @@ def recycle(
                 # otherwise a mode with long evaluations would be left out of every proposal
                 density.wait(points.running() - 1)
                 continue
-            following = next_beta(points.log_ratio, beta, target, log_weights)
+            # more draws shall not make larger steps: it is their number per step that finds narrow modes
+            kept = max(target, min(search.increase * target, LARGEST_SHARE_KEPT * effective))
+            following = next_beta(points.log_ratio, beta, kept, log_weights)
             if following == 1.0 and points.running() > 0:  # the draws at beta = 1 are the result
                 density.wait(0)
                 continue
@@ -185,6 +195,8 @@ def recycle(
         else:
             mixture = with_components(mixture, basins)
             wanted = n if finished else DRAWS_PER_TARGET * target
+        if last_beta < beta < 1.0:
+            wanted = search.enlarge(wanted, beta)
 
         # draw
         new, made = draw_inside(mixture, int(round(wanted)), random, density.inside)
@@ -340,8 +352,13 @@ def smallest_target(size: int, ndim: int) -> float:
 
 
 def first_draws(size: int) -> int:
-    """Number of draws of the prior that recycling starts from, for a number of walkers."""
-    return max(FIRST_SHARE * size, FIRST_DRAWS if size >= FEWEST_TO_SEARCH else 0)
+    """Number of draws of the prior that a run starts from, for a number of walkers."""
+    return max(size, LEAST_DRAWS if size >= FEWEST_TO_SEARCH else 0)
+
+
+def search_draws(size: int) -> int:
+    """Number of further draws that search for narrow modes, for a number of walkers."""
+    return max(DRAWS_SHARE * size - first_draws(size), LEAST_DRAWS if size >= FEWEST_TO_SEARCH else 0)
 
 
 def most_running(density: Density, submitted: int) -> int:
@@ -350,6 +367,23 @@ def most_running(density: Density, submitted: int) -> int:
     Half the points that were submitted last must have arrived: fewer would improve a proposal too little.
     """
     return min(density.workers, submitted // 2)
+
+
+class _Search:
+    """Additional draws that search for narrow modes, spread over the stages of an annealing.
+
+    `left` : float, their number. `increase` : float, all draws of the latest stage over the necessary draws.
+    """
+
+    def __init__(self, left: float) -> None:
+        self._left, self.increase = left, 1.0
+
+    def enlarge(self, draws: float, beta: float) -> float:
+        """The draws of a stage, plus additional draws: those left are spread evenly over the stages still expected."""
+        share = self._left / max(-np.log(beta) / np.log(EXPECTED_GROWTH), 1.0)
+        self._left -= share
+        self.increase = 1.0 + share / draws
+        return draws + share
 
 
 def _stopped_at(points: WeightedPoints, beta: float, of_stages: float, inherited: float) -> StoppedEarly:

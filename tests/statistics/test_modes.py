@@ -80,6 +80,7 @@ def test_moves_keep_the_narrow_mode():
 def test_a_mode_that_is_met_at_the_end_is_explored(rounds, found, monkeypatch):
     """One draw of the last round before the check hits the flank of the narrow mode."""
     monkeypatch.setattr(anneal, "first_draws", lambda size: size)
+    monkeypatch.setattr(recycling, "search_draws", lambda size: 0)
     monkeypatch.setattr(recycling, "MOST_BASIN_ROUNDS", rounds)
     result = analytic_runs.run(analytic_runs.Cell("two", 100.0, "SMC", 500), 4, 1, {})
     assert (min(result["shares"]) > 0.15) == found
