@@ -63,8 +63,8 @@ def test_founders_are_followed_while_there_are_enough(rng):
     "mode, target, nwalkers, low",
     [
         *((mode, Gaussian, 150, 0.6) for mode in ("default", "tmcmc", "moves", "literal")),
-        # by moves, shares of modes have the error of the stages, as if no draw crossed between the modes; here nearly all
-        # do, so that the stated errors are 3 times too large
+        # by moves, shares of modes have the error of the stages, as if no draw crossed between the modes; here nearly
+        # all do, so that the stated errors are 3 times too large
         ("moves", two_modes, 120, 0.2),
         ("default", two_modes, 250, 0.6),
     ],
