@@ -1,23 +1,12 @@
-r"""Expectations from few weighted draws and a known density close to the posterior (control variates).
+"""Expectations from few weighted draws and a known density close to the posterior (control variates).
 
-A guide may know a density :math:`p_e` close to the posterior whose expectations :math:`E_e[f]` cost nothing, such as
-the posterior of an emulator. The draws :math:`\theta_i` of a round have the proposal density :math:`q`, which was fixed
-before they were made. With the weights
-:math:`w_i = \pi(\theta_i) / q(\theta_i)` of the posterior and :math:`v_i = p_e(\theta_i) / q(\theta_i)` of the known
-density,
-
-.. math::
-
-   \hat E[f] = E_e[f] + \frac{1}{n} \sum_i c_i f(\theta_i), \qquad
-   c_i = \frac{w_i}{\hat Z} - v_i, \qquad
-   \hat Z = \frac{\sum_i w_i}{\sum_i v_i} .
-
-The posterior enters only through the differences :math:`c_i`, which are small where the known density is close to the
-posterior. The estimate is consistent for any known density: it costs accuracy, but no bias, if the density is poor.
-:math:`\hat Z` estimates the evidence with the same gain. Since :math:`\sum_i c_i = 0`, the estimate is an expectation
-over a *signed sample*: points of the known density with positive weights, and the draws with weights of both signs.
-
-The equations are in ``docs/theory/guided``.
+A guide may know a density close to the posterior whose expectations cost nothing, such as the posterior of an emulator.
+An expectation under the posterior is the known one plus the mean, over the draws of a round, of the function times the
+difference between two weights: of the posterior and of the known density, both relative to the proposal.
+The differences are small where the known density is close to the posterior; a poor one costs accuracy, but no bias.
+They have the sum 0, so the estimate is an expectation over a *signed sample*: points of the known density with positive
+weights, and the draws with weights of both signs. The evidence is estimated with the same gain. The equations are in
+``docs/theory/guided``.
 
 References
 ----------

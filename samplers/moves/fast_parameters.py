@@ -1,11 +1,11 @@
 """Sweeps over fast parameters, made after each move that needs a simulation.
 
-In many posteriors some parameters change the density without a new simulation: the noise standard deviations, for
-example, when the sums of squared residuals are cached. A posterior declares their indices by an attribute
-``fast_parameters``. After each expensive move the ensemble makes a few random-walk steps in them alone. This is
-Metropolis within Gibbs, so the target distribution is unchanged. Without these sweeps, 16 runs of 50 walkers by moves
-with five structural parameters and four noise levels had means that were off by 0.75 standard deviations (with them by
-0.13), and took 14 % more simulations.
+Some parameters change the density without a new simulation: noise standard deviations, when the sums of squared
+residuals are cached. A posterior declares their indices by an attribute ``fast_parameters``. After each move that needs
+a simulation, the ensemble makes a few random-walk steps in them alone: Metropolis within Gibbs, so the target is
+unchanged. Without these sweeps, 12 runs of 50 walkers by moves with five structural parameters and four noise levels
+had means that were off by 0.60 standard deviations (with them 0.14), and log-evidences by 10.8 (0.4); 100 walkers 0.26
+(0.10), and 3.2 (0.0); 250 walkers, which recycle, show no difference.
 
 References
 ----------

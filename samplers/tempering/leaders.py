@@ -3,8 +3,7 @@
 Ching & Chen (2007) draw a leader by the weights for every new point, and move its chain by one step: a leader that is
 drawn n times has a chain of n points. Its first points have made few steps, and the leaders of long chains have large
 weights, so the new points have a bias, which decreases with the steps that every chain makes before its points count
-(burn-in; Betz, Papaioannou & Straub 2016). Weights that are computed again after every single step, as in the paper,
-would leave a pool idle.
+(burn-in; Betz, Papaioannou & Straub 2016).
 
 If many points are copies, the next fit and the next weights see too few distinct points: with 100 walkers and 12
 parameters, the means were wrong by 1 to 6 standard deviations. So all points are swept together after the burn-in and

@@ -11,14 +11,12 @@ Beta is increased only when the draws made at it have an effective sample size o
 many old points some have large weights by chance, and if the likelihood is rough, annealing that follows these points
 ends in a local mode. Once beta = 1 is reached, points are drawn until the effective sample size suffices.
 
-Adaptive proposals can be wrong although their errors are small, so the last fit is checked with fresh draws. The result
-is used only if their weights are well-behaved and their evidence agrees (`Recycled.reliable`). If not, these draws join
-the other points and the next fit is checked, a few times. Reusing points that a proposal was fitted to underweights
-them, and a small mode can vanish. Therefore the resulting population consists only of draws made at beta = 1, each
-weighted by the proposal that it was drawn from.
-
-The equations are in ``docs/theory/recycling``. Constants without a reference were chosen by trials on posteriors with
-known answers. The *efficiency* of a round is the effective sample size of its fresh draws divided by their number.
+The last fit is checked with fresh draws, and the result is used only if their weights are well-behaved and their
+evidence agrees (`Recycled.reliable`); if not, they join the other points, and the next fit is checked, a few times.
+Points that a proposal was fitted to weigh too little, and a small mode can vanish, so the resulting population consists
+only of draws made at beta = 1, each weighted by its own proposal. The equations are in ``docs/theory/recycling``.
+Constants without a reference were chosen by trials on posteriors with known answers. The *efficiency* of a round is the
+effective sample size of its fresh draws divided by their number.
 
 References
 ----------

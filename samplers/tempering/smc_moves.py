@@ -9,10 +9,8 @@ carries N points :math:`\theta_i` from :math:`\beta` to a larger :math:`\beta'`:
 4. resample the points by :math:`w_i`, which copies some points and drops others;
 5. move every point by a Markov kernel that leaves :math:`\pi_{\beta'}` unchanged, which separates the copies.
 
-Weights depend only on the points before the moves (Del Moral et al. 2006), so steps 1 to 4 need no evaluation. Before
-step 4, the kernels of step 5 are fitted to the weighted points. Steps 1 to 3 are pure functions in
-`samplers.estimates.weights`, the schemes of step 4 are in `samplers.resampling`, and the kernels of step 5 are in
-`samplers.tempering.mutation`. The equations are derived in ``docs/theory/tempering``.
+Weights depend only on the points before the moves, so steps 1 to 4 need no evaluation. Before step 4, the kernels of
+step 5 are fitted to the weighted points. The equations are derived in ``docs/theory/tempering``.
 
 References
 ----------
