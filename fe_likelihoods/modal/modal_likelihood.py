@@ -93,7 +93,7 @@ class ModalLikelihood(FELikelihood):
         if not 0.0 <= close < 1.0:
             raise ValueError(f"ModalLikelihood: close must be a share from 0 to 1, such as {_CLOSE}; got {close!r}")
         paired = PairedModes(_with_modes(model), data, close)
-        noise = modal_noise(paired, frequency_error, shape_error, student_t)
+        noise = modal_noise(paired, (frequency_error, shape_error), student_t)
         self.held_out = held_out
         if held_out is not None:
             sensor_rows(paired.model, held_out)  # refuses what cannot be predicted

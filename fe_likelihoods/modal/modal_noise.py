@@ -36,7 +36,7 @@ from ..signals.channels import Channel
 __all__ = ["ModalNoise", "ModeSums", "modal_noise"]
 
 
-LEAST_FREQUENCY_ERROR, LEAST_SHAPE_ERROR = 1e-4, 1e-3  # of an identification, known where no error is stated
+LEAST_ERRORS = 1e-4, 1e-3  # of frequencies and shapes, known where no error is stated
 
 
 @dataclass(frozen=True)
@@ -56,22 +56,18 @@ class ModeSums:
 class ModalNoise:
     """Errors of m modes, with a `Noise`'s members: known errors, unknown ones, or both.
 
-    Frequencies have the known errors `frequency_known` (m,), shapes `shape_known` (m,), zero if none is known.
-    `frequency` and `shape` say what is unknown: ``"common"`` for one error of all modes, ``"mode"`` for one each, or an
-    empty text for none. `counts` and `freedoms` (m n_sets,) are the numbers of frequencies, 0 or 1, and of degrees of
-    freedom of the shapes, of the sets of the first mode, of the second one, and so on. `student` are the degrees of
-    freedom of Student-t errors, 0 for Gaussian ones.
+    All pairs are of frequencies and of shapes: `known` errors (m,), zero if none is known; what is `unknown`, an error
+    ``"common"`` to all modes, one for each (``"mode"``), or an empty text for none; and `counts` (m n_sets,) of degrees
+    of freedom, of the sets of the first mode, of the second one, and so on. `student` are the degrees of freedom of
+    Student-t errors, 0 for Gaussian ones.
     """
 
     channels: tuple[Channel, ...]
     n_sets: int
     n_sensors: int
-    counts: tuple[int, ...]
-    freedoms: tuple[int, ...]
-    frequency_known: tuple[float, ...]
-    shape_known: tuple[float, ...]
-    frequency: str
-    shape: str
+    known: tuple[tuple[float, ...], tuple[float, ...]]
+    unknown: tuple[str, str]
+    counts: tuple[tuple[int, ...], tuple[int, ...]]
     student: float = 0.0
     level = "si"  # the errors do not depend on the response
 
@@ -87,33 +83,32 @@ class ModalNoise:
         return ModeSums(self.n_sets)
 
     @property
+    def _ends(self) -> dict[str, list[str]]:
+        """Ends of the names of unknown errors."""
+        return {"": [], "common": [""], "mode": [f"_{channel.name.split()[-1]}" for channel in self.channels]}
+
+    @property
     def parameter_names(self) -> tuple[str, ...]:
         """``frequency_error`` and ``shape_error``, or one of each per mode, ``frequency_error_2``."""
-        numbers = [channel.name.split()[-1] for channel in self.channels]
-        kinds = {"": [], "common": [""], "mode": [f"_{number}" for number in numbers]}
-        return tuple(f"{what}_error{end}" for what in ("frequency", "shape") for end in kinds[getattr(self, what)])
+        kinds = zip(("frequency_error", "shape_error"), self.unknown, strict=True)
+        return tuple(f"{what}{end}" for what, kind in kinds for end in self._ends[kind])
 
-    def deviations(self, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def deviations(self, parameters: np.ndarray) -> list[np.ndarray]:
         """Standard deviations of frequencies and of components of shapes, (n, m) each, at parameters (n, n_noise)."""
-        m, parameters = len(self.channels), np.asarray(parameters, dtype=float)
+        parameters = np.asarray(parameters, dtype=float)
         # an unknown error that is not positive is impossible, also beside a known one
         variances = np.square(np.where(parameters > 0.0, parameters, np.nan))
-        split = {"": 0, "common": 1, "mode": m}[self.frequency]
+        split = len(self._ends[self.unknown[0]])
         found = []
-        for known, unknown, least in (
-            (self.frequency_known, variances[:, :split], LEAST_FREQUENCY_ERROR),
-            (self.shape_known, variances[:, split:], LEAST_SHAPE_ERROR),
-        ):
-            floor = np.where(np.array(known) > 0.0, 0.0, least)
-            more = unknown if unknown.shape[1] else np.zeros((len(parameters), m))
-            found.append(np.sqrt(np.square(known) + np.square(floor) + more))
-        return found[0], found[1]
+        for known, more, least in zip(self.known, np.split(variances, [split], axis=1), LEAST_ERRORS, strict=True):
+            own = np.square(known) + np.square(np.where(np.array(known) > 0.0, 0.0, least))
+            found.append(np.sqrt(own + (more if more.shape[1] else np.zeros((len(parameters), 1)))))
+        return found
 
     def log_likelihood(self, statistics: np.ndarray, n_samples: Any, parameters: np.ndarray) -> np.ndarray:
         """Log-likelihood (n,) for the statistics (n, m + 2 m n_sets); -inf for impossible errors."""
         total, sums = np.zeros(len(statistics)), np.split(statistics[:, len(self.channels) :], 2, axis=1)
-        kinds = zip(self.deviations(parameters), sums, (self.counts, self.freedoms), strict=True)
-        for deviations, squares, counts in kinds:
+        for deviations, squares, counts in zip(self.deviations(parameters), sums, self.counts, strict=True):
             used = np.flatnonzero(counts)
             d, spread = np.array(counts)[used], np.repeat(deviations, self.n_sets, axis=1)[:, used]
             with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -137,37 +132,25 @@ class ModalNoise:
         return np.tile(one, self.n_sets) * (np.asarray(response) != 0.0)
 
 
-def modal_noise(
-    paired: Any, frequency_error: str | None, shape_error: str | None, student_t: float | None
-) -> ModalNoise:
+def modal_noise(paired: Any, unknown: tuple[Any, Any], student_t: float | None) -> ModalNoise:
     """The errors of `PairedModes`, from what their data and the arguments of a `ModalLikelihood` say."""
-    data, m = paired.data, paired.data.n_modes
-    if data.covariance is not None and (frequency_error is not None or student_t is not None):
+    data, stated = paired.data, (paired.frequency_cv, paired.data.shape_error)
+    if data.covariance is not None and (unknown[0] is not None or student_t is not None):
         raise ValueError(
             "ModalLikelihood: beside a covariance of the frequencies, neither an unknown frequency_error nor student_t "
             "is possible: leave it out, or give the data frequency_cv and no covariance"
         )
-    known, unknown = {}, {"frequency": frequency_error, "shape": shape_error}
-    for what, stated in (("frequency", paired.frequency_cv), ("shape", data.shape_error)):
-        known[what] = (0.0,) * m if stated is None else tuple(stated.tolist())
-        if unknown[what] is None:
-            unknown[what] = "common" if stated is None else ""
-        if unknown[what] not in ("", "common", "mode"):
-            raise ValueError(
-                f'ModalLikelihood: {what}_error must be "common" or "mode"; got {unknown[what]!r}: known errors belong '
-                "to the data (frequency_cv, shape_error), or are numbers in the mapping of priors"
-            )
+    if wrong := [each for each in unknown if each not in (None, "common", "mode")]:
+        raise ValueError(
+            f'ModalLikelihood: frequency_error and shape_error must be "common" or "mode"; got {wrong[0]!r}: known '
+            "errors belong to the data (frequency_cv, shape_error), or are numbers in the mapping of priors"
+        )
+    known = [(0.0,) * data.n_modes if each is None else tuple(each.tolist()) for each in stated]
+    of_frequency, of_shape = (each or ("common" if x is None else "") for each, x in zip(unknown, stated, strict=True))
     sizes = {mode: len(group) for group in paired.groups for mode in group}
-    fitted = np.array([sizes[mode] for mode in range(m)])
+    fitted = np.array([sizes[mode] for mode in range(data.n_modes)])
     freedoms = (data.has_shape * np.maximum(data.n_sensors - fitted, 0)).T
-    return ModalNoise(
-        paired.channels,
-        data.n_sets,
-        data.n_sensors,
-        tuple((~np.isnan(data.frequencies)).T.astype(int).ravel().tolist()),
-        tuple(freedoms.ravel().tolist()),
-        *known.values(),
-        unknown["frequency"],
-        unknown["shape"] if freedoms.any() else "",
-        0.0 if student_t is None else check_degrees("ModalLikelihood: student_t", student_t),
-    )
+    counts = [tuple(each.ravel().tolist()) for each in ((~np.isnan(data.frequencies)).T.astype(int), freedoms)]
+    student = 0.0 if student_t is None else check_degrees("ModalLikelihood: student_t", student_t)
+    unknown = of_frequency, of_shape if freedoms.any() else ""
+    return ModalNoise(paired.channels, data.n_sets, data.n_sensors, tuple(known), unknown, tuple(counts), student)

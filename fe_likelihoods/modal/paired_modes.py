@@ -31,20 +31,18 @@ _REFERENCE_TEMPERATURE = 20.0  # [°C], of the frequencies of the model
 
 def sensor_rows(model: Model, data: ModalData) -> list[int]:
     """Rows of a model's response that are the sensors of the data; ValueError if the model has no modes at them."""
-    names = [channel.name for channel in model.channels]
+    names, kind = [channel.name for channel in model.channels], type(model).__name__
     if model.channels[0].dimension != "frequency":
         raise ValueError(
-            f"expected a model that has modes, whose first channel is a frequency; the channels of "
-            f"{type(model).__name__} are {', '.join(names)}: use FunctionModes, or modal_channels(sensors) and "
-            "modal_response (fe_likelihoods.modal.mode_models)"
+            f"expected a model that has modes, whose first channel is a frequency; the channels of {kind} are "
+            f"{', '.join(names)}: use FunctionModes, or modal_channels(sensors) and modal_response"
         )
     if unknown := [name for name in data.sensors if name not in names[1:]]:
         raise ValueError(
             f"the model has no sensors {', '.join(unknown)}; its sensors are {', '.join(names[1:]) or 'none'}: rename "
             'them, or leave them out with data.at(sensors); in a TOML file, columns = {sensor = "its column"}'
         )
-    by_number = [data.mode_numbers[mode] for mode in np.flatnonzero(~data.has_shape.any(axis=0))]
-    if max([data.n_modes, *by_number]) > model.n_steps:
+    if max(data.n_modes, *np.where(data.has_shape.any(axis=0), 0, data.mode_numbers)) > model.n_steps:
         raise ValueError(
             f"the model has {model.n_steps} modes, and {data.n_modes} were measured, with the numbers "
             f"{data.mode_numbers}: compute more modes (n_modes), twice as many as were measured"

@@ -198,7 +198,7 @@ def test_frequencies_alone_are_paired_by_number():
         ),
         (
             lambda data: ModalLikelihood(FRAME, data, frequency_error="each"),
-            'frequency_error must be "common" or "mode"',
+            'shape_error must be "common" or "mode"',
         ),
         (lambda data: ModalLikelihood(FRAME, data, shape_error=0.02), "numbers in the mapping of priors"),
         (lambda data: ModalLikelihood(FRAME, data, close=2), "close must be a share"),
