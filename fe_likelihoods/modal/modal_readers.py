@@ -20,7 +20,7 @@ _KINDS = {
     "frequency": r"f|fn|freq|(natural[ _])?frequency|omega",
     "deviation": r"(f|fn|freq|frequency)[ _]std",
     "damping": r"damping|zeta|xi",
-    "temperature": r"t|temp|temperature",
+    "temperature": r"temp|temperature|t[ _]?[\[(]?(°c|degc|c)[\])]?",  # a T alone may be a sensor
     "set": r"set|identification|date",
     "mode": r"mode([ _]no\.?)?",
 }
@@ -96,9 +96,10 @@ def read_modal_data(
 
 
 def _kind(name: str) -> str:
-    """What a column is, by its name without a unit; empty for a sensor."""
-    plain = re.sub(r"[\s_]*([\[(].*[\])]|_(hz|rad/s|%|c|°c|degc))$", "", name.strip().lower())
-    return next((kind for kind, known in _KINDS.items() if re.fullmatch(known, plain)), "")
+    """What a column is, by its name with or without a unit; empty for a sensor."""
+    name = name.strip().lower()
+    plain = re.sub(r"[\s_]*([\[(].*[\])]|_(hz|rad/s|%|c|°c|degc))$", "", name)
+    return next((kind for kind, known in _KINDS.items() if any(re.fullmatch(known, x) for x in (name, plain))), "")
 
 
 def _of_modes(table: Table, sensors: Sequence[str], unit: str | None, options: dict[str, Any]) -> ModalData:
@@ -165,7 +166,9 @@ def _si(table: Table, place: int, dimension: str, default: str) -> np.ndarray:
 
 def _in_hertz(table: Table, place: int, given: str | None) -> np.ndarray:
     """Frequencies [Hz] in a column; ValueError if the unit is not known, or is stated and given differently."""
-    return _si(table, place, "frequency", agree_on_unit(stated_unit(table, place), given, "frequency", table.file))
+    return _si(
+        table, place, "frequency", agree_on_unit(stated_unit(table, place, "frequency"), given, "frequency", table.file)
+    )
 
 
 def _of_matlab(

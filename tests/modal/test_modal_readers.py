@@ -58,6 +58,8 @@ def test_errors_and_what_is_no_sensor(tmp_path):
         assert data.sensors == ("a",)
     data = read_modal_data(written(tmp_path, "f_Hz,T_C,a,MAC", "1.0,12,1,2", "2.0,12,1,3"), ["a", "MAC"])  # a sensor
     assert data.sensors == ("a", "MAC") and data.temperatures == [12.0]
+    data = read_modal_data(written(tmp_path, "f_Hz,T,B", "1.0,1,2"))  # top and bottom
+    assert data.sensors == ("T", "B") and data.temperatures is None
     data = read_modal_data(written(tmp_path, "mode,frequency_Hz,damping_%", "1,2.0,1.5", "2,5.0,2"))
     assert data.sensors == () and data.damping.tolist() == [[0.015, 0.02]]
 
@@ -66,8 +68,9 @@ def test_errors_and_what_is_no_sensor(tmp_path):
     ("head", "row", "text"),
     [
         ("period_s,a", "1.0,1", "expected one column of frequencies"),
-        ("T [s],f_Hz,a", "1.0,1,1", "expected a unit of temperature"),
-        ("f_Hz,T [K],a", "1.0,293,1", "subtract 273.15"),
+        ("T [s],f_Hz,a", "1.0,1,1", "other units"),
+        ("f_Hz,T [K],a", "1.0,293,1", "other units"),
+        ("f_Hz,temperature [K],a", "1.0,293,1", "subtract 273.15"),
         ("f_Hz,a_re,a_im", "2.0,1.0,0.1", "may be no components of real shapes"),
         ("f_Hz,Re(a),Im(a)", "2.0,1.0,0.1", "may be no components of real shapes"),
         ("f_Hz,a,MAC [%]", "2.0,1.0,0.1", "give those that are sensors"),
