@@ -215,5 +215,5 @@ def test_losses_between_two_temperatures_of_fifty_twins():
 def test_covariates_of_both_states_are_needed():
     rng = np.random.default_rng(1)
     bare = StoredPosterior(state(np.zeros(D), 0.0, rng).samples, Prior({name: LogNormal(1.0, 3.0) for name in NAMES}))
-    with pytest.raises(ValueError, match="the covariates temperature in both calibrations"):
+    with pytest.raises(ValueError, match="covariates of slopes .temperature. in both calibrations"):
         stiffness_loss(bare, state(np.zeros(D), 0.0, rng), NAMES, slopes={"temperature": SLOPE})
