@@ -127,7 +127,9 @@ class Modes(Section):
         "Parameters frequency_error and shape_error, of all modes or of each; by default where no error is known",
     )
     student_t: Any = key("number", "Degrees of freedom of Student-t errors, such as 4, for wrong identifications")
-    n_modes: Any = key("whole number >= 1", "Modes that the model computes (twice as many as were measured)")
+    n_modes: Any = key(
+        "whole number >= 1", "Modes that the model computes (twice as many as were measured, or all of a function)"
+    )
     close: Any = key("number", "Share of a frequency within which modes are compared as a plane of shapes (0.02)")
 
 
