@@ -88,17 +88,13 @@ def _check_sets(data: Any) -> list[Finding]:
     k, mode = np.unravel_index(np.nan_to_num(far).argmax(), far.shape)
     if not far[k, mode] > 1.0:
         return []
+    ratio, like = float(np.exp(off[k, mode])), 1.0 - unlike[k, mode]
     text = (
-        f"Mode {data.mode_numbers[mode]} of set {k + 1} has {np.exp(off[k, mode]):.3g} times the median frequency of "
-        f"{data.n_sets} sets"
-        + (
-            f", and a MAC of {1.0 - unlike[k, mode]:.2f} with the shapes of the others."
-            if unlike[k, mode] >= 0.0
-            else "."
-        )
+        f"Mode {data.mode_numbers[mode]} of set {k + 1} ({data.frequencies[k, mode]:.4g} Hz) has {ratio:.3g} times the "
+        f"median frequency of {data.n_sets} sets" + (f", and a MAC of {like:.2f} with them." if like <= 1.0 else ".")
     )
     action = "Check its line in the file; if it is right, `student_t=4` lets it move the parameters little."
-    return [Finding("A value may be wrong", CARE, text, action, {"ratio": float(np.exp(off[k, mode]))})]
+    return [Finding("A value may be wrong", CARE, text, action, {"ratio": ratio})]
 
 
 def _check_errors(fit: Any) -> list[Finding]:
