@@ -61,14 +61,12 @@ class _Commands(click.Group):
         try:
             with _plain_warnings():
                 return super().invoke(ctx)
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, SystemExit) as error:  # exit code 0 of the user's code would say that all is done
+            stopped = isinstance(error, KeyboardInterrupt)
             message = ctx.obj.get("interrupted", "Interrupted: nothing was changed.")
-            click.echo(f"\n{message}", err=True)
-            ctx.exit(INTERRUPTED)
-        except SystemExit as error:  # of the user's code: exit code 0 would say that the command is done
-            message = ctx.obj.get("interrupted", "Nothing was changed.")
-            click.echo(f"Error: sys.exit({error.code!r}) in the user's code has ended the command. {message}", err=True)
-            ctx.exit(ERROR)
+            code = "" if stopped else f"Error: sys.exit({error.code!r}) in the user's code has ended the command. "
+            click.echo(f"\n{message}" if stopped else code + message, err=True)
+            ctx.exit(INTERRUPTED if stopped else ERROR)
         except (ValueError, OSError, RuntimeError, ImportError) as error:
             if ctx.params["debug"] or isinstance(error, RuntimeError) and type(error).__module__.startswith("click"):
                 raise
@@ -117,17 +115,15 @@ def run(ctx: click.Context, file: Path, out: Path | None, overwrite: bool, quiet
 
 def _show(outcome: Any) -> None:
     click.echo((outcome.folder / "summary.txt").read_text(encoding="utf-8").rstrip())
-    for part, _ in outcome.problem.posterior.likelihood.parts():
+    posterior, assumed = outcome.problem.posterior, outcome.problem.assumed
+    for part, _ in posterior.likelihood.parts():
         if "CAUTION" in part.measurements.description:
             click.echo(f"Measurements: {part.measurements.description}")
-    problem = outcome.problem
-    for parameter in (each for each in problem.posterior.parameters if each.name in problem.assumed):
-        prior = problem.assumed[parameter.name]
+    for parameter in (each for each in posterior.parameters if each.name in assumed):
+        prior = assumed[parameter.name]
         mean, sd = (parameter.shown(value) for value in prior.moments)
-        click.echo(
-            f"Assumed, since the file does not give it: prior of {parameter.label}: {type(prior).__name__}, mean "
-            f"{mean:.3g}, standard deviation {sd:.3g}"
-        )
+        told = f"{type(prior).__name__}, mean {mean:.3g}, standard deviation {sd:.3g}"
+        click.echo(f"Assumed, since the file does not give it: prior of {parameter.label}: {told}")
     for finding in outcome.findings:
         click.echo(f"CAUTION: {finding}")
     click.echo(f"Written to {outcome.folder}/: {', '.join(outcome.files)}")

@@ -236,31 +236,26 @@ class ExecutableModel(UserModel):
 
     def _write(self, folder: Path, values: dict[str, str]) -> None:
         """Write the input files into the folder of the run."""
-        for name, text in self.templates.items():
-            path = folder / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(string.Template(text).substitute(values))
-        for name, source in self.files.items():
-            path = folder / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(source, path)
+        texts = {name: string.Template(text).substitute(values) for name, text in self.templates.items()}
         if self.record is not None:
-            path = folder / self.record_file
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text("".join(f"{value!r}\n" for value in self.record.acceleration.tolist()))
+            texts[self.record_file] = "".join(f"{value!r}\n" for value in self.record.acceleration.tolist())
+        for name in (*texts, *self.files):
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        for name, text in texts.items():
+            (folder / name).write_text(text)
+        for name, source in self.files.items():
+            shutil.copyfile(source, folder / name)
 
     def _execute(self, place: Path, arguments: list[str]) -> None:
         """Run the program in the folder ``run`` of `place`; raise SimulationFailed unless it succeeds."""
         start = time.monotonic()
 
         def watch(seconds: float) -> float:
-            if seconds > self.time_limit:
-                text = f"stopped at the time limit of {self.time_limit:g} s"
+            text = f"stopped at the time limit of {self.time_limit:g} s" if seconds > self.time_limit else ""
+            if not text and _size(place) > self.max_output:
+                text = f"stopped because it wrote more than {self.max_output} bytes"
+            if text:
                 raise SimulationFailed(TransientReason(text), seconds)
-            if _size(place) > self.max_output:
-                raise SimulationFailed(
-                    TransientReason(f"stopped because it wrote more than {self.max_output} bytes"), seconds
-                )
             return min(_WATCH_INTERVAL, self.time_limit - seconds + 1e-3)
 
         outputs = place / "stdout.txt", place / "stderr.txt"
@@ -291,11 +286,8 @@ class ExecutableModel(UserModel):
             return self.output(folder)
         table = read_table(folder, self.output)
         if table.shape[1] <= max(self.columns) or (self._no_other_columns and table.shape[1] != len(self.columns)):
-            wanted = (
-                f"{len(self.columns)} columns"
-                if self._no_other_columns
-                else f"columns {', '.join(map(str, self.columns))}"
-            )
+            listed = f"columns {', '.join(map(str, self.columns))}"
+            wanted = f"{len(self.columns)} columns" if self._no_other_columns else listed
             raise SimulationFailed(f"{self.output} has {table.shape[1]} columns, expected {wanted}")
         return self._factors * table[:, self.columns].T
 

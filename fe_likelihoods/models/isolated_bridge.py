@@ -196,9 +196,8 @@ class IsolatedBridge(BuiltInModel):
     def followed_by(self, record: Record | tuple[Record, Record], rest: float = 10.0) -> IsolatedBridge:
         """Return the same bridge under its present records, a pause and further table accelerations.
 
-        The pause of `rest` [s] is lengthened to a whole number of response steps. The response ends with the samples of
-        ``with_record(record)``. If only one of the two excitations has a vertical acceleration, it is zero during the
-        other. Errors are as for `Record.followed_by`.
+        The pause of `rest` [s] is lengthened to a whole number of response steps. If only one of the two excitations
+        has a vertical acceleration, it is zero during the other. Errors are as for `Record.followed_by`.
         """
         horizontal, vertical = _components(record)
         n_zeros = rest_samples(rest, self.record.dt)
@@ -210,11 +209,7 @@ class IsolatedBridge(BuiltInModel):
         return replace(self, record=self.record.followed_by(horizontal, rest), vertical=joined)
 
     def first(self, seconds: float) -> IsolatedBridge:
-        """Return the same bridge under the first part of its records.
-
-        `seconds` is the time of the last sample of the response [s]. ValueError if it is not within the response, or
-        fewer than two samples remain.
-        """
+        """Return the same bridge up to the sample at `seconds` [s] of its response; errors as for other models."""
         last = sample_window("the response", self.n_steps, self.dt, 0.0, seconds).stop - 1
         stop = last * self.every * self.record.dt
         vertical = None if self.vertical is None else self.vertical.trim(0.0, stop)
@@ -240,11 +235,8 @@ class IsolatedBridge(BuiltInModel):
     def _check_parts(self) -> None:
         """Raise ValueError for parts of the wrong type or number."""
         if not isinstance(self.record, Record):
-            raise invalid(
-                "a Record of the table acceleration",
-                type(self.record).__name__,
-                "read one with fe_likelihoods.read_record",
-            )
+            kind = type(self.record).__name__
+            raise invalid("a Record of the table acceleration", kind, "read one with fe_likelihoods.read_record")
         pairs = (("piers", self.piers, Pier), ("bearings", self.bearings, Bearing), ("dampers", self.dampers, Damper))
         for name, pair, kind in pairs:
             if not isinstance(pair, Sequence) or len(pair) != 2 or not all(isinstance(part, kind) for part in pair):
@@ -252,11 +244,8 @@ class IsolatedBridge(BuiltInModel):
         if not isinstance(self.rubber, Rubber):
             raise invalid("Rubber(...) as rubber", self.rubber, "import it from fe_likelihoods")
         if self.bearings[0].gamma != self.bearings[1].gamma:
-            raise invalid(
-                "the same gamma for both bearings",
-                [bearing.gamma for bearing in self.bearings],
-                "it is a constant of the friction law",
-            )
+            given = [bearing.gamma for bearing in self.bearings]
+            raise invalid("the same gamma for both bearings", given, "it is a constant of the friction law")
         if self.vertical is not None and (
             not isinstance(self.vertical, Record)
             or not same_sampling(self.record.dt, self.record.n_steps, self.vertical.dt, self.vertical.n_steps)

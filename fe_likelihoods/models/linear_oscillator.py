@@ -83,11 +83,7 @@ class LinearOscillator(StructuralModel):
         return type(self)(record, self.period, self.damping_ratio)
 
     def first(self, seconds: float) -> LinearOscillator:
-        """Return the same oscillator under the first part of its record.
-
-        `seconds` is the time of the last sample of the response [s]. ValueError if it is not within the response, or
-        fewer than two samples remain.
-        """
+        """Return the same oscillator up to the sample at `seconds` [s]; ValueError as `Record.trim`."""
         return self.with_record(self.record.trim(0.0, seconds))
 
     def jacobian(self, theta: ArrayLike) -> np.ndarray:

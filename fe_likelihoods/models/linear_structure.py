@@ -151,27 +151,17 @@ class LinearStructure(ExternalModel):
         self.fingerprint = self._digest(repr(self.parts), self._window.start, motions, *(self.outputs or ()))
 
     def with_record(self, record: Record | Sequence[Record]) -> LinearStructure:
-        """Return the same structure under other support accelerations; errors as for a new structure.
-
-        The lead is kept.
-        """
+        """Return the same structure, with its lead, under other support accelerations; errors as for a new one."""
         return type(self)(self.parts, record, self.unit, self.lead, self.outputs)
 
     def followed_by(self, record: Record | Sequence[Record], rest: float = 10.0) -> LinearStructure:
-        """Return the same structure under its present motions, a pause of `rest` [s] and further support motions.
-
-        Its response ends with the samples of ``with_record(record)``. ValueError as `Record.followed_by`.
-        """
+        """Return the same structure under its present motions, a pause of `rest` [s] and further support motions."""
         further = self.with_record(record).supports
         joined = [own.followed_by(each, rest) for own, each in zip(self.supports, further, strict=True)]
         return self.with_record(joined)
 
     def first(self, seconds: float) -> LinearStructure:
-        """Return the same structure under the first part of its records.
-
-        `seconds` is the time of the last sample of the response [s], which starts after the lead. ValueError if it is
-        not within the response, or fewer than two samples remain.
-        """
+        """Return the same structure up to the sample at `seconds` [s] of its response; ValueError as `Record.trim`."""
         last = self._window.start + sample_window("the response", self.n_steps, self.dt, 0.0, seconds).stop
         return self.with_record([support.trim(0.0, (last - 1) * self.dt) for support in self.supports])
 

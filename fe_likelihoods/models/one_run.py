@@ -43,11 +43,6 @@ def one_run(
     dict of str to PartOfRun
         A model for each likelihood, by name.
 
-    Raises
-    ------
-    ValueError
-        If there are no parts, or files are not named for the same parts; as `make`.
-
     Examples
     --------
     >>> from fe_likelihoods.models.one_run import one_run

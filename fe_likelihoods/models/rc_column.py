@@ -205,18 +205,8 @@ class RCColumn(BuiltInModel):
 
         Height, diameter, Ec, Es, ft, damping and weight are from Ramancha et al. (2022), the other values from a
         published model of the same column. They do not give, and this model assumes: the peak strain 2 fc/Ec, tension
-        softening over a strain of 0.001 to a tenth of ft, and no rotational inertia of the superstructure.
-
-        Parameters
-        ----------
-        loading : Record or DisplacementHistory
-            Base acceleration, or lateral displacement of the top.
-        **changes
-            Arguments of `RCColumn` that replace the values of the tested column.
-
-        Returns
-        -------
-        RCColumn
+        softening over a strain of 0.001 to a tenth of ft, and no rotational inertia of the superstructure. `changes`
+        are arguments of `RCColumn` that replace the values of the tested column.
 
         Examples
         --------
@@ -251,11 +241,8 @@ class RCColumn(BuiltInModel):
     def _warn_of_coarse_steps(self) -> None:
         """Accelerations below the top contain vibrations of the column's own mass, which need short steps."""
         step = self.dt / self.substeps
-        below = [
-            name
-            for name in self.outputs
-            if "acceleration@" in name and float(name.partition("@")[2]) < self.height * (1.0 - 1e-6)
-        ]
+        heights = {name: float(name.partition("@")[2]) for name in self.outputs if "acceleration@" in name}
+        below = [name for name, height in heights.items() if height < self.height * (1.0 - 1e-6)]
         if isinstance(self.loading, Record):
             warn(check_steps_of_mass(below, step), stacklevel=4)
 
@@ -323,22 +310,17 @@ class RCColumn(BuiltInModel):
     def followed_by(self, record: Record, rest: float = 10.0) -> RCColumn:
         """Return the same column under its present record, a pause of `rest` [s] and a further record.
 
-        Its response ends with the response to the further record, of the column that the first record has damaged.
-        Errors are as for `Record.followed_by`; a column under imposed displacement raises ValueError.
+        ValueError as `Record.followed_by`, and for a column under imposed displacement.
         """
         if not isinstance(self.loading, Record):
-            raise invalid(
-                "a column under a Record",
-                type(self.loading).__name__,
-                "join the displacements in one DisplacementHistory and build a new RCColumn",
-            )
+            advice = "join the displacements in one DisplacementHistory and build a new RCColumn"
+            raise invalid("a column under a Record", type(self.loading).__name__, advice)
         return self.with_record(self.loading.followed_by(record, rest))
 
     def first(self, seconds: float) -> RCColumn:
-        """Return the same column under the first part of its loading.
+        """Return the same column up to the sample at `seconds` [s] of its response, or the step of this number.
 
-        `seconds` is the time of the last sample of the response [s], under a `DisplacementHistory` the number of the
-        last step. ValueError if it is not within the response, or fewer than two samples remain.
+        ValueError if it is not within the response, or fewer than two samples remain.
         """
         window = sample_window("the response", self.n_steps, self.dt, 0.0, seconds)
         if isinstance(self.loading, Record):
@@ -348,14 +330,8 @@ class RCColumn(BuiltInModel):
     def history(self, theta: np.ndarray) -> ColumnHistory:
         """Simulate and return all histories that the kernels record, and the outputs of the column by their names.
 
-        Parameters and errors as for `simulate`.
-
-        Notes
-        -----
-        The kernel histories, such as "base moment" and "base curvature", have the signs of the element, whose second
-        axis points against the direction of loading. Outputs, such as "base_moment" and "curvature@0", are positive
-        where the column bends towards positive displacements: ``history["base_moment"]`` is
-        ``-history["base moment"]``.
+        The kernel histories, such as "base moment", have the signs of the element, whose second axis points against the
+        direction of loading: ``history["base_moment"]``, an output, is ``-history["base moment"]``.
         """
         history, outputs = run_column(self, self._prepared, check_theta(theta, self.parameters))
         sensors = {name: values for name, values in outputs.items() if name not in history.names}

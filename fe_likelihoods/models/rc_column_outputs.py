@@ -111,28 +111,19 @@ class Sections(NamedTuple):
         element = self.height / self.n_elements
         node = max(1, round(height / element))
         if abs(node * element - height) > _SAME_PLACE * self.height:
-            raise invalid(
-                f"a height of a node, {_heights(element * np.arange(1, self.n_elements + 1))}",
-                name,
-                "n_elements decides where the nodes are; displacements are interpolated between them",
-            )
+            advice = "n_elements decides where the nodes are; displacements are interpolated between them"
+            raise invalid(f"a height of a node, {_heights(element * np.arange(1, self.n_elements + 1))}", name, advice)
         if node < self.n_elements and not self.has_mass:
-            raise invalid(
-                "a column whose nodes have a mass, for velocities and accelerations below the top",
-                name,
-                "give the mass of the column itself, column_mass [kg]",
-            )
+            expected = "a column whose nodes have a mass, for velocities and accelerations below the top"
+            raise invalid(expected, name, "give the mass of the column itself, column_mass [kg]")
         return node
 
     def fiber_at(self, name: str, height: float, position: float, bar: bool) -> tuple[int, int]:
         """Section and number of a fiber (`fe_likelihoods.kernels.frame.Recorder`) at a place; ValueError as above."""
         distances = np.abs(section_heights(self) - height)
         if distances.min() > _SAME_PLACE * self.height:
-            raise invalid(
-                f"a height of a section, {_heights(np.unique(section_heights(self)))}",
-                name,
-                "n_elements and n_points decide where the sections are; stresses are not interpolated",
-            )
+            advice = "n_elements and n_points decide where the sections are; stresses are not interpolated"
+            raise invalid(f"a height of a section, {_heights(np.unique(section_heights(self)))}", name, advice)
         section = int(np.flatnonzero(distances <= distances.min() + _ROUNDING * self.height)[-1])  # the upper element's
         core, cover, bars = self.section.fibers()
         if not bar:
@@ -140,11 +131,8 @@ class Sections(NamedTuple):
             return section, first + int(np.abs(part[:, 0] + position).argmin())
         nearest = int(np.abs(bars[:, 0] + position).argmin())
         if abs(bars[nearest, 0] + position) > 0.5 * self.section.bars.diameter:
-            raise invalid(
-                f"a position on a bar, {_heights(np.unique(np.round(-bars[:, 0], 4)))}",
-                name,
-                "concrete_stress has the concrete",
-            )
+            places = _heights(np.unique(np.round(-bars[:, 0], 4)))
+            raise invalid(f"a position on a bar, {places}", name, "concrete_stress has the concrete")
         return section, -1 - nearest
 
     def _locate(self, height: float) -> tuple[int, float]:
@@ -288,11 +276,8 @@ def _parse(name: object, sections: Sections, at_top: Sequence[str]) -> Output:
         return Output(name, quantity, si_unit, None, strain=none, curvature=-sections.interpolation(place[0]))
     if kind != "rotation":
         if not abs(place[1]) <= sections.radius * (1.0 + _ROUNDING):
-            raise invalid(
-                f"a position in the section, between {-sections.radius:.6g} and {sections.radius:.6g} m",
-                name,
-                "positions are measured from the axis of the column in the direction of loading",
-            )
+            expected = f"a position in the section, between {-sections.radius:.6g} and {sections.radius:.6g} m"
+            raise invalid(expected, name, "positions are from the axis of the column in the direction of loading")
         if kind != "strain":
             return Output(name, quantity, si_unit, None, fiber=sections.fiber_at(name, *place, kind == "bar_stress"))
         weights = sections.interpolation(place[0])

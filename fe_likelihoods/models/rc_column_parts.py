@@ -336,24 +336,16 @@ class ReinforcedSection:
     def __post_init__(self) -> None:
         bars, hoops, radius = self.bars, self.hoops, self.bar_circle_radius
         if self.core_diameter <= 0.0:
-            raise invalid(
-                f"a cover smaller than the radius {self.diameter / 2:.4g} m minus the hoops",
-                self.cover,
-                "give the clear cover in m",
-            )
+            expected = f"a cover smaller than the radius {self.diameter / 2:.4g} m minus the hoops"
+            raise invalid(expected, self.cover, "give the clear cover in m")
         chord = 2.0 * radius * math.sin(math.pi / bars.number)
         if radius <= 0.0 or chord < bars.diameter:
-            raise invalid(
-                f"bars that fit on their circle of radius {radius:.4g} m",
-                f"{bars.number} bars of {bars.diameter:.4g} m, {chord:.4g} m apart",
-                "use fewer or thinner bars, or less cover",
-            )
+            got = f"{bars.number} bars of {bars.diameter:.4g} m, {chord:.4g} m apart"
+            expected = f"bars that fit on their circle of radius {radius:.4g} m"
+            raise invalid(expected, got, "use fewer or thinner bars, or less cover")
         if self.steel_ratio > 0.3:
-            raise invalid(
-                "an area of bars below 30 % of the core's",
-                f"{100 * self.steel_ratio:.3g} %",
-                "give the area of one bar, in m²",
-            )
+            share = f"{100 * self.steel_ratio:.3g} %"
+            raise invalid("an area of bars below 30 % of the core's", share, "give the area of one bar, in m²")
         if hoops.spacing - hoops.diameter >= 2.0 * self.core_diameter:
             raise invalid(
                 "a spacing of hoops below two core diameters", hoops.spacing, "a larger spacing confines no core"

@@ -26,16 +26,7 @@ from .validation import check_theta
 
 __all__ = ["SensedModel", "Sensor"]
 
-_OF_THE_MODEL = (
-    "code_parts",
-    "nominal",
-    "nominal_units",
-    "path_dependent",
-    "range_remark",
-    "time_limit",
-)
-
-
+_OF_THE_MODEL = ("code_parts", "nominal", "nominal_units", "path_dependent", "range_remark", "time_limit")
 ENDS = np.array([1e-6, 1.0 - 1e-6])  # probabilities of the prior's shortest and longest lags
 
 
@@ -91,16 +82,9 @@ class SensedModel:
 
     Attributes
     ----------
-    model : Model
-        The structure.
     priors : dict of str to Distribution
         Priors of the parameters of sensors: ``gain_deck`` and ``lag_deck`` of the output deck, ``gain_support_2`` and
         ``lag_support_2`` of an input.
-
-    Raises
-    ------
-    ValueError
-        If there are no sensors, a channel or a support does not exist, or the model has no ``with_record`` for inputs.
 
     Examples
     --------

@@ -63,10 +63,7 @@ def undamped_modes(stiffness: Any, mass: Any, n: int | None = None) -> Modes:
     size = stiffness.shape[0]
     n = size if n is None else n
     if n > size:
-        raise SimulationFailed(
-            f"a structure with {size} degrees of freedom has no {n} modes: set n_modes to {size} (in [modes] of a TOML "
-            "file)"
-        )
+        raise SimulationFailed(f"a structure with {size} degrees of freedom has no {n} modes: set n_modes to {size}")
     try:
         if in_band and n < size - 1:
             from scipy.sparse.linalg import eigsh  # slow to import

@@ -172,8 +172,8 @@ class UserModel(ExternalModel):
     def followed_by(self, record: Record, rest: float = 10.0) -> UserModel:
         """Return the same model under its present record, a pause of `rest` [s] and a further record.
 
-        The pause is lengthened to a whole number of response steps. The response ends with the samples of
-        ``with_record(record)``. Errors are as for `with_record` and `Record.followed_by`.
+        The pause is lengthened to a whole number of response steps. ValueError as `with_record` and
+        `Record.followed_by`.
         """
         self.with_record(record)
         n_zeros = rest_samples(rest, self.record.dt)

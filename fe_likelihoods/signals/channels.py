@@ -255,7 +255,9 @@ class Measurements:
         if isinstance(names, str):
             raise ValueError(f"select takes a sequence of names, for instance [{names!r}]")
         rows = [self._row(name) for name in names]
-        return self._with_rows(rows, [self.values[row] for row in rows], self.starts, self.steps)
+        each = (self.channels, self.steps, self.values, self.starts)
+        channels, dt, values, start = (tuple(one[row] for row in rows) for one in each)
+        return replace(self, channels=channels, dt=dt, values=values, start=start)
 
     def trim(self, start: float = 0.0, stop: float | None = None) -> "Measurements":
         """Return the samples between two times [s], both included; default of `stop`: the end of the measurements.
@@ -285,7 +287,7 @@ class Measurements:
             rows.append(values[inside] if inside.size else [np.nan])
             first = float(times[inside[0]]) - start if inside.size else 0.0
             starts.append(0.0 if abs(first) <= 1e-9 * dt else first)
-        return self._with_rows(range(self.n_channels), rows, starts, self.steps)
+        return replace(self, values=rows, start=tuple(starts))
 
     def shift(self, seconds: float, channels: Sequence[str] | None = None) -> "Measurements":
         """Return the measurements with the times of `channels` (default: all) later by `seconds` [s].
@@ -326,18 +328,6 @@ class Measurements:
             raise ValueError(f"factor must be a whole number from 1 to {self.n_steps}, got {factor!r}")
         dt = self.dt * factor if self.simultaneous else tuple(dt * factor for dt in self.steps)
         return replace(self, dt=dt, values=self.values[:, ::factor], points=self.points[::factor])
-
-    def _with_rows(
-        self, rows: Sequence[int], values: Sequence[Any], starts: Sequence[float], steps: Sequence[float]
-    ) -> "Measurements":
-        """Return measurements of some channels, with new samples."""
-        return replace(
-            self,
-            channels=tuple(self.channels[row] for row in rows),
-            values=values,
-            start=tuple(starts[row] for row in rows),
-            dt=tuple(steps[row] for row in rows),
-        )
 
     def _row(self, name: str) -> int:
         names = [channel.name for channel in self.channels]

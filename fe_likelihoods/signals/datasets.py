@@ -53,27 +53,15 @@ class Dataset(NamedTuple):
 
 
 def write_dataset(path: str | Path, record: Record, measurements: Measurements, attributes: dict | None = None) -> None:
-    """Write a data set to an HDF5 file.
-
-    The file is written under a temporary name and then renamed, so that it is never incomplete. An existing file is
-    replaced.
+    """Write a data set to an HDF5 file, which is replaced as a whole.
 
     Parameters
     ----------
-    path : str or path
-        The file to write.
-    record : Record
-        The excitation.
-    measurements : Measurements
-        The response.
+    path, record, measurements
+        The file, the excitation, and the response under it.
     attributes : dict, optional
         Values that JSON can represent exactly: text, finite numbers, lists, and dicts with text as keys. Arrays are
-        written as lists.
-
-    Raises
-    ------
-    ValueError
-        If the attributes have other values, or the folder does not exist.
+        written as lists; ValueError for others.
 
     Examples
     --------
@@ -99,7 +87,7 @@ def write_dataset(path: str | Path, record: Record, measurements: Measurements, 
             samples.attrs.update({"name": record.name, "source": record.source, "dt": record.dt})
             samples.attrs.update({"units": DIMENSIONS["acceleration"], "dt_units": "s"})
             if isinstance(record, Events):
-                samples.attrs["events"] = _windows_text(record)
+                samples.attrs["events"] = json.dumps([window[:3] for window in record.windows])
                 samples.attrs["sources"] = json.dumps([each.source for each in record.records])
             values = file.create_dataset("measurements/values", data=measurements.values, dtype="<f8")
             values.attrs.update({"description": measurements.description, "dt": measurements.dt, "dt_units": "s"})
@@ -114,21 +102,8 @@ def write_dataset(path: str | Path, record: Record, measurements: Measurements, 
 def read_dataset(path: str | Path) -> Dataset:
     """Read a data set written by `write_dataset`.
 
-    Parameters
-    ----------
-    path : str or path
-        The file.
-
-    Returns
-    -------
-    Dataset
-        Record, measurements and attributes.
-
-    Raises
-    ------
-    ValueError
-        If the file does not exist, is not a data set, has another version, is incomplete, or does not match its
-        checksum.
+    ValueError if the file does not exist, is not a data set, has another version, is incomplete, or does not match its
+    checksum.
     """
     import h5py
 
@@ -162,10 +137,6 @@ def read_dataset(path: str | Path) -> Dataset:
             f"{path}: the contents do not match their checksum; the file is damaged, make it or download it again"
         )
     return Dataset(record, measurements, free)
-
-
-def _windows_text(events: Events) -> str:
-    return json.dumps([window[:3] for window in events.windows])  # name, first sample, sample after the last
 
 
 def _record(acceleration: np.ndarray, attributes: Mapping) -> Record:
@@ -205,7 +176,9 @@ def _checksum(record: Record, measurements: Measurements, attributes: str) -> st
     names = json.dumps([record.name, record.source, measurements.description, _channel_columns(measurements.channels)])
     parts = [record.fingerprint, measurements.fingerprint, names, attributes]
     if isinstance(record, Events):
-        parts.append(_windows_text(record))
+        parts.append(
+            json.dumps([window[:3] for window in record.windows])
+        )  # name, first sample, the one after the last
     return hashlib.blake2b("\n".join(parts).encode(), digest_size=16).hexdigest()
 
 

@@ -88,14 +88,13 @@ class Events(Record):
         if not given or not all(isinstance(record, Record) for record in given):
             found = ", ".join(type(record).__name__ for record in given) or "none"
             raise ValueError(f"Events expects a sequence of one Record or more, got {found}")
-        parts, pauses = _flatten(given, _pauses(rest, len(given) - 1))
+        parts, pauses, names = _flatten(given, rest, names)
         for part in parts[1:]:
             if not same_step(parts[0].dt, part.dt):
                 raise ValueError(
                     f"events must have the same time step, got {parts[0].dt!r} s ({parts[0].name!r}) and {part.dt!r} s "
                     f"({part.name!r}); use Record.resample(dt) on one of them"
                 )
-        names = _unique(given) if names is None else _checked_names(names, len(parts))
         dt = parts[0].dt
         zeros = [rest_samples(pause, dt) for pause in pauses]
         samples, windows, first = [], [], 0
@@ -202,7 +201,14 @@ class Events(Record):
                     f"the measurements of {name!r} end at {end:g} s, after the end of the event at {duration:g} s; use "
                     "Measurements.trim(start, stop)"
                 )
-            start = _whole_steps(windows[name].start + each.start, dt, name)
+            time = windows[name].start + each.start
+            start = round(time / dt)
+            if abs(time - start * dt) > 1e-6 * dt:
+                raise ValueError(
+                    f"the first measured sample of {name!r} is at {time:g} s of the joined record, which is no "
+                    f"multiple of the step {dt:g} s of the measurements; choose pauses after which every event begins "
+                    "at such a multiple"
+                )
             for channel, samples in zip(each.channels, each.values, strict=True):
                 values[rows[channel.name], start : start + each.n_steps] = samples
         described = [f"{name}: {each.description}" for name, each in measurements.items() if each.description]
@@ -221,56 +227,28 @@ class Events(Record):
         return Events([self, other], rest)
 
 
-def _whole_steps(time: float, dt: float, name: str) -> int:
-    """Number of steps `dt` in `time` [s]; raise ValueError if it is not whole."""
-    steps = round(time / dt)
-    if abs(time - steps * dt) > 1e-6 * dt:
-        raise ValueError(
-            f"the first measured sample of {name!r} is at {time:g} s of the joined record, which is no multiple of the "
-            f"step {dt:g} s of the measurements; choose pauses after which every event begins at such a multiple"
-        )
-    return steps
-
-
-def _pauses(rest: float | Sequence[float], n: int) -> list[float]:
-    """Return the n pauses."""
-    if isinstance(rest, str | Mapping) or np.ndim(rest) == 0:
-        return [rest] * n
-    pauses = list(rest)
+def _flatten(
+    given: list[Record], rest: float | Sequence[float], names: Sequence[str] | None
+) -> tuple[list[Record], list[float], list[str]]:
+    """All records with those of `Events` among them, the pauses between them, and their names, each once."""
+    n = len(given) - 1
+    pauses = [rest] * n if isinstance(rest, str | Mapping) or np.ndim(rest) == 0 else list(rest)
     if len(pauses) != n:
         raise ValueError(f"expected one pause, or one for each of the {n} pauses between the records; got {rest!r}")
-    return pauses
-
-
-def _flatten(given: list[Record], pauses: list[float]) -> tuple[list[Record], list[float]]:
-    """Replace `Events` among the records by their records; return all records and the pauses between them."""
-    parts, between = [], []
+    parts, between, unique = [], [], list[str]()
     for record, pause in zip(given, [*pauses, None], strict=True):
         inner = isinstance(record, Events)
         parts += record.records if inner else [record]
-        between += record.rests if inner else ()
-        between += [] if pause is None else [pause]
-    return parts, between
-
-
-def _unique(given: list[Record]) -> list[str]:
-    """Names of the events, with a number for repeated names."""
-    names: list[str] = []
-    for wanted in [name for each in given for name in (each.names if isinstance(each, Events) else [each.name])]:
-        count, name = 1, wanted
-        while name in names:
-            count += 1
-            name = f"{wanted}_{count}"
-        names.append(name)
-    return names
-
-
-def _checked_names(names: Sequence[str], n: int) -> list[str]:
-    """The given names of n events; raise ValueError if they are not n different texts."""
-    given = [names] if isinstance(names, str) else list(names)
-    if len(given) != n or len(set(given)) != n or not all(isinstance(name, str) and name for name in given):
-        raise ValueError(f"names must be {n} different texts, one for each event; got {names!r}")
-    return given
+        between += [*(record.rests if inner else ()), *([] if pause is None else [pause])]
+        for wanted in record.names if inner else [record.name]:
+            numbered = (wanted if k == 1 else f"{wanted}_{k}" for k in range(1, len(unique) + 2))
+            unique.append(next(name for name in numbered if name not in unique))
+    if names is None:
+        return parts, between, unique
+    stated = [names] if isinstance(names, str) else list(names)
+    if len(stated) != len(parts) or len(set(stated)) != len(parts) or not all(isinstance(x, str) and x for x in stated):
+        raise ValueError(f"names must be {len(parts)} different texts, one for each event; got {names!r}")
+    return parts, between, stated
 
 
 def find_events(model: Any) -> Events | None:

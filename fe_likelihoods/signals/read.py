@@ -6,7 +6,7 @@ the file or the arguments; ValueError is raised if neither states them or if the
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -56,15 +56,13 @@ def read_record(
     SAC and GSE2 by the package obspy; CSV files with a header line such as ``time_s,acc_g``, and Excel workbooks.
 
     In tables, commas, semicolons, tabs or blanks separate cells. Decimal commas are read where commas do not separate.
-    The text is UTF-8, UTF-16 with a byte-order mark, or Latin-1. The unit is the suffix of the column name (``acc_g``,
-    ``acc_cm_s2``, ``acc [m/s²]``, ``acc, g``), a cell in a line of units below the header line, the comment ``# units:
-    g``, or `units`; if several are given, they must agree. Times must be uniform within the rounding of the printed
-    digits. The first sample of the record is at time zero, even if the times in the file begin later.
+    The unit is the suffix of the column name (``acc_g``, ``acc_cm_s2``, ``acc [m/s²]``, ``acc, g``), a cell in a line
+    of units below the header line, the comment ``# units: g``, or `units`; if several are given, they must agree. Times
+    must be uniform within the rounding of the printed digits. The first sample of the record is at time zero.
 
     What comments and the text above a table state is used, and must agree with the arguments and the samples: step or
-    rate (``# dt = 0.02 s``, ``Sampling rate: 200 Hz``), number of samples (``npts = 1559``, ``NUMBER OF DATA: 1559``),
-    unit and peak acceleration (``PGA (gal): 312.8``). A step without its unit is compared only. Blocks of samples below
-    a line with their number and step, as of eqsig and RSPMatch, are read; such a file does not state the unit.
+    rate (``# dt = 0.02 s``, ``Sampling rate: 200 Hz``), number of samples (``npts = 1559``), unit and peak acceleration
+    (``PGA (gal): 312.8``). Samples below a line with their number and step, as of eqsig and RSPMatch, are read.
 
     Parameters
     ----------
@@ -170,16 +168,13 @@ def _table_series(
     dt: float | None,
     column: int | str | None,
     resample: float | None,
-    time: int | str | None,
-    time_unit: str | None,
-    skip: int | None,
-    missing: Sequence[float | str] | None,
+    **options: Any,
 ) -> Series:
     """One column of a table, checked against what the file states."""
-    table = read_table(path, skip, time_unit, time, column == "rows", missing)
+    table = read_table(path, along_rows=column == "rows", **options)
     rows = column == "rows" and "rows" not in [each.name for each in table.columns]
     wanted = (None if rows else column, "acceleration", units, table.file)
-    ((values, unit, _),) = table_values(table, [wanted], missing, stacklevel=3)
+    ((values, unit, _),) = table_values(table, [wanted], options["missing"], stacklevel=3)
     absent = np.flatnonzero(np.isnan(values))
     if absent.size:
         raise ValueError(
@@ -194,18 +189,10 @@ def _table_series(
 
 
 class ImposedTest(NamedTuple):
-    """A laboratory test with an imposed displacement.
-
-    Attributes
-    ----------
-    history : DisplacementHistory
-        The imposed displacement.
-    measurements : Measurements
-        The channels measured at its steps. ``measurements.dt`` is 1, one step.
-    """
+    """A laboratory test with an imposed displacement, and the channels measured at its steps."""
 
     history: DisplacementHistory
-    measurements: Measurements
+    measurements: Measurements  # with ``dt = 1``, one step
 
 
 def read_columns(
@@ -336,12 +323,7 @@ def read_imposed_test(
     Returns
     -------
     ImposedTest
-        The history, named after the file, and the measurements.
-
-    Raises
-    ------
-    ValueError
-        As `read_columns`, except for times, which the test does not have.
+        The history, named after the file, and the measurements. ValueError as `read_columns`, but for times.
 
     Examples
     --------
