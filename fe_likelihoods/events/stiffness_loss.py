@@ -155,7 +155,7 @@ def stiffness_loss(
     log_prior += np.log(presence) - np.logaddexp.reduce(log_prior[1:])
     log_prior[0] = np.log(1.0 - presence)
     nodes = [
-        _node(first, second, factor, scatter**2, common**2, damaged)
+        _Node(first, second, factor, scatter**2, common**2, damaged)
         for factor in _quantiles(error, _NODES[1], "error")
         for scatter in _quantiles(spread, _NODES[0], "spread")
     ]
@@ -210,7 +210,7 @@ def _state(stored: StoredPosterior, names: tuple[str, ...]) -> _State:
     center, prior_covariance = logs.mean(axis=0), np.cov(logs.T, bias=True)  # exact for lognormal priors
     factor = np.linalg.cholesky(prior_covariance)
     whitened = np.linalg.solve(factor, np.linalg.solve(factor, covariance).T)
-    variances, directions = np.linalg.eigh(0.5 * (whitened + whitened.T))
+    variances, directions = np.linalg.eigh(_symmetric(whitened))
     gained = 1.0 / np.maximum(variances, np.finfo(float).tiny) - 1.0
     seen = gained > _LEAST_INFORMATION
     gained, directions = gained[seen], directions[:, seen]
@@ -223,29 +223,41 @@ def _state(stored: StoredPosterior, names: tuple[str, ...]) -> _State:
     return _State(peak, back * gained @ back.T, int(seen.sum()), center, prior_covariance, findings)
 
 
-class _Node(NamedTuple):
-    """The change T (d,) of the logarithms, at one factor of the errors and one spread.
+class _Node:
+    """The change T of the logarithms, exp(vector' T - T' matrix T / 2), at one factor of the errors and one spread.
 
-    Its likelihood is exp(vector' T - T' matrix T / 2); `reduced` and `pull` are the same with scatter and common factor
-    integrated out, where nothing is damaged, and `evidence` is its integral. T is the damage plus `parts` (d, d + 1)
-    times scatter and common factor, whose precision is `precision`.
+    T is the damage plus `parts` times scatter and common factor, of the given variances and joint precision `whole`;
+    `reduced` and `pull` are matrix and vector with both integrated out. The stiffnesses before are integrated out.
     """
 
-    matrix: np.ndarray
-    vector: np.ndarray
-    reduced: np.ndarray
-    pull: np.ndarray
-    evidence: float
-    parts: np.ndarray
-    precision: np.ndarray
-    damaged: LogNormal
-    error: float
+    def __init__(
+        self, before: _State, after: _State, error: float, scatter: float, common: float, damaged: LogNormal
+    ) -> None:
+        self.error, self.damaged, eye = error, damaged, np.eye(len(before.peak))
+        first, second = before.information / error**2, after.information / error**2
+        peak, later = before.peak - before.center, after.peak - before.center
+        precision = np.linalg.inv(before.covariance) + first
+        covariance = np.linalg.inv(precision)
+        mean = covariance @ (first @ peak)
+        # x_before ~ N(mean, covariance), and the likelihood after of x_before + T
+        spread = eye + second @ covariance
+        self.matrix = _symmetric(np.linalg.solve(spread, second))
+        self.vector = self.matrix @ (later - mean)
+        both = eye + self.matrix @ (other := scatter * eye + common)
+        self.reduced, self.pull = _symmetric(np.linalg.solve(both, self.matrix)), np.linalg.solve(both, self.vector)
+        logs = sum(np.linalg.slogdet(each)[1] for each in (precision, spread, both))
+        squares = mean @ precision @ mean - peak @ first @ peak - (later - mean) @ self.vector
+        squares += self.vector @ other @ self.pull
+        # densities of the peaks, whose errors grow with the factor
+        self.evidence = 0.5 * (squares - logs) - (before.seen + after.seen) * np.log(error)
+        self.parts = np.column_stack([eye, np.ones(len(eye))])
+        self.whole = self.parts.T @ self.matrix @ self.parts + np.diag([1.0 / scatter] * len(eye) + [1.0 / common])
 
     def _damage(self, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Precision (n, m, m), and times it the mean (n, m), of the damage of sets (n, m)."""
-        variance = self.damaged.log_sd**2
+        mean, variance = np.log(self.damaged.median), self.damaged.log_sd**2
         precision = self.reduced[members[:, :, None], members[:, None, :]] + np.eye(members.shape[1]) / variance
-        return precision, self.pull[members] + np.log(self.damaged.median) / variance
+        return precision, self.pull[members] + mean / variance
 
     def log_evidences(self, members: np.ndarray) -> np.ndarray:
         """Of sets (n, m) of damaged stiffnesses."""
@@ -262,31 +274,12 @@ class _Node(NamedTuple):
         change = np.zeros((n, d + 1))
         change[np.arange(n)[:, None], members] = np.linalg.solve(precision, vector[:, :, None] + noise)[:, :, 0]
         left = (self.vector - change[:, :-1] @ self.matrix) @ self.parts
-        noise = np.linalg.cholesky(self.precision) @ rng.standard_normal((d + 1, n))
-        return change + np.linalg.solve(self.precision, left.T + noise).T
+        noise = np.linalg.cholesky(self.whole) @ rng.standard_normal((d + 1, n))
+        return change + np.linalg.solve(self.whole, left.T + noise).T
 
 
-def _node(before: _State, after: _State, factor: float, scatter: float, common: float, damaged: LogNormal) -> _Node:
-    """A node, from the variances of scatter and common factor: the stiffnesses before are integrated out."""
-    first, second = before.information / factor**2, after.information / factor**2
-    peak, later, eye = before.peak - before.center, after.peak - before.center, np.eye(len(before.peak))
-    precision = np.linalg.inv(before.covariance) + first
-    covariance = np.linalg.inv(precision)
-    mean = covariance @ (first @ peak)
-    # x_before ~ N(mean, covariance), and the likelihood after of x_before + T
-    spread = eye + second @ covariance
-    matrix = np.linalg.solve(spread, second)
-    matrix = 0.5 * (matrix + matrix.T)
-    vector = matrix @ (later - mean)
-    both = eye + matrix @ (other := scatter * eye + common)
-    reduced, pull = np.linalg.solve(both, matrix), np.linalg.solve(both, vector)
-    logs = sum(np.linalg.slogdet(each)[1] for each in (precision, spread, both))
-    squares = mean @ precision @ mean - peak @ first @ peak - (later - mean) @ vector + vector @ other @ pull
-    # densities of the peaks, whose errors grow with the factor
-    evidence = 0.5 * (squares - logs) - (before.seen + after.seen) * np.log(factor)
-    parts = np.column_stack([eye, np.ones(len(eye))])
-    whole = parts.T @ matrix @ parts + np.diag([1.0 / scatter] * len(eye) + [1.0 / common])
-    return _Node(matrix, vector, 0.5 * (reduced + reduced.T), pull, evidence, parts, whole, damaged, factor)
+def _symmetric(matrix: np.ndarray) -> np.ndarray:
+    return 0.5 * (matrix + matrix.T)
 
 
 def _quantiles(value: Distribution | float, n: int, name: str) -> np.ndarray:

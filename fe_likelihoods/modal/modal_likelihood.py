@@ -30,8 +30,7 @@ class ModalLikelihood(FELikelihood):
 
     Modes are paired by their shapes at every point. One number per frequency and per shape is cached for a simulation,
     so that all errors are served without another one. It is an `FELikelihood`: `Posterior`, all samplers, guides and
-    `JointLikelihood` take it. The channels of its ``model`` are the measured modes
-    (`fe_likelihoods.modal.paired_modes`).
+    `JointLikelihood` take it. The channels of its ``model`` are the measured modes.
 
     Parameters
     ----------
@@ -44,8 +43,6 @@ class ModalLikelihood(FELikelihood):
         What is unknown: one error of all modes, the parameters ``frequency_error`` and ``shape_error``; or one of each
         mode, ``frequency_error_1``, ... Its variance is added to the known one of the data. Default: nothing if the
         data have known errors, else ``"common"``.
-    pool : optional
-        As for `FELikelihood`.
     student_t : float, optional
         Degrees of freedom, above 2, of Student-t errors, such as 4, of which errors are the scales: wrong
         identifications move the parameters little. Default: Gaussian errors.
@@ -54,14 +51,13 @@ class ModalLikelihood(FELikelihood):
         frequencies by the order in the pair. Zero compares each shape.
     held_out : ModalData, optional
         Measured modes that are not compared, but that reports show beside the predicted ones.
-    **options
+    pool, **options
         Of `FELikelihood`, such as ``cache``.
 
     Raises
     ------
     ValueError
-        If the model has no modes, other sensors or fewer modes, an error is neither known nor unknown, or as
-        `FELikelihood`.
+        If the model has no modes, other sensors or fewer modes, an error is not as above, or as `FELikelihood`.
 
     Examples
     --------
@@ -115,10 +111,9 @@ class ModalLikelihood(FELikelihood):
         """Modes that samples of a posterior predict, beside measured ones, which may be others than the data.
 
         `samples` (n, n_parameters), or a mapping of names to samples, have the structural parameters; the parameters of
-        the errors may follow, and enter the intervals. Default of `data`: the data of the likelihood. At most `most`
-        samples are taken, evenly spaced among all, and simulated where their modes are not cached. Raises ValueError
-        for samples of another shape, or if the model has other sensors or fewer modes than the data, and
-        SimulationFailed if no sample can be simulated.
+        the errors may follow, and enter the intervals. At most `most` samples are taken, evenly spaced among all, and
+        simulated where their modes are not cached. Raises ValueError for samples of another shape, or data with other
+        sensors or more modes than the model, and SimulationFailed if no sample can be simulated.
 
         Examples
         --------

@@ -41,12 +41,12 @@ LEAST_ERRORS = 1e-4, 1e-3  # of frequencies and shapes, known where no error is 
 
 @dataclass(frozen=True)
 class ModeSums:
-    """Statistic of residuals: the sum of squares of each mode, then the squares of each frequency and of each shape."""
+    """Statistic of residuals (m, n_sets (1 + n_sensors)): sums of squares of modes, of frequencies and of shapes."""
 
     n_sets: int
 
     def __call__(self, residuals: np.ndarray) -> np.ndarray:
-        """Sums (m + 2 m n_sets,) for residuals (m, n_sets (1 + n_sensors))."""
+        """Sums (m + 2 m n_sets,): of each mode, then of each frequency and of each shape."""
         squares = np.square(residuals).reshape(len(residuals), self.n_sets, -1)
         frequencies, shapes = squares[:, :, 0], squares[:, :, 1:].sum(axis=2)
         return np.concatenate([(frequencies + shapes).sum(axis=1), frequencies.ravel(), shapes.ravel()])
