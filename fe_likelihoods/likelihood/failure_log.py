@@ -8,7 +8,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..simulation.faults import TransientReason
-from ..simulation.model import split_seconds
 
 __all__ = ["FailureLog", "reason_without_numbers"]
 
@@ -41,7 +40,7 @@ class FailureLog:
     `outcomes` counts simulations with a known outcome (run here, read from the disk, or recalled), `count` failures,
     and `transient` failures whose cause is not the model, so that a later run simulates the point again. `records` has
     ``{"parameters": {name: value}, "reason": str}`` of the first 1000 failures of each of these two kinds, with
-    ``"seconds"`` where known and ``"transient": True``. `reasons` counts failures per reason; after the first 100
+    ``"transient": True`` of the second. `reasons` counts failures per reason; after the first 100
     reasons by their text without numbers, and after 100 of these together.
     """
 
@@ -62,7 +61,6 @@ class FailureLog:
         """Record one failure at the structural parameters `theta` (n_structural,); the first one is logged."""
         parameters = dict(zip(self._names, theta.tolist(), strict=True))
         transient = isinstance(reason, TransientReason)
-        reason, seconds = split_seconds(reason)
         if not self.count or (transient and not self.transient):
             logger.warning(
                 "A simulation failed (%s) at %s%s. Further failures are counted without a message",
@@ -74,8 +72,6 @@ class FailureLog:
         self.transient += transient
         if (self.transient if transient else self.count - self.transient) <= _MAX_RECORDS:
             self.records.append({"parameters": parameters, "reason": reason})
-            if seconds is not None:
-                self.records[-1]["seconds"] = seconds
             if transient:
                 self.records[-1]["transient"] = True
         self.reasons[self._counted_under(reason)] += 1

@@ -563,7 +563,7 @@ class Posterior:
             ``simulations``, ``verifications`` (rows of the cache on disk that were compared with a further simulation),
             ``unverified`` (rows that could not be compared, because the further simulation was stopped), ``cache_hits``
             (rows whose statistics were cached), ``disk_hits`` (how many of these came from the cache on disk),
-            ``failures`` (list of ``{"parameters", "reason"}``, with ``"seconds"`` where known and ``"transient"`` where
+            ``failures`` (list of ``{"parameters", "reason"}``, with ``"transient"`` where
             the cause is not the model; the first 1000), ``failure_count``, ``transient_failures`` (failures that a
             later run simulates again, see `FailureLog`), ``failure_reasons`` (count per reason), ``seconds`` (wall time
             of the simulations). For a `JointLikelihood` also ``likelihoods``, the report of each part.

@@ -15,7 +15,6 @@ from ..priors.distributions import Distribution, RandomState, as_generator
 from ..priors.multivariate import as_distribution
 from ..priors.points import as_points
 from ..simulation.faults import TransientReason
-from ..simulation.model import split_seconds
 from .data_identity import combined_digest
 from .parameters import Parameter, describe_parameters
 
@@ -120,7 +119,7 @@ class SumOfParts:
     def fault(self, x: Any) -> str:
         """Reason of a failed simulation whose cause is not the model, see `Posterior.fault`."""
         _, reason = self._failure_at(as_points(x, self.parameter_names))
-        return split_seconds(reason)[0] if isinstance(reason, TransientReason) else ""
+        return reason if isinstance(reason, TransientReason) else ""
 
     def _failure_at(self, point: np.ndarray) -> tuple[str, str]:
         """The data set whose simulation has failed at a point (ndim,), and the reason; empty texts if none has."""

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..signals.channels import Channel
 from ..simulation.faults import ChangedModel, TransientReason, UnusableModel, reason_of
-from ..simulation.model import SimulationFailed, simulate_batch, split_seconds
+from ..simulation.model import SimulationFailed, simulate_batch
 from .user_model import ExternalModel
 from .validation import check_integer, check_number, positive_float
 
@@ -204,7 +204,7 @@ def _application(models: list[Any]) -> Any:
             return await handler(request)
         except Exception as error:
             kind = "TransientReason" if isinstance(reason_of(error), TransientReason) else type(error).__name__
-            answer = {"error": {"type": kind, "message": split_seconds(str(error))[0]}}
+            answer = {"error": {"type": kind, "message": str(error)}}
             return web.json_response(answer, status=getattr(error, "status", 500))
 
     taken, run = [], web.run_app

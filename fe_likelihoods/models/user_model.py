@@ -10,7 +10,6 @@ import copy
 import json
 import os
 import sys
-import time
 from collections.abc import Iterable, Sequence
 from hashlib import blake2b
 from pathlib import Path
@@ -25,7 +24,7 @@ from ..signals.channels import Channel
 from ..signals.records import Record
 from ..signals.sampling import rest_samples
 from ..simulation.by_value import is_arriving
-from ..simulation.faults import ChangedModel, reason_of, reworded
+from ..simulation.faults import ChangedModel, reason_of
 from ..simulation.files import file_digest
 from ..simulation.label import value_digest
 from ..simulation.model import SimulationFailed, real_response
@@ -93,22 +92,18 @@ class ExternalModel(StructuralModel):
         """Response [SI] (n_channels, n_steps) for one set of parameters (n_parameters,), of which the code gets a copy.
 
         Raises SimulationFailed if the external code raises an exception, or its response has a wrong shape, is complex
-        or is not finite; the reason ends with the duration. It is a `TransientReason` if the cause is not the model
+        or is not finite; the reason is a `TransientReason` if the cause is not the model
         (see `fe_likelihoods.simulation.faults`). Raises ValueError if `theta` has another shape. KeyboardInterrupt and
         SystemExit of the code in this process, even as the cause of another exception, are no failed simulation: they
         end the run.
         """
         theta = check_theta(theta, self.parameter_names).copy()
-        start, before = time.perf_counter(), sys.exception()
+        before = sys.exception()
         try:
             return self._check_response(self._respond(theta))
         except BaseException as error:  # external code may raise anything
             raise_if_it_ends_the_run(error, before)
-            reason = reason_of(error)
-            seconds = getattr(error, "seconds", None)  # excludes the start of a process, where that is known
-            seconds = time.perf_counter() - start if seconds is None else seconds
-            text = f"{reason} after {seconds:.3g} s"
-            raise SimulationFailed(reworded(reason, text)) from error
+            raise SimulationFailed(reason_of(error)) from error
 
     def _digest(self, *parts: Any) -> str:
         """Fingerprint of the names, the channels, the step, the length and `parts`, which JSON can represent."""

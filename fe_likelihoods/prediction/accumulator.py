@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..noise.draws import SampleNoise
-from ..simulation.model import is_collapse, split_seconds
+from ..simulation.model import is_collapse
 from .model_error import ModelError
 from .quantities import Evaluator
 
@@ -169,7 +169,7 @@ class Accumulator:
         self.failed.append(samples)
         if is_collapse(reason):
             self.collapsed.append(samples)
-        self.reasons[split_seconds(reason)[0]] += len(samples)
+        self.reasons[reason] += len(samples)
 
     def values_of(self, samples: np.ndarray) -> np.ndarray:
         """Values (m, ...) of samples that did not fail."""

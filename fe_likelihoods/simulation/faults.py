@@ -18,7 +18,6 @@ __all__ = [
     "UnusableModel",
     "is_transient",
     "reason_of",
-    "reworded",
     "shortened",
 ]
 
@@ -29,9 +28,8 @@ _LONGEST_REASON = 2000  # characters
 class SimulationFailed(RuntimeError):
     """A simulation that failed.
 
-    `reason` says why, in words; a `TransientReason` if the process was stopped, was killed or crashed. `seconds` [s] is
-    the duration of a run in another process, where that is known; a reason may also end with it, as in "crashed after
-    12.3 s". A reason that begins with "collapse" says that the structure has collapsed: this is a result, which
+    `reason` says why, in words; a `TransientReason` if the process was stopped, was killed or crashed. A reason that
+    begins with "collapse" says that the structure has collapsed: this is a result, which
     `fe_likelihoods.prediction.fragility.fragility` counts as an exceedance.
 
     Examples
@@ -45,10 +43,9 @@ class SimulationFailed(RuntimeError):
     -inf
     """
 
-    def __init__(self, reason: str, seconds: float | None = None) -> None:
+    def __init__(self, reason: str) -> None:
         super().__init__(reason)
         self.reason = (reason if isinstance(reason, str) else str(reason)) or "no reason given"
-        self.seconds = seconds
 
 
 class UnusableModel(ValueError):
@@ -88,9 +85,4 @@ def shortened(reason: str) -> str:
     """The first 2000 characters of a reason, which may be the whole output of a program; its kind is kept."""
     if len(reason) <= _LONGEST_REASON:
         return reason
-    return reworded(reason, f"{reason[:_LONGEST_REASON]} ...")
-
-
-def reworded(reason: str, text: str) -> str:
-    """A reason of the same kind in other words."""
-    return type(reason)(text)
+    return type(reason)(f"{reason[:_LONGEST_REASON]} ...")

@@ -8,7 +8,6 @@ reason in words and a row of NaN. Ctrl-C and ``sys.exit`` are no failures.
 """
 
 import logging
-import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -50,7 +49,6 @@ __all__ = [
     "real_response",
     "sent_simulation",
     "simulate_batch",
-    "split_seconds",
 ]
 
 logger = logging.getLogger(__name__)
@@ -61,12 +59,6 @@ _RESPONSE_VALUES = 2**23  # largest number of response values in memory at once:
 def is_collapse(reason: str) -> bool:
     """Return whether a simulation ended because the structure collapsed: its reason begins with "collapse"."""
     return reason.startswith("collapse")
-
-
-def split_seconds(reason: str) -> tuple[str, float | None]:
-    """Split a reason such as "crashed after 12.3 s" into the reason and the duration [s], None if it is not given."""
-    found = re.fullmatch(r"(.+) after ([0-9.]+(?:e[-+]?[0-9]+)?) s", reason, re.DOTALL)
-    return (found[1], float(found[2])) if found else (reason, None)
 
 
 class SimulationBatch(NamedTuple):

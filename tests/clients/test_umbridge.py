@@ -117,8 +117,8 @@ def test_served_model_has_the_same_bits_and_failures_keep_their_kind(ours):
     for theta in [*THETAS, [1e-300, 1.0 / 3.0], [-0.0, 2.0**60]]:
         assert client.simulate(theta).tobytes() == line(theta).tobytes()
     for offset, reason, transient in (
-        (3.5, r"^collapse at the top after [\d.e-]+ s$", False),
-        (2.5, "^no licence was free after", True),
+        (3.5, r"^collapse at the top$", False),
+        (2.5, "^no licence was free$", True),
         (np.nan, "not finite", False),
     ):
         with pytest.raises(SimulationFailed, match=reason) as failed:

@@ -9,7 +9,6 @@ import pytest
 
 from fe_likelihoods import LinearOscillator, OpenSeesModel, Record, SimulationFailed
 from fe_likelihoods.models.opensees import _Codes
-from fe_likelihoods.simulation.model import split_seconds
 from tests.opensees_column import require_opensees
 from tests.opensees_oscillator import CHANNELS, DAMPING, PERIOD, Oscillator
 
@@ -69,9 +68,7 @@ def test_the_run_after_a_failure_is_not_affected(model):
     for stiffness, reason in reasons.items():
         with pytest.raises(SimulationFailed) as caught:
             model.simulate([stiffness, 1.0])
-        text, seconds = split_seconds(caught.value.reason)
-        assert text.startswith(reason)
-        assert seconds is not None
+        assert caught.value.reason.startswith(reason)
         np.testing.assert_array_equal(model.simulate([1.0, 1.0]), expected)
 
 
