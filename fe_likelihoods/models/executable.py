@@ -231,7 +231,7 @@ class ExecutableModel(UserModel):
                 self._keep(place, values, reason, seconds)
                 if not isinstance(reason, TransientReason) and shutil.disk_usage(place).free < _FREE_BYTES:
                     text = f"{reason} (the disk of the temporary folder {place.parent} is full)"
-                    raise SimulationFailed(TransientReason(text), seconds) from error
+                    raise SimulationFailed(TransientReason(text)) from error
                 raise
 
     def _write(self, folder: Path, values: dict[str, str]) -> None:
@@ -248,27 +248,25 @@ class ExecutableModel(UserModel):
 
     def _execute(self, place: Path, arguments: list[str]) -> None:
         """Run the program in the folder ``run`` of `place`; raise SimulationFailed unless it succeeds."""
-        start = time.monotonic()
 
         def watch(seconds: float) -> float:
             text = f"stopped at the time limit of {self.time_limit:g} s" if seconds > self.time_limit else ""
             if not text and _size(place) > self.max_output:
                 text = f"stopped because it wrote more than {self.max_output} bytes"
             if text:
-                raise SimulationFailed(TransientReason(text), seconds)
+                raise SimulationFailed(TransientReason(text))
             return min(_WATCH_INTERVAL, self.time_limit - seconds + 1e-3)
 
         outputs = place / "stdout.txt", place / "stderr.txt"
         exit_code = run_program([self.command[0], *arguments], place / "run", *outputs, place, watch)
-        seconds = time.monotonic() - start
         if exit_code:
             with open(outputs[1], "rb") as stderr:
                 reason = ": ".join(filter(None, [describe_exit(exit_code, "the program"), last_lines(stderr, 3)]))
             reason += self._missing(place / "run")
             killed = exit_code < 0 or exit_code in _EXIT_CODES_OF_SHELLS
-            raise SimulationFailed(TransientReason(reason) if killed else reason, seconds)
+            raise SimulationFailed(TransientReason(reason) if killed else reason)
         if _size(place) > self.max_output:
-            raise SimulationFailed(TransientReason(f"the program wrote more than {self.max_output} bytes"), seconds)
+            raise SimulationFailed(TransientReason(f"the program wrote more than {self.max_output} bytes"))
 
     def _missing(self, folder: Path) -> str:
         """What a failed program may have looked for in the folder of the run, where it is not."""
