@@ -93,14 +93,10 @@ def write_events(folder: Path, events: Sequence[OtherEvent]) -> tuple[str, ...]:
     rows = []
     for event in events:
         for row in event.numbers:
-            ends = zip(("q05", "q95", "q25", "q75"), (*row.ends, *row.quartiles), strict=True)
+            (q25, q75), (q05, q95) = row.quartiles, row.ends
+            values = {"q05": q05, "q25": q25, "median": row.median, "q75": q75, "q95": q95}
             known = {"measured": row.measured, "pit": row.pit} if np.isfinite(row.pit) else {"measured": "", "pit": ""}
-            rows.append(
-                {"event": event.name, "quantity": row.name, "unit": row.unit}
-                | dict(ends)
-                | {"median": row.median}
-                | known
-            )
+            rows.append({"event": event.name, "quantity": row.name, "unit": row.unit} | values | known)
     if rows:
         _write_csv(folder / "events.csv", rows)
     return ("events.csv",) if rows else ()
