@@ -10,6 +10,7 @@ import numpy as np
 
 from ..models.function import FunctionModel
 from ..signals.channels import Channel, Measurements
+from ..signals.read import units_of
 from ..signals.tables import read_table, table_values
 from ..units import to_si
 
@@ -90,16 +91,17 @@ def read_load_test(
     path: str | Path,
     channels: Sequence[Channel],
     columns: Mapping[str, str] | None = None,
-    units: Mapping[str, str] | None = None,
+    units: str | Sequence[str] | Mapping[str, str] | None = None,
     cases: str | None = None,
     errors: Mapping[str, float] | None = None,
 ) -> LoadTest:
     """Read a load test from a CSV file or workbook with a header line and a line for each load case.
 
-    `columns` and `units` have names of columns and units by the names of channels, where the column has not the name of
-    the channel (with or without a unit), or the file does not state the unit. `cases` is the column with the names of
-    the load cases, or with numbers such as positions; default: the first column, if it is no channel, else numbers from
-    1. `errors` are those of `LoadTest`. Raises ValueError if a column is missing, or a unit is unknown or not stated.
+    `columns` has names of columns by the names of channels, where the column has not the name of the channel (with or
+    without a unit); `units` are for files that state none, as in `read_columns`. `cases` is the column with the
+    names of the load cases, or with numbers such as positions; default: the first column, if it is no channel, else
+    numbers from 1. `errors` are those of `LoadTest`. Raises ValueError if a column is missing, or a unit is unknown or
+    not stated.
     """
     table = read_table(path, labels=cases or "")
     names = [column.name for column in table.columns]
@@ -109,7 +111,8 @@ def read_load_test(
         found = [name for name in names if wanted in (name, re.sub(r"\s*[\[(].*", "", name).strip())]
         return found[0] if len(found) == 1 else wanted
 
-    wanted = [(column_of(each), each.dimension, (units or {}).get(each.name), each.name) for each in channels]
+    given = zip(channels, units_of(channels, units), strict=True)
+    wanted = [(column_of(each), each.dimension, unit, each.name) for each, unit in given]
     values = [to_si(*each) for each in table_values(table, wanted, None, stacklevel=2)]
     chosen = cases or next((name for name in names[:1] if name not in [each[0] for each in wanted]), None)
     options = {"errors": errors, "description": f"load test of {Path(path).name}"}

@@ -4,7 +4,7 @@
 the file or the arguments; ValueError is raised if neither states them or if they disagree.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,6 +30,7 @@ __all__ = [
     "read_columns",
     "read_imposed_test",
     "read_record",
+    "units_of",
 ]
 
 _TABLES = ("", ".csv", ".txt", ".dat", ".tsv", ".lvm", ".out", *WORKBOOKS)
@@ -199,7 +200,7 @@ def read_columns(
     path: str | Path,
     channels: Sequence[Channel],
     columns: Sequence[str | int],
-    units: str | Sequence[str] | None = None,
+    units: str | Sequence[str] | Mapping[str, str] | None = None,
     dt: float | None = None,
     description: str = "",
     *,
@@ -224,7 +225,7 @@ def read_columns(
         The measured channels.
     columns : sequence of str or int
         Names of the columns in the header line, or without one their numbers, from 1; one per channel.
-    units : str or sequence of str, optional
+    units : str, sequence of str, or mapping of channel names to str, optional
         Unit of the numbers, one for all columns or one per column. Not needed if the names of the columns end with the
         unit (``disp_in``). If both are given, they must agree.
     description : str, optional
@@ -302,7 +303,7 @@ def read_imposed_test(
     displacement: str,
     channels: Sequence[Channel],
     columns: Sequence[str],
-    units: str | Sequence[str] | None = None,
+    units: str | Sequence[str] | Mapping[str, str] | None = None,
     displacement_unit: str | None = None,
     description: str = "",
     *,
@@ -341,16 +342,29 @@ def read_imposed_test(
     return ImposedTest(DisplacementHistory(Path(path).stem, history, Path(path).name), measurements)
 
 
+def units_of(channels: Sequence[Channel], units: str | Sequence[str] | Mapping[str, str] | None) -> list[str | None]:
+    """The given unit of each channel, None where the file states it; ValueError for other names or another number."""
+    names = [channel.name for channel in channels]
+    if units is None or isinstance(units, str):
+        return [units] * len(names)
+    given = [units.get(name) for name in names] if isinstance(units, Mapping) else list(units)
+    if len(given) != len(names) or set(units) - set(names if isinstance(units, Mapping) else units):
+        raise ValueError(
+            f"expected a unit for each of {', '.join(names)}, one for all, or units by name; got {units!r}"
+        )
+    return given
+
+
 def _wanted(
-    path: str | Path, channels: Sequence[Channel], columns: Sequence[str | int], units: str | Sequence[str] | None
+    path: str | Path,
+    channels: Sequence[Channel],
+    columns: Sequence[str | int],
+    units: str | Sequence[str] | Mapping[str, str] | None,
 ) -> list[tuple[str | int | None, str, str | None, str]]:
     """Columns as `table_values` takes them."""
-    given = [units] * len(columns) if units is None or isinstance(units, str) else list(units)
-    if isinstance(columns, str) or not len(channels) == len(columns) == len(given):
-        raise ValueError(
-            f"expected one column and one unit for each of {len(channels)} channels, got columns {columns!r}, "
-            f"units {units!r}; the unit of the times is given by time_unit="
-        )
+    given = units_of(channels, units)
+    if isinstance(columns, str) or len(channels) != len(columns):
+        raise ValueError(f"expected one column for each of {len(channels)} channels; got {columns!r}")
     return [
         (column, channel.dimension, unit, f"{path}, column {column!r}")
         for channel, column, unit in zip(channels, columns, given, strict=True)

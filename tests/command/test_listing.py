@@ -186,7 +186,7 @@ def test_data_without_time_have_sections_of_their_own(tmp_path, text, section, g
             {"columns": [8]},
             "expected one channel with channel = 8, .*found 0; choose with channel= and member=, or in a TOML file",
         ),
-        ({"columns": [3, 7]}, "expected one column and one unit for each of 1 channels"),
+        ({"columns": [3, 7]}, "expected one column for each of 1 channels"),
         ({"resample": 0.01}, "a uniform step; leave resample out"),
     ],
 )

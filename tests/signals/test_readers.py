@@ -395,7 +395,7 @@ class TestColumns:
         path = tmp_path / "a.csv"
         path.write_text("time_s,acc_g,disp [in]\n0,1,2\n0.01,3,4\n")
         expected = [[G0, 3 * G0], [0.0508, 0.1016]]
-        for units in (None, ["g", "in"]):
+        for units in (None, ["g", "in"], {DRIFT.name: "in"}):
             found = read_columns(path, (TOP, DRIFT), ("acc_g", "disp [in]"), units, description="two rows")
             np.testing.assert_allclose(found.values, expected)
             assert (found.dt, found.description, found.channels) == (0.01, "two rows", (TOP, DRIFT))
@@ -403,8 +403,9 @@ class TestColumns:
     @pytest.mark.parametrize(
         ("channels", "columns", "units", "message"),
         [
-            ((TOP,), ("acc_g", "disp"), None, "one column and one unit for each of 1 channels"),
-            ((TOP,), "acc_g", None, "one column and one unit"),
+            ((TOP,), ("acc_g", "disp"), None, "one column for each of 1 channels"),
+            ((TOP,), "acc_g", None, "one column for each"),
+            ((TOP,), ("acc_g",), {"acc_g": "g"}, "a unit for each of"),
             ((TOP,), ("acc",), None, "named 'acc', the columns are time_s, acc_g, disp"),
             ((TOP,), ("time_s",), None, "named 'time_s'"),
             ((DRIFT,), ("disp",), None, "column 'disp' does not state the unit of its displacement.* for instance 'm'"),
