@@ -40,8 +40,8 @@ from fe_likelihoods import (
     read_columns,
     read_record,
 )
+from fe_likelihoods.checks.faults import support_gains, supports_apart
 from fe_likelihoods.checks.finding import Judgement, judge
-from fe_likelihoods.checks.slow_motion import support_gains, supports_apart
 from fe_likelihoods.emulation.modes import Mode, find_modes
 from fe_likelihoods.emulation.target import ResponseTarget
 

@@ -4,10 +4,10 @@ Responses are taken from the caches of the likelihood where they are there; the 
 """
 
 import logging
-import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from functools import cached_property, partial
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from time import perf_counter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,11 +23,11 @@ from ..signals.events import find_events
 from ..simulation.faults import ChangedModel
 from ..simulation.model import SimulationFailed
 from ..text_tables import listed
+from .faults import FEWEST_DRAWS
 from .run import FinishedRun
-from .slow_motion import FEWEST_DRAWS, SlowMotion, slow_motions
+from .tables import MOST_DRAWS
 
 __all__ = [
-    "MOST_DRAWS",
     "ChannelFit",
     "Fit",
     "Fits",
@@ -41,13 +41,13 @@ __all__ = [
 
 logger = logging.getLogger(__name__)
 
-MOST_DRAWS = 100  # of the prior
 SECONDS = 10.0  # of simulations of these draws
 
 
 class ModalFit(NamedTuple):
     """Measured and computed modes, `PredictedModes` of `fe_likelihoods.modal`."""
 
+    title: str  # name of the data set; empty if there is one only
     likelihood: Any
     draws: Any  # modes at draws of the prior; None if none can be simulated
     deviations: np.ndarray  # (2, m) of errors of frequencies, as shares, and of components of shapes, at these draws
@@ -83,11 +83,6 @@ class Fit:
     modal: ModalFit | None = None  # modes, instead of responses
 
     @property
-    def is_history(self) -> bool:
-        """Whether there are samples along time, of which clocks, offsets and slow motions can be judged."""
-        return self.modal is None and self.measurements.is_history
-
-    @property
     def residuals(self) -> np.ndarray | None:
         """Measured minus simulated (n_channels, n_samples) of the fit."""
         return None if self.after is None else self.measurements.values - self.after
@@ -96,11 +91,6 @@ class Fit:
     def responses(self) -> np.ndarray:
         """The fit, if there is one, and the draws (n, n_channels, n_samples)."""
         return self.draws if self.after is None else np.concatenate([self.after[None], self.draws])
-
-    @cached_property
-    def slow(self) -> dict[str, SlowMotion]:
-        """Channels that follow the draws of the prior where no parameter changes the response, see `slow_motions`."""
-        return slow_motions(self.measurements, self.draws) if self.is_history else {}
 
     @cached_property
     def channels(self) -> tuple[ChannelFit, ...]:
@@ -153,22 +143,20 @@ def data_sets_of(posterior: Any) -> list[tuple[str, FELikelihood, np.ndarray]]:
 def draws_to_compare(posterior: Posterior, seconds: float | None = None) -> np.ndarray:
     """Draws of the prior (n, ndim), always the same ones: 100, or fewer if these take longer than ten seconds.
 
-    A simulation takes `seconds`; by default the mean of those that the posterior has made, or else the fastest draw.
+    A simulation takes `seconds`; by default the mean of those that the posterior has made, or else those of two draws.
     """
     try:
         draws = posterior.sample_prior(MOST_DRAWS, np.random.RandomState(1))
     except NotImplementedError:  # a prior without draws
         return np.empty((0, posterior.ndim))
-    if seconds is None and posterior.report()["simulations"]:
-        report = posterior.report()
-        seconds = report["seconds"] / report["simulations"]
-    fastest = np.inf if seconds is None else seconds
-    for row in draws[:3] if seconds is None else ():  # the first one may compile, and the machine be busy
-        if fastest * MOST_DRAWS > SECONDS:
-            start = time.perf_counter()
+    if seconds is None:
+        for row in draws[:2] if not posterior.report()["simulations"] else ():  # the first one may compile
+            start = perf_counter()
             posterior.likelihood.log_likelihood(row)
-            fastest = min(fastest, time.perf_counter() - start)
-    return draws[: int(np.clip(SECONDS / max(fastest, 1e-6), FEWEST_DRAWS, MOST_DRAWS))]
+            seconds = perf_counter() - start
+        report = posterior.report()
+        seconds = report["seconds"] / max(report["simulations"], 1) if seconds is None else seconds
+    return draws[: int(np.clip(SECONDS / max(seconds, 1e-6), FEWEST_DRAWS, MOST_DRAWS))]
 
 
 def compare(
@@ -186,7 +174,9 @@ def compare(
     """
     measured, n = likelihood.measurements, len(likelihood.model.parameter_names)
     if likelihood.is_modal:
-        return [Fit(key, measured, np.empty((0, *measured.values.shape)), modal=_modes(likelihood, draws, samples))], {}
+        return [
+            Fit(key, measured, np.empty((0, *measured.values.shape)), modal=_modes(key, likelihood, draws, samples))
+        ], {}
     found, failed = {}, {}
     for name, theta in (("before", start), ("after", point)):
         batch = None if theta is None else likelihood.simulate(theta[None, :n])
@@ -208,12 +198,25 @@ def compare(
     assumed = getattr(sampled_noise(likelihood.noise), "effective_samples", None)
     assumed = None if assumed is None else np.broadcast_to(assumed, measured.n_channels)
     fits = []
-    for title, part, rows, cut in _events(likelihood, key):
-        of_event = {name: cut(each) for name, each in found.items()}
-        own = None if white is None else cut(white)
+    for title, part, rows, inside in _events(likelihood, key):
+
+        def cut(values: np.ndarray | None, rows: np.ndarray = rows, inside: np.ndarray = inside) -> np.ndarray | None:
+            columns = inside[rows].any(axis=0)
+            return None if values is None else np.where(inside, values, np.nan)[..., rows, :][..., columns]
+
         counts, errors, stated = (None if each is None else each[rows] for each in (assumed, deviations, expected))
+        of_event = {name: cut(each) for name, each in found.items()}
         fits.append(
-            Fit(title, part, cut(drawn), white=own, assumed=counts, deviations=errors, expected=stated, **of_event)
+            Fit(
+                title,
+                part,
+                cut(drawn),
+                white=cut(white),
+                assumed=counts,
+                deviations=errors,
+                expected=stated,
+                **of_event,
+            )
         )
     return fits, failed
 
@@ -233,38 +236,29 @@ def _errors(
     return sampled.whitened(residuals, response, parameters) if hasattr(sampled, "whitened") else residuals, None
 
 
-def _events(likelihood: FELikelihood, key: str) -> Iterator[tuple[str, Measurements, np.ndarray, Callable]]:
-    """Name, measurements and rows of channels of each event, and what cuts (..., n_channels, n_samples) to it."""
+def _events(likelihood: FELikelihood, key: str) -> Iterator[tuple[str, Measurements, np.ndarray, np.ndarray]]:
+    """Name, measurements and rows of channels of each event, and which samples (n_channels, n_samples) are in it."""
     measured, events = likelihood.measurements, find_events(likelihood.model)
-    spans = [(key, -np.inf, np.inf)]
-    if events is not None and len(events.windows) > 1:
-        spans = [(f"{key}, {each.name}" if key else each.name, each.start, each.end) for each in events.windows]
     times = np.stack([measured.times(channel.name) for channel in measured.channels])
     half = 0.5 * np.array(measured.steps)[:, None]
-    for title, start, end in spans:
-        inside = (times > start - half) & (times < end + half)
+    windows = events.windows if events is not None and len(events.windows) > 1 else [None]
+    for each in windows:
+        inside = np.ones(times.shape, bool) if each is None else (times > each.start - half) & (times < each.end + half)
         rows = np.flatnonzero((inside & np.isfinite(measured.values)).any(axis=1))
-        columns = np.flatnonzero(inside[rows].any(axis=0))
-        if not len(rows):
-            continue
-        cut = partial(_cut, inside, rows, columns)
-        part = Measurements(
-            tuple(measured.channels[row] for row in rows),
-            tuple(measured.steps[row] for row in rows),
-            cut(measured.values),
-            measured.description,
-            tuple(measured.starts[row] + columns[0] * measured.steps[row] for row in rows),
-            measured.axis,
-            () if measured.is_history else np.array(measured.points, dtype=object)[columns],
-        )
-        yield title, part, rows, cut
+        if len(rows):
+            columns = np.flatnonzero(inside[rows].any(axis=0))
+            part = replace(
+                measured,
+                channels=tuple(measured.channels[row] for row in rows),
+                dt=tuple(measured.steps[row] for row in rows),
+                values=np.where(inside, measured.values, np.nan)[np.ix_(rows, columns)],
+                start=tuple(measured.starts[row] + columns[0] * measured.steps[row] for row in rows),
+                points=() if measured.is_history else np.array(measured.points, dtype=object)[columns],
+            )
+            yield ", ".join(filter(None, (key, "" if each is None else each.name))), part, rows, inside
 
 
-def _cut(inside: np.ndarray, rows: np.ndarray, columns: np.ndarray, values: np.ndarray) -> np.ndarray:
-    return np.where(inside, values, np.nan)[..., rows[:, None], columns]
-
-
-def _modes(likelihood: Any, draws: np.ndarray, samples: np.ndarray | None) -> ModalFit:
+def _modes(key: str, likelihood: Any, draws: np.ndarray, samples: np.ndarray | None) -> ModalFit:
     """Modes at draws of the prior, and at four times as many samples of the posterior (n, ndim)."""
     found: list[Any] = []
     for points in (draws, samples):
@@ -277,7 +271,7 @@ def _modes(likelihood: Any, draws: np.ndarray, samples: np.ndarray | None) -> Mo
     few = None if samples is None else samples[:: -(-len(samples) // max(len(draws), 1))]
     held_out = None if None in (found[1], likelihood.held_out) else found[1].against(likelihood.held_out)
     deviations = np.median(likelihood.noise.deviations(draws[:, len(likelihood.model.parameter_names) :]), axis=1)
-    return ModalFit(likelihood, found[0], deviations, few, found[1], held_out)
+    return ModalFit(key, likelihood, found[0], deviations, few, found[1], held_out)
 
 
 def fit_data_sets(run: FinishedRun) -> Fits:

@@ -1,6 +1,5 @@
 """Findings about a fit: does the model follow the measurements at all, and what would explain it if not?"""
 
-import re
 from collections.abc import Container, Iterable, Sequence
 from typing import Any
 
@@ -14,18 +13,17 @@ from ..priors.points import as_points
 from ..signals.error_measures import relative_errors
 from ..simulation.model import simulate_batch
 from ..text_tables import listed
-from .compared import MOST_DRAWS, ChannelFit, Fit, checks_of, compare, data_sets_of, draws_to_compare
-from .data_faults import EXPLAINED, Fault, describe_unit, find_faults
+from .compared import Fit, checks_of, compare, data_sets_of, draws_to_compare
+from .fault_words import describe_unit, finding_of
+from .faults import EXPLAINED, Fault, find_faults, support_gains, supports_apart
 from .finding import CARE, CORRELATED, HALF, NOTE, SMALL_PROBABILITY, SURE, WRONG, Finding, about, percent
-from .modal_faults import check_modes, check_squares
-from .slow_motion import find_slow_faults, support_gains, supports_apart
-from .steps import motions_to_replace
-from .table import Moments, ParameterRow, rows_of
-from .wrong_values import check_load_cases
+from .modal import check_modes, check_squares
+from .model import motions_to_replace
+from .run import ParameterRow, moments, rows_of
+from .tables import MOST_DRAWS, Table, find_changes
 
 __all__ = [
     "SAME_AS_PRIOR",
-    "check_damping",
     "check_fit",
     "check_other_events",
     "check_parameters",
@@ -35,39 +33,11 @@ __all__ = [
     "check_supports",
     "describe_residuals",
     "limits_of_model",
-    "residual_sentence",
 ]
 
 SAME_AS_PRIOR = 0.9  # ratio of the standard deviations of posterior and prior: a fifth of the variance is gone
 NEAR_BOUND = 0.1  # distance of the 5 % or 95 % quantile from a bound, in 90 % intervals and in prior deviations
-LARGE_ERROR = HALF  # RRMSE of a channel that is hardly reproduced: a quarter of its power is left
-LARGE_DAMPING = 0.3  # in 9 of 37 right fits of decks on abutments, and in 5 of 8 with a gain of one half
 FEWEST = 10  # samples that the tests of correlation and distribution need
-FAULTS = {
-    "factor": (
-        "A {what} may be wrong",
-        "{where}: measured values are {value} times the computed ones{units}{better}.",
-        "Look up unit and gain of the channel and of the base motion or loads, and correct the wrong one; a model of "
-        "your own must return SI units.",
-    ),
-    "sign": (
-        "A sign may be wrong",
-        "{where}: measured and computed values have opposite signs{better}.",
-        "Where the sensor counts the other way, change its sign (`reversed` in [measurements] does so).",
-    ),
-    "swap": (
-        "Channels may be swapped",
-        "{where}: each measurement resembles the computed response of the other{better}.",
-        "Look up which cable, or column of the file, belongs to which; if they were exchanged, exchange the columns.",
-    ),
-    "lag": (
-        "Clocks may differ",
-        "{where}: measured values are {value} s {late} than the computed ones{better}.",
-        "Check the clocks of sensors and motions, and when the motion begins (`zero` in [measurements], or "
-        "measurements.shift); a lag that stays unknown can be a parameter (`Sensor`).",
-    ),
-}
-"""Kind, text and action of each fault of data."""
 PLACES = (
     "Check that it is the right column, its unit, sign and clock, and the place of the sensor in the model; if all "
     "of them are right, the model lacks what moves it."
@@ -101,66 +71,47 @@ def check_fit(posterior: Posterior, samples: Any = None) -> tuple[Finding, ...]:
     mean = None
     if samples is not None:
         samples = as_points(samples, posterior.prior.names)
-        mean, none = samples.mean(axis=0), np.full(posterior.ndim, np.nan)
-        rows = rows_of(posterior.parameters, posterior.prior, Moments.of_samples(samples, none, none), none)
+        mean, rows = samples.mean(axis=0), rows_of(posterior.parameters, posterior.prior, moments(samples))
         found += check_parameters(rows, limits_of_model(posterior.likelihood, posterior.parameters, rows, mean))
     for key, likelihood, columns in data_sets_of(posterior):
         own, point = (None if each is None else each[..., columns] for each in (samples, mean))
-        of_data, _ = compare(likelihood, draws[:, columns], key, point, samples=own)
-        fits += of_data
+        fits += compare(likelihood, draws[:, columns], key, point, samples=own)[0]
         found += check_supports(likelihood.model)
-        found += [] if point is None else check_damping(likelihood.model, point, of_data)
     return (*check_responses(fits), *found)
 
 
 def check_responses(fits: Iterable[Fit]) -> list[Finding]:
-    """What responses show of the data and of the fit, if there is one: faults of the data, and missed channels."""
-    found, histories = list[Finding](), list[Fit]()
+    """What responses show of the data and of the fit, if there is one: faults of the data, and missed channels.
+
+    Faults are those that draws of the prior show, before a run and after it: a fit may make up for them.
+    """
+    found, others = list[Finding](), list[Fit]()
     for fit in fits:
-        found += check_modes(fit.modal) if fit.modal else about("data", check_load_cases(fit) or check_faults(fit))
-        histories += [] if fit.modal else [fit]
+        if fit.modal:
+            found += check_modes(fit.modal)
+            continue
+        others.append(fit)
+        history = fit.measurements.is_history
+        for fault in find_faults(fit.measurements, fit.draws) if history else _changes(fit):
+            channels = [each for each in fit.measurements.channels if each.name in fault.names]
+            # of right real events, 5 to 20 draws blame 19 of 396, 50 or 70 draws 3 of 264, and 100 draws 0 of 43
+            severity = WRONG if fault.where or len(fit.draws) >= HALF * MOST_DRAWS else CARE
+            loads = not history and len(channels) == fit.measurements.n_channels
+            found.append(finding_of(fault, fit.title, channels, severity, loads))
+        found += about("data", _check_offset(fit)) if history and fit.after is not None else []
     unexplained = all(each.severity != WRONG for each in found)
-    return found + (about("fit", check_errors(histories)) if unexplained else [])
+    return found + (about("fit", check_errors(others)) if unexplained else [])
 
 
-def check_faults(fit: Fit) -> list[Finding]:
-    """Faults of the data. One that draws of the prior show before a run is named after it: a fit may make up for it."""
-    found, faults = list[Finding](), find_faults(fit.measurements, fit.responses)
-    slow = {(fault.kind, *fault.names): (fault, band) for fault, band in find_slow_faults(fit.slow)}
-    for fault in faults:
-        own = [slow.pop((fault.kind, name))[0].value for name in fault.names if (fault.kind, name) in slow]
-        found.append(_of_a_fault(fit, fault._replace(value=float(np.median(own))) if own else fault, WRONG))
-    found += [
-        _of_a_fault(fit, fault, WRONG, f" between {low:.2g} and {high:.2g} Hz, where parameters hardly change it")
-        for fault, (low, high) in slow.values()
-    ]
-    known = {fault.kind for fault in (*faults, *(fault for fault, _ in slow.values()))}
-    if fit.after is not None:
-        how = " at the best draw of the prior; the fit hides it by other parameters"
-        # of right real events, 5 to 20 draws blame 19 of 396, 50 or 70 draws 3 of 264, and 100 draws 0 of 43
-        severity = WRONG if len(fit.draws) >= HALF * MOST_DRAWS else CARE
-        before = [each for each in find_faults(fit.measurements, fit.draws) if each.kind not in known]
-        found += [_of_a_fault(fit, fault, severity, how) for fault in before]
-        found += _check_offset(fit) if fit.is_history else []
-    return found
-
-
-def _of_a_fault(fit: Fit, fault: Fault, severity: str, how: str = "") -> Finding:
-    of_fault = [each for each in fit.measurements.channels if each.name in fault.names]
-    loads = not fit.is_history and len(of_fault) == fit.measurements.n_channels
-    near = [describe_unit(fault.value, c.dimension, c.unit, loads) for c in of_fault] if fault.kind == "factor" else []
-    units = " or ".join(filter(None, dict.fromkeys(near)))
-    words = {
-        "where": fit.where(*fault.names),
-        "better": f"; corrected, the error (RRMSE) is {percent(fault.after)} instead of {percent(fault.before)}{how}",
-        "value": f"{abs(fault.value):.0f}" if abs(fault.value) >= 1e3 else f"{abs(fault.value):.3g}",
-        "late": "later" if fault.value > 0.0 else "earlier",
-        "what": "unit" if units else "gain",
-        "units": f", about the ratio of {units}" if units else "",
-    }
-    kind, text, action = (each.format(**words) for each in FAULTS[fault.kind])
-    numbers = {"before": fault.before, "after": fault.after, fault.kind: fault.value}
-    return Finding(kind, severity, text, action, numbers)
+def _changes(fit: Fit) -> tuple[Fault, ...]:
+    """Faults of data without time."""
+    measured = fit.measurements
+    if fit.expected is None or not len(fit.draws):
+        return ()
+    cases = [str(each) for each in measured.points or range(1, measured.n_steps + 1)]
+    deviations = np.broadcast_to(fit.expected, measured.values.shape)
+    table = Table(measured.values, fit.draws, deviations, [each.name for each in measured.channels], cases)
+    return find_changes(table, [each.dimension for each in measured.channels])
 
 
 def check_supports(model: Any) -> list[Finding]:
@@ -205,23 +156,23 @@ def _check_offset(fit: Fit) -> list[Finding]:
 def check_errors(fits: Sequence[Fit]) -> list[Finding]:
     """Channels that the fit, or the best draw of the prior, does not reproduce.
 
-    Noise, white and normal, is in no model: a channel with more noise than signal is hardly reproduced.
+    Noise, white and normal, is in no model, and is no fault of a fit.
     """
     useless, poor, far = {}, {}, {}
-    for fit in fits:
-        errors = np.nan_to_num(relative_errors(fit.measurements.values - fit.responses, fit.measurements.values))
-        if not len(errors):
-            continue
-        best = 0 if fit.after is not None else int(np.argmin(np.log(np.maximum(errors, 1e-3)).sum(axis=1)))
+    for fit in (each for each in fits if len(each.draws) or each.after is not None):
+        errors = relative_errors(
+            fit.measurements.values - (fit.draws if fit.after is None else fit.after[None]), fit.measurements.values
+        )
+        best = int(np.argmin(np.log(np.maximum(np.nan_to_num(errors), 1e-3)).sum(axis=1)))
         for row, channel in enumerate(fit.measurements.channels):
-            error = {fit.where(channel.name): float(errors[best, row])}
+            error = {fit.where(channel.name): float(np.nan_to_num(errors[best, row]))}
+            (size,) = error.values()
             if fit.after is None:
-                far |= error if errors[best, row] > EXPLAINED else {}
-            elif errors[best, row] > LARGE_ERROR:
+                far |= error if size > EXPLAINED else {}
+            elif size > HALF:  # a quarter of its power is left
                 checks = checks_of(fit.residuals[row])
-                noise = checks is None or min(checks.white[0], checks.normal[0]) > SMALL_PROBABILITY
-                useless |= error if errors[best, row] ** 2 > HALF and not noise else {}
-                poor |= error if (errors[best, row] ** 2 > HALF) == noise else {}
+                if checks is not None and min(checks.white[0], checks.normal[0]) < SMALL_PROBABILITY:
+                    (useless if size**2 > HALF else poor).update(error)
     kinds = [
         (
             useless,
@@ -239,14 +190,16 @@ def check_errors(fits: Sequence[Fit]) -> list[Finding]:
         ),
     ]
     return [
-        Finding(kind, WRONG if errors is useless else CARE, text.format(_shares(errors)), action, errors)
+        Finding(
+            kind,
+            WRONG if errors is useless else CARE,
+            text.format(listed([f"{percent(share)} in {name}" for name, share in errors.items()])),
+            action,
+            errors,
+        )
         for errors, kind, text, action in kinds
         if errors
     ]
-
-
-def _shares(named: dict[str, float]) -> str:
-    return listed([f"{percent(share)} in {name}" for name, share in named.items()])
 
 
 def edges(rows: Sequence[ParameterRow]) -> dict[str, tuple[str, float, float]]:
@@ -275,26 +228,6 @@ def limits_of_model(
             elif i in columns:
                 found |= set() if part.possible(moved[None, columns])[0] else {name}
     return found
-
-
-def check_damping(model: Any, theta: np.ndarray, fits: Iterable[Fit]) -> list[Finding]:
-    """Damping ratios at the structural parameters (n_parameters,) that no structure has by itself.
-
-    Soil and abutments do radiate so much energy; where gain and clock of every channel are known to be right, the ratio
-    makes up for neither, and is no fault.
-    """
-    large = {}
-    for name, value in zip(model.parameter_names, theta.tolist(), strict=False):
-        own = 1.0 if hasattr(model, "supports") else getattr(model, "damping_ratio", None)
-        ratio = value * getattr(model, "nominal", {}).get(name, np.nan if own is None else own)
-        large |= {name: ratio} if re.fullmatch(r"damping(_\d+)?", name) and ratio > LARGE_DAMPING else {}
-    fits = [each for each in fits if not each.modal]
-    if not large or all(len(each.slow) == len(each.channels) and not find_slow_faults(each.slow) for each in fits):
-        return []
-    shown = listed([f"{name} {ratio:.2g}" for name, ratio in large.items()])
-    text = f"The fit has damping ratios that structures seldom have: {shown} (at most {LARGE_DAMPING:g} is usual)."
-    action = "Look for a wrong gain, a clock or a sensor that was stuck, which damping makes up for, and at the model."
-    return [Finding("The damping is not plausible", WRONG, text, action, large)]
 
 
 def check_parameters(rows: Sequence[ParameterRow], limits: Container[str] = ()) -> list[Finding]:
@@ -387,8 +320,10 @@ def check_stated_errors(fits: Iterable[Fit]) -> list[Finding]:
     return found
 
 
-def describe_residuals(checks: ResidualChecks) -> list[str]:
-    """What the residuals of each channel look like, in words."""
+def describe_residuals(checks: ResidualChecks | None) -> list[str]:
+    """What the residuals of each channel look like, in words; None could not be checked."""
+    if checks is None:
+        return ["not checked (too few samples, or an exact fit)."]
     found = []
     for lag, worth, white, normal, n in zip(*checks[2:7], strict=True):
         if n < FEWEST:
@@ -399,10 +334,3 @@ def describe_residuals(checks: ResidualChecks) -> list[str]:
             text = "White: no correlation from sample to sample was found."
         found.append(f"{text} Not normal: look at the tails." if normal < SMALL_PROBABILITY else text)
     return found
-
-
-def residual_sentence(fit: Fit, each: ChannelFit) -> str:
-    """What the residuals of one channel look like, in a sentence."""
-    if each.checks is None:
-        return f"{fit.where(each.channel.name)}: not checked (too few samples, or an exact fit)."
-    return f"{fit.where(each.channel.name)}: {describe_residuals(each.checks)[0]}"

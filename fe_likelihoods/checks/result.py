@@ -1,6 +1,5 @@
 """One judgement over the result of a run: sampling, fit, residuals, failures, priors, data, and what was not tested."""
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,10 +10,8 @@ from ..cache.simulation_cache import SimulationCache
 from ..signals.events import find_events
 from ..simulation.model import SimulationBatch, simulate_batch
 from .compared import Fits, data_sets_of, fit_data_sets
-from .failed_simulations import Failures, failures
 from .finding import CARE, NOTE, TAIL, WRONG, Finding, Judgement, judge
 from .fit import (
-    check_damping,
     check_other_events,
     check_parameters,
     check_residuals,
@@ -23,20 +20,11 @@ from .fit import (
     check_supports,
     limits_of_model,
 )
-from .run import FinishedRun, read_run
+from .model import STEP, StepTest, check_stronger_motion, halve_steps, has_steps, motions_to_replace
+from .run import Failures, FinishedRun, ParameterRow, failures, moments_of, read_run, rows_of
 from .screening import check_data, check_gaps
-from .steps import (
-    StepTest,
-    check_stronger_motion,
-    halve_steps,
-    has_steps,
-    motions_to_replace,
-    not_tested,
-    simulations_of_the_test,
-)
-from .table import ParameterRow, parameter_rows
 
-__all__ = ["JudgedRun", "check_result", "check_run", "judge_run"]
+__all__ = ["JudgedRun", "check_failures", "check_result", "judge_run"]
 
 # effective, below which the interval between the 5 % and 95 % quantiles of n samples, which holds a further sample with
 # the probability 0.9 (n - 1) / (n + 1), loses as much as a tail of it: 0.85; with 57 it is 0.87
@@ -89,41 +77,38 @@ def check_result(sampler: Any, posterior: Any = None, *, discard: int = 0) -> Ju
 
 
 def judge_run(run: FinishedRun) -> JudgedRun:
-    """Judge a run; simulates the points that `check_result` names, where they are not cached."""
-    rows, fits = parameter_rows(run), fit_data_sets(run)
-    model, made = _check_model(run)
-    failed = failures(run)  # those of the fits included
-    fits = fits._replace(simulations=fits.simulations + made)
-    return JudgedRun(rows, fits, failed, check_run(run, rows, fits, failed, model))
-
-
-def check_run(
-    run: FinishedRun, rows: Sequence[ParameterRow], fits: Fits, failed: Failures, model: StepTest | None = None
-) -> Judgement:
-    """The judgement of a run, with all that a reader has to know; `model` is about its motion, step and mesh.
+    """Judge a run; simulates the points that `check_result` names, where they are not cached.
 
     A run that says nothing about the parameters gets no findings that compare its samples with prior, truth or noise.
     """
-    model = StepTest([], {}) if model is None else model
+    rows, fits = rows_of(run.parameters, run.prior, moments_of(run), run.truth), fit_data_sets(run)
+    model, made = _check_model(run)
+    failed, fits = failures(run), fits._replace(simulations=fits.simulations + made)  # failures of the fits included
     found = check_responses(fits.fits) + model.findings  # first, because they explain a sampling that is not good
-    found += _check_sampling(run) + _check_chain(run) + _check_failures(run, failed)
+    found += _check_sampling(run) + _check_chain(run) + check_failures(run, failed)
     for text in fits.failures:
         action = "Use another point or mend the model."
         found.append(Finding("A response is missing", CARE, f"{text}.", action, about="fit"))
-    for likelihood, columns in [] if run.likelihood is None else run.likelihood.parts():
-        found += [] if run.is_inconclusive else check_damping(likelihood.model, run.centre[columns], fits.fits)
-        found += check_supports(likelihood.model)
+    for likelihood, _ in [] if run.likelihood is None else run.likelihood.parts():
+        found += check_supports(likelihood.model) + _check_range(likelihood) + check_gaps(likelihood.noise)
         found += check_data(likelihood.measurements, motions_to_replace(likelihood.model))
-        found += check_gaps(likelihood.noise) + _check_range(likelihood)
     if not run.is_inconclusive:
-        known = run.likelihood is not None
-        limits = limits_of_model(run.likelihood, run.parameters, rows, run.centre) if known else set()
+        limits = set() if run.likelihood is None else limits_of_model(run.likelihood, run.parameters, rows, run.centre)
         found += check_parameters(rows, limits)
         if all(each.severity != WRONG for each in found):  # a fault explains the residuals
             found += check_residuals(fits.fits) + check_stated_errors(fits.fits)
             found += check_other_events([row for row in rows if row.name in _of_one_event(run)])
+    checked = sum(each.checks is not None for fit in fits.fits for each in fit.channels)
+    responses = max((len(each.modal.points if each.modal else each.responses) for each in fits.fits), default=0)
+    alone = "the length of the chain alone: a Markov chain gives no verdict"
+    tests = {
+        "Sampling": "by the sampler" if run.tempered else alone,
+        "Failed simulations": f"not tested: {failed.unknown}" if failed.unknown else f"{failed.attempts} simulations",
+        "Units, signs, clocks, swapped channels": f"{responses} responses were compared" if responses else "not tested",
+        "Residuals": f"channels: {checked}" if checked else "not tested: there are none",
+    }
     unique = dict.fromkeys(found)  # data sets may share a description or a motion
-    return judge(unique, (*_tests(run, fits, failed), *model.tests.items()))
+    return JudgedRun(rows, fits, failed, judge(unique, (tests | model.tests).items()))
 
 
 def _of_one_event(run: FinishedRun) -> tuple[str, ...]:
@@ -134,37 +119,13 @@ def _of_one_event(run: FinishedRun) -> tuple[str, ...]:
     return tuple(parts[0].model.parameter_names) if is_one else ()
 
 
-def _tests(run: FinishedRun, fits: Fits, failed: Failures) -> list[tuple[str, str]]:
-    """Names of the tests of a run, and what was tested or why it was not."""
-    checked = [each for fit in fits.fits for each in fit.channels if each.checks is not None]
-    sampling = "by the sampler" if run.tempered else "the length of the chain alone: a Markov chain gives no verdict"
-    responses = max((len(each.modal.points if each.modal else each.responses) for each in fits.fits), default=0)
-    clocks = [
-        f"{fit.where(each.channel.name)} {'' if each.channel.name in fit.slow else 'not '}tested"
-        for fit in fits.fits
-        for each in fit.channels
-        if fit.is_history
-    ]
-    timed = has_steps(run.likelihood)
-    return [
-        ("Sampling", sampling),
-        ("Failed simulations", f"not tested: {failed.unknown}" if failed.unknown else f"{failed.attempts} simulations"),
-        (
-            f"Units, signs, {'clocks, ' if timed else ''}swapped channels",
-            f"{responses} responses were compared" if responses else "not tested: there is no response to compare",
-        ),
-        *([("Gains and clocks where parameters change nothing", "; ".join(clocks) or "not tested")] if timed else []),
-        ("Residuals", f"channels: {len(checked)}" if checked else "not tested: there are none"),
-    ]
-
-
 def _check_model(run: FinishedRun) -> tuple[StepTest, int]:
     """Whether the model reads its motion, and the error of step and mesh, at the centre of the samples.
 
     Also returns the number of simulations that this took. The derivatives take one simulation for each parameter. Where
     these are more than a twentieth of the run's simulations and take longer than ten seconds, they are left out.
     """
-    if run.likelihood is None or run.prior is None:
+    if run.likelihood is None or run.prior is None or not has_steps(run.likelihood):
         return StepTest([], {}), 0
     known = {likelihood.model.fingerprint: likelihood for likelihood, _ in run.likelihood.parts()}
     report, others = run.likelihood.report(), 0
@@ -184,18 +145,19 @@ def _check_model(run: FinishedRun) -> tuple[StepTest, int]:
             motion = "twice the motion was simulated"
             found = check_stronger_motion(likelihood.model, theta, batch.response[0], simulate)
             unread += [each for each in found if each.severity == WRONG]  # failures are said where they are predicted
-    test, needed = StepTest([], {}), simulations_of_the_test(run.posterior)
+    needed = sum(2 + len(likelihood.model.parameter_names) for likelihood, _ in run.likelihood.parts())
     seconds = report["seconds"] / max(report["simulations"], 1)
     if unread or run.is_inconclusive:
-        pass
+        test = StepTest([], {})
     elif run.n_modes > 1:
-        test = not_tested(run.likelihood, "the samples have several modes, which have no common standard deviation")
+        why = "the samples have several modes, which have no common standard deviation"
+        test = StepTest([], {STEP: f"not tested: {why}"})
     elif needed > LARGEST_TEST * report["simulations"] and needed * seconds > TEST_SECONDS:
-        test = not_tested(run.likelihood, f"the test takes {needed} simulations of {seconds:.2g} s")
+        test = StepTest([], {STEP: f"not tested: the test takes about {needed} simulations of {seconds:.2g} s"})
     else:
         test = halve_steps(run.posterior, run.centre, run.samples.std(axis=0), simulate)
-    tests = {"Motion": motion} | test.tests if has_steps(run.likelihood) else {}
-    return StepTest(unread + test.findings, tests), run.likelihood.simulations - report["simulations"] + others
+    made = run.likelihood.simulations - report["simulations"] + others
+    return StepTest(unread + test.findings, {"Motion": motion} | test.tests), made
 
 
 def _check_sampling(run: FinishedRun) -> list[Finding]:
@@ -241,7 +203,7 @@ def _check_chain(run: FinishedRun) -> list[Finding]:
     return found
 
 
-def _check_failures(run: FinishedRun, failed: Failures) -> list[Finding]:
+def check_failures(run: FinishedRun, failed: Failures) -> list[Finding]:
     """How many simulations failed, and where a sampler has not said it, whether they border on the samples."""
     if not failed.count:
         return []

@@ -1,9 +1,10 @@
-"""What a report needs of a finished run, read from the sampler and the posterior in one place.
+"""What a report needs of a finished run, read from the sampler and the posterior in one place, and its two tables.
 
 A posterior of this package knows the units of its parameters, its prior and its data. A plain function knows none of
 them; what is missing is empty or NaN here, and the report leaves it out.
 """
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -12,13 +13,26 @@ from emcee import EnsembleSampler
 
 from samplers import Verdict
 from samplers.estimates.importance import EvidenceCheck
+from samplers.judgement.failures import NearFailures, failures_near
 
+from ..likelihood.failure_log import reason_without_numbers
 from ..likelihood.joint import JointLikelihood
 from ..likelihood.likelihood import FELikelihood
 from ..likelihood.parameters import Parameter
 from ..priors.priors import Prior
 
-__all__ = ["FinishedRun", "read_run"]
+__all__ = [
+    "Failure",
+    "Failures",
+    "FinishedRun",
+    "Moments",
+    "ParameterRow",
+    "failures",
+    "moments",
+    "moments_of",
+    "read_run",
+    "rows_of",
+]
 
 LONGEST_AUTOCORRELATION = 50.0  # iterations per autocorrelation time that emcee recommends
 
@@ -141,9 +155,8 @@ def _names_of(sampler: EnsembleSampler) -> list[str]:
     """Names that emcee's sampler was given, x0, x1, ... by default."""
     names = [f"x{i}" for i in range(sampler.ndim)]
     for name, places in (sampler.parameter_names if sampler.params_are_named else {}).items():
-        places = np.atleast_1d(places)
-        for k, place in enumerate(places):
-            names[place] = name if len(places) == 1 else f"{name}_{k}"
+        for k, place in enumerate(np.atleast_1d(places)):
+            names[place] = name if np.ndim(places) == 0 else f"{name}_{k}"
     return names
 
 
@@ -156,19 +169,12 @@ def _verdict(sampler: EnsembleSampler) -> Verdict | None:
 
 
 def _truth(truth: Mapping[str, float] | Sequence[float] | None, names: Sequence[str]) -> np.ndarray:
-    if truth is None:
-        return np.full(len(names), np.nan)
-    if isinstance(truth, Mapping):
-        if unknown := [name for name in truth if name not in names]:
-            raise ValueError(f"truth has the unknown parameters {', '.join(unknown)}; known are {', '.join(names)}")
-        return np.array([float(truth.get(name, np.nan)) for name in names])
-    values = np.asarray(truth, dtype=float)
-    if values.shape != (len(names),):
-        raise ValueError(
-            f"truth must be a mapping of names to values, or {len(names)} numbers in the order {', '.join(names)}; "
-            f"got shape {values.shape}"
-        )
-    return values
+    known = truth if isinstance(truth, Mapping) else {} if truth is None else dict(zip(names, truth, strict=False))
+    if unknown := [name for name in known if name not in names]:
+        raise ValueError(f"truth has the unknown parameters {', '.join(unknown)}; known are {', '.join(names)}")
+    if not isinstance(truth, Mapping | None) and np.shape(truth) != (len(names),):
+        raise ValueError(f"truth must have {len(names)} numbers, of {', '.join(names)}; got {truth!r}")
+    return np.array([float(known.get(name, np.nan)) for name in names])
 
 
 def _autocorrelation_time(sampler: EnsembleSampler, discard: int) -> float:
@@ -194,3 +200,162 @@ def _errors(
     size = min(iterations * sampler.nwalkers / autocorrelation, float(len(samples)))  # min keeps a first NaN
     of_variance = np.square(samples - samples.mean(axis=0)).std(axis=0)
     return spread / np.sqrt(size), 0.5 * of_variance / np.where(spread > 0.0, spread, 1.0) / np.sqrt(size), float(size)
+
+
+class Moments(NamedTuple):
+    """Means and standard deviations, their Monte Carlo errors, 5 %, 50 % and 95 % quantiles (ndim,)."""
+
+    mean: np.ndarray
+    mean_error: np.ndarray
+    sd: np.ndarray
+    sd_error: np.ndarray
+    low: np.ndarray
+    median: np.ndarray
+    high: np.ndarray
+
+
+def moments(samples: np.ndarray, mean_error: Any = np.nan, sd_error: Any = np.nan) -> Moments:
+    """Moments of samples (n, ndim), and their errors (ndim,) if they are known."""
+    quantiles, none = np.quantile(samples, [0.05, 0.5, 0.95], axis=0), np.zeros(samples.shape[1])
+    return Moments(samples.mean(axis=0), none + mean_error, samples.std(axis=0), none + sd_error, *quantiles)
+
+
+def moments_of(run: FinishedRun) -> Moments:
+    """Moments of the chain, or of the signed sample of a run with a guide if that is the more accurate sample.
+
+    It has smaller errors of all means, and determines all standard deviations.
+    """
+    signed = getattr(run.sampler, "signed_sample", None)
+    if signed is not None:
+        mean, sd = signed.expectation(), signed.standard_deviation()
+        if np.all(mean.error < run.mean_error) and np.all(sd.value > 0.0):
+            quantiles = (signed.quantile(probability).value for probability in (0.05, 0.5, 0.95))
+            return Moments(*mean, *sd, *quantiles)
+    return moments(run.samples, run.mean_error, run.sd_error)
+
+
+class ParameterRow(NamedTuple):
+    """One parameter, all values in the unit of its label; texts are empty and numbers NaN where they are not known."""
+
+    name: str
+    label: str  # name with unit
+    unit: str
+    prior: str  # in words
+    prior_mean: float
+    prior_sd: float
+    mean: float
+    mean_error: float  # Monte Carlo standard error
+    sd: float
+    cv: float  # coefficient of variation [-]; NaN for a mean of zero
+    low: float  # 5 % quantile
+    high: float  # 95 % quantile
+    nominal: float
+    truth: float
+    lower: float  # bound of the prior; infinite where there is none or it is not known
+    upper: float  # bound of the prior; infinite where there is none or it is not known
+
+    def widened(self, factor: float) -> float:
+        """Standard deviation if the data are worth fewer independent samples, by the square of a factor.
+
+        The precision of the data, which is the precision beyond the prior's, is divided by the square.
+        """
+        if not self.sd > 0.0:
+            return self.sd
+        prior = 1.0 / self.prior_sd**2 if self.prior_sd > 0.0 else 0.0
+        data = max(1.0 / self.sd**2 - prior, 0.0)
+        return max(self.sd, (prior + data / factor**2) ** -0.5)
+
+
+def rows_of(
+    parameters: Sequence[Parameter], prior: Prior | None, moments: Moments, truth: np.ndarray | None = None
+) -> list[ParameterRow]:
+    """One row for each parameter; errors of the means and true values (ndim,) may be NaN."""
+    rows, known = [], [] if prior is None else prior.table()[1]
+    for i, parameter in enumerate(parameters):
+        family, *of_prior = ("", np.nan, np.nan, -np.inf, np.inf) if prior is None else known[i][1:]
+        mean, mean_error, sd, _, low, _, high = (float(each[i]) for each in moments)
+        true = np.nan if truth is None else truth[i]
+        prior_mean, prior_sd, lower, upper = (float(each) for each in parameter.shown(of_prior))
+        numbers = parameter.shown([mean, mean_error, sd, low, high, parameter.nominal, true])
+        *of_posterior, lowest, highest, nominal, true = (float(each) for each in numbers)
+        family = family.split("(")[0]
+        text = family if family in ("", "Uniform") else f"{family}, mean {prior_mean:.4g}, sd {prior_sd:.3g}"
+        bounds = (("above", lower), ("below", upper))
+        text += "".join(f", {side} {bound:.4g}" for side, bound in bounds if family and np.isfinite(bound))
+        unit, cv = parameter.label.removeprefix(parameter.name).strip(), sd / abs(mean) if mean else np.nan
+        shown = text, prior_mean, prior_sd, *of_posterior, cv, lowest, highest, nominal, true, lower, upper
+        rows.append(ParameterRow(parameter.name, parameter.label, unit, *shown))
+    return rows
+
+
+class Failure(NamedTuple):
+    """Failures for one reason."""
+
+    reason: str  # with "#" for numbers
+    count: int
+    example: str  # parameters of one failure, after its reason where `reason` has "#"
+
+
+class Failures(NamedTuple):
+    """All failures, with the number of attempts; `near` are those on which a tempered sampler's verdict depends."""
+
+    rows: tuple[Failure, ...]  # by reason, the most frequent first
+    count: int
+    attempts: int
+    unknown: str = ""  # what is not known about them
+    near: NearFailures = NearFailures(0, 0)  # among the posterior samples, and all evaluated points there
+
+    @property
+    def sentence(self) -> str:
+        """The sentence for a report without a table of failures."""
+        return self.unknown or "No simulation failed."
+
+
+def failures(run: FinishedRun) -> Failures:
+    """Failed simulations by reason, the most frequent first, with the parameters at which they happened.
+
+    They are counted in the likelihoods, with the first parts of the record that a guide simulates, or in the sampler.
+    """
+    rows, count, attempts, near, unknown = list[Failure](), 0, 0, [NearFailures(0, 0)], ""
+    for likelihood, columns in [] if run.likelihood is None else run.likelihood.parts():
+        names, logs = likelihood.model.parameter_names, [each.simulator for each in (likelihood, *likelihood.shortened)]
+        records = [record for each in logs for record in each.failures.records]
+        failed = np.array([list(record["parameters"].values()) for record in records]).reshape(-1, len(names))
+        succeeded = logs[0].memory_cache.successes(len(names))
+        near.append(failures_near(run.samples[:, columns[: len(names)]], failed, succeeded))
+        counts = sum((each.failures.reasons for each in logs), Counter())
+        rows += _by_reason(counts, [(record["reason"], record["parameters"]) for record in records])
+        count, attempts = count + counts.total(), attempts + sum(each.failures.outcomes for each in logs)
+        if logs[0].failures.outcomes < len(np.unique(run.samples[:, columns[: len(names)]], axis=0)):
+            unknown = "Not known: simulations of this run were made in another process, or are no longer in memory."
+    if run.likelihood is None and not run.tempered:
+        unknown = "Not known: neither the sampler nor the log-density counts failures."
+    elif run.likelihood is None:
+        known = [
+            (each["reason"], dict(zip(run.names, each["parameters"], strict=True))) for each in run.sampler.failures
+        ]
+        rows = _by_reason(Counter(reason for reason, _ in known), known)
+        count, attempts = run.sampler.failure_count, run.sampler.evaluations
+        unknown = (
+            "No evaluation raised an error or returned NaN; whether -inf stands for a failed simulation is not known."
+        )
+    judged = None if run.verdict is None else run.verdict.near_failures
+    return Failures(
+        tuple(sorted(rows, key=lambda each: -each.count)),
+        count,
+        max(attempts, count),
+        unknown,
+        max(near, key=lambda each: each.failed) if judged is None else judged,
+    )
+
+
+def _by_reason(counts: Counter, known: Sequence[tuple[str, Mapping[str, float]]]) -> list[Failure]:
+    """Failures of one model; reasons that differ in their numbers only are one."""
+    found, examples = Counter(), dict[str, str]()
+    for text, count in counts.items():
+        found[reason_without_numbers(text)] += count
+    for text, point in known:
+        shown = ", ".join(f"{name} = {value:.4g}" for name, value in point.items())
+        reason = reason_without_numbers(text)
+        examples.setdefault(reason, shown if text == reason else f"{text}: {shown}")
+    return [Failure(reason, count, examples.get(reason, "")) for reason, count in found.items()]

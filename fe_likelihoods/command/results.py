@@ -10,8 +10,7 @@ import numpy as np
 from ..checks.compared import Fit, ModalFit, data_sets_of
 from ..checks.finding import Judgement
 from ..checks.result import JudgedRun
-from ..checks.run import FinishedRun
-from ..checks.table import moments_of
+from ..checks.run import FinishedRun, moments_of
 from ..prediction.prediction import Prediction
 from ..reporting.other_events import OtherEvent
 

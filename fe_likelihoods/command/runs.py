@@ -16,7 +16,7 @@ import numpy as np
 
 from ..cache.simulation_cache import SimulationCache
 from ..checks.finding import NOTE, grouped
-from ..checks.rehearsal import refuse_chance
+from ..checks.model import refuse_chance
 from ..checks.result import judge_run
 from ..checks.run import read_run
 from ..reporting.other_events import describe_event

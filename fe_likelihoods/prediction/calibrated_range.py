@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..cache.verification import StaleCache
-from ..checks.steps import relative_difference
+from ..checks.model import relative_difference
 from ..likelihood.joint import JointLikelihood
 from ..signals.events import find_events, motions_of
 from ..simulation.faults import ChangedModel

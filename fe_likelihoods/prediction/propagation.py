@@ -26,8 +26,8 @@ from samplers.evaluation.values import most_common_reasons
 
 from ..cache.simulation_cache import SimulationCache
 from ..checks.finding import warn
+from ..checks.model import check_same_response
 from ..checks.screening import check_gaps
-from ..checks.steps import check_same_response
 from ..checks.transfer import check_bandwidth, check_final_values, check_peaks
 from ..likelihood.simulator import Simulator
 from ..noise.protocol import noise_under

@@ -6,9 +6,8 @@ import numpy as np
 
 from ..checks.compared import Fit, Fits
 from ..checks.finding import Judgement
-from ..checks.fit import SAME_AS_PRIOR, residual_sentence
-from ..checks.run import FinishedRun
-from ..checks.table import ParameterRow
+from ..checks.fit import SAME_AS_PRIOR, describe_residuals
+from ..checks.run import FinishedRun, ParameterRow
 from ..likelihood.likelihood import FELikelihood
 from ..noise.protocol import noise_title
 from ..prediction.prediction import Prediction
@@ -174,7 +173,8 @@ def evidence(run: FinishedRun) -> list[str]:
 def residual_sentences(fits: Fits) -> list[str]:
     """The checks of the residuals, one sentence per channel and event; values without an order in time have none."""
     histories = [fit for fit in fits.fits if fit.residuals is not None and fit.measurements.is_history]
-    return [residual_sentence(fit, each) for fit in histories for each in fit.channels]
+    channels = [(fit, each) for fit in histories for each in fit.channels]
+    return [f"{fit.where(each.channel.name)}: {describe_residuals(each.checks)[0]}" for fit, each in channels]
 
 
 def cost(run: FinishedRun, fits: Fits) -> list[tuple[str, str]]:

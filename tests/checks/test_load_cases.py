@@ -42,10 +42,10 @@ def typo(y):
     ("kind", "words", "change"),
     [
         ("", "", lambda y: y),
-        ("Load cases may be exchanged", "truck at 4 m and truck at 13 m", lambda y: y[:, [2, 1, 0, 3, 4]]),
-        ("Load cases may be exchanged", "reversed order", lambda y: y[:, ::-1]),
+        ("Values may be exchanged", "truck at 4 m and truck at 13 m", lambda y: y[:, [2, 1, 0, 3, 4]]),
+        ("Values may be exchanged", "reversed order", lambda y: y[:, ::-1]),
         ("Channels may be swapped", "at 6 m and at 12 m", lambda y: y[[1, 0, 2]]),
-        ("A value may be wrong", "at 12 m at truck at 13 m", typo),
+        ("A value may be wrong", "at 12 m of truck at 13 m", typo),
         ("A unit may be wrong", "kN and N of the loads", lambda y: 1e-3 * y),
         ("A sign may be wrong", "at 6 m", lambda y: y * [[-1.0], [1.0], [1.0]]),
     ],

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fe_likelihoods import FunctionModes, LogNormal, ModalData, ModalLikelihood, Posterior, ShearFrame, check_fit
+from fe_likelihoods import LogNormal, ModalData, ModalLikelihood, Posterior, ShearFrame, check_fit
 from fe_likelihoods.checks.compared import compare
 from fe_likelihoods.checks.fit import check_responses
 from fe_likelihoods.checks.rehearsal import check_model
@@ -86,10 +86,10 @@ def test_held_out_modes_outside_of_their_interval_are_named():
 @pytest.mark.parametrize(
     ("gain", "order", "wanted"),
     [
-        (-1.0, [0, 1, 2, 3], "sensor floor 4 counts the other way"),
-        (1.0, [0, 3, 2, 1], "floor 2 and floor 4 are exchanged"),
-        (0.02, [0, 1, 2, 3], "sensor floor 4 is dead"),
-        (3.0, [0, 1, 2, 3], "sensor floor 4 has a gain of"),
+        (-1.0, [0, 1, 2, 3], "A sign may be wrong: floor 4:"),
+        (1.0, [0, 3, 2, 1], "Channels may be swapped: floor 2 and floor 4:"),
+        (0.02, [0, 1, 2, 3], "A gain may be wrong: floor 4: measured values are 0.0"),
+        (3.0, [0, 1, 2, 3], "A gain may be wrong: floor 4: measured values are "),
     ],
 )
 def test_faults_of_sensors_are_named(gain, order, wanted):
@@ -99,7 +99,7 @@ def test_faults_of_sensors_are_named(gain, order, wanted):
         data = identified(seed)
         shapes = (data.shapes[0] * [1.0, 1.0, 1.0, gain])[:, order]
         found = check_fit(Posterior(ModalLikelihood(FRAME, changed(data, shapes=shapes)), PRIOR))
-        named += any(each.kind == "A sensor may be wrong" and wanted in each.text for each in found)
+        named += any(str(each).startswith(wanted) for each in found)
     assert named >= 3
 
 
@@ -107,27 +107,7 @@ def test_a_mode_that_was_identified_twice_is_named():
     for seed in range(5):
         data = identified(seed)
         shapes = data.shapes[0][[0, 1, 0]] + 0.01 * np.random.default_rng(seed).normal(size=(3, 4))
-        assert before(changed(data, [1.0, 1.0, 0.8], shapes)) == ["Two measured modes are one"]
-
-
-def test_wrong_numbers_and_planes_of_modes_are_named():
-    named = 0
-    for seed in range(5):
-        right = identified(seed, (1, 2, 4)).frequencies
-        posterior = Posterior(ModalLikelihood(FRAME, ModalData(right, frequency_cv=0.005)), PRIOR)
-        named += any("with the numbers [1, 2, 4]" in each.text for each in check_fit(posterior))
-        assert not before(ModalData(right, mode_numbers=[1, 2, 4], frequency_cv=0.005))
-
-    assert named >= 3
-
-    def square(theta):
-        return np.diag([theta[0], theta[0] * 1.01, 4.0]), np.eye(3)
-
-    model = FunctionModes(square, ("k",), {"x": 0, "y": 1, "z": 2}, 3)
-    modes = model.simulate([1.0])
-    for close, expected in ((0.02, ["Close modes are compared as a plane"]), (0.0, [])):
-        likelihood = ModalLikelihood(model, ModalData(modes[0], modes[1:].T, ("x", "y", "z"), **KNOWN), close=close)
-        assert kinds(Posterior(likelihood, {"k": LogNormal(1.0, 0.2)})) == expected
+        assert before(changed(data, [1.0, 1.0, 0.8], shapes)) == ["A mode has no counterpart"]
 
 
 def test_a_mode_that_the_model_lacks_is_no_fault_of_a_sensor():
@@ -158,31 +138,17 @@ def test_one_wrong_line_among_identifications_is_named_before_a_run():
             assert not wrong or "Mode 3 of set 2 (" in found[0].text
 
 
-def test_a_pairing_that_changes_in_the_posterior_is_named():
-    def crossing(theta):
-        return np.diag([1.0, theta[0]]), np.eye(2)
-
-    data = ModalData([0.155, 0.165], [[1.0, 0.1], [0.1, 1.0]], ("x", "y"))
-    likelihood = ModalLikelihood(FunctionModes(crossing, ("k",), {"x": 0, "y": 1}, 2), data)
-    prior = {"k": LogNormal(1.0, 0.3), "frequency_error": LogNormal(0.05, 0.5), "shape_error": LogNormal(0.05, 0.5)}
-    posterior = Posterior(likelihood, prior)
-    samples = np.column_stack([[0.9, 1.1, 1.2, 0.8] * 10, [0.05] * 40, [0.05] * 40])
-    found = [each for each in check_fit(posterior, samples) if each.kind == "The pairing of modes changes"]
-    assert len(found) == 2 and "1 (50%), 2 (50%)" in found[0].text
-    assert "The pairing of modes changes" not in kinds(posterior, samples[:1])
-
-
 def test_a_fault_that_is_named_before_a_run_is_named_after_it():
     """Parameters make up for a part of it; a unit is found beside a sensor."""
     for seed in range(1):
         data, signs = identified(seed), np.ones((3, 4))
         signs[1, 3] = -1.0
-        for factor, wanted in ((1.0, {"A sensor may be wrong"}), (2 * np.pi, {"A sensor may be wrong", UNIT})):
+        for factor, wanted in ((1.0, {"A value may be wrong"}), (2 * np.pi, {"A value may be wrong", UNIT})):
             posterior = Posterior(ModalLikelihood(FRAME, changed(data, factor, data.shapes[0] * signs)), PRIOR)
             for samples in (None, fitted(posterior)):
                 found = check_fit(posterior, samples)
                 assert {each.kind for each in found if each.severity == "wrong"} == wanted, (seed, factor)
-                assert any("the sign of floor 4 is turned in mode 2" in each.text for each in found)
+                assert any("floor 4 of mode 2" in each.text for each in found)
 
 
 def test_values_far_beyond_their_stated_errors_are_not_used():
@@ -214,8 +180,8 @@ def test_one_wrong_frequency_is_named_before_a_run_and_after_it():
                 assert not found
                 continue
             assert {each.kind for each in found} <= {"A value may be wrong"}
-            named += any(f"The frequency of mode {mode + 1} " in each.text for each in found)
-            assert all(0.8 < each.numbers["ratio"] / ratio < 1.25 for each in found)
+            named += any(f"frequency of mode {mode + 1} " in each.text for each in found)
+            assert all(0.8 < each.numbers["value"] / ratio < 1.25 for each in found)
             if seed == 0 and known:
                 assert found[0] in check_fit(posterior, fitted(posterior))
         assert named >= 8
@@ -227,7 +193,7 @@ def test_exchanged_frequencies_are_named():
         frequencies = data.frequencies.copy()
         frequencies[:, [i, j]] = frequencies[:, [j, i]]
         (found,) = check_fit(Posterior(ModalLikelihood(FRAME, replace(data, frequencies=frequencies)), PRIOR))
-        assert found.kind == "Values may be exchanged" and f"the modes {i + 1} (" in found.text
+        assert found.kind == "Values may be exchanged" and f"of mode {i + 1} (" in found.text
 
 
 def test_the_set_of_a_wrong_number_is_named():

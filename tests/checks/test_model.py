@@ -17,8 +17,7 @@ from fe_likelihoods import (
     check_model,
     check_result,
 )
-from fe_likelihoods.checks.rehearsal import refuse_chance
-from fe_likelihoods.checks.steps import halve_steps
+from fe_likelihoods.checks.model import halve_steps, refuse_chance
 from fe_likelihoods.emulation.modes import find_modes
 from fe_likelihoods.problems import table_motion
 from fe_likelihoods.simulation.model import simulate_batch

@@ -1,7 +1,5 @@
 """Gains, signs and clocks are known where no parameter changes the response, whatever a fit makes of them."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -22,8 +20,8 @@ from fe_likelihoods import (
     check_fit,
 )
 from fe_likelihoods.checks.compared import Fit
-from fe_likelihoods.checks.fit import check_damping, check_responses, check_supports
-from fe_likelihoods.checks.slow_motion import compare_slow_motion
+from fe_likelihoods.checks.faults import slow_motion
+from fe_likelihoods.checks.fit import check_responses, check_supports
 
 STEP, TIME = 0.01, 0.01 * np.arange(2000)
 PRIOR = {"frequency": Uniform(0.5, 10.0), "damping": Uniform(0.005, 0.8), "share": Uniform(0.0, 1.0)}
@@ -61,22 +59,22 @@ def test_gain_and_lag_of_a_damped_deck_are_found_without_a_fit(seed, gain, steps
     draws, true = draws_of(model, rng), model.simulate([4.5, 0.1, 0.7])[0]
     noise = np.convolve(rng.standard_normal(len(true)), np.ones(4) / 2.0, "same")
     measured = gain * later(true, steps) + 0.05 * abs(gain) * true.std() * noise
-    gappy = np.where(np.abs(TIME - 7.3) < 0.3, np.nan, measured)
+    gappy = np.where(np.abs(TIME - 7.3) < 0.2, np.nan, measured)
     for values in (measured, gappy):
-        found = compare_slow_motion(values, draws, STEP)
+        found = slow_motion(values, draws, STEP)
         # draws and truth agree to a tenth
         assert np.sign(found.gain) == np.sign(gain) and abs(np.log(found.gain / gain)) < 0.2
-        assert abs(found.lag - STEP * steps) < 0.01 + 4.0 * found.lag_error
-        assert found.coherence > (0.95 if values is measured else 0.8) and found.highest < 4.5
+        assert abs(found.lag - STEP * steps) < 0.015
+        assert found.coherence > 0.9 and found.band[1] < 4.5
 
 
 def test_nothing_is_known_where_the_draws_disagree_or_are_few():
     rng = np.random.default_rng(2)
     model = LinearOscillator(motions(rng, 1)[0], 0.3)
     relative = np.stack([model.simulate(theta)[1] for theta in rng.uniform(0.3, 2.0, (40, 2))])
-    assert compare_slow_motion(relative[0], relative[1:], STEP) is None  # a = omega^2 x depends on the stiffness
-    assert compare_slow_motion(TIME, np.zeros((10, len(TIME))), STEP) is None
-    assert compare_slow_motion(TIME, np.ones((4, len(TIME))), STEP) is None
+    assert slow_motion(relative[0], relative[1:], STEP) is None  # a = omega^2 x depends on the stiffness
+    assert slow_motion(TIME, np.zeros((10, len(TIME))), STEP) is None
+    assert slow_motion(TIME, np.ones((4, len(TIME))), STEP) is None
 
 
 def findings(values, fit, draws):
@@ -103,9 +101,7 @@ def test_white_noise_is_no_fault_of_a_fit_but_spikes_are():
     model = deck(rng)
     draws, true = draws_of(model, rng), model.simulate([4.5, 0.1, 0.7])[0]
     noise = true.std() * rng.standard_normal(len(true))
-    assert findings(true + 0.8 * noise, true, draws) == {}
-    (most,) = findings(true + 2.0 * noise, true, draws).values()
-    assert (most.kind, most.severity) == ("A channel is hardly reproduced", "care")
+    assert findings(true + 0.8 * noise, true, draws) == findings(true + 2.0 * noise, true, draws) == {}
     spikes = np.where(np.arange(len(true)) % 200 == 150, 20.0 * true.std(), 0.0)
     assert findings(true + spikes, true, draws)["The model does not follow the measurements"].severity == "wrong"
 
@@ -150,21 +146,3 @@ def test_a_support_with_another_gain_or_sign_is_named():
     assert check_supports(LinearStructure(BridgeDeck("deck"), [first, other.scale(2.0), third])) == []
     assert check_supports(LinearStructure(ShearFrame({"roof": 1}, [1.0], [900.0]), first)) == []
     assert check_supports(LinearOscillator(first)) == []
-
-
-def test_a_damping_that_no_structure_has_speaks_against_a_fit_unless_gains_and_clocks_are_known():
-    rng = np.random.default_rng(6)
-    model = deck(rng)
-    draws, true = draws_of(model, rng)[:, None], model.simulate([4.5, 0.35, 0.7])
-    known = Fit("", Measurements(model.channels, STEP, true), draws)
-    noise = 9.0 * true.std() * rng.standard_normal(true.shape)
-    unknown = Fit("", Measurements(model.channels, STEP, true + noise), draws)
-    assert check_damping(model, np.array([4.5, 0.25, 0.5]), [unknown]) == []
-    (found,) = check_damping(model, np.array([9.9, 0.6, 0.5]), [known, unknown])
-    assert found.severity == "wrong" and found.numbers == {"damping": 0.6}
-    assert check_damping(model, np.array([9.9, 0.6, 0.5]), [known]) == []
-    halved = replace(known, measurements=Measurements(model.channels, STEP, 0.5 * true))
-    assert check_damping(model, np.array([9.9, 0.6, 0.5]), [halved])[0].severity == "wrong"
-    oscillator = LinearOscillator(motions(rng, 1)[0], 0.3, damping_ratio=0.05)
-    assert check_damping(oscillator, np.array([1.0, 3.0]), [unknown]) == []
-    assert check_damping(oscillator, np.array([1.0, 8.0]), [unknown])[0].numbers == {"damping": pytest.approx(0.4)}

@@ -25,11 +25,9 @@ from fe_likelihoods import (
     report,
 )
 from fe_likelihoods.checks.compared import fit_data_sets
-from fe_likelihoods.checks.failed_simulations import Failures
 from fe_likelihoods.checks.finding import Finding, judge
-from fe_likelihoods.checks.result import check_result, check_run
-from fe_likelihoods.checks.run import read_run
-from fe_likelihoods.checks.table import moments_of, parameter_rows
+from fe_likelihoods.checks.result import check_failures, check_result
+from fe_likelihoods.checks.run import Failures, moments_of, read_run
 from fe_likelihoods.reporting.contents import evidence, residual_sentences
 from samplers import SamplingWarning, SMCSampler, TMCMCSampler, ladder_table, plot_run
 from samplers.estimates.control_variates import SignedSample
@@ -169,10 +167,8 @@ def test_the_fit_is_that_of_the_posterior_mean_and_its_simulations_are_counted(v
 
 def test_many_failed_simulations_limit_a_result(vibrating):
     finished = read_run(*vibrating)
-    rows, fits = parameter_rows(finished), fit_data_sets(finished)
     for count, severity in ((0, []), (4, ["note"]), (30, ["care"])):
-        found = check_run(finished, rows, fits, Failures((), count, 100)).findings
-        named = [each for each in found if each.kind == "Simulations failed"]
+        named = check_failures(finished, Failures((), count, 100))
         assert [each.severity for each in named] == severity
         assert all(f"{count} of 100 simulations failed ({count} %)" in each.text for each in named)
 

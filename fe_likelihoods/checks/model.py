@@ -1,7 +1,8 @@
-"""Checks of a model at a fit: does it read its motion, and are step and mesh fine enough for its data?
+"""Checks of a model: does it repeat itself and read its motion, and are step and mesh fine enough for its data?
 
-At a fit, the response r changes by d with half the step. With the derivatives J of the response by the parameters, each
-in units of its posterior standard deviation, and the weights W = 1 / sigma^2 of the residuals, ::
+Before a run, `check_model` simulates a few times what a run would simulate thousands of times. At a fit, the response
+changes by d with half the step. With the derivatives J of the response by the parameters, each in units of its
+posterior standard deviation, and the weights W = 1 / sigma^2 of the residuals, ::
 
     delta = (J^T W J + P)^-1 J^T W d
 
@@ -18,24 +19,23 @@ import numpy as np
 from ..likelihood.posterior import Posterior
 from ..signals.events import motions_of
 from ..signals.records import Record
-from ..simulation.model import SimulationBatch
+from ..simulation.model import SimulationBatch, simulate_batch
 from .finding import CARE, WRONG, Finding
 
 __all__ = [
     "LARGE_SHIFT",
-    "NOTHING",
     "NO_STEP",
+    "STEP",
     "StepTest",
+    "check_chance",
     "check_same_response",
     "check_stronger_motion",
-    "has_steps",
-    "motions_to_replace",
-    "not_tested",
-    "relative_difference",
-    "simulations_of_the_test",
     "halve_steps",
     "halved",
-    "under",
+    "has_steps",
+    "motions_to_replace",
+    "refuse_chance",
+    "relative_difference",
 ]
 
 # Shift of a parameter by half a step, in standard deviations, that limits a result: the mean square of its error is
@@ -45,7 +45,7 @@ __all__ = [
 SHIFT, LARGE_SHIFT = 0.5, 2.0
 NOTHING = 1e-6  # difference of two responses, relative to their norm, well above the round-off of a long response
 STEP, MESH = "Time step", "Mesh"
-NO_STEP = {STEP: "the model takes neither a motion nor a step that could be halved"}
+NO_STEP = "the model takes neither a motion nor a step that could be halved"
 
 Simulate = Callable[[Any, np.ndarray], SimulationBatch]
 """Simulates a model at points (n, n_parameters)."""
@@ -56,11 +56,6 @@ class StepTest(NamedTuple):
 
     findings: list[Finding]
     tests: dict[str, str]
-
-
-def not_tested(likelihood: Any, why: str) -> StepTest:
-    """No test of step and mesh, and the reason; nothing where the data have no steps."""
-    return StepTest([], {STEP: f"not tested: {why}"} if has_steps(likelihood) else {})
 
 
 def has_steps(likelihood: Any) -> bool:
@@ -74,28 +69,40 @@ def halve_steps(posterior: Posterior, point: np.ndarray, sd: np.ndarray, simulat
     ``simulate(model, points)`` returns a `SimulationBatch`. A model that fails with half a step, or whose response does
     not change, keeps a step of its own, which is not tested.
     """
-    if not has_steps(posterior.likelihood):
-        return StepTest([], {})
-    prior_sd = np.array([row[3] for row in posterior.prior.table()[1]])
-    parts, changes, left = [], {}, NO_STEP
+    widths = sd / np.array([row[3] for row in posterior.prior.table()[1]])
+    precision = np.diag(np.square(np.where(np.isfinite(widths), widths, 0.0)))
+    pulls, squares, tests = dict[str, np.ndarray](), dict[str, np.ndarray](), {STEP: f"not tested: {NO_STEP}"}
     for likelihood, columns in posterior.likelihood.parts():
-        n = len(likelihood.model.parameter_names)
-        theta, at = point[columns], columns[:n]
-        batch = simulate(likelihood.model, theta[:n] + np.vstack([np.zeros(n), np.diag(sd[at])]))
+        model, n = likelihood.model, len(likelihood.model.parameter_names)
+        theta, at = point[columns][:n], columns[:n]
+        batch = simulate(model, theta + np.vstack([np.zeros(n), np.diag(sd[at])]))
         if reason := next(filter(None, batch.reasons), ""):
-            return not_tested(posterior.likelihood, f"a simulation failed ({reason})")
+            return StepTest([], {STEP: f"not tested: a simulation failed ({reason})"})
         response, slopes = batch.response[0], batch.response[1:] - batch.response[0]
-        residuals = likelihood.residuals_of(response)
-        parts.append((at, response, slopes, np.sqrt(np.nanmean(np.square(residuals), axis=1))))
-        for name, what, change, why in halved(likelihood.model, theta[:n], response, simulate):
-            left = {key: each for key, each in left.items() if key != name} | ({name: why} if why else {})
+        sigma = np.sqrt(np.nanmean(np.square(likelihood.residuals_of(response)), axis=1))
+        used = sigma > 0.0
+        jacobian = (slopes[:, used] / sigma[used, None]).reshape(n, -1)
+        precision[np.ix_(at, at)] += jacobian @ jacobian.T
+        for name, what, change, why in halved(model, theta, response, simulate):
+            tests[name] = f"not tested: {why}" if why else f"{what} was halved at the fit"
             if change is not None:
-                changes.setdefault((name, what), {})[len(parts) - 1] = change
+                pull = pulls.setdefault(what, np.zeros(len(sd)))
+                pull[at] += jacobian @ (change[used] / sigma[used, None]).ravel()
+                size = np.square(change).sum(), np.square(response).sum()
+                squares[what] = squares.get(what, np.zeros(2)) + size
     found = []
-    for (_, what), change in changes.items():
-        found += _compare(what, change, parts, sd, prior_sd, posterior.parameter_names)
-    tested = {name: f"{what} was halved at the fit" for name, what in changes}
-    return StepTest(found, tested | {name: f"not tested: {why}" for name, why in left.items()})
+    for what, pull in pulls.items():
+        shift = np.abs(np.linalg.lstsq(precision, pull)[0])
+        numbers = {posterior.parameter_names[i]: float(shift[i]) for i in np.flatnonzero(shift >= SHIFT)}
+        moves = ", ".join(f"{name} by {by:.2g}" for name, by in numbers.items())
+        change = 100.0 * np.sqrt(squares[what][0] / squares[what][1])
+        text = (
+            f"Half of {what} changes the response by {change:.2g} %, which moves {moves} posterior standard deviations."
+        )
+        severity, action = WRONG if (shift > LARGE_SHIFT).any() else CARE, f"Halve {what} until this is small."
+        title = "The model is too coarse for its data"
+        found += [Finding(title, severity, text, action, numbers, "fit")] if numbers else []
+    return StepTest(found, tests)
 
 
 def halved(
@@ -120,7 +127,7 @@ def check_stronger_motion(model: Any, theta: np.ndarray, response: np.ndarray, s
     """
     if not motions_to_replace(model):
         return []
-    batch = simulate(under(model, lambda each: each.scale(2.0)), theta[None])
+    batch = simulate(_under(model, lambda each: each.scale(2.0)), theta[None])
     if batch.reasons[0]:
         text = f"Under twice the base motion the simulation fails: {batch.reasons[0]}."
         return [Finding("A stronger motion fails", CARE, text, "Predictions of stronger events may fail as well.")]
@@ -136,16 +143,34 @@ def check_same_response(difference: float | None, motion: str = "this motion") -
     return [Finding("The motion changes nothing", WRONG, text, action, {"difference": difference}, "input")]
 
 
+def check_chance(response: np.ndarray, later: SimulationBatch) -> list[Finding]:
+    """Whether later simulations of the same parameters give the same response."""
+    text = ""
+    for again, reason in zip(later.response, later.reasons, strict=True):
+        share = np.inf if reason else relative_difference(again - response, response)
+        if reason:
+            text = f"The first simulation at the mean of the prior succeeded, a later one failed: {reason}."
+        elif share > NOTHING:
+            text = f"Two simulations of the same parameters differ by {100.0 * share:.2g} %: no sampler converges."
+    action = "Set the seeds of the model, give each simulation a folder of its own, read no results of earlier runs."
+    return [Finding("The model is not repeatable", WRONG, text, action, about="input")] if text else []
+
+
+def refuse_chance(posterior: Posterior) -> None:
+    """Simulate the mean of the prior again; ValueError if the responses differ. A failed simulation is no such case."""
+    mean = posterior.prior.mean()
+    for likelihood, columns in posterior.likelihood.parts():
+        theta = mean[columns][: len(likelihood.model.parameter_names)]
+        first = likelihood.simulate(theta[None])
+        later = simulate_batch(likelihood.model, np.tile(theta, (2, 1)), likelihood.simulator.pool)
+        for finding in () if any((*first.reasons, *later.reasons)) else check_chance(first.response[0], later):
+            raise ValueError(str(finding))
+
+
 def relative_difference(difference: np.ndarray, reference: np.ndarray) -> float:
     """Norm of a difference, relative to the norm of a reference [-]."""
     norm = float(np.linalg.norm(reference))
     return float(np.linalg.norm(difference)) / norm if norm > 0.0 else float(np.any(difference))
-
-
-def simulations_of_the_test(posterior: Posterior) -> int:
-    """Number of simulations that `halve_steps` makes."""
-    models = [likelihood.model for likelihood, _ in posterior.likelihood.parts()]
-    return sum(1 + len(model.parameter_names) + len(list(_finer(model))) for model in models)
 
 
 def motions_to_replace(model: Any) -> tuple[Record, ...]:
@@ -156,7 +181,7 @@ def motions_to_replace(model: Any) -> tuple[Record, ...]:
     return found if supports and len(found) == len(supports) else found[:1]
 
 
-def under(model: Any, change: Callable[[Record], Record]) -> Any:
+def _under(model: Any, change: Callable[[Record], Record]) -> Any:
     """The model under its motions, each of which is changed."""
     motions = tuple(change(each) for each in motions_to_replace(model))
     vertical = getattr(model, "vertical", None)
@@ -173,35 +198,8 @@ def _finer(model: Any) -> Iterator[tuple[str, str, Any, int]]:
     elif "step" in names and hasattr(model, "integration_step"):
         yield "the integration step", STEP, replace(model, step=0.5 * model.integration_step), 1
     elif motions_to_replace(model):
-        finer = under(model, lambda each: each.resample(0.5 * each.dt))
+        finer = _under(model, lambda each: each.resample(0.5 * each.dt))
         if (finer.n_steps - 1) == 2 * (model.n_steps - 1):
             yield "the time step", STEP, finer, 2
     if "mesh" in names and isinstance(model.mesh, int):
         yield "the fibers of the section", MESH, replace(model, mesh=2 * model.mesh), 1
-
-
-def _compare(
-    what: str, change: dict[int, np.ndarray], parts: list, sd: np.ndarray, prior_sd: np.ndarray, names: tuple[str, ...]
-) -> list[Finding]:
-    """The finding about one refinement, whose changes of the response are given by data set; none if it is small."""
-    ndim = len(sd)
-    widths = sd / prior_sd
-    precision = np.diag(np.square(np.where(np.isfinite(widths), widths, 0.0)))
-    pull, squares = np.zeros(ndim), np.zeros(2)
-    for i, (at, response, slopes, sigma) in enumerate(parts):
-        used = sigma > 0.0
-        jacobian = (slopes[:, used] / sigma[used, None]).reshape(len(slopes), -1)
-        precision[np.ix_(at, at)] += jacobian @ jacobian.T
-        if i in change:
-            pull[at] += jacobian @ (change[i][used] / sigma[used, None]).ravel()
-            squares += np.square(change[i]).sum(), np.square(response).sum()
-    shift = np.abs(np.linalg.lstsq(precision, pull)[0])
-    numbers = {names[i]: float(shift[i]) for i in np.flatnonzero(shift >= SHIFT)}
-    if not numbers:
-        return []
-    moves = ", ".join(f"{name} by {by:.2g}" for name, by in numbers.items())
-    change = 100.0 * np.sqrt(squares[0] / squares[1])
-    text = f"Half of {what} changes the response by {change:.2g} %, which moves {moves} posterior standard deviations."
-    severity = WRONG if (shift > LARGE_SHIFT).any() else CARE
-    action = f"Halve {what} until this is small."
-    return [Finding("The model is too coarse for its data", severity, text, action, numbers, "fit")]
