@@ -20,13 +20,13 @@ RESEMBLES = HALF  # MAC; one shape cannot have more than this with two orthogona
 
 def check_modes(fit: Any) -> list[Finding]:
     """What a `ModalFit` shows: faults at draws of the prior, and stated errors at samples of the posterior, if any."""
-    found = about("data", _check_sets(fit.likelihood.model.data))
+    found, strange = _check_sets(fit.likelihood.model.data), [] if fit.draws is None else _check_shapes(fit.draws)
     if fit.draws is not None:
-        found += about("data", _check_shapes(fit.draws))
         changes = find_changes_of_modes(fit.draws, fit.deviations)
         # a mode that the model lacks has no value that could be expected
-        found += [finding_of(each, fit.title) for each in changes if each.kind != "value" or not found]
-        found += [] if found else about("data", _check_reach(fit.draws))
+        strange += [finding_of(each, fit.title) for each in changes if each.kind != "value" or not strange]
+        strange = strange or _check_reach(fit.draws)
+    found = about("data", found + strange)
     if any(each.severity == WRONG for each in found) or fit.samples is None:
         return found
     return found + _check_errors(fit) + ([] if fit.held_out is None else _check_held_out(fit.held_out))

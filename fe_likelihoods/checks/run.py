@@ -6,6 +6,7 @@ them; what is missing is empty or NaN here, and the report leaves it out.
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -114,15 +115,18 @@ def read_run(
         )
     posterior = getattr(sampler.log_prob_fn, "f", None) if posterior is None else posterior
     samples = sampler.get_chain(flat=True, discard=discard)
-    parameters = _parameters(sampler, posterior, names)
+    described = getattr(posterior, "parameters", None) if names is None else None
+    known = names or getattr(posterior, "parameter_names", None) or [f"x{i}" for i in range(samples.shape[1])]
+    parameters = tuple(Parameter(str(name)) for name in known) if described is None else tuple(described)
     if len(parameters) != samples.shape[1]:
         raise ValueError(
             f"the chain has {samples.shape[1]} parameters, but the posterior or names= has {len(parameters)} "
             f"({', '.join(each.name for each in parameters)}): give the posterior that was sampled"
         )
-    tempered = hasattr(sampler, "ladder") and bool(sampler.ladder)
-    autocorrelation = np.nan if tempered else _autocorrelation_time(sampler, discard)
-    mean_error, sd_error, size = _errors(sampler, samples, tempered, autocorrelation, discard)
+    tempered, verdict = hasattr(sampler, "ladder") and bool(sampler.ladder), None
+    with suppress(ValueError):  # a file may hold no verdict
+        verdict = sampler.verdict if tempered else None
+    mean_error, sd_error, size, autocorrelation = _errors(sampler, samples, tempered, discard)
     likelihood, prior = getattr(posterior, "likelihood", None), getattr(posterior, "prior", None)
     return FinishedRun(
         sampler=sampler,
@@ -138,34 +142,10 @@ def read_run(
         truth=_truth(truth, [each.name for each in parameters]),
         discard=discard,
         tempered=tempered,
-        verdict=_verdict(sampler) if tempered else None,
+        verdict=verdict,
         check=sampler.log_evidence_check if tempered else None,
         autocorrelation_time=autocorrelation,
     )
-
-
-def _parameters(sampler: EnsembleSampler, posterior: Any, names: Sequence[str] | None) -> tuple[Parameter, ...]:
-    if (described := getattr(posterior, "parameters", None)) is not None and names is None:
-        return tuple(described)
-    known = names or getattr(posterior, "parameter_names", None) or _names_of(sampler)
-    return tuple(Parameter(str(name)) for name in known)
-
-
-def _names_of(sampler: EnsembleSampler) -> list[str]:
-    """Names that emcee's sampler was given, x0, x1, ... by default."""
-    names = [f"x{i}" for i in range(sampler.ndim)]
-    for name, places in (sampler.parameter_names if sampler.params_are_named else {}).items():
-        for k, place in enumerate(np.atleast_1d(places)):
-            names[place] = name if np.ndim(places) == 0 else f"{name}_{k}"
-    return names
-
-
-def _verdict(sampler: EnsembleSampler) -> Verdict | None:
-    """The verdict; None for a chain whose file has none."""
-    try:
-        return sampler.verdict
-    except ValueError:
-        return None
 
 
 def _truth(truth: Mapping[str, float] | Sequence[float] | None, names: Sequence[str]) -> np.ndarray:
@@ -177,29 +157,25 @@ def _truth(truth: Mapping[str, float] | Sequence[float] | None, names: Sequence[
     return np.array([float(known.get(name, np.nan)) for name in names])
 
 
-def _autocorrelation_time(sampler: EnsembleSampler, discard: int) -> float:
-    """Largest integrated autocorrelation time [iterations]; NaN where the chain is too short for any estimate."""
-    with np.errstate(all="ignore"):
-        times = sampler.get_autocorr_time(discard=discard, tol=0)
-    return float(np.max(times)) if np.isfinite(times).all() else np.nan
-
-
 def _errors(
-    sampler: EnsembleSampler, samples: np.ndarray, tempered: bool, autocorrelation: float, discard: int
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Standard errors of means and standard deviations (ndim,), and the effective sample size of the worst parameter.
+    sampler: EnsembleSampler, samples: np.ndarray, tempered: bool, discard: int
+) -> tuple[np.ndarray, np.ndarray, float, float]:
+    """Errors of means and standard deviations (ndim,), effective sample size of the worst parameter, autocorrelation.
 
-    For emcee's own sampler, those of as many independent draws.
+    For emcee's own sampler, those of as many independent draws; its largest integrated autocorrelation time
+    [iterations] is NaN where the chain is too short for any estimate.
     """
     spread = samples.std(axis=0)
     if tempered:
         error = sampler.mean_error(discard=discard)
         size = float(np.min((spread[error > 0.0] / error[error > 0.0]) ** 2, initial=len(samples)))
-        return error, sampler.sd_error(discard=discard), size
-    iterations = sampler.iteration - discard
-    size = min(iterations * sampler.nwalkers / autocorrelation, float(len(samples)))  # min keeps a first NaN
+        return error, sampler.sd_error(discard=discard), size, np.nan
+    with np.errstate(all="ignore"):
+        time = float(np.max(sampler.get_autocorr_time(discard=discard, tol=0)))  # NaN if one is
+    size = min((sampler.iteration - discard) * sampler.nwalkers / time, float(len(samples)))  # min keeps a first NaN
     of_variance = np.square(samples - samples.mean(axis=0)).std(axis=0)
-    return spread / np.sqrt(size), 0.5 * of_variance / np.where(spread > 0.0, spread, 1.0) / np.sqrt(size), float(size)
+    sd_error = 0.5 * of_variance / np.where(spread > 0.0, spread, 1.0) / np.sqrt(size)
+    return spread / np.sqrt(size), sd_error, float(size), time if np.isfinite(time) else np.nan
 
 
 class Moments(NamedTuple):
@@ -316,46 +292,34 @@ def failures(run: FinishedRun) -> Failures:
 
     They are counted in the likelihoods, with the first parts of the record that a guide simulates, or in the sampler.
     """
-    rows, count, attempts, near, unknown = list[Failure](), 0, 0, [NearFailures(0, 0)], ""
+    reasons, known, attempts, near, unknown = Counter(), list[tuple[str, dict]](), 0, [NearFailures(0, 0)], ""
     for likelihood, columns in [] if run.likelihood is None else run.likelihood.parts():
         names, logs = likelihood.model.parameter_names, [each.simulator for each in (likelihood, *likelihood.shortened)]
-        records = [record for each in logs for record in each.failures.records]
-        failed = np.array([list(record["parameters"].values()) for record in records]).reshape(-1, len(names))
-        succeeded = logs[0].memory_cache.successes(len(names))
-        near.append(failures_near(run.samples[:, columns[: len(names)]], failed, succeeded))
-        counts = sum((each.failures.reasons for each in logs), Counter())
-        rows += _by_reason(counts, [(record["reason"], record["parameters"]) for record in records])
-        count, attempts = count + counts.total(), attempts + sum(each.failures.outcomes for each in logs)
-        if logs[0].failures.outcomes < len(np.unique(run.samples[:, columns[: len(names)]], axis=0)):
+        records = [(each["reason"], each["parameters"]) for log in logs for each in log.failures.records]
+        failed = np.array([list(point.values()) for _, point in records]).reshape(-1, len(names))
+        samples = run.samples[:, columns[: len(names)]]
+        near.append(failures_near(samples, failed, logs[0].memory_cache.successes(len(names))))
+        known, reasons = known + records, sum((each.failures.reasons for each in logs), reasons)
+        attempts += sum(each.failures.outcomes for each in logs)
+        if logs[0].failures.outcomes < len(np.unique(samples, axis=0)):
             unknown = "Not known: simulations of this run were made in another process, or are no longer in memory."
+    count = reasons.total()
     if run.likelihood is None and not run.tempered:
         unknown = "Not known: neither the sampler nor the log-density counts failures."
     elif run.likelihood is None:
         known = [
             (each["reason"], dict(zip(run.names, each["parameters"], strict=True))) for each in run.sampler.failures
         ]
-        rows = _by_reason(Counter(reason for reason, _ in known), known)
-        count, attempts = run.sampler.failure_count, run.sampler.evaluations
-        unknown = (
-            "No evaluation raised an error or returned NaN; whether -inf stands for a failed simulation is not known."
-        )
-    judged = None if run.verdict is None else run.verdict.near_failures
-    return Failures(
-        tuple(sorted(rows, key=lambda each: -each.count)),
-        count,
-        max(attempts, count),
-        unknown,
-        max(near, key=lambda each: each.failed) if judged is None else judged,
-    )
-
-
-def _by_reason(counts: Counter, known: Sequence[tuple[str, Mapping[str, float]]]) -> list[Failure]:
-    """Failures of one model; reasons that differ in their numbers only are one."""
-    found, examples = Counter(), dict[str, str]()
-    for text, count in counts.items():
-        found[reason_without_numbers(text)] += count
+        reasons, count = Counter(reason for reason, _ in known), run.sampler.failure_count
+        attempts, unknown = run.sampler.evaluations, "Not known: whether a log-density of -inf is a failed simulation."
+    rows, examples = Counter(), dict[str, str]()  # reasons that differ in their numbers only are one
     for text, point in known:
         shown = ", ".join(f"{name} = {value:.4g}" for name, value in point.items())
         reason = reason_without_numbers(text)
         examples.setdefault(reason, shown if text == reason else f"{text}: {shown}")
-    return [Failure(reason, count, examples.get(reason, "")) for reason, count in found.items()]
+    for text, each in reasons.items():
+        rows[reason_without_numbers(text)] += each
+    table = tuple(Failure(reason, each, examples.get(reason, "")) for reason, each in rows.most_common())
+    judged = None if run.verdict is None else run.verdict.near_failures
+    judged = max(near, key=lambda each: each.failed) if judged is None else judged
+    return Failures(table, count, max(attempts, count), unknown, judged)

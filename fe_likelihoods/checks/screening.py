@@ -60,24 +60,24 @@ def check_data(measurements: Measurements, record: Record | Sequence[Record] | N
     care A size is not plausible: The peak of channel displacement is ...
     """
     motions = record if isinstance(record, list | tuple) else [] if record is None else [record]
-    peaks = [(f"motion {each.name}", "motion", float(np.abs(each.acceleration).max())) for each in motions]
+    sizes = [(f"motion {each.name}", "motion", each.acceleration) for each in motions]
+    found, silent = [], []
     for channel, values in zip(measurements.channels, measurements.values, strict=True):
-        if np.isfinite(values).any():
-            peaks.append((f"channel {channel.name}", channel.dimension, float(np.nanmax(np.abs(values)))))
-    found = [each for peak in peaks for each in _check_size(*peak)]
+        known = values[np.isfinite(values)]
+        sizes += [(f"channel {channel.name}", channel.dimension, known)] if len(known) else []
+        equal = len(known) > 1 and np.ptp(known) == 0.0  # of data without time, zeros alone are no sign of life
+        silent += [channel.name] if equal and (measurements.is_history or known[0] == 0.0) else []
+    for name, kind, values in sizes:
+        peak, (largest, unit) = float(np.abs(values).max()), LARGEST_PEAKS.get(kind, (np.inf, ""))
+        if unit and (shown := from_si(peak, unit).item()) > largest:
+            text = f"The peak of {name} is {shown:.3g} {unit}."
+            action = "Check the unit of its file. A number without a unit is in SI units (m, m/s²)."
+            found.append(Finding("A size is not plausible", CARE, text, action, {"peak": peak}))
     found += check_sensors(screen(measurements))
     for each in (part for motion in motions for part in getattr(motion, "records", (motion,))):
         found += check_sensors(screen_motion(each))
-    silent = []  # of data without time, zeros alone
-    for channel, values in zip(measurements.channels, measurements.values, strict=True):
-        known = values[np.isfinite(values)]
-        equal = len(known) > 1 and np.ptp(known) == 0.0
-        silent += [channel.name] if equal and (measurements.is_history or known[0] == 0.0) else []
     if silent:
-        text, action = (
-            f"All samples of {', '.join(silent)} are equal.",
-            "Leave the channel out, or read another column.",
-        )
+        text, action = f"All samples of {', '.join(silent)} are equal.", "Leave it out, or read another column."
         found.append(Finding("A sensor was silent", CARE, text, action))
     if "synthetic" in measurements.description.lower():
         text = "The measurements were computed with a model, not measured."
@@ -154,19 +154,13 @@ def _key(name: str) -> str:
     return name if re.fullmatch(r"[\w-]+", name, re.ASCII) else json.dumps(name, ensure_ascii=False)
 
 
-_FAULTS = {
-    "clipped": (
-        "A sensor is clipped",
-        "{name} has exactly its largest or smallest value for several samples in a row, {when}.",
-    ),
-    "stuck": ("A sensor was stuck", "{name} stands still {when}, while it moves before and after."),
-    "spikes": ("A channel has spikes", "{name} has spikes of one to three samples {when}."),
-    "offset": ("A channel has an offset", "{name} has the same mean in all its parts, about {level}."),
-    "drift": ("A channel drifts", "{name} has a mean that changes steadily, from {level}."),
-    "noise": (
-        "A channel is mostly noise",
-        "{name} has samples that hardly depend on each other (correlation {size:.2f}).",
-    ),
+FAULTS = {
+    "clipped": ("A sensor is clipped", "has its largest or smallest value for several samples in a row, {when}."),
+    "stuck": ("A sensor was stuck", "stands still {when}, while it moves before and after."),
+    "spikes": ("A channel has spikes", "has spikes of one to three samples {when}."),
+    "offset": ("A channel has an offset", "has the same mean in all its parts, about {level}."),
+    "drift": ("A channel drifts", "has a mean that changes steadily, from {level}."),
+    "noise": ("A channel is mostly noise", "has samples that hardly depend on each other (correlation {size:.2f})."),
 }
 
 
@@ -178,35 +172,19 @@ def check_sensors(channels: Sequence[Screened]) -> list[Finding]:
         places = [first if first == last else f"{first} to {last}" for first, last in only.missing()]
         more = f" and at {len(places) - MOST_PLACES} more" if len(places) > MOST_PLACES else ""
         level = " to ".join(f"{value:.3g}" for value in fault.level[:: max(len(fault.level) - 1, 1)])
-        kind, text = _FAULTS[fault.kind]
-        text = text.format(
-            name=f"The motion {channel.name}" if channel.is_motion else channel.name,
-            when=f"at {', '.join(places[:MOST_PLACES])} s{more}",
-            level=f"{level} {channel.unit}".rstrip(),
-            size=fault.size,
-        )
+        words = {"when": f"at {', '.join(places[:MOST_PLACES])} s{more}", "level": f"{level} {channel.unit}".rstrip()}
+        kind, text = FAULTS[fault.kind]
+        text = text.format(size=fault.size, **words)
         action = "Check the file, or take another record of the motion: a motion needs all samples."
         if not channel.is_motion:
+            do = "Subtract it, unless the structure did move so" if fault.level else "Leave these samples out"
             line = repair_lines([only])[0].removeprefix("# ")
-            action = f"Leave these samples out; in [measurements] of a TOML file: {line}."
-            if fault.level:
-                action = f"Subtract it, unless the structure did move so; in [measurements] of a TOML file: {line}."
-            elif fault.kind == "noise":
-                action = f"{line[0].upper()}{line[1:]}."
+            action = f"{do}; in [measurements] of a TOML file: {line}."
+            action = f"{line[0].upper()}{line[1:]}." if fault.kind == "noise" else action
+        name = f"The motion {channel.name}" if channel.is_motion else channel.name
         severity = NOTE if fault.kind == "noise" else CARE
-        found.append(Finding(kind, severity, text, action, {channel.name: float(fault.size)}))
+        found.append(Finding(kind, severity, f"{name} {text}", action, {channel.name: float(fault.size)}))
     return found
-
-
-def _check_size(name: str, kind: str, peak: float) -> list[Finding]:
-    """A peak [SI] whose size is not plausible; `kind` is "motion" or the dimension of a channel."""
-    largest, unit = LARGEST_PEAKS.get(kind, (np.inf, ""))
-    shown = from_si(peak, unit).item() if unit else 0.0
-    if shown <= largest:
-        return []
-    text = f"The peak of {name} is {shown:.3g} {unit}."
-    action = "Check the unit of its file. A number without a unit is in SI units (m, m/s²)."
-    return [Finding("A size is not plausible", CARE, text, action, {"peak": peak})]
 
 
 def check_gaps(noise: Any) -> list[Finding]:

@@ -1,26 +1,19 @@
 """Findings about predictions, populations of stored posteriors and compared stiffnesses, from numbers."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
-from ..signals.channels import Channel
-from ..units import DIMENSIONS, to_si
-from .finding import CARE, SMALL_PROBABILITY, Finding
+from .finding import CARE, Finding
 
 __all__ = [
     "check_bandwidth",
-    "check_failed_samples",
     "check_final_values",
-    "check_impossible_draws",
-    "check_laplace",
     "check_most",
-    "check_new_test",
     "check_normal",
     "check_peaks",
     "check_reweighting",
-    "check_unit_of_threshold",
 ]
 
 # of a predicted peak to the calibrated ones: named in 1 of 100 right runs, and in 96 of 100 at three times the strength
@@ -90,36 +83,6 @@ def check_final_values(ends: Mapping[str, Sequence[float]]) -> list[Finding]:
     return [Finding("A final value still moves", CARE, text, action, numbers)] if numbers else []
 
 
-def check_failed_samples(reasons: Mapping[str, int], nothing: str = "") -> list[Finding]:
-    """Samples that failed and were left out, by reason; or why there is no prediction at all."""
-    if nothing:
-        return [Finding("No prediction", CARE, f"All simulations failed: {nothing}.")]
-    known = "; ".join(f"{count}: {reason}" for reason, count in reasons.items())
-    text = f"{sum(reasons.values())} samples failed and are left out ({known})."
-    return [Finding("Samples failed", CARE, text)] if reasons else []
-
-
-def check_unit_of_threshold(limits: np.ndarray, values: np.ndarray, channel: Channel) -> list[Finding]:
-    """Thresholds that are beside all values [SI], and among them in the unit of the channel."""
-    shown, values = np.asarray(to_si(limits, channel.unit, channel.dimension)), np.abs(values)
-    inside = (shown >= values.min()) & (shown <= values.max())
-    text = (
-        f"The threshold {limits.flat[0]:g} is in SI units, {DIMENSIONS[channel.dimension]}, and beside all predicted "
-        f"values (up to {values.max():.3g}): is it in {channel.unit}?"
-    )
-    found = [Finding("A threshold may have another unit", CARE, text, f'Then pass unit="{channel.unit}".')]
-    return found if np.all(inside & ((limits < values.min()) | (limits > values.max()))) else []
-
-
-def check_impossible_draws(possible: np.ndarray) -> list[Finding]:
-    """Draws (n,) bool of a new event whose noise is impossible, and which are left out."""
-    share = 1.0 - float(np.mean(possible))
-    text = f"{share:.0%} of the draws have an impossible noise, a share of the signal of 1 or more, and are left out."
-    action = "Use level='response', or a narrower prior of the spread of shares between events."
-    found = [Finding("Impossible draws", CARE, text, action, {"share": share})]
-    return found if share > SMALL_PROBABILITY else []
-
-
 def check_reweighting(tests: Mapping[str, _Reweighted], error: float, parameters: Sequence[str]) -> list[Finding]:
     """Whether the stored samples of each test suffice; `error` is the largest error of a mean [posterior sd]."""
     found = []
@@ -138,27 +101,6 @@ def check_reweighting(tests: Mapping[str, _Reweighted], error: float, parameters
         action = "Give more samples of this test, or draw fresh samples with the population as its prior."
         found.append(Finding("Too few samples of a test", CARE, text, action, {"error": error}))
     return found
-
-
-def check_new_test(outside: Mapping[str, float], share: float) -> list[Finding]:
-    """Draws of a new test outside of the bounds of the tests' priors, by parameter, and the share of all such draws."""
-    named = ", ".join(f"{name} {each:.1%}" for name, each in outside.items() if each > 0.0)
-    text = f"{share:.0%} of the draws of a new test are outside the bounds of the priors of the tests ({named})."
-    action = "Use scale='log' of Varying for positive parameters, a narrower prior of the spread, or wider bounds."
-    found = [Finding("Draws beyond the bounds of the tests", CARE, text, action, outside)]
-    return found if share > SMALL_PROBABILITY else []
-
-
-def check_laplace(search: Any) -> list[Finding]:
-    """Whether a search for modes (`ModeSearch`) says that its highest one is the posterior."""
-    ends = sum(end == 0 for end in search.ends)
-    faults = [
-        (not search.finished, "The limit of simulations ended the search for modes.", "Use a larger limit."),
-        (not search.modes[0].converged, "The search ended before the top of the mode.", "Use more starts."),
-        (len(search.modes) > 1, f"The search found {len(search.modes)} modes; the highest is used.", "Sample instead."),
-        (ends < 2, f"Only one of {len(search.ends)} starts led to the mode.", "Use more starts."),
-    ]
-    return [Finding("The mode may not be the posterior", CARE, text, action) for said, text, action in faults if said]
 
 
 def check_normal(skewness: np.ndarray, kurtosis: np.ndarray) -> list[Finding]:

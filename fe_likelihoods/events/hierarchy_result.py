@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from ..checks.finding import labelled, warn
-from ..checks.transfer import check_new_test
 from ..priors.distributions import RandomState, as_generator
 from ..priors.points import as_points, complete_repr
 from ..text_tables import number, text_table
@@ -154,12 +153,6 @@ class Hierarchy:
         center[:, :varying] += sd * generator.standard_normal((n, varying))
         draws = posterior.scales.from_scale(center)
         own = [*posterior.varying, *posterior.common]
-        outside = np.zeros(draws.shape, dtype=bool)
-        for each in posterior.described.values():
-            low, high = each.prior.bounds.T
-            outside |= (draws < low) | (draws > high)
-        shares = dict(zip(own, outside.mean(axis=0).tolist(), strict=True))
-        warn(check_new_test(shares, float(outside.any(axis=1).mean())))
         found = dict(zip(own, draws.T, strict=True))
         for name in () if names is None else [name for name in names if name not in own]:
             found[name] = self._prior_draws(name, n, generator)

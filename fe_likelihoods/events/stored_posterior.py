@@ -15,7 +15,6 @@ from samplers.estimates.weights import effective_sample_size
 from samplers.resampling import systematic
 
 from ..checks.finding import NOTE, Finding
-from ..checks.transfer import check_laplace
 from ..priors.distributions import TruncatedNormal
 from ..priors.mixture_prior import MixtureDistribution, fit_mixture
 from ..priors.points import as_points
@@ -154,14 +153,16 @@ class StoredPosterior:
         Raises
         ------
         ValueError
-            If the search found no mode.
+            If the search found no mode, several ones, or ended early.
         """
-        if not search.modes:
-            raise ValueError("the search found no mode: use more starts, or a larger limit of simulations")
+        if len(search.modes) != 1 or not search.finished or not search.modes[0].converged:
+            raise ValueError(
+                f"the search found {len(search.modes)} modes, or ended early: use more starts or a larger limit of "
+                "simulations, or sample the posterior"
+            )
         mode = search.modes[0]
         coords = np.random.default_rng(seed).multivariate_normal(mode.coords, mode.covariance, n, method="cholesky")
-        samples, findings = posterior.prior.from_normal(coords), check_laplace(search)
-        return cls(samples, posterior.prior, findings=findings, covariates=covariates or {})
+        return cls(posterior.prior.from_normal(coords), posterior.prior, covariates=covariates or {})
 
     def __post_init__(self) -> None:
         if not isinstance(self.prior, Prior):

@@ -19,8 +19,6 @@ from typing import Any
 
 import numpy as np
 
-from ..checks.finding import warn
-from ..checks.transfer import check_impossible_draws
 from ..events.hierarchy_result import Hierarchy
 from ..events.ratios import PRIOR_EVENTS, PRIOR_SD, EventRatios
 from ..events.scatter import REMAINDER, log_variance, remainder_variance, spread_rows
@@ -34,6 +32,8 @@ from .propagation import propagate
 from .quantities import ChannelQuantity, Quantity, evaluator, measured_quantity
 
 __all__ = ["event_ratios", "predict_new_event"]
+
+_IMPOSSIBLE = 0.05  # share of draws that may be left out: as much as a tail of a 90 % interval
 
 
 def event_ratios(
@@ -319,7 +319,11 @@ def _possible(draws: dict[str, np.ndarray], noise: Any) -> dict[str, np.ndarray]
         return draws
     deviations = noise.standard_deviations(np.stack([draws[name] for name in noise.parameter_names], axis=1))
     possible = (deviations > 0.0).all(axis=1)
-    warn(check_impossible_draws(possible), stacklevel=3)
+    if (share := 1.0 - possible.mean()) > _IMPOSSIBLE:
+        raise ValueError(
+            f"{share:.0%} of the draws have an impossible noise, a share of the signal of 1 or more: use "
+            "level='response', or a narrower prior of the spread of shares between events"
+        )
     return {name: values[possible] for name, values in draws.items()}
 
 

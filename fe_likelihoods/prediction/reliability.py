@@ -18,8 +18,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
-from ..checks.finding import warn
-from ..checks.transfer import check_unit_of_threshold
 from ..events.ratios import EventRatios
 from ..signals.channels import Channel
 from ..text_tables import number, text_table
@@ -214,7 +212,12 @@ def inputs(
     limits = _threshold_in_si(threshold, unit, channels)
     finite = values[np.isfinite(values)]
     if caller and unit is None and len({channel.unit for channel in channels}) == 1 and limits.size and finite.size:
-        warn(check_unit_of_threshold(limits, finite, channels[0]), stacklevel=3)
+        shown, (low, high) = (
+            to_si(limits, channels[0].unit, channels[0].dimension),
+            np.percentile(np.abs(finite), (0, 100)),
+        )
+        if np.all((low <= shown) & (shown <= high) & ((limits < low) | (limits > high))):
+            raise ValueError(f"the threshold {limits.flat[0]:g} has no unit: give unit=, such as {channels[0].unit!r}")
     if prediction is not None and prediction.ratios is not None:  # exact, not by the draws
         ratios, values = prediction.ratios, prediction.predicted[None]
     if ratios is not None and not (limits > 0.0).all():

@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..checks.finding import Finding
-from ..checks.transfer import check_failed_samples
 from ..prediction.prediction import Prediction
 from ..prediction.scores import HistoryScores, QuantityScores, central_interval, share_within
 from ..signals.channels import Measurements
@@ -90,19 +89,20 @@ def describe_event(
 ) -> OtherEvent:
     """Describe and score the predictions of an event, or the error that `propagate` raises if all simulations fail."""
     if isinstance(predictions, SimulationFailed):
-        found = tuple(check_failed_samples({}, predictions.reason))
-        return OtherEvent(name, {}, measured, (), (), (), "It could not be predicted.", found)
+        reason = f"It could not be predicted: all simulations failed: {predictions.reason}."
+        return OtherEvent(name, {}, measured, (), (), (), reason, ())
     findings = list(dict.fromkeys(found for each in predictions.values() for found in each.findings))
     first = next(iter(predictions.values()))
-    findings += check_failed_samples(first.failure_reasons if first.n_failed else {})
-    histories, values, numbers, told = [], [], [], ""
+    reasons = "; ".join(f"{count}: {reason}" for reason, count in first.failure_reasons.items())
+    told = f" {first.n_failed} samples failed and are left out ({reasons})." if first.n_failed else ""
+    histories, values, numbers = [], [], []
     for each in predictions.values():
         scores = None
         if measured is not None:
             try:
                 scores = each.score(measured, LEVEL)
             except ValueError as error:
-                told = f" No scores: {error}."
+                told += f" No scores: {error}."
         if scores is not None:
             (histories if each.dt is not None else values).append(scores)
         if each.dt is None and each.values is not None:

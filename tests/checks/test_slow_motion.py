@@ -64,7 +64,7 @@ def test_gain_and_lag_of_a_damped_deck_are_found_without_a_fit(seed, gain, steps
         found = slow_motion(values, draws, STEP)
         # draws and truth agree to a tenth
         assert np.sign(found.gain) == np.sign(gain) and abs(np.log(found.gain / gain)) < 0.2
-        assert abs(found.lag - STEP * steps) < 0.015
+        assert abs(found.lag - STEP * steps) < 0.02  # from 0.025 on it is named
         assert found.coherence > 0.9 and found.band[1] < 4.5
 
 
