@@ -87,29 +87,21 @@ class Fit:
         """Measured minus simulated (n_channels, n_samples) of the fit."""
         return None if self.after is None else self.measurements.values - self.after
 
-    @property
-    def responses(self) -> np.ndarray:
-        """The fit, if there is one, and the draws (n, n_channels, n_samples)."""
-        return self.draws if self.after is None else np.concatenate([self.after[None], self.draws])
-
     @cached_property
     def channels(self) -> tuple[ChannelFit, ...]:
         """The table of the fit; none of modes."""
-        if self.modal is not None:
-            return ()
-        measured, none = self.measurements.values, np.full(self.measurements.n_channels, np.nan)
-        counts = np.isfinite(measured).sum(axis=1)
-        assumed = counts if self.assumed is None else np.minimum(counts, self.assumed)
-        checks = none if self.white is None else [checks_of(each) for each in self.white]
-        before, after = (
-            none if each is None else relative_errors(measured - each, measured) for each in (self.before, self.after)
-        )
-        return tuple(
-            ChannelFit(channel, int(n), float(b), float(a), c if isinstance(c, ResidualChecks) else None, float(worth))
-            for channel, n, b, a, c, worth in zip(
-                self.measurements.channels, counts, before, after, checks, assumed, strict=True
+        found = []
+        for row, channel in enumerate(() if self.modal else self.measurements.channels):
+            measured = self.measurements.values[row]
+            n = int(np.isfinite(measured).sum())
+            before, after = (
+                np.nan if each is None else float(relative_errors(measured - each[row], measured))
+                for each in (self.before, self.after)
             )
-        )
+            checks = None if self.white is None else checks_of(self.white[row])
+            worth = n if self.assumed is None else min(n, float(self.assumed[row]))
+            found.append(ChannelFit(channel, n, before, after, checks, worth))
+        return tuple(found)
 
     def where(self, *names: str) -> str:
         """Names of channels, and the event that they are of."""
@@ -143,19 +135,19 @@ def data_sets_of(posterior: Any) -> list[tuple[str, FELikelihood, np.ndarray]]:
 def draws_to_compare(posterior: Posterior, seconds: float | None = None) -> np.ndarray:
     """Draws of the prior (n, ndim), always the same ones: 100, or fewer if these take longer than ten seconds.
 
-    A simulation takes `seconds`; by default the mean of those that the posterior has made, or else those of two draws.
+    A simulation takes `seconds`; by default the mean of those that the posterior has made, or else the second draw's.
     """
     try:
         draws = posterior.sample_prior(MOST_DRAWS, np.random.RandomState(1))
     except NotImplementedError:  # a prior without draws
         return np.empty((0, posterior.ndim))
-    if seconds is None:
-        for row in draws[:2] if not posterior.report()["simulations"] else ():  # the first one may compile
-            start = perf_counter()
-            posterior.likelihood.log_likelihood(row)
-            seconds = perf_counter() - start
-        report = posterior.report()
-        seconds = report["seconds"] / max(report["simulations"], 1) if seconds is None else seconds
+    report = posterior.report()
+    if seconds is None and report["simulations"]:
+        seconds = report["seconds"] / report["simulations"]
+    for row in draws[:2] if seconds is None else ():  # the first one may compile
+        start = perf_counter()
+        posterior.likelihood.log_likelihood(row)
+        seconds = perf_counter() - start
     return draws[: int(np.clip(SECONDS / max(seconds, 1e-6), FEWEST_DRAWS, MOST_DRAWS))]
 
 
@@ -174,9 +166,7 @@ def compare(
     """
     measured, n = likelihood.measurements, len(likelihood.model.parameter_names)
     if likelihood.is_modal:
-        return [
-            Fit(key, measured, np.empty((0, *measured.values.shape)), modal=_modes(key, likelihood, draws, samples))
-        ], {}
+        return [Fit(key, measured, np.empty(0), modal=_modes(key, likelihood, draws, samples))], {}
     found, failed = {}, {}
     for name, theta in (("before", start), ("after", point)):
         batch = None if theta is None else likelihood.simulate(theta[None, :n])
@@ -197,27 +187,14 @@ def compare(
         expected = _errors(likelihood, np.empty(0), np.median(draws, axis=0))[1]
     assumed = getattr(sampled_noise(likelihood.noise), "effective_samples", None)
     assumed = None if assumed is None else np.broadcast_to(assumed, measured.n_channels)
-    fits = []
+    fits, by_sample = [], found | {"draws": drawn, "white": white}
+    by_channel = {"assumed": assumed, "deviations": deviations, "expected": expected}
     for title, part, rows, inside in _events(likelihood, key):
-
-        def cut(values: np.ndarray | None, rows: np.ndarray = rows, inside: np.ndarray = inside) -> np.ndarray | None:
-            columns = inside[rows].any(axis=0)
-            return None if values is None else np.where(inside, values, np.nan)[..., rows, :][..., columns]
-
-        counts, errors, stated = (None if each is None else each[rows] for each in (assumed, deviations, expected))
-        of_event = {name: cut(each) for name, each in found.items()}
-        fits.append(
-            Fit(
-                title,
-                part,
-                cut(drawn),
-                white=cut(white),
-                assumed=counts,
-                deviations=errors,
-                expected=stated,
-                **of_event,
-            )
-        )
+        cut = {name: each[rows] for name, each in by_channel.items() if each is not None}
+        for name, each in by_sample.items():
+            if each is not None:
+                cut[name] = np.where(inside, each, np.nan)[..., rows, :][..., inside[rows].any(axis=0)]
+        fits.append(Fit(title, part, **cut))
     return fits, failed
 
 

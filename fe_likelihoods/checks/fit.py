@@ -42,6 +42,19 @@ PLACES = (
     "Check that it is the right column, its unit, sign and clock, and the place of the sensor in the model; if all "
     "of them are right, the model lacks what moves it."
 )
+MISSED = {
+    "The model does not follow the measurements": (
+        "The update leaves more than half of the power unexplained: the error (RRMSE) is {}; 71 % is half.",
+        PLACES,
+    ),
+    "A channel is hardly reproduced": ("After the update, the error (RRMSE) is still {}.", PLACES),
+    "The prior does not reach the measurements": (
+        "No draw of the prior comes near the measurements; the best one has an error (RRMSE) of {}.",
+        "Check model and priors. A model of your own must return SI units (m, m/s², N, Pa, rad), and zero in "
+        "[measurements] is the time at which the base motion begins.",
+    ),
+}
+"""Text and action for channels that are not reproduced."""
 
 
 def check_fit(posterior: Posterior, samples: Any = None) -> tuple[Finding, ...]:
@@ -158,48 +171,25 @@ def check_errors(fits: Sequence[Fit]) -> list[Finding]:
 
     Noise, white and normal, is in no model, and is no fault of a fit.
     """
-    useless, poor, far = {}, {}, {}
-    for fit in (each for each in fits if len(each.draws) or each.after is not None):
-        errors = relative_errors(
-            fit.measurements.values - (fit.draws if fit.after is None else fit.after[None]), fit.measurements.values
-        )
-        best = int(np.argmin(np.log(np.maximum(np.nan_to_num(errors), 1e-3)).sum(axis=1)))
-        for row, channel in enumerate(fit.measurements.channels):
-            error = {fit.where(channel.name): float(np.nan_to_num(errors[best, row]))}
-            (size,) = error.values()
-            if fit.after is None:
-                far |= error if size > EXPLAINED else {}
-            elif size > HALF:  # a quarter of its power is left
+    useless, poor, far = found = {}, {}, {}
+    for fit in fits:
+        measured, responses = fit.measurements.values, fit.draws if fit.after is None else fit.after[None]
+        errors = np.nan_to_num(relative_errors(measured - responses, measured))
+        best = errors[np.log(np.maximum(errors, 1e-3)).sum(axis=1).argmin()] if len(errors) else ()
+        for row, size in enumerate(best):
+            name = fit.where(fit.measurements.channels[row].name)
+            if fit.after is None and size > EXPLAINED:
+                far[name] = float(size)
+            elif fit.after is not None and size > HALF:  # a quarter of its power is left
                 checks = checks_of(fit.residuals[row])
                 if checks is not None and min(checks.white[0], checks.normal[0]) < SMALL_PROBABILITY:
-                    (useless if size**2 > HALF else poor).update(error)
-    kinds = [
-        (
-            useless,
-            "The model does not follow the measurements",
-            "The update leaves more than half of the power unexplained: the error (RRMSE) is {}; 71 % is half.",
-            PLACES,
-        ),
-        (poor, "A channel is hardly reproduced", "After the update, the error (RRMSE) is still {}.", PLACES),
-        (
-            far,
-            "The prior does not reach the measurements",
-            "No draw of the prior comes near the measurements; the best one has an error (RRMSE) of {}.",
-            "Check model and priors. A model of your own must return SI units (m, m/s², N, Pa, rad), and zero in "
-            "[measurements] is the time at which the base motion begins.",
-        ),
-    ]
-    return [
-        Finding(
-            kind,
-            WRONG if errors is useless else CARE,
-            text.format(listed([f"{percent(share)} in {name}" for name, share in errors.items()])),
-            action,
-            errors,
-        )
-        for errors, kind, text, action in kinds
-        if errors
-    ]
+                    (useless if size**2 > HALF else poor)[name] = float(size)
+    findings = []
+    for errors, (kind, (text, action)) in zip(found, MISSED.items(), strict=True):
+        shown = listed([f"{percent(size)} in {name}" for name, size in errors.items()]) if errors else ""
+        severity = WRONG if errors is useless else CARE
+        findings += [Finding(kind, severity, text.format(shown), action, errors)] if errors else []
+    return findings
 
 
 def edges(rows: Sequence[ParameterRow]) -> dict[str, tuple[str, float, float]]:
@@ -222,11 +212,9 @@ def limits_of_model(
         i, moved = names.index(name), np.array(point)
         moved[i] = beyond * parameters[i].factor
         for part, columns in likelihood.parts():
-            n = len(part.model.parameter_names)
-            if i in columns[:n]:  # not by the likelihood, which would count a failure
-                found |= {name} if simulate_batch(part.model, moved[None, columns[:n]]).reasons[0] else set()
-            elif i in columns:
-                found |= set() if part.possible(moved[None, columns])[0] else {name}
+            own = columns[: len(part.model.parameter_names)]  # not by the likelihood, which would count a failure
+            fails = i in own and simulate_batch(part.model, moved[None, own]).reasons[0]
+            found |= {name} if fails or not part.possible(moved[None, columns])[0] else set()
     return found
 
 

@@ -20,13 +20,14 @@ RESEMBLES = HALF  # MAC; one shape cannot have more than this with two orthogona
 
 def check_modes(fit: Any) -> list[Finding]:
     """What a `ModalFit` shows: faults at draws of the prior, and stated errors at samples of the posterior, if any."""
-    found, strange = _check_sets(fit.likelihood.model.data), [] if fit.draws is None else _check_shapes(fit.draws)
+    found = about("data", _check_sets(fit.likelihood.model.data))
     if fit.draws is not None:
         changes = find_changes_of_modes(fit.draws, fit.deviations)
+        explained = any(each.kind in ("sign", "swap") or each.names[0] in fit.draws.data.sensors for each in changes)
+        strange = [] if explained else _check_shapes(fit.draws)
         # a mode that the model lacks has no value that could be expected
-        strange += [finding_of(each, fit.title) for each in changes if each.kind != "value" or not strange]
-        strange = strange or _check_reach(fit.draws)
-    found = about("data", found + strange)
+        named = [finding_of(each, fit.title) for each in changes if each.kind != "value" or not strange]
+        found += about("data", named + strange or _check_reach(fit.draws))
     if any(each.severity == WRONG for each in found) or fit.samples is None:
         return found
     return found + _check_errors(fit) + ([] if fit.held_out is None else _check_held_out(fit.held_out))

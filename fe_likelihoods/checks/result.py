@@ -99,7 +99,7 @@ def judge_run(run: FinishedRun) -> JudgedRun:
             found += check_residuals(fits.fits) + check_stated_errors(fits.fits)
             found += check_other_events([row for row in rows if row.name in _of_one_event(run)])
     checked = sum(each.checks is not None for fit in fits.fits for each in fit.channels)
-    responses = max((len(each.modal.points if each.modal else each.responses) for each in fits.fits), default=0)
+    responses = max((len(each.modal.points if each.modal else each.draws) for each in fits.fits), default=0)
     alone = "the length of the chain alone: a Markov chain gives no verdict"
     tests = {
         "Sampling": "by the sampler" if run.tempered else alone,

@@ -27,6 +27,7 @@ from .finding import HALF, SMALL_PROBABILITY, TAIL
 __all__ = ["MOST_DRAWS", "Table", "find_changes", "find_changes_of_modes"]
 
 MOST_DRAWS = 100  # of the prior
+MENDED = 0.1  # of the distance that is left without a fault, if the model is not right either
 
 
 class Table(NamedTuple):
@@ -103,7 +104,9 @@ def find_change(
         value, shift = table.values[row, column], pull[k] / weights[k, k]
         ratio = float(value / (value - shift)) if value != shift else np.inf
         found.append((0, float(pull[k] * shift), chance, "value", (table.rows[row], table.columns[column]), ratio))
-    good = [each for each in found if each[1] > each[2] and before - each[1] < FACTOR**2 * n]
+    # a model that is not right leaves more, but one value may be all that is not right in it
+    limits = (FACTOR**2 * n, *2 * [max(FACTOR**2 * n, MENDED * before)])
+    good = [each for each in found if each[1] > each[2] and before - each[1] < limits[each[0]]]
     if not good:
         return None
     _, drop, _, kind, names, value = max(good, key=lambda each: each[:2])

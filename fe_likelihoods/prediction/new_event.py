@@ -182,8 +182,7 @@ def predict_new_event(
     Warns
     -----
     UserWarning
-        As `propagate`, for peaks outside the range of all events; for histories also as `Hierarchy.new_test`, and if
-        more than 1 % of the draws have an impossible noise.
+        As `propagate`, for peaks outside the range of all events.
 
     Notes
     -----

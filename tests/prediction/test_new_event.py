@@ -158,12 +158,10 @@ def test_histories_of_a_new_event_have_noise_of_its_own_level(hierarchy, posteri
     np.testing.assert_allclose(prediction.sd[0], np.sqrt(variance), rtol=0.06)
 
 
-def test_draws_of_impossible_shares_are_left_out(hierarchy, posterior):
+def test_many_draws_of_impossible_shares_are_refused(hierarchy, posterior):
     wide = Hierarchy(hierarchy.posterior, hierarchy.samples * [1.0, 1.0, 3.0, 5.0])  # a median of 0.6, a spread of 0.5
-    with pytest.warns(UserWarning, match=r"1\d% of the draws have an impossible noise.*level='response'"):
-        prediction = predict_new_event(wide, {"EQ0": posterior}, 0.1, noise=True, n=2000, seed=1)
-    expected = 2000 * stats.norm.cdf(np.log(1.0 / 0.6) / 0.5)
-    assert abs(prediction.n_samples - expected) < 4.0 * np.sqrt(2000 * 0.15 * 0.85)
+    with pytest.raises(ValueError, match=r"1\d% of the draws have an impossible noise.*level='response'"):
+        predict_new_event(wide, {"EQ0": posterior}, 0.1, noise=True, n=2000, seed=1)
 
 
 def test_what_cannot_be_predicted_is_refused(events, hierarchy, posterior):
