@@ -10,6 +10,7 @@ from .finding import CARE, Finding
 __all__ = [
     "check_bandwidth",
     "check_final_values",
+    "check_most",
     "check_normal",
     "check_peaks",
     "check_reweighting",
@@ -110,3 +111,11 @@ def check_normal(skewness: np.ndarray, kurtosis: np.ndarray) -> list[Finding]:
     shown = f"skewness {np.max(np.abs(skewness)):.1f}, excess kurtosis {np.min(kurtosis):.1f} to {np.max(kurtosis):.1f}"
     text = f"The logarithms of the stiffnesses are not normal ({shown}): ridges and several modes are not represented."
     return [Finding("A calibration is not normal", CARE, text, "Use narrower priors, or fix what is not identified.")]
+
+
+def check_most(counts: np.ndarray, most: int, stiffnesses: int) -> list[Finding]:
+    """Whether more stiffnesses may be damaged than are allowed: draws (n,) of their number that grow up to `most`."""
+    as_many, fewer = (float(np.mean(counts == count)) for count in (most, most - 1))
+    text = f"The probability of {most} damaged stiffnesses is {as_many:.2f}: there may be more."
+    found = [Finding("More stiffnesses may be damaged", CARE, text, "Increase most.", {"share": as_many})]
+    return found if most < stiffnesses and as_many > fewer else []

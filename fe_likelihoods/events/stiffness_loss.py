@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..checks.finding import Finding, judge, labelled
-from ..checks.transfer import check_normal
+from ..checks.transfer import check_most, check_normal
 from ..priors.distributions import Distribution, HalfNormal, LogNormal
 from ..text_tables import text_table
 from .scales import Scales
@@ -174,9 +174,7 @@ def stiffness_loss(
         for each in state.findings
     ]
     factors, common_factor = np.array([node.error for node in nodes])[of_node], np.exp(change[:, -1] + shift)
-    as_many, fewer = (np.mean(count == k) for k in (most, most - 1))
-    if most < d and as_many > fewer:  # their probability grows with their number
-        raise ValueError(f"stiffness_loss: the probability of {most} damaged ones is {as_many:.2f}: increase most")
+    findings += check_most(count, most, d)
     return StiffnessLoss(names, -np.expm1(change[:, :-1]), common_factor, count, factors, tuple(findings))
 
 

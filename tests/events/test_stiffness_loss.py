@@ -218,7 +218,7 @@ def test_searches_and_guided_runs_find_the_storey(calibrated):
         np.testing.assert_allclose(search.samples.std(axis=0), sd, rtol=0.15)
 
 
-def test_doubted_runs_and_searches_have_findings(calibrated):
+def test_doubted_runs_have_findings_and_doubted_searches_are_refused(calibrated):
     (posterior, _), (sampler, _) = calibrated
     fake = SimpleNamespace(
         verdict=SimpleNamespace(
@@ -234,11 +234,14 @@ def test_doubted_runs_and_searches_have_findings(calibrated):
     search = find_modes(posterior, 2, seed=1)
     assert StoredPosterior.from_search(search, posterior).findings == ()
     (mode,) = search.modes
-    doubted = search._replace(modes=(mode._replace(converged=False), mode), ends=(0, 1), finished=False)
-    texts = [each.text for each in StoredPosterior.from_search(doubted, posterior).findings]
-    assert [text.split()[-1] for text in texts] == ["modes.", "mode.", "used.", "mode."]
-    with pytest.raises(ValueError, match="no mode"):
-        StoredPosterior.from_search(search._replace(modes=()), posterior)
+    for modes, finished in (
+        ((mode, mode), True),
+        ((mode._replace(converged=False),), True),
+        ((mode,), False),
+        ((), True),
+    ):
+        with pytest.raises(ValueError, match=f"found {len(modes)} modes, or ended early"):
+            StoredPosterior.from_search(search._replace(modes=modes, finished=finished), posterior)
 
 
 # ---------------------------------------------------------------------- alarms
@@ -269,8 +272,7 @@ def test_contradictions_enlarge_the_errors_and_many_damaged_stiffnesses_are_foun
     states, _ = pair(change, noise=False)
     assert np.median(stiffness_loss(*states, NAMES, spread=0.01).error) > 2.5
     states, _ = pair(np.log([0.7, 1, 0.7, 0.7, 0.7, 1]), noise=False)
-    with pytest.raises(ValueError, match="increase most"):
-        stiffness_loss(*states, NAMES, **KNOWN)
+    assert any(each.action == "Increase most." for each in stiffness_loss(*states, NAMES, **KNOWN).findings)
     assert stiffness_loss(*states, NAMES, most=5, **KNOWN).findings == ()
 
 
