@@ -40,16 +40,21 @@ def _number(modes: Any, k: int) -> str:
 def _check_sets(data: Any) -> list[Finding]:
     """The frequency of one identification, of three or more, that the other ones contradict most.
 
-    Of 2000 data sets with a scatter of 0.5, 1, 2 and 3 %, right ones were named in 0, 0, 8 and 25, one frequency 10 %
-    off in 1996, 1770, 371 and 82, exchanged lines in all but 4.
+    Of 500 data sets each with a scatter of 0.5, 1, 2 and 3 %, right ones were named in 0, 0, 1 and 3, one frequency
+    10 % off in 500, 448, 104 and 22, days on which all change by 12 % in 0, 1, 0 and 2, exchanged lines in 480 to 500.
     """
+    if data.n_sets < 3 or data.n_modes < 2:
+        return []
     off = np.log(data.frequencies / np.nanmedian(data.frequencies, axis=0))
     spread, stated = 1.4826 * np.nanmedian(np.abs(off)), data.frequency_cv  # of normal errors
     limit = 8.0 * spread if stated is None else 5.0 * np.maximum(stated, spread)
-    common = np.nanmedian(off, axis=1, keepdims=True)  # not where all modes change alike
-    far = np.nan_to_num(np.minimum(np.abs(off), np.abs(off - common)) / np.maximum(limit, TAIL))
+    common = np.stack(
+        [np.nanmedian(np.delete(off, k, axis=1), axis=1) for k in range(data.n_modes)], axis=1
+    )  # of others
+    # not where all modes change alike
+    far = np.nan_to_num(np.fmin(np.abs(off), np.abs(off - common)) / np.maximum(limit, TAIL))
     k, mode = np.unravel_index(far.argmax(), far.shape)
-    if data.n_sets < 3 or data.n_modes < 2 or not far[k, mode] > 1.0:
+    if not far[k, mode] > 1.0:
         return []
     ratio, number = float(np.exp(off[k, mode])), data.mode_numbers[mode]
     text = f"Mode {number} of set {k + 1} has {ratio:.3g} times the median frequency of {data.n_sets} sets."

@@ -58,15 +58,10 @@ class _Pair(NamedTuple):
     dt: float  # step of the reference [s]
     reference: np.ndarray
 
-    @property
-    def durations(self) -> tuple[float, float]:
-        """Of the channel and of the reference [s]."""
-        return float(np.ptp(np.flatnonzero(np.isfinite(self.values)))) * self.step, (len(self.reference) - 1) * self.dt
-
     def at(self, times: np.ndarray) -> np.ndarray:
         """The reference at times [s], NaN beyond its ends."""
-        end = self.durations[1]
-        found = interpolate(self.reference, make_interpolation(self.dt, len(self.reference), np.clip(times, 0.0, end)))
+        n, end = len(self.reference), (len(self.reference) - 1) * self.dt
+        found = interpolate(self.reference, make_interpolation(self.dt, n, np.clip(times, 0.0, end)))
         return np.where((times >= -1e-9) & (times <= end + 1e-9), found, np.nan)
 
     def both(self, *lags: float) -> np.ndarray:
@@ -87,7 +82,7 @@ class _Pair(NamedTuple):
 
         every = max(1, math.ceil(self.step / self.dt - 1e-9))
         step = self.step / every
-        times = np.arange(int(self.durations[1] / step + 1e-9) + 1) * step
+        times = np.arange(int((len(self.reference) - 1) * self.dt / step + 1e-9) + 1) * step
         there, values = np.zeros((2, every * (len(self.values) - 1) + 1))
         there[::every], values[::every] = np.isfinite(self.values), np.nan_to_num(self.values)
         history = np.nan_to_num(self.at(times))
@@ -97,7 +92,11 @@ class _Pair(NamedTuple):
         return np.log1p(-np.interp(lags, grid, np.minimum(squares, _NEARLY_ONE), left=0.0, right=0.0))
 
     def fit(self, lag: float) -> tuple[float, float, float, float]:
-        """Gain, correlation, effective number of samples, and information about the lag [1/s²]."""
+        """Gain, correlation, effective number of samples, and information about the lag [1/s²].
+
+        With the derivative s of the shifted reference times its gain, and errors with the spectrum P, the variance of
+        the lag by least squares is ``sum(|S|^2 P) / (n sum(s^2))^2``.
+        """
         from scipy.ndimage import uniform_filter1d  # slow to import
 
         y, r, ahead, behind = self.both(lag, lag + 0.05 * self.dt, lag - 0.05 * self.dt)
@@ -146,11 +145,6 @@ def align(
         If channels do not exist or do not fit, a channel or the reference is constant, the largest lag is beyond the
         record, or the correlation is largest at an end of the lag range.
 
-    Notes
-    -----
-    The standard error is that of least squares with correlated errors: the derivative s of the shifted reference times
-    its factor, and the errors with the spectrum P, give the variance ``sum(|S|^2 P) / (n sum(s^2))^2``.
-
     Examples
     --------
     >>> early = Measurements(measurements.channels, 0.05, measurements.values[:, 10:])  # begins 0.5 s too late
@@ -161,13 +155,13 @@ def align(
     from scipy.optimize import minimize_scalar  # slow to import
 
     pairs = _pairs(reference, measurements, channels)
-    longest = min(max(pair.durations) for pair in pairs)
-    max_lag = 0.5 * min(min(pair.durations) for pair in pairs) if max_lag is None else max_lag
+    durations = [((len(each.values) - 1) * each.step, (len(each.reference) - 1) * each.dt) for each in pairs]
+    longest, max_lag = min(map(max, durations)), 0.5 * min(map(min, durations)) if max_lag is None else max_lag
     if not 0.0 < max_lag < longest:
         raise ValueError(f"max_lag must be positive and below {longest:g} s, the longer duration, got {max_lag!r}")
-    step = min(pair.step / max(1, math.ceil(pair.step / pair.dt - 1e-9)) for pair in pairs)
+    step = min(each.step / max(1, math.ceil(each.step / each.dt - 1e-9)) for each in pairs)
     lags = step * np.arange(-math.floor(max_lag / step), math.floor(max_lag / step) + 1)
-    score = -sum(pair.on(lags) for pair in pairs)
+    score = -sum(each.on(lags) for each in pairs)
     if (best := int(np.argmax(score))) in (0, len(lags) - 1):
         raise ValueError(
             f"the correlation is largest at a lag of {lags[best]:g} s, an end of the range; give a larger max_lag, or "
@@ -181,14 +175,13 @@ def align(
         tops.append(float(found.x))
     advantage = math.inf
     if len(tops) > 1:
-        losses = [pair.losses(*tops) for pair in pairs]
-        advantage = sum(0.5 * pair.fit(tops[0])[2] * (b - a) for pair, (a, b) in zip(pairs, losses, strict=True))
+        losses = [each.losses(*tops) for each in pairs]
+        advantage = sum(0.5 * each.fit(tops[0])[2] * (b - a) for each, (a, b) in zip(pairs, losses, strict=True))
     lag, *others = tops if advantage >= 0.0 else tops[::-1]
-    fits = {pair.name: pair.fit(lag) for pair in pairs}
-    information = sum(fit[3] for fit in fits.values())
+    fits = {each.name: each.fit(lag) for each in pairs}
     return Alignment(
         lag,
-        1.0 / math.sqrt(information) if information > 0.0 else math.inf,
+        1.0 / math.sqrt(sum(fit[3] for fit in fits.values()) or 1e-300),
         {name: fit[0] for name, fit in fits.items()},
         {name: fit[1] for name, fit in fits.items()},
         1.0 / (1.0 + math.exp(-abs(advantage))),
@@ -197,7 +190,7 @@ def align(
 
 
 def _pairs(reference: Record | Measurements, measurements: Measurements, channels: Sequence[str] | None) -> list[_Pair]:
-    names = [channel.name for channel in measurements.channels]
+    names = [each.name for each in measurements.channels]
     if isinstance(reference, Record):
         of_motion = [each.name for each in measurements.channels if each.dimension == "acceleration"]
         if channels is None and len(of_motion) != 1:
@@ -209,17 +202,16 @@ def _pairs(reference: Record | Measurements, measurements: Measurements, channel
         reference = Measurements(kinds, reference.dt, np.tile(reference.acceleration, (len(kinds), 1)))
     if not reference.complete or any(reference.starts):
         raise ValueError("the reference needs all its samples, from time zero; give a simulated response")
-    known = [channel.name for channel in reference.channels]
+    known, pairs = [each.name for each in reference.channels], []
     channels = [name for name in names if name in known] if channels is None else channels
     if not channels or not set(channels) <= set(known):
         raise ValueError(f"the reference has the channels {', '.join(known)}; got {', '.join(channels or names)}")
-    pairs = []
     for name in channels:
         one, other = measurements.select([name]), reference.select([name])
-        (values,), (history,) = one.values, other.values
+        values, history = (each.values[0] - np.nanmean(each.values) for each in (one, other))
         if (mine := one.channels[0].dimension) != (theirs := other.channels[0].dimension):
             raise ValueError(f"channel {name!r} is {mine!r}, its reference {theirs!r}; compare like with like")
         if any(np.isfinite(each).sum() < 10 or not np.nanmax(each) > np.nanmin(each) for each in (values, history)):
             raise ValueError(f"channel {name!r} and its reference need ten samples or more that are not constant")
-        pairs.append(_Pair(name, one.start, one.dt, values - np.nanmean(values), other.dt, history - history.mean()))
+        pairs.append(_Pair(name, one.start, one.dt, values, other.dt, history))
     return pairs
