@@ -108,7 +108,7 @@ def _check_errors(fit: Any) -> list[Finding]:
         f"The largest: {listed(places)}. Look for a wrong number or sensor, and at the model. If both are right, add "
         'an unknown error: frequency_error="common", shape_error="common" (unknown_errors in a TOML file).'
     )
-    what, data = "At the best sample, frequencies and shapes", sum(noise.counts) + sum(noise.freedoms)
+    what, data = "At the best sample, frequencies and shapes", sum(map(sum, noise.counts))
     return check_squares(float(best.sum()), data, what, action)
 
 

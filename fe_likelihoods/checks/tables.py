@@ -104,9 +104,10 @@ def find_change(
         value, shift = table.values[row, column], pull[k] / weights[k, k]
         ratio = float(value / (value - shift)) if value != shift else np.inf
         found.append((0, float(pull[k] * shift), chance, "value", (table.rows[row], table.columns[column]), ratio))
-    # a model that is not right leaves more, but one value may be all that is not right in it
-    limits = (FACTOR**2 * n, *2 * [max(FACTOR**2 * n, MENDED * before)])
-    good = [each for each in found if each[1] > each[2] and before - each[1] < limits[each[0]]]
+    # a model that is not right leaves more, but then one value must not explain as much
+    rough, one = max(FACTOR**2 * n, MENDED * before), max(each[1] for each in found if not each[0])
+    limits = [rough if each[0] and each[1] > one else FACTOR**2 * n for each in found]
+    good = [each for each, limit in zip(found, limits, strict=True) if each[1] > each[2] and before - each[1] < limit]
     if not good:
         return None
     _, drop, _, kind, names, value = max(good, key=lambda each: each[:2])
