@@ -47,7 +47,8 @@ def find_sensor_faults(values: np.ndarray, dimension: str = "") -> tuple[SensorF
             return tuple(found)
         if spans := look(x):
             found.append(SensorFault(kind, spans, sum(last - first + 1 for first, last in spans) / len(x)))
-            x = _without(x, spans)
+            for first, last in spans:
+                x[first : last + 1] = np.nan
     if not _is_judged(x):
         return tuple(found)
     whole = ((0, len(x) - 1),)
@@ -71,13 +72,6 @@ def _peak(x: np.ndarray) -> float:
 
 def _round_off(x: np.ndarray) -> float:
     return 8.0 * float(np.spacing(np.nanmax(np.abs(x))))
-
-
-def _without(x: np.ndarray, spans: tuple[tuple[int, int], ...]) -> np.ndarray:
-    x = x.copy()
-    for first, last in spans:
-        x[first : last + 1] = np.nan
-    return x
 
 
 def runs_of(true: np.ndarray) -> list[tuple[int, int]]:
@@ -172,7 +166,7 @@ def _spikes(x: np.ndarray) -> tuple[tuple[int, int], ...]:
         if not width:
             break
         found.append((max(first, 0), min(first + width, len(x)) - 1))
-        x = _without(x, (found[-1],))
+        x[found[-1][0] : found[-1][1] + 1] = np.nan
         if np.nanmax(x) == np.nanmin(x):  # a pulse is all there is
             return ()
     return tuple(sorted(found))

@@ -56,20 +56,15 @@ class Table(NamedTuple):
         """Which values are known (n_rows, n_columns)."""
         return np.isfinite(self.values) & np.isfinite(self.draws).all(axis=0)
 
-    def expected(self, rows: list[int]) -> tuple[np.ndarray, np.ndarray]:
-        """Known values of some rows, and what all other rows let expect there (n,)."""
+    def times(self, rows: list[int]) -> tuple["Table", float]:
+        """The table with a factor of some rows of the draws, and this factor, by what all other rows let expect."""
         there, (_, off, _, covariance) = self.there, self.distance()
         own = np.isin(np.nonzero(there)[0], rows)
         expected = self.draws.mean(axis=0)[there][own]
         if not own.all():
             mixed, others = covariance[np.ix_(own, ~own)], covariance[np.ix_(~own, ~own)]
             expected = expected + mixed @ np.linalg.solve(others, off[~own])
-        return self.values[there][own], expected
-
-    def times(self, rows: list[int]) -> tuple["Table", float]:
-        """The table with a factor of some rows of the draws, and this factor, by least squares."""
-        values, expected = self.expected(rows)
-        factor = float(values @ expected / max(expected @ expected, 1e-300))
+        factor = float(self.values[there][own] @ expected / max(expected @ expected, 1e-300))
         draws, deviations = self.draws.copy(), self.deviations.copy()
         draws[:, rows] *= factor
         deviations[rows] *= max(abs(factor), 1.0)
