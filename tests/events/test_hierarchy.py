@@ -179,14 +179,6 @@ def test_new_test_of_an_oscillator_is_predicted(rng):
     assert hierarchy.new_test(2000, ["sigma", "damping"], 1)["sigma"].std() == pytest.approx(0.6, rel=0.1)
 
 
-def test_draws_of_a_new_test_beyond_the_bounds_are_a_warning(rng):
-    prior = Prior({"a": TruncatedNormal(1.0, 0.5)})
-    posterior = HierarchicalPosterior({"T": StoredPosterior(1.0 + 0.1 * rng.random((200, 1)), prior)}, {"a": LINEAR})
-    hierarchy = Hierarchy(posterior, np.tile([0.5, 0.5], (50, 1)) + 0.01 * rng.random((50, 2)))
-    with pytest.warns(UserWarning, match=r"% of the draws of a new test.*scale='log'"):
-        hierarchy.new_test(1000, rng=1)
-
-
 # ------------------------------------------------------------------ checks
 
 
