@@ -134,11 +134,6 @@ class Hierarchy:
         ValueError
             If a name is unknown, the priors of a parameter differ between the tests, or a covariate is missing.
 
-        Warns
-        -----
-        UserWarning
-            If more than 1 % of the draws are outside the tests' prior bounds; the parameters are named.
-
         Examples
         --------
         >>> sorted(hierarchy.new_test(100, rng=1))

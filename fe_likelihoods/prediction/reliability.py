@@ -133,8 +133,7 @@ def exceedance(
     Warns
     -----
     UserWarning
-        If a prediction contains no model error: its probability is then too close to 0 or to 1. If a threshold without
-        a unit seems to be in the unit of the channel.
+        If a prediction contains no model error: its probability is then too close to 0 or to 1.
 
     Examples
     --------
