@@ -57,7 +57,10 @@ def _check_sets(data: Any) -> list[Finding]:
     if not far[k, mode] > 1.0:
         return []
     ratio, number = float(np.exp(off[k, mode])), data.mode_numbers[mode]
-    text = f"Mode {number} of set {k + 1} has {ratio:.3g} times the median frequency of {data.n_sets} sets."
+    text = (
+        f"Mode {number} of set {k + 1} ({data.frequencies[k, mode]:.4g} Hz) has {ratio:.3g} times the median frequency "
+        f"of {data.n_sets} sets."
+    )
     action = "Check its line in the file; if it is right, `student_t=4` lets it move the parameters little."
     return [Finding("A value may be wrong", CARE, text, action, {"ratio": ratio})]
 

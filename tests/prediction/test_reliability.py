@@ -49,11 +49,9 @@ def test_units_and_shapes_of_thresholds(record, rng):
     assert np.array_equal(exceedance(p, 10.0, unit="cm").probability, exceedance(p, 0.1).probability)
     assert exceedance(p, [[0.05, 0.1], [0.15, 0.2]]).probability.shape == (2, 2)
     shown = {"m": 1.0, "cm": 100.0, "mm": 1000.0}[p.channels[0].unit]
-    with pytest.warns(UserWarning, match=f'beside all predicted values .* pass unit="{p.channels[0].unit}"'):
+    with pytest.raises(ValueError, match=f"give unit=, such as '{p.channels[0].unit}'"):
         exceedance(p, 0.1 * shown)
-    with warnings.catch_warnings():  # a rare event is no mistake of units
-        warnings.filterwarnings("error", message=".*beside all")
-        exceedance(p, 0.3)
+    assert exceedance(p, 0.3).probability < 0.1  # a rare event is no mistake of units
         exceedance(p, 0.1 * shown, unit=p.channels[0].unit)
     assert exceedance(np.zeros((50, 3)), [1.0, -1.0, 2.0]).probability.tolist() == [0.0, 1.0, 0.0]
     for values, limit, options, message in (
