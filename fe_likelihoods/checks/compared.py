@@ -1,7 +1,4 @@
-"""Measurements of each data set and event beside responses: before and after an update, and at draws of the prior.
-
-Responses are taken from the caches of the likelihood where they are there; the likelihood counts the others.
-"""
+"""Measurements of each data set and event beside responses: before and after an update, and at draws of the prior."""
 
 import logging
 from collections.abc import Iterator
@@ -133,10 +130,7 @@ def data_sets_of(posterior: Any) -> list[tuple[str, FELikelihood, np.ndarray]]:
 
 
 def draws_to_compare(posterior: Posterior, seconds: float | None = None) -> np.ndarray:
-    """Draws of the prior (n, ndim), always the same ones: 100, or fewer if these take longer than ten seconds.
-
-    A simulation takes `seconds`; by default the mean of those that the posterior has made, or else the second draw's.
-    """
+    """Draws of the prior (n, ndim), always the same: 100, or fewer where they take ten seconds, of `seconds` each."""
     try:
         draws = posterior.sample_prior(MOST_DRAWS, np.random.RandomState(1))
     except NotImplementedError:  # a prior without draws
@@ -252,10 +246,7 @@ def _modes(key: str, likelihood: Any, draws: np.ndarray, samples: np.ndarray | N
 
 
 def fit_data_sets(run: FinishedRun) -> Fits:
-    """Simulate two points of each data set, before and after the update, and compare them with the measurements.
-
-    The result is empty for a posterior without a likelihood of this package.
-    """
+    """Simulate two points of each data set, before and after the update; empty without a likelihood of this package."""
     if run.likelihood is None:
         return Fits((), "", "", 0, ())
     start, start_name = _before(run)

@@ -167,10 +167,7 @@ def _check_offset(fit: Fit) -> list[Finding]:
 
 
 def check_errors(fits: Sequence[Fit]) -> list[Finding]:
-    """Channels that the fit, or the best draw of the prior, does not reproduce.
-
-    Noise, white and normal, is in no model, and is no fault of a fit.
-    """
+    """Channels that the fit, or the best draw of the prior, does not reproduce; white and normal noise is no fault."""
     useless, poor, far = found = {}, {}, {}
     for fit in fits:
         measured, responses = fit.measurements.values, fit.draws if fit.after is None else fit.after[None]
@@ -219,10 +216,7 @@ def limits_of_model(
 
 
 def check_parameters(rows: Sequence[ParameterRow], limits: Container[str] = ()) -> list[Finding]:
-    """Parameters at bounds, far from their prior or not informed.
-
-    The bounds of the names in `limits` are limits of the model as well, and end a posterior rightly.
-    """
+    """Parameters far from their prior, not informed, or at bounds that are not `limits` of the model as well."""
     found = []
     far = {row.label: (row.mean - row.prior_mean) / row.prior_sd for row in rows}
     far = {name: distance for name, distance in far.items() if abs(distance) > SURE}
@@ -259,10 +253,7 @@ def check_other_events(rows: Sequence[ParameterRow]) -> list[Finding]:
 
 
 def check_residuals(fits: Iterable[Fit]) -> list[Finding]:
-    """How much successive errors depend on each other, which widens standard deviations.
-
-    Residuals of real measurements are always correlated, so that this alone limits no result.
-    """
+    """How much successive errors depend on each other: of real measurements always, so that this limits no result."""
     checked = [(fit, each) for fit in fits for each in fit.channels if each.checks is not None]
     coloured = [fit.where(each.channel.name) for fit, each in checked if each.checks.white[0] < SMALL_PROBABILITY]
     # the information of independent samples is proportional to their number

@@ -116,10 +116,7 @@ def _check_errors(fit: Any) -> list[Finding]:
 
 
 def check_squares(square: float, n: int, what: str, action: str) -> list[Finding]:
-    """Whether the sum of the squares of n residuals, each by its stated error, is larger than errors explain.
-
-    The result is not used where the mean square is five times as stated.
-    """
+    """Whether the sum of the squares of n residuals, each by its stated error, is larger than errors explain."""
     factor = float(np.sqrt(square / n))
     if not chi2.sf(square, n) < SMALL_PROBABILITY:
         return []

@@ -121,10 +121,7 @@ def halved(
 
 
 def check_stronger_motion(model: Any, theta: np.ndarray, response: np.ndarray, simulate: Simulate) -> list[Finding]:
-    """Whether twice the motion fails, or does not change the response (n_channels, n_steps) at `theta`.
-
-    A model without a motion that can be replaced has no finding; `simulate` as for `halve_steps`.
-    """
+    """Whether twice the motion, if it can be replaced, fails or does not change the response (n_channels, n_steps)."""
     if not motions_to_replace(model):
         return []
     batch = simulate(_under(model, lambda each: each.scale(2.0)), theta[None])

@@ -120,10 +120,9 @@ def _of_one_event(run: FinishedRun) -> tuple[str, ...]:
 
 
 def _check_model(run: FinishedRun) -> tuple[StepTest, int]:
-    """Whether the model reads its motion, and the error of step and mesh, at the centre of the samples.
+    """Whether the model reads its motion, the error of step and mesh at the centre of the samples, and simulations.
 
-    Also returns the number of simulations that this took. The derivatives take one simulation for each parameter. Where
-    these are more than a twentieth of the run's simulations and take longer than ten seconds, they are left out.
+    These are one for each parameter and more; where they are many and take long, step and mesh are not tested.
     """
     if run.likelihood is None or run.prior is None or not has_steps(run.likelihood):
         return StepTest([], {}), 0

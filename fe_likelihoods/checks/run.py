@@ -13,7 +13,6 @@ import numpy as np
 from emcee import EnsembleSampler
 
 from samplers import Verdict
-from samplers.estimates.importance import EvidenceCheck
 from samplers.judgement.failures import NearFailures, failures_near
 
 from ..likelihood.failure_log import reason_without_numbers
@@ -39,10 +38,7 @@ LONGEST_AUTOCORRELATION = 50.0  # iterations per autocorrelation time that emcee
 
 
 class FinishedRun(NamedTuple):
-    """A run, as a report reads it.
-
-    A tempered sampler is a subclass of emcee's sampler, with a ladder, an evidence and a verdict.
-    """
+    """A run, as a report reads it; a tempered sampler has a ladder, an evidence and a verdict."""
 
     sampler: EnsembleSampler
     posterior: Any  # None if the sampler's log-density is a plain function
@@ -58,7 +54,6 @@ class FinishedRun(NamedTuple):
     discard: int  # iterations left out at the beginning of the chain
     tempered: bool
     verdict: Verdict | None
-    check: EvidenceCheck | None  # independent estimate of the evidence
     autocorrelation_time: float  # the largest, of emcee's own sampler [iterations]; else NaN
 
     @property
@@ -143,7 +138,6 @@ def read_run(
         discard=discard,
         tempered=tempered,
         verdict=verdict,
-        check=sampler.log_evidence_check if tempered else None,
         autocorrelation_time=autocorrelation,
     )
 
@@ -160,10 +154,9 @@ def _truth(truth: Mapping[str, float] | Sequence[float] | None, names: Sequence[
 def _errors(
     sampler: EnsembleSampler, samples: np.ndarray, tempered: bool, discard: int
 ) -> tuple[np.ndarray, np.ndarray, float, float]:
-    """Errors of means and standard deviations (ndim,), effective sample size of the worst parameter, autocorrelation.
+    """Errors of means and standard deviations (ndim,), least effective sample size, and autocorrelation time.
 
-    For emcee's own sampler, those of as many independent draws; its largest integrated autocorrelation time
-    [iterations] is NaN where the chain is too short for any estimate.
+    The time [iterations] is NaN where a chain of emcee's own sampler is too short for any estimate.
     """
     spread = samples.std(axis=0)
     if tempered:
@@ -197,10 +190,7 @@ def moments(samples: np.ndarray, mean_error: Any = np.nan, sd_error: Any = np.na
 
 
 def moments_of(run: FinishedRun) -> Moments:
-    """Moments of the chain, or of the signed sample of a run with a guide if that is the more accurate sample.
-
-    It has smaller errors of all means, and determines all standard deviations.
-    """
+    """Moments of the chain, or of the signed sample if that has smaller errors and determines all deviations."""
     signed = getattr(run.sampler, "signed_sample", None)
     if signed is not None:
         mean, sd = signed.expectation(), signed.standard_deviation()
@@ -231,10 +221,7 @@ class ParameterRow(NamedTuple):
     upper: float  # bound of the prior; infinite where there is none or it is not known
 
     def widened(self, factor: float) -> float:
-        """Standard deviation if the data are worth fewer independent samples, by the square of a factor.
-
-        The precision of the data, which is the precision beyond the prior's, is divided by the square.
-        """
+        """Standard deviation if the precision of the data, beyond the prior's, is divided by the square of a factor."""
         if not self.sd > 0.0:
             return self.sd
         prior = 1.0 / self.prior_sd**2 if self.prior_sd > 0.0 else 0.0
@@ -288,10 +275,7 @@ class Failures(NamedTuple):
 
 
 def failures(run: FinishedRun) -> Failures:
-    """Failed simulations by reason, the most frequent first, with the parameters at which they happened.
-
-    They are counted in the likelihoods, with the first parts of the record that a guide simulates, or in the sampler.
-    """
+    """Failed simulations by reason, counted in likelihoods, also of first parts of the record, or in the sampler."""
     reasons, known, attempts, near, unknown = Counter(), list[tuple[str, dict]](), 0, [NearFailures(0, 0)], ""
     for likelihood, columns in [] if run.likelihood is None else run.likelihood.parts():
         names, logs = likelihood.model.parameter_names, [each.simulator for each in (likelihood, *likelihood.shortened)]

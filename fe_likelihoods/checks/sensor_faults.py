@@ -81,10 +81,7 @@ def runs_of(true: np.ndarray) -> list[tuple[int, int]]:
 
 
 def _flat_parts(x: np.ndarray) -> list[tuple[int, int]]:
-    """First and last samples of parts of equal samples between steep ones.
-
-    The top of a smooth wave is flat as well, but the steps beside it are small.
-    """
+    """First and last samples of parts of equal samples between steep steps, which the top of a wave has not."""
     steps, equal = np.abs(np.diff(x)), _round_off(x)
     known, found = steps[np.isfinite(steps)], []
     least = DIGITS * known[known > equal].min(initial=np.inf)
@@ -141,8 +138,7 @@ def _moving_deviation(x: np.ndarray, length: int) -> np.ndarray:
 def _spikes(x: np.ndarray) -> tuple[tuple[int, int], ...]:
     """Up to three neighbouring samples that are off by the same amount, far more than the samples around them.
 
-    Errors are those of cubic interpolation from the neighbours. A spike has a known pattern of errors, whose size is
-    fitted; what remains around it is what the signal itself does there.
+    A spike has a known pattern of errors of cubic interpolation; what is left without it, the signal itself does there.
     """
     cubic = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0  # a sample less the cubic through its four neighbours
     x, found = x.copy(), list[tuple[int, int]]()
@@ -175,8 +171,7 @@ def _spikes(x: np.ndarray) -> tuple[tuple[int, int], ...]:
 def _baseline(x: np.ndarray, dimension: str) -> tuple[float, ...]:
     """Offset, or values at the ends (and in the middle) of a drift; empty if there is neither.
 
-    A part of a right channel has a mean near zero. A structure that keeps a residual displacement starts from zero, and
-    does not move at the end.
+    A structure that keeps a residual displacement starts from zero, and does not move at the end.
     """
     parts = np.array([np.nan if np.isnan(part).all() else np.nanmean(part) for part in np.array_split(x, 10)])
     places, parts = np.linspace(-0.9, 0.9, 10)[np.isfinite(parts)], parts[np.isfinite(parts)]

@@ -74,10 +74,7 @@ class Table(NamedTuple):
 def find_change(
     table: Table, factors: Mapping[tuple[str, ...], list[int]], others: Mapping[tuple[str, ...], Table]
 ) -> Fault | None:
-    """The change that explains a table best: rows that may have a factor, by names, or tables that may be meant.
-
-    Their keys are the kind of the fault and its names.
-    """
+    """The change that explains a table best: a factor of rows, by names, or another table, by kind and names."""
     if len(table.draws) < HALF * MOST_DRAWS or table.there.sum() < 3:
         return None
     (before, off, weights, _), n = table.distance(), int(table.there.sum())

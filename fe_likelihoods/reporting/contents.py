@@ -147,7 +147,7 @@ def evidence(run: FinishedRun) -> list[str]:
     """The evidence with its check, in sentences; the findings judge them."""
     if not run.tempered:
         return ["This sampler gives no evidence; SMCSampler and TMCMCSampler do."]
-    sampler, check = run.sampler, run.check
+    sampler, check = run.sampler, run.sampler.log_evidence_check
     lines = [
         f"Log-evidence {sampler.log_evidence:.2f} ± {sampler.log_evidence_error:.2g}. Only differences between models "
         "for the same data mean something: a difference of 3 is odds of 20 to 1."
