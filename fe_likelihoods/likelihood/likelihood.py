@@ -9,7 +9,6 @@ residuals, see `fe_likelihoods.noise.gaussian`.) A `Simulator` runs and caches t
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -24,7 +23,6 @@ from ..signals.comparison import Comparison
 from ..signals.events import join_measurements
 from ..signals.sampling import same_step
 from ..simulation.model import Model, SimulationBatch, SimulationFailed, first_part, simulate_batch
-from .data_identity import data_digests
 from .inputs import check_model, check_noise, match_measurements
 from .simulator import Simulator
 from .sum_of_parts import SumOfParts
@@ -168,11 +166,6 @@ class FELikelihood(SumOfParts):
     def fingerprint(self) -> str:
         """Hex digest of everything the statistics are known to depend on, see `Simulator.fingerprint`."""
         return self.simulator.fingerprint
-
-    def data_digests(self) -> list[str]:
-        """Digests of the compared samples, one for each event; one digest if there are no events."""
-        compared = replace(self.measurements, values=getattr(self.measured, "values", self.measured))
-        return data_digests(self.model, compared)
 
     def first(self, seconds: float) -> "FELikelihood":
         """The likelihood of the first part of the measurements, for models that can be shortened (`first_part`).

@@ -15,7 +15,6 @@ from ..priors.distributions import Distribution, RandomState, as_generator
 from ..priors.multivariate import as_distribution
 from ..priors.points import as_points
 from ..simulation.faults import TransientReason
-from .data_identity import combined_digest
 from .parameters import Parameter, describe_parameters
 
 __all__ = ["COUNTS", "SumOfParts"]
@@ -167,10 +166,19 @@ class SumOfParts:
     def data_fingerprint(self) -> str:
         """Hex digest of the samples that are compared: equal for likelihoods of the same data.
 
-        The order of the channels and of data sets has no effect. Times count from the start of each event and missing
-        samples do not count, so that it is the same for EQ2 alone and for EQ2 after an EQ1 that is not compared.
+        Neither the order of channels, events and data sets nor missing samples have an effect, so that it is the same
+        for EQ2 alone and for EQ2 after an EQ1 that is not compared.
         """
-        return combined_digest([digest for part in self.likelihoods.values() for digest in part.data_digests()])
+        samples: dict[str, list[np.ndarray]] = {}
+        for part in self.likelihoods.values():
+            compared = getattr(part.measured, "values", part.measured)
+            for channel, dt, row in zip(part.measurements.channels, part.measurements.steps, compared, strict=True):
+                name = f"{channel.name} {channel.quantity} {dt:.9g}"
+                samples.setdefault(name, []).append(row[~np.isnan(row)] + 0.0)
+        digest = hashlib.blake2b(digest_size=16)
+        for name, rows in sorted(samples.items()):
+            digest.update(f"{name} {sum(map(len, rows))} ".encode() + np.sort(np.concatenate(rows)).tobytes())
+        return digest.hexdigest()
 
     def density_parts(self) -> list[str]:
         """Texts that identify the density; ValueError if the ``repr`` of a noise does not show its values."""

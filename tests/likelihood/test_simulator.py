@@ -92,7 +92,7 @@ def test_duplicates_and_rows_that_are_not_finite():
     assert np.isnan(batch.response[[1, 5, 6]]).all()
     reasons = ["", "the parameters are not finite", "", "", "", Line.reason, Line.reason]
     assert batch.reasons == reasons
-    assert likelihood.simulator.failures.reasons == {"θ too steep": 1}
+    assert likelihood.simulator.failures.reasons == {Line.reason: 1}
     assert likelihood.simulate(thetas[1:2]).reasons == reasons[1:2]
     assert likelihood.simulate(thetas[3]).response.shape == (1, 2, 8)
     empty = likelihood.simulate(np.empty((0, 2)))
