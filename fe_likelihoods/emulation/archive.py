@@ -1,60 +1,51 @@
-"""All runs of a record, with their residuals in a file, and bilinear forms of linear combinations of residuals.
+"""All runs of a record, and quadratic forms of linear combinations of their residuals.
 
 Slopes, principal components and predictions are linear combinations sum_i w_i r_i of histories r_i, residuals of runs
-or derivatives of residuals, and are kept as their weights w. For white noise, the statistics of a combination are sums
-over the products r_i . r_j per channel, which are computed once, when they are needed. With hundreds of channels, all
-histories have gigabytes, so histories and products are in temporary files, of which a part is in memory at a time.
+or derivatives of residuals, and are kept as their weights w. The numbers that a Gaussian noise needs (sums of squares,
+of squared differences, ...) are quadratic in the residuals, so those of a combination are sums over
+
+    B(r_i, r_j) = (S(r_i + r_j) - S(r_i - r_j)) / 4,
+
+which are computed once for every pair. No statistic needs to be known in more detail than as a function. With hundreds
+of channels all histories have gigabytes, so they are in a temporary file.
 """
 
 import tempfile
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
 from ..noise.statistics import sums_of_squares
-from .quadratic import bilinear_form
 
-__all__ = ["Archive"]
+__all__ = ["Archive", "check_quadratic"]
 
-_VALUES = 2**22  # largest number of values of residuals in memory at once: 32 MiB
-_RUNS = 64  # whose products are in memory at once
-
-
-class _Numbers:
-    """Arrays of one type in a temporary file without a name, which the system deletes with this object."""
-
-    def __init__(self, dtype: type) -> None:
-        self._dtype = np.dtype(dtype)
-        self._file = tempfile.TemporaryFile(buffering=0)
-        weakref.finalize(self, self._file.close)
-
-    def __reduce__(self) -> tuple:
-        self._file.seek(0)
-        return _restored, (self._dtype.type, self._file.read())
-
-    def write(self, place: int, array: np.ndarray) -> None:
-        """Write an array from a place on, counted in numbers."""
-        self._file.seek(place * self._dtype.itemsize)
-        data = memoryview(np.ascontiguousarray(array, self._dtype).reshape(-1).view(np.uint8))
-        while data:
-            data = data[self._file.write(data) :]
-
-    def read(self, place: int, shape: tuple[int, ...]) -> np.ndarray:
-        """The array of a shape that begins at a place; zero where nothing was written."""
-        array = np.zeros(shape, self._dtype)
-        self._file.seek(place * self._dtype.itemsize)
-        data = memoryview(array.reshape(-1).view(np.uint8))
-        while data and (count := self._file.readinto(data)):
-            data = data[count:]
-        return array
+_VALUES = 2**21  # of residuals that are multiplied together: 16 MiB
+_TOLERANCE = 1e-6
 
 
-def _restored(dtype: type, content: bytes) -> _Numbers:
-    numbers = _Numbers(dtype)
-    numbers.write(0, np.frombuffer(content, dtype))
-    return numbers
+def _bilinear_form(statistic: Callable[[np.ndarray], np.ndarray], first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """The form (k, l, n_numbers) of a quadratic statistic for histories (k, n_channels, n_steps) and (l, ...)."""
+    if statistic is sums_of_squares:
+        return np.matmul(first.transpose(1, 0, 2), second.transpose(1, 2, 0)).transpose(1, 2, 0)
+    rows = []
+    for a in first:
+        scales = [np.abs(a).max() / (np.abs(b).max() or 1.0) or 1.0 for b in second]
+        rows.append([(statistic(a + s * b) - statistic(a - s * b)) / s for s, b in zip(scales, second, strict=True)])
+    return 0.25 * np.array(rows)
+
+
+def check_quadratic(statistic: Callable[[np.ndarray], np.ndarray], residuals: np.ndarray) -> None:
+    """Raise ValueError if a statistic is not quadratic in the residuals (n_channels, n_steps)."""
+    both = np.stack([residuals, np.roll(residuals, residuals.shape[-1] // 3, axis=-1)])
+    form = _bilinear_form(statistic, both, both)
+    direct, combined = statistic(both[0] + 0.5 * both[1]), form[0, 0] + form[0, 1] + 0.25 * form[1, 1]
+    if not np.allclose(direct, combined, rtol=_TOLERANCE, atol=_TOLERANCE * np.abs(direct).max()):
+        raise ValueError(
+            f"the statistic {statistic!r} of the noise is not quadratic in the residuals, so the posterior cannot be "
+            "emulated from responses: use GaussianNoise, AutoregressiveNoise, or a sampler without a guide"
+        )
 
 
 class Archive:
@@ -65,49 +56,79 @@ class Archive:
     """
 
     def __init__(self, statistic: Callable[[np.ndarray], np.ndarray], shape: tuple[int, int]) -> None:
-        self._statistic, self._shape, self._size = statistic, shape, shape[0] * shape[1]
+        self._statistic, self._shape = statistic, shape
         self._numbers: list[int] = []
         self._coords: list[np.ndarray] = []
         self._statistics: list[np.ndarray] = []
-        # computed in double precision and then rounded, a residual keeps its digits where a channel has an offset of a
-        # million times its noise; a rounded response would not
-        self._residuals = _Numbers(np.float32)
-        self._products = _Numbers(np.float64)  # of the runs i and j <= i in all channels, from i (i + 1) / 2 + j on
-        self._multiplied: list[np.ndarray] = []  # whether the products of run i with the runs up to i are known
+        self._forms: list[np.ndarray] = []  # (i + 1, n_numbers) of history i with those up to itself
+        self._open(b"")
+
+    def _open(self, content: bytes) -> None:
+        self._file = tempfile.TemporaryFile(buffering=0)
+        weakref.finalize(self, self._file.close)
+        np.frombuffer(content, np.uint8).tofile(self._file)
+
+    def __getstate__(self) -> dict:
+        self._file.seek(0)
+        return {**self.__dict__, "_file": self._file.read()}
+
+    def __setstate__(self, state: dict) -> None:
+        self.__dict__.update(state)
+        self._open(state["_file"])
 
     def __len__(self) -> int:
-        return len(self._multiplied)
+        return len(self._forms)
 
     @property
     def numbers(self) -> np.ndarray:
+        """Numbers (m,) of the runs among all histories."""
         return np.array(self._numbers, dtype=int)
 
     @property
     def coords(self) -> np.ndarray:
+        """Structural coordinates (m, n_structural) of the runs."""
         return np.array(self._coords)
 
     @property
     def statistics(self) -> np.ndarray:
+        """Statistics (m, n_numbers) of the residuals of the runs."""
         return np.array(self._statistics)
 
     def add(self, coords: np.ndarray, residuals: np.ndarray, statistics: np.ndarray) -> np.ndarray:
-        """Add m runs; returns their numbers (m,)."""
-        self._coords += list(coords)
-        self._statistics += list(statistics)
+        """Add runs at coordinates (m, n_structural); returns their numbers (m,)."""
         numbers = self.add_histories(residuals)
         self._numbers += list(numbers)
+        self._coords += list(coords)
+        self._statistics += list(statistics)
         return numbers
 
     def add_histories(self, histories: np.ndarray) -> np.ndarray:
         """Add histories (m, n_channels, n_steps), rounded to single precision; returns their numbers (m,)."""
-        first = len(self)
-        self._residuals.write(first * self._size, histories)
-        self._multiplied += [np.zeros(number + 1, dtype=bool) for number in range(first, first + len(histories))]
-        return np.arange(first, len(self))
+        # computed in double precision and then rounded, a residual keeps its digits where a channel has an offset of a
+        # million times its noise; a rounded response would not
+        first, end = len(self), len(self) + len(histories)
+        self._file.seek(0, 2)
+        np.asarray(histories, np.float32).tofile(self._file)
+        for rows in self._blocks(first, end):
+            own = self._read(rows)
+            parts = [_bilinear_form(self._statistic, own, self._read(each)) for each in self._blocks(0, rows.stop)]
+            products = np.concatenate(parts, axis=1)
+            self._forms += [row[: number + 1].copy() for number, row in zip(rows, products, strict=True)]
+        return np.arange(first, end)
 
-    def residuals(self, run: int) -> np.ndarray:
-        """Residuals (n_channels, n_steps) float32 of a run, by its number: measured minus simulated response [SI]."""
-        return self._residuals.read(run * self._size, self._shape)
+    def _blocks(self, first: int, end: int) -> Iterator[range]:
+        """Numbers of histories that are in memory together."""
+        size = max(1, _VALUES // (self._shape[0] * self._shape[1]))
+        return (range(begin, min(begin + size, end)) for begin in range(first, end, size))
+
+    def _read(self, rows: range) -> np.ndarray:
+        size = self._shape[0] * self._shape[1]
+        self._file.seek(4 * size * rows.start)
+        return np.fromfile(self._file, np.float32, size * len(rows)).reshape(-1, *self._shape).astype(float)
+
+    def residuals(self, number: int) -> np.ndarray:
+        """Residuals (n_channels, n_steps) of a run, by its number: measured minus simulated response [SI]."""
+        return self._read(range(number, number + 1))[0]
 
     def weights(self, rows: Sequence[Any]) -> np.ndarray:
         """Combinations (k, n) that are given as numbers of histories, or as weights of the first of them."""
@@ -119,63 +140,13 @@ class Archive:
                 row[each] = 1.0
         return result
 
-    def combined(self, weights: np.ndarray) -> np.ndarray:
-        """Histories (k, n_channels, n_steps) of combinations (k, n)."""
-        result = np.zeros((len(weights), self._size))
-        used = np.flatnonzero(weights.any(axis=0))
-        count = max(1, _VALUES // self._size)
-        for some in np.split(used, range(count, len(used), count)):
-            result += weights[:, some] @ np.array([self.residuals(run).ravel() for run in some], dtype=float)
-        return result.reshape(len(weights), *self._shape)
-
-    def forms(self, first: np.ndarray, second: np.ndarray | None = None) -> np.ndarray:
-        """Bilinear form (k, l, n_numbers) of the statistic for combinations (k, n) and (l, n), `first` by default."""
-        if self._statistic is not sums_of_squares:
-            others = None if second is None else self.combined(second)
-            return bilinear_form(self._statistic, self.combined(first), others)
-        second = first if second is None else second
-        used = np.flatnonzero(first.any(axis=0) | second.any(axis=0))
-        both = np.concatenate([first, second])[:, used]
-        ahead = np.array([both[:, : place + 1] @ row for place, row in enumerate(self._halves(used))])
-        lower = np.einsum("ki,ilc->klc", both, ahead, optimize=True)
-        k = len(first)
-        return lower[:k, k:] + lower[k:, :k].transpose(1, 0, 2)
-
-    def products(self, runs: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Sums (m, m) over the channels of weights (n_channels,) times the products of the residuals of m runs."""
-        order = np.argsort(runs)
-        lower = np.zeros((len(runs), len(runs)))
-        for place, row in enumerate(self._halves(runs[order])):
-            lower[place, : place + 1] = row @ weights
-        back = np.argsort(order)
-        return (lower + lower.T)[np.ix_(back, back)]
-
-    def _halves(self, runs: np.ndarray) -> Any:
-        """For each of m ascending runs, its products (i, n_channels) with the runs up to it; of itself, a half."""
-        self._multiply(runs)
-        for place, run in enumerate(runs):
-            row = self._products.read(run * (run + 1) // 2 * self._shape[0], (run + 1, self._shape[0]))
-            row = row[runs[: place + 1]]
+    def forms(self, combinations: np.ndarray) -> np.ndarray:
+        """Bilinear form (k, k, n_numbers) of the statistic for combinations (k, n)."""
+        used = np.flatnonzero(combinations.any(axis=0))
+        both, below = combinations[:, used], []
+        for place, number in enumerate(used):
+            row = self._forms[number][used[: place + 1]]
             row[-1] *= 0.5
-            yield row
-
-    def _multiply(self, runs: np.ndarray) -> None:
-        """Compute those products of ascending runs that are not known."""
-        n_channels, n_steps = self._shape
-        new = [place for place, run in enumerate(runs) if not self._multiplied[run][runs[: place + 1]].all()]
-        width = max(1, _VALUES // (len(runs) * n_steps))
-        for begin in range(0, len(new), _RUNS):
-            rows = new[begin : begin + _RUNS]
-            found = np.empty((len(rows), rows[-1] + 1, n_channels))
-            for channel in range(0, n_channels, width):
-                shape = min(width, n_channels - channel), n_steps
-                part = np.empty((rows[-1] + 1, *shape))
-                for row, run in zip(part, runs, strict=False):
-                    row[:] = self._residuals.read(run * self._size + channel * n_steps, shape)
-                for k in range(shape[0]):
-                    found[:, :, channel + k] = part[rows, k] @ part[:, k].T
-            for place, products in zip(rows, found, strict=True):
-                run, others = runs[place], runs[: place + 1]
-                for other, values in zip(others, products, strict=False):
-                    self._products.write((run * (run + 1) // 2 + other) * n_channels, values)
-                self._multiplied[run][others] = True
+            below.append(both[:, : place + 1] @ row)
+        lower = np.einsum("ki,ilc->klc", both, np.array(below), optimize=True)
+        return lower + lower.transpose(1, 0, 2)

@@ -6,9 +6,9 @@ all residuals. Modes and emulators therefore need no code for several data sets.
 up with residuals of zero, which no statistic counts.
 """
 
-import hashlib
 import json
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,30 +16,12 @@ import numpy as np
 from ..noise.protocol import noise_title
 from ..noise.statistics import needs_response, sums_of_squares
 from ..signals.comparison import Comparison, measured_values
-from ..simulation.model import derivatives_batch, has_jacobian
-from .quadratic import check_quadratic
+from ..simulation.model import derivatives_batch, has_jacobian, most_responses
+from .archive import check_quadratic
 
 __all__ = ["DataSets"]
 
-
-class _Models(NamedTuple):
-    """What modes and emulators read of a model, for several models."""
-
-    parameter_names: tuple[str, ...]
-    channels: tuple[Any, ...]
-    dt: float
-    n_steps: int
-    fingerprint: str
-
-
-class _WithoutMissing(NamedTuple):
-    """A statistic of residuals, which are zero where a sample is missing, for a noise that expects NaN there."""
-
-    statistic: Callable[[np.ndarray], np.ndarray]
-    missing: np.ndarray
-
-    def __call__(self, residuals: np.ndarray) -> np.ndarray:
-        return self.statistic(np.where(self.missing, np.nan, residuals))
+_MANY = 10_000  # runs of a pool whose size is not known
 
 
 class _DataSet(NamedTuple):
@@ -64,18 +46,27 @@ class _DataSet(NamedTuple):
                 row[:] = -measured.known_residuals(response)
         return residuals
 
+    def slopes(self, thetas: np.ndarray) -> np.ndarray:
+        """Derivatives (n, d, n_channels, n_samples) of the residuals by the parameters, by the model's ``jacobian``."""
+        model, measured = self.likelihood.model, self.likelihood.measured
+        found = derivatives_batch(model, thetas[:, self.structural], self.likelihood.simulator.pool)
+        if isinstance(measured, Comparison):
+            found = [[measured.at_samples(np.ascontiguousarray(each)) for each in rows] for rows in found]
+            found = np.where(measured.missing, 0.0, found)
+        return -found
+
 
 class DataSets:
-    """All data sets of an `FELikelihood` or a `JointLikelihood`; `model` is the only model, or what is read of several.
+    """All data sets of an `FELikelihood` or a `JointLikelihood`.
 
-    `measured` are the values (n_channels, n_samples) [SI], `statistic` is that of the residuals, `with_gaps` says
-    whether samples are missing or have times of their own, and `differentiable` whether all models know their
-    derivatives. ValueError for statistics that are not quadratic in the residuals, or a noise whose level depends on
-    the response.
+    `measured` are the values (n_channels, n_samples) [SI], `statistic` is that of the residuals, `differentiable` says
+    whether all models know their derivatives, and `together` is how many runs have their responses in memory at once.
+    ValueError for statistics that are not quadratic in the residuals, or a noise whose level depends on the response.
     """
 
     def __init__(self, likelihood: Any) -> None:
         n_structural = likelihood.ndim - len(likelihood.fast_parameters)
+        self.parameter_names = tuple(likelihood.parameter_names[:n_structural])
         self._parts: list[_DataSet] = []
         channels = numbers = 0
         for part, columns in likelihood.parts():
@@ -86,38 +77,28 @@ class DataSets:
             rows, sums = slice(channels, channels + len(values)), slice(numbers, numbers + width)
             self._parts.append(_DataSet(part, *places, rows, slice(values.shape[1]), sums, statistic))
             channels, numbers = rows.stop, sums.stop
-        self._n_numbers = numbers
-        likelihoods = [part.likelihood for part in self._parts]
-        self.with_gaps = any(isinstance(each.measured, Comparison) for each in likelihoods)
-        self.differentiable = all(has_jacobian(each.model) for each in likelihoods)
-        self.kinds = " or ".join(dict.fromkeys(type(each.model).__name__ for each in likelihoods))
-        if len(self._parts) == 1 and likelihood is likelihoods[0]:
-            self.model = likelihood.model
-            self.measured, self.statistic = measured_values(likelihood.measured), self._parts[0].statistic
-            return
-        text = json.dumps([[part.likelihood.model.fingerprint, part.structural] for part in self._parts])
-        self.model = _Models(
-            tuple(likelihood.parameter_names[:n_structural]),
-            tuple(channel for each in likelihoods for channel in each.model.channels),
-            likelihoods[0].model.dt,
-            max(each.model.n_steps for each in likelihoods),
-            hashlib.blake2b(text.encode(), digest_size=16).hexdigest(),
-        )
         self.measured = np.zeros((channels, max(part.samples.stop for part in self._parts)))
         for part in self._parts:
             self.measured[part.channels, part.samples] = measured_values(part.likelihood.measured)
         # white noise keeps its fast way: zeros add nothing to a sum of squares
         white = all(part.statistic is sums_of_squares for part in self._parts)
         self.statistic = sums_of_squares if white else self._statistic
+        models = [part.likelihood.model for part in self._parts]
+        self.differentiable = all(map(has_jacobian, models))
+        self.kinds = " or ".join(dict.fromkeys(type(model).__name__ for model in models))
+        gaps = [part.likelihood for part in self._parts if isinstance(part.likelihood.measured, Comparison)]
+        self.identity = json.dumps(
+            [
+                [[part.likelihood.model.fingerprint, part.structural] for part in self._parts],
+                [each.measurements.fingerprint for each in gaps],
+            ]
+        )
+        pools = [part.likelihood.simulator.pool for part in self._parts]
+        workers = [1 if pool is None else getattr(pool, "n_workers", None) or _MANY for pool in pools]
+        self.together = max(*workers, *map(most_responses, models))
 
     def _statistic(self, residuals: np.ndarray) -> np.ndarray:
         return np.concatenate([part.statistic(residuals[part.channels, part.samples]) for part in self._parts])
-
-    @property
-    def identity(self) -> str:
-        """Text that identifies the residuals at given parameters, besides the measured values at the model's steps."""
-        gaps = (part.likelihood for part in self._parts if isinstance(part.likelihood.measured, Comparison))
-        return self.model.fingerprint + "".join(each.measurements.fingerprint for each in gaps)
 
     def log_likelihood(self, statistics: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         """Log-likelihood (n,) of statistics (n, n_numbers) at noise parameters (n, n_noise)."""
@@ -136,7 +117,7 @@ class DataSets:
         """
         reasons = [""] * len(thetas)
         residuals = np.zeros((len(thetas), *self.measured.shape), np.float32)
-        statistics = np.full((len(thetas), self._n_numbers), np.nan)
+        statistics = np.full((len(thetas), self._parts[-1].numbers.stop), np.nan)
         left = np.arange(len(thetas))
         for part in self._parts:
             residuals[:, part.channels, part.samples] = np.nan
@@ -150,29 +131,12 @@ class DataSets:
                 left = left[[not reason for reason in batch.reasons]]
         return [residuals, statistics, np.frombuffer(json.dumps(reasons).encode(), dtype=np.uint8)]
 
-    def derivatives(self, thetas: np.ndarray) -> np.ndarray:
-        """Derivatives (n, n_structural, n_channels, n_steps) of the responses by the models' ``jacobian``.
-
-        In single precision, as residuals.
-        """
-        found = np.zeros((*thetas.shape, len(self.measured), self.model.n_steps), np.float32)
+    def derivatives(self, thetas: np.ndarray) -> list[np.ndarray]:
+        """Derivatives (n, n_structural, n_channels, n_samples) of the residuals, in single precision as these."""
+        found = np.zeros((*thetas.shape, *self.measured.shape), np.float32)
         for part in self._parts:
-            model = part.likelihood.model
-            own = derivatives_batch(model, thetas[:, part.structural], part.likelihood.simulator.pool)
-            found[:, part.structural, part.channels, : model.n_steps] = own
-        return found
-
-    def of_residuals(self, slopes: np.ndarray) -> np.ndarray:
-        """Derivatives (n, d, n_channels, n_samples) of residuals, from derivatives (n, d, n_channels, n_steps)."""
-        found = np.zeros((*slopes.shape[:2], *self.measured.shape))
-        for part in self._parts:
-            measured = part.likelihood.measured
-            own = slopes[:, :, part.channels, : part.likelihood.model.n_steps]
-            if isinstance(measured, Comparison):
-                own = [[measured.at_samples(np.ascontiguousarray(each)) for each in rows] for rows in own]
-                own = np.where(measured.missing, 0.0, own)
-            found[:, :, part.channels, part.samples] = -own
-        return found
+            found[:, part.structural, part.channels, part.samples] = part.slopes(thetas)
+        return [found]
 
     def recall(self, thetas: np.ndarray, statistics: np.ndarray, reasons: Sequence[str]) -> None:
         """Cache what an earlier run has found, as `Simulator.recall`."""
@@ -185,6 +149,11 @@ class DataSets:
             left = left[good]
 
 
+def _known_part(statistic: Callable, missing: np.ndarray, residuals: np.ndarray) -> np.ndarray:
+    """A statistic of residuals, which are zero where a sample is missing, for a noise that expects NaN there."""
+    return statistic(np.where(missing, np.nan, residuals))
+
+
 def _statistic_of(likelihood: Any) -> Callable[[np.ndarray], np.ndarray]:
     """Statistic of residuals that are zero where a sample is missing; ValueError if it cannot be emulated."""
     measured, statistic = likelihood.measured, getattr(likelihood.noise, "statistic", None) or sums_of_squares
@@ -195,5 +164,5 @@ def _statistic_of(likelihood: Any) -> Callable[[np.ndarray], np.ndarray]:
             "AutoregressiveNoise"
         )
     if isinstance(measured, Comparison) and statistic is not sums_of_squares:
-        return _WithoutMissing(statistic, measured.missing)
+        return partial(_known_part, statistic, measured.missing)
     return statistic

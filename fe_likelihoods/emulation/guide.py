@@ -15,7 +15,7 @@ The equations are on the page ``docs/theory/guided.rst``.
 
 import copy
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -33,20 +33,10 @@ from samplers.judgement.guides import (
 )
 from samplers.proposals.mixture import Mixture, draw, fit_mixture, log_density
 
-from .density import EmulatedPosterior, Region, factor_of, student_mixture, tempered
-from .emulator import ResponseEmulator, TrainingSet, fit_emulator
-from .modes import (
-    MOST_STARTS,
-    ModeSearch,
-    check_starts,
-    counted,
-    draw_starts,
-    ended,
-    enough,
-    search_modes,
-    unseen_share,
-)
-from .target import SCALES, ResponseTarget, at_once
+from .density import EmulatedPosterior, Region, student_mixture, tempered
+from .emulator import ResponseEmulator
+from .modes import ModeSearch, Search, check_starts, draw_starts
+from .target import SCALES, ResponseTarget, Steps, at_once
 
 __all__ = ["ResponseGuide"]
 
@@ -58,14 +48,10 @@ _WIDE_SHARE_ALONE = 0.9  # before there is an emulator
 # `_ENOUGH` draws per dimension on. For a cyclic test whose response has jumps, draws of a mixture fitted to 600 draws
 # of the posterior have an effective share of .31, and draws of emulators of .05 to .16.
 _FITTED_SHARE, _EVEN, _ENOUGH = 0.4, 0.5, 6.0
-_WIDE_FREEDOM = 5.0
-_WIDENED = 1.5  # variances of the wide components, as multiples of their regions' variances
-_SHARE_OF_MODES = 0.25  # of the wide mixture around the modes that were found, the rest around the emulated means
+_WIDENED, _FREEDOM = 1.5, 5.0  # of the wide components: variances over those of their regions; degrees of freedom
 _SMALLEST_WEIGHT = 0.1  # of a component of the wide mixture, over their number
 _FEWEST_CACHED = 10_000  # simulations that the likelihood must cache in memory
-_FEWEST_RUNS = 1.0, 4.0  # training runs that an emulator needs: per dimension, and in addition
-_MOST_RUNS = 300
-_WITHIN = 36.0  # squared Mahalanobis distance per dimension within which runs train the emulator of a region
+_MOST_RUNS = 300  # that train the emulator of a region
 _DEPTH = 40.0, 8.0  # log-density below the best within which runs train an emulator: constant, per dimension
 _ALWAYS = 5  # best runs per dimension that train in any case
 _LARGE = 10.0  # error of an emulated log-likelihood, beyond which its size does not matter
@@ -88,9 +74,6 @@ class ResponseGuide:
     ----------
     search : ModeSearch, optional
         Result of the search for modes; None before it.
-    simulations : float
-        Simulations run by the guide itself, parts of a record counted as fractions; a call of the model's ``jacobian``
-        counts as one.
 
     Examples
     --------
@@ -112,11 +95,17 @@ class ResponseGuide:
         self._target = ResponseTarget(posterior)
         self._posterior, self._starts = posterior, starts
         self.search: ModeSearch | None = None
-        self.simulations, self.highest = 0.0, -np.inf  # the highest log-density of a draw
+        self._searching: Search | None = None
+        self.highest = -np.inf  # log-density of a draw
         self._regions: list[Region] = []
         self._emulated: EmulatedPosterior | None = None
         self._wide: Mixture | None = None
         self._fitted: Mixture | None = None  # to weighted draws
+
+    @property
+    def simulations(self) -> float:
+        """Simulations run by the guide: parts of a record are fractions, a call of a ``jacobian`` counts as one."""
+        return 0.0 if self._searching is None else self._searching.spent
 
     def check(self, log_prob_fn: Callable) -> None:
         """Raise ValueError if a sampler evaluates another object: every draw would be simulated twice."""
@@ -133,7 +122,7 @@ class ResponseGuide:
     @property
     def fingerprint(self) -> str:
         """Identity of the guide: a sampler resumes a run only with an equal one."""
-        derivatives = ", derivatives" if self._target.differentiable else ""
+        derivatives = ", derivatives" if self._target.data.differentiable else ""
         return f"{type(self).__name__}({self._posterior.fingerprint}, starts={self._starts}{derivatives})"
 
     @property
@@ -151,11 +140,9 @@ class ResponseGuide:
         else:
             found = []
         if len(search.modes) > 1:
-            found += check_unseen_modes(unseen_share(search), ended(search), len(search.modes))
+            found += check_unseen_modes(search.unseen_share, search.ended, len(search.modes))
         else:
-            made = len(search.ends)
-            wanted = enough(search, self._starts) if made < MOST_STARTS * self._starts else self._starts
-            found += check_ends(ended(search), made, wanted, search.grown)
+            found += check_ends(search.ended, len(search.ends), search.wanted(self._starts), search.grown)
         found += check_tops(self.highest - max((mode.log_density for mode in search.modes), default=np.inf))
         if self._emulated is not None:
             found += check_draws_in_memory(self._emulated.largest_weight)
@@ -167,7 +154,7 @@ class ResponseGuide:
         """What a verdict without such findings rests on."""
         if self.search is None or not self.search.modes:
             return ""
-        n, modes = ended(self.search), len(self.search.modes)
+        n, modes = self.search.ended, len(self.search.modes)
         missed = 1.0 - 0.05 ** (1.0 / n)
         return (
             f"{n} starts led to {modes} mode{'s' if modes > 1 else ''}; with 95 % probability, they would have found "
@@ -186,21 +173,17 @@ class ResponseGuide:
 
     # ------------------------------------------------------------------ what a sampler calls
 
-    def prepare(self, session: Any) -> Iterator[None]:
-        """Search for modes; yields as `search_modes`."""
+    def prepare(self, session: Any) -> Steps:
+        """Search for modes; yields as `Search.run`."""
         starts = draw_starts(self._target, self._starts, session.random)
-        search = search_modes(self._target, starts, session.remember, session.fits, self._starts, session.remaining)
-        self.search = yield from counted(search, self._spend)
-        modes = self.search.modes
-        self._regions = [Region(mode.coords, mode.covariance, None, mode.log_evidence) for mode in modes]
-        if modes:
-            self._wide = self._wide_mixture()
+        self._searching = Search(self._target, starts, session)
+        self.search = yield from self._searching.run(self._starts)
+        self._regions = [Region(mode.coords, mode.covariance, None, mode.log_evidence) for mode in self.search.modes]
         archive = self._target.archive
-        runs = archive.numbers
-        if len(runs) > 1 and all(np.array_equal(*map(archive.residuals, (runs[0], other))) for other in runs):
+        if len(archive.numbers) > 1 and not np.ptp(archive.statistics, axis=0).any():
             raise ValueError(
-                f"expected responses that depend on the parameters; all {len(runs)} simulations of the search "
-                f"gave the same one. Check where the model reads {', '.join(self._target.model.parameter_names)}, "
+                f"expected responses that depend on the parameters; all {len(archive.numbers)} simulations of the "
+                f"search gave the same one. Check where the model reads {', '.join(self._target.data.parameter_names)} "
                 "and whether an old file of results is read"
             )
         self._emulate(session.random)
@@ -211,17 +194,15 @@ class ResponseGuide:
 
     def draw(self, n: int, random: np.random.RandomState) -> np.ndarray:
         """Independent draws (n, ndim) of the parameters, inside the support of the prior."""
-        emulated, prior, *shares = self._shares()
+        parts = self._parts()
         # as many draws of each part as its share says, rounded at random: fewer chance differences than by lot
-        ends = np.floor(n * np.cumsum([0.0, emulated, *shares, prior]) + random.random_sample()).astype(int)
-        parts = np.diff(np.minimum(ends, n + ends[0]))
-        coords = [random.standard_normal((parts[-1], self._target.ndim))]
-        for mixture, count in zip((self._wide, self._fitted), parts[1:-1], strict=True):
-            if count:
-                coords.append(draw(mixture, count, random))
-        if parts[0]:
-            coords.append(self._emulated.draw(parts[0], random))
-        return self._target.parameters(random.permutation(np.concatenate(coords)))
+        ends = np.floor(n * np.cumsum([0.0, *(share for share, _ in parts)]) + random.random_sample()).astype(int)
+        counts = np.diff(np.minimum(ends, n + ends[0]))
+        drawn = [
+            draw(part, count, random) if isinstance(part, Mixture) else part.draw(count, random)
+            for count, (_, part) in zip(counts, parts, strict=True)
+        ]
+        return self._target.parameters(random.permutation(np.concatenate(drawn)))
 
     def log_density(self, parameters: np.ndarray) -> np.ndarray:
         """Normalised log-density (n,) of the draws at parameters (n, ndim)."""
@@ -233,16 +214,14 @@ class ResponseGuide:
 
     def observe(self, parameters: np.ndarray, session: Any) -> None:
         """Simulate the responses of points (n, ndim) that are evaluated next, or take cached ones, and keep them."""
-        structural = parameters[:, : self._target.n_structural]
-        coords = self._target.coordinates(parameters)[:, : self._target.n_structural]
-        at_once(self._target.run(coords, session.remember, structural))
+        d = self._target.n_structural
+        at_once(self._target.run(self._target.coordinates(parameters)[:, :d], session.remember, parameters[:, :d]))
 
     def refine(self, parameters: np.ndarray, log_prob: np.ndarray, session: Any) -> None:
         """Learn from evaluated points (n, ndim): new emulators."""
         alive = np.isfinite(log_prob)
-        coords = self._target.coordinates(parameters)
-        heights = log_prob - self._posterior.log_prior(parameters) + self._target.log_prior(coords)
-        self.highest = max(self.highest, float(np.max(heights[alive], initial=-np.inf)))
+        heights = log_prob[alive] - self._target.with_volume(parameters[alive])[1]
+        self.highest = max(self.highest, float(np.max(heights, initial=-np.inf)))
         latest = np.where(alive, np.where(alive, log_prob, 0.0) - self.log_density(parameters), -np.inf)
         drawn = session.weighted()
         fitted = None if drawn is None else self._fit_draws(latest, *drawn)
@@ -252,70 +231,79 @@ class ResponseGuide:
     # ------------------------------------------------------------------ parts
 
     def _emulate(self, random: np.random.RandomState) -> None:
-        """Fit emulators to all runs, and the emulated posterior."""
-        self._fit_in_best_scale()
-        ready = [region for region in self._regions if region.emulator is not None]
-        if ready and len(ready) == len(self._regions):
-            try:
-                self._emulated = EmulatedPosterior(self._target, self._regions, random)
-            except np.linalg.LinAlgError as error:
-                logger.info("no draws of the emulated posterior could be made: %s", error)
-                return
-            self._regions = self._emulated.regions
-            self._wide = self._wide_mixture()
+        """Fit emulators to all runs, and the emulated posterior.
 
-    def _fit_in_best_scale(self) -> None:
-        """Fit emulators; of logarithms or reciprocals if these predict left-out runs clearly better than parameters.
-
-        A ridge of equal products is straight in logarithms, and flexibilities of springs add; other responses are often
-        closer to linear in parameters. The few runs of a first fit cannot always tell: on a ridge that was emulated in
+        Emulators are of logarithms or reciprocals if these predict left-out runs clearly better than parameters. A
+        ridge of equal products is straight in logarithms, and flexibilities of springs add; others are often closer
+        to linear in parameters. The few runs of a first fit cannot always tell: on a ridge that was emulated in
         parameters to the end, rounds grew along it by a part each, and 2 of 20 were wrong.
         """
-        earlier, fits = (self._target, self._regions), []
-        for scale in SCALES:
-            self._target, self._regions = earlier[0].in_scale(scale), list(earlier[1])
-            self._fit_emulators()
-            if all(emulator.target is self._target for emulator in self.emulators):
-                error = self._left_out_error() * (_CLEARLY if scale == SCALES[0] else 1.0)
-                fits.append((error, self._target, self._regions))
-        self._target, self._regions = min(fits, key=lambda fit: fit[0])[1:] if fits else earlier
+        fits = []
+        for scale in SCALES if self._regions else ():
+            target = self._target.in_scale(scale)
+            regions, errors = zip(*(self._fit_region(target, k) for k in range(len(self._regions))), strict=True)
+            if all(region.emulator is not None and region.emulator.target is target for region in regions):
+                fits.append((np.mean(errors) * (_CLEARLY if scale == SCALES[0] else 1.0), list(regions)))
+        if fits:
+            regions = min(fits, key=lambda fit: fit[0])[1]
+            try:
+                self._emulated = EmulatedPosterior(self._target, regions, random)
+                self._regions = self._emulated.regions
+            except np.linalg.LinAlgError as error:
+                logger.info("no draws of the emulated posterior could be made: %s", error)
+        if self._regions:
+            self._wide = self._wide_mixture()
 
-    def _left_out_error(self) -> float:
-        """Mean error of the log-likelihood of runs that the emulators were not fitted to, each at most `_LARGE`."""
-        errors = []
-        for region, mode in zip(self._regions, self.search.modes, strict=True):
-            if region.emulator is not None:
-                predicted, true = (
-                    self._target.log_likelihood(
-                        each, np.repeat(mode.coords[None, self._target.n_structural :], len(each), 0)
-                    )
-                    for each in region.emulator.left_out_statistics()
-                )
-                errors.append(np.minimum(np.abs(predicted - true), _LARGE).mean())
-        return float(np.mean(errors)) if errors else np.inf
+    def _fit_region(self, target: ResponseTarget, k: int) -> tuple[Region, float]:
+        """A region with an emulator of its nearest runs, and the mean error of the log-likelihood of left-out runs."""
+        region, mode, d, archive = self._regions[k], self.search.modes[k], target.n_structural, target.archive
+        coords, noise = archive.coords, np.repeat(mode.coords[None, d:], len(archive.numbers), axis=0)
+        density = target.log_likelihood(archive.statistics, noise) + target.log_prior(coords)
+        # runs where the last emulator was wrong as well: left out, it would be wrong there again
+        expected = density
+        if region.emulator is not None:
+            emulated = region.emulator.log_likelihood(np.column_stack([coords, noise]))
+            expected = np.fmax(density, emulated + target.log_prior(coords))
+        inverses = [np.linalg.inv(each.covariance[:d, :d]) for each in self._regions]
+        apart = [coords - each.centre[:d] for each in self._regions]
+        distances = [np.einsum("ni,ij,nj->n", *each) for each in zip(apart, inverses, apart, strict=True)]
+        rows = np.flatnonzero(np.argmin(distances, axis=0) == k)
+        rows = rows[np.argsort(-expected[rows])]
+        good = expected[rows] > density[rows].max(initial=-np.inf) - _DEPTH[0] - _DEPTH[1] * d
+        good[: _ALWAYS * d] = True
+        rows = rows[good][:_MOST_RUNS]
+        if len(rows) < d + 4:
+            return region, np.inf
+        best = archive.statistics[rows[np.argmax(density[rows])]]
+        slopes = target.slopes(best, target.fit_noise(best, mode.coords[d:]).coords)
+        try:
+            emulator = ResponseEmulator(
+                target, rows, region.centre[:d], region.covariance[:d, :d], slopes, region.emulator
+            )
+        except np.linalg.LinAlgError as error:  # runs that do not span the parameters: the earlier fit stays
+            logger.info("no emulator could be fitted to %d runs: %s", len(rows), error)
+            return region, np.inf
+        predicted, true = (target.log_likelihood(each, noise[rows]) for each in emulator.left_out_statistics())
+        return region._replace(emulator=emulator), float(np.minimum(np.abs(predicted - true), _LARGE).mean())
 
-    def _spend(self, simulations: float) -> None:
-        self.simulations += simulations
-
-    def _shares(self) -> tuple[float, float, float, float]:
-        """Shares of the emulated posterior, the prior, the wide mixture and the fitted one in the draws."""
+    def _parts(self) -> list[tuple[float, Any]]:
+        """Shares of the draws, and the densities of coordinates that they are from."""
+        d = self._target.ndim
+        prior = student_mixture(np.ones(1), np.zeros((1, d)), np.eye(d)[None], np.inf)
         if self._wide is None:
-            return 0.0, 1.0, 0.0, 0.0
+            return [(1.0, prior)]
         if self._emulated is None:
-            return 0.0, 1.0 - _WIDE_SHARE_ALONE, _WIDE_SHARE_ALONE, 0.0
-        fitted = 0.0 if self._fitted is None else _FITTED_SHARE
-        return 1.0 - _WIDE_SHARE - _PRIOR_SHARE - fitted, _PRIOR_SHARE, _WIDE_SHARE, fitted
+            return [(_WIDE_SHARE_ALONE, self._wide), (1.0 - _WIDE_SHARE_ALONE, prior)]
+        parts = [(_WIDE_SHARE, self._wide), (_PRIOR_SHARE, prior)]
+        parts += [] if self._fitted is None else [(_FITTED_SHARE, self._fitted)]
+        return [(1.0 - sum(share for share, _ in parts), self._emulated), *parts]
 
     def _log_density(self, coords: np.ndarray) -> np.ndarray:
-        share, prior, *shares = self._shares()
-        total = np.log(prior) + self._target.log_prior(coords)
-        for mixture, part in zip((self._wide, self._fitted), shares, strict=True):
-            if part > 0.0:
-                total = np.logaddexp(total, np.log(part) + log_density(mixture, coords))
-        if self._emulated is not None:
-            emulated = self._emulated.log_density(coords) - self._emulated.log_evidence
-            total = np.logaddexp(total, np.log(share) + emulated)
-        return total
+        densities = [
+            np.log(share) + (log_density(part, coords) if isinstance(part, Mixture) else part.normalised(coords))
+            for share, part in self._parts()
+        ]
+        return np.logaddexp.reduce(densities)
 
     def _fit_draws(self, latest: np.ndarray, parameters: np.ndarray, log_weights: np.ndarray) -> Mixture | None:
         """A wide mixture around weighted draws (n, ndim), if the log-weights (m,) of the latest ones are uneven."""
@@ -328,67 +316,11 @@ class ResponseGuide:
         return fitted._replace(roots=wider * fitted.roots, inverses=fitted.inverses / wider)
 
     def _wide_mixture(self) -> Mixture:
-        shares = np.array([region.log_evidence for region in self._regions])
-        weights = np.exp(shares - shares.max())
-        weights = (1.0 - _SMALLEST_WEIGHT) * weights / weights.sum() + _SMALLEST_WEIGHT / len(weights)
+        weights = normalised_weights(np.array([region.log_evidence for region in self._regions]))
+        weights = (1.0 - _SMALLEST_WEIGHT) * weights + _SMALLEST_WEIGHT / len(weights)
         # the modes themselves as well: where an emulator is wrong, so are the moments that it gives
-        centres = [*(region.centre for region in self._regions), *(mode.coords for mode in self.search.modes)]
-        covariances = [
-            *(region.covariance for region in self._regions),
-            *(mode.covariance for mode in self.search.modes),
-        ]
-        factors = [factor_of(_WIDENED * covariance) for covariance in covariances]
-        weights = np.concatenate([(1.0 - _SHARE_OF_MODES) * weights, _SHARE_OF_MODES * weights])
-        return student_mixture(weights, centres, factors, _WIDE_FREEDOM)
-
-    def _distances(self, coords: np.ndarray) -> np.ndarray:
-        """Squared Mahalanobis distances (n_regions, n) of structural coordinates (n, d)."""
-        d = self._target.n_structural
-        rows = []
-        for region in self._regions:
-            inverse = np.linalg.inv(np.linalg.cholesky(region.covariance[:d, :d]))
-            rows.append(np.square((coords - region.centre[:d]) @ inverse.T).sum(axis=1))
-        return np.array(rows)
-
-    def _fit_emulators(self) -> None:
-        archive, d = self._target.archive, self._target.n_structural
-        if not self._regions or not len(archive):
-            return
-        coords, statistics = archive.coords, archive.statistics
-        distances = self._distances(coords)
-        nearest = np.argmin(distances, axis=0)
-        for k, region in enumerate(self._regions):
-            rows = np.flatnonzero((nearest == k) & (distances[k] < _WITHIN * d))
-            if len(rows) < _FEWEST_RUNS[0] * d + _FEWEST_RUNS[1]:
-                continue
-            noise = self.search.modes[k].coords[d:]
-            density = self._target.log_likelihood(statistics[rows], np.repeat(noise[None], len(rows), axis=0))
-            density = density + self._target.log_prior(coords[rows])
-            best = rows[np.argmax(density)]
-            # runs where the last emulator was wrong as well: left out, it would be wrong there again
-            expected = (
-                density if region.emulator is None else np.fmax(density, self._expected(region, coords[rows], noise))
-            )
-            order = np.argsort(-expected)
-            good = expected[order] > density.max() - _DEPTH[0] - _DEPTH[1] * d
-            good[: _ALWAYS * d] = True
-            rows = rows[order[good][:_MOST_RUNS]]
-            if len(rows) < _FEWEST_RUNS[0] * d + _FEWEST_RUNS[1]:
-                continue
-            residuals = archive.residuals(archive.numbers[best]).astype(float)
-            scales = np.sqrt(np.square(residuals).mean(axis=1)) + 1e-12 * np.abs(self._target.measured).max(axis=1)
-            training = TrainingSet(coords[rows], archive.numbers[rows])
-            slopes = self._target.slopes(statistics[best], self._target.fit_noise(statistics[best], noise).coords)
-            centre, covariance = region.centre[:d], region.covariance[:d, :d]
-            try:
-                emulator = fit_emulator(self._target, training, centre, covariance, scales, slopes, region.emulator)
-            except np.linalg.LinAlgError as error:  # runs that do not span the parameters: the earlier fit stays
-                logger.info("no emulator could be fitted to %d runs: %s", len(rows), error)
-                continue
-            self._regions[k] = region._replace(emulator=emulator)
-
-    def _expected(self, region: Region, coords: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """Log-density (n,) at structural coordinates (n, d) by the emulator of a region."""
-        full = np.column_stack([coords, np.repeat(noise[None], len(coords), axis=0)])
-        scaled = region.emulator.target.scaled(full)
-        return region.emulator.log_likelihood(scaled) + self._target.log_prior(coords)
+        around = [(each.coords, each.covariance) for each in self.search.modes]
+        around = [(each.centre, each.covariance) for each in self._regions] + around
+        centres, covariances = zip(*around, strict=True)
+        weights = np.concatenate([0.75 * weights, 0.25 * weights])
+        return student_mixture(weights, centres, [_WIDENED * each for each in covariances], _FREEDOM)

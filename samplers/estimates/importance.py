@@ -268,16 +268,16 @@ def tail_variance(log_weights: np.ndarray) -> float:
     r"""Variance of the log-evidence due to weights larger than all drawn weights, from log-weights (n,).
 
     If the largest weights have a Pareto shape :math:`0 < k < 1`, the mean excess over the largest normalised weight
-    :math:`W_{max}` is about :math:`k W_{max} / (1 - k)`, which is taken as a standard error. It is infinite for
-    :math:`k \ge 1`. If there are too few weights for an estimate, k is 0.7. With an effective sample size below 5,
-    points that were not drawn may have any weight, and the variance is infinite.
+    :math:`W_{max}` is about :math:`k W_{max} / (1 - k)`, which is taken as a standard error, up to 1, which a single
+    point has. It is infinite for :math:`k \ge 1`. If there are too few weights for an estimate, k is 0.7. With an
+    effective sample size below 5, points that were not drawn may have any weight, and the variance is infinite.
     """
     shape = tail_shape(log_weights)
     shape = SHAPE_OF_FEW if shape == np.inf else shape
     if shape >= 1.0 or effective_sample_size(log_weights) < FEWEST_EFFECTIVE:
         return float("inf")
     largest = float(np.max(normalised_weights(log_weights)))
-    return (largest * max(shape, 0.0) / (1.0 - shape)) ** 2
+    return min(largest * max(shape, 0.0) / (1.0 - shape), 1.0) ** 2
 
 
 def add_round(rounds: Sequence[Round], latest: Round) -> list[Round]:

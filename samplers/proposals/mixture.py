@@ -154,7 +154,8 @@ def draw(mixture: Mixture, n: int, random: np.random.RandomState) -> np.ndarray:
     ndim = mixture.means.shape[1]
     component = systematic(mixture.weights, random, n)
     z = random.standard_normal((n, ndim))
-    z *= np.sqrt(mixture.dof / random.chisquare(mixture.dof, size=n))[:, None]
+    if mixture.dof < math.inf:
+        z *= np.sqrt(mixture.dof / random.chisquare(mixture.dof, size=n))[:, None]
     coords = np.empty((n, ndim))
     for k in range(len(mixture.weights)):
         rows = component == k

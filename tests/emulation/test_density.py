@@ -12,7 +12,7 @@ RADIUS, THICKNESS = 1.0, 0.01
 
 
 class Target:
-    """Two parameters with standard normal priors, which are their own scaled parameters; runs along an arc [rad]."""
+    """Two parameters with standard normal priors; runs along an arc [rad]."""
 
     ndim = n_structural = 2
 
@@ -29,9 +29,6 @@ class Target:
 
     def scaled(self, coords):
         return coords
-
-    def region_in_scaled(self, centre, covariance):
-        return centre, covariance
 
     def unscaled(self, scaled):
         return scaled, np.zeros(len(scaled))

@@ -203,7 +203,7 @@ PRIORS = {
 
 def histories(target, numbers):
     return np.array([target.archive.residuals(k) for k in numbers.ravel()], float).reshape(
-        *numbers.shape, *target.measured.shape
+        *numbers.shape, *target.data.measured.shape
     )
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import HalfNormal, LogNormal, TruncatedNormal, Uniform
-from fe_likelihoods.emulation.emulator import TrainingSet, fit_emulator
+from fe_likelihoods.emulation.emulator import ResponseEmulator
 from fe_likelihoods.emulation.gaussian_process import predict
 from fe_likelihoods.emulation.target import SCALES, ResponseTarget, at_once
 
@@ -14,24 +14,30 @@ AT = np.array([1.2, 0.8])
 SCALE = np.array([0.01, 0.05])  # of the training points, in standard deviations of the prior
 
 
+def structural_coordinates(target, points):
+    """Coordinates (n, 2) of structural parameters (n, 2), beside those of the median of the noise."""
+    median = target.parameters(np.zeros((1, target.ndim)))[:, 2:]
+    return target.coordinates(np.column_stack([points, np.repeat(median, len(points), axis=0)]))[:, :2]
+
+
 def emulator_of(posterior, n=40, seed=1):
     target = ResponseTarget(posterior)
-    centre = target.structural_coordinates(AT[None])[0]
+    centre = structural_coordinates(target, AT[None])[0]
     coords = centre + SCALE * np.random.default_rng(seed).standard_normal((n, 2))
     at_once(target.run(coords))
-    training = TrainingSet(target.archive.coords, np.arange(len(target.archive)))
+    rows = np.arange(len(target.archive))
     statistics = target.archive.statistics
     slopes = target.slopes(statistics[0], target.fit_noise(statistics[0]).coords)
-    return target, fit_emulator(target, training, centre, np.diag(SCALE**2), np.array([2e-3, 5.0]), slopes)
+    return target, ResponseEmulator(target, rows, centre, np.diag(SCALE**2), slopes)
 
 
 @pytest.mark.parametrize("noise", ["marginal", "autoregressive"])
 def test_the_likelihood_near_the_training_points(noise):
     target, emulator = emulator_of(vibration(noise))
-    coords = target.structural_coordinates(AT[None]) + 0.7 * SCALE * np.random.default_rng(2).standard_normal((20, 2))
+    coords = structural_coordinates(target, AT[None]) + 0.7 * SCALE * np.random.default_rng(2).standard_normal((20, 2))
     true = at_once(target.run(coords))
     noises = np.tile(target.fit_noise(true.statistics[0]).coords, (20, 1))
-    error = emulator.log_likelihood(target.scaled(np.column_stack([coords, noises])))
+    error = emulator.log_likelihood(np.column_stack([coords, noises]))
     error -= target.log_likelihood(true.statistics, noises)
     assert error.max() < 0.05 and error.min() > -0.5
 
@@ -41,32 +47,28 @@ def test_near_a_bound_the_emulator_follows_the_response(prior):
     """There the coordinates go to infinity: these are up to 12 standard deviations from the training points."""
     posterior = vibration(truth=np.array([1.2, 0.03]), damping=prior)
     target = ResponseTarget(posterior)
-    centre = target.structural_coordinates(np.array([[1.2, 0.05]]))[0]
+    centre = structural_coordinates(target, np.array([[1.2, 0.05]]))[0]
     covariance = np.diag(np.square([0.01, 0.3]))
     at_once(target.run(centre + np.random.default_rng(4).standard_normal((40, 2)) @ np.sqrt(covariance)))
-    training = TrainingSet(target.archive.coords, np.arange(len(target.archive)))
+    rows = np.arange(len(target.archive))
     slopes = target.slopes(target.archive.statistics[0], np.zeros(0))
-    emulator = fit_emulator(target, training, centre, covariance, np.array([2e-3, 5.0]), slopes)
-    coords = target.structural_coordinates(np.array([[1.2, 1e-2], [1.2, 1e-3], [1.203, 1e-6], [1.198, 1e-9]]))
-    emulated = emulator.log_likelihood(target.scaled(coords))
+    emulator = ResponseEmulator(target, rows, centre, covariance, slopes)
+    coords = structural_coordinates(target, np.array([[1.2, 1e-2], [1.2, 1e-3], [1.203, 1e-6], [1.198, 1e-9]]))
+    emulated = emulator.log_likelihood(coords)
     true = target.log_likelihood(at_once(target.run(coords)).statistics, np.zeros((4, 0)))
     assert np.abs(emulated - true).max() < 0.3
 
 
 @pytest.mark.parametrize("scale", SCALES)
-def test_scaled_parameters_can_be_undone_and_their_volume_is_known(scale):
-    target = ResponseTarget(vibration(damping=LogNormal(0.8, 0.3))).in_scale(scale)
-    coords = np.random.default_rng(1).standard_normal((50, target.ndim))
-    scaled = target.scaled(coords)
-    back, log_volume = target.unscaled(scaled)
-    np.testing.assert_allclose(back, coords, atol=1e-6)
-    slopes = np.ones(len(coords))
-    for i in range(target.n_structural):
-        step = 1e-5 * np.eye(target.ndim)[i]
-        slopes *= (target.scaled(coords + step) - target.scaled(coords - step))[:, i] / 2e-5
-    assert (slopes > 0.0).all()
-    np.testing.assert_allclose(log_volume, -np.log(slopes), atol=1e-5)
-    assert target.unscaled(np.full((1, target.ndim), 1e5))[1] == -np.inf or scale != "reciprocals"
+def test_a_line_is_straight_in_scaled_parameters(scale):
+    """In logarithms, in which lines are drawn; and scaled parameters increase with the coordinates."""
+    target = ResponseTarget(vibration(damping=LogNormal(0.8, 0.3)))
+    first, last = np.random.default_rng(1).standard_normal((2, 2))
+    shares = np.array([0.0, 0.3, 1.0])
+    scaled = target.scaled(target.line(first, last, shares))
+    np.testing.assert_allclose(scaled - scaled[0], shares[:, None] * (scaled[2] - scaled[0]), atol=1e-9)
+    np.testing.assert_allclose(target.line(first, last, shares)[[0, 2]], [first, last], atol=1e-6)
+    assert (np.diff(target.in_scale(scale).scaled(np.outer(np.linspace(-3.0, 3.0, 9), [1.0, 1.0])), axis=0) > 0.0).all()
 
 
 def test_uncertainty_enters_through_the_expected_likelihood():
@@ -75,11 +77,11 @@ def test_uncertainty_enters_through_the_expected_likelihood():
     emulator.process = emulator.process._replace(variances=emulator.process.variances * 1e8)
     noise = target.fit_noise(target.archive.statistics[0]).coords
     offsets = np.array([[0.0, 0.0], [0.02, 0.0], [0.05, 0.2], [-0.08, 0.1]])
-    structural = target.structural_coordinates(AT[None]) + SCALE * offsets
+    structural = structural_coordinates(target, AT[None]) + SCALE * offsets
     coords = np.concatenate([structural, np.tile(noise, (4, 1))], axis=1)
-    mean, variance = predict(emulator.process, emulator._inputs(target.scaled_parameters(structural)))
+    mean, variance = predict(emulator.process, emulator._inputs(structural))
     gains = []
-    for k, expected in enumerate(emulator.log_likelihood(target.scaled(coords))):
+    for k, expected in enumerate(emulator.log_likelihood(coords)):
         draws = mean[k] + np.sqrt(variance[k]) * np.random.default_rng(5).standard_normal((100_000, mean.shape[1]))
         values = target.log_likelihood(emulator._at(draws), np.tile(noise, (len(draws), 1)))
         average = np.log(np.mean(np.exp(values - values.max()))) + values.max()

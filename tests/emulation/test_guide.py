@@ -129,7 +129,8 @@ def test_springs_in_series_are_emulated_in_flexibilities():
     posterior = Posterior(FELikelihood(model, measured, GaussianNoise(model.channels)), prior).marginal()
     sampler = guided(posterior, steps=0)
     (emulator,) = sampler.guide.emulators
-    assert np.abs(np.subtract(*emulator.left_out_statistics())).max() < 1e-6  # with logarithms: 0.1
+    predicted, true = emulator.left_out_statistics()
+    assert np.abs(predicted - true).max() < 1e-6 * true.max()  # residuals are in single precision; with logarithms 0.1
     assert sampler.verdict.simulations < 250
     draws = posterior.sample_prior(40_000, 1)
     weights = np.exp(posterior(draws) - posterior.log_prior(draws) - sampler.log_evidence)
