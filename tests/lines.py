@@ -13,7 +13,7 @@ class Line:
     channels = (Channel("a", "acceleration", "m/s2"), Channel("b", "displacement", "m"))
     dt = 0.5
     n_steps = 8
-    reason = "\N{GREEK SMALL LETTER THETA} too steep after 2 s"
+    reason = "\N{GREEK SMALL LETTER THETA} too steep"
 
     def __init__(self, steepest=1.0, fingerprint="line"):
         self.steepest, self.fingerprint = steepest, fingerprint

@@ -239,8 +239,16 @@ def _numbers(
         values = np.array([])
     fits = values.ndim in (1, 2) if shape is None else values.shape in ((), shape, shape[-1:])
     inside = (values >= limits[0]) & (values < limits[1]) | np.isnan(values) & (what in ("frequencies", "damping"))
-    if not fits or not values.size or not inside.all():
+    if not fits or not values.size:
         raise ValueError(f"ModalData: {what} must be {expected}; got {given!r}")
+    if not inside.all():
+        places = np.argwhere(~inside)[:3]
+        got = (
+            ", ".join(f"{values[tuple(place)]:g} at {(place + 1).tolist()}" for place in places)
+            if values.ndim
+            else given
+        )
+        raise ValueError(f"ModalData: {what} must be {expected}; got {got}: correct or leave out")
     return values if shape is None else np.broadcast_to(values, shape).copy()
 
 
