@@ -283,19 +283,12 @@ def check_stated_errors(fits: Iterable[Fit]) -> list[Finding]:
         if fit.deviations is None or fit.residuals is None:
             continue
         measured, squares = fit.measurements, np.square(fit.residuals / fit.deviations)
-        n = int(np.isfinite(squares).sum())
-        what = f"The {n} values{f' of {fit.title}' if fit.title else ''}"
-        largest = np.argsort(-np.nan_to_num(squares), axis=None)[:3]
-        places = [
-            f"{measured.channels[row].name} at {measured.points[column] if measured.points else column + 1}"
-            for row, column in np.transpose(np.unravel_index(largest, squares.shape))
-        ]
-        action = (
-            f"The largest: {listed(places)}. Look for a wrong value, sensor or load case (exchanged, another place "
-            "or unit of the load), and at the model. If all of them are right, leave the stated errors out: they are "
-            "then estimated."
+        n, cases = int(np.isfinite(squares).sum()), measured.points or range(1, measured.n_steps + 1)
+        names = [f"{channel.name} at {case}" for channel in measured.channels for case in cases]
+        more = "leave the stated errors out: they are then estimated."
+        found += check_squares(
+            squares.ravel(), n, names, f"The {n} values{f' of {fit.title}' if fit.title else ''}", more
         )
-        found += check_squares(float(np.nansum(squares)), n, what, action)
     return found
 
 

@@ -1,5 +1,6 @@
 """Findings about modes, which are `PredictedModes` of `fe_likelihoods.modal`, above this folder."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -23,10 +24,10 @@ def check_modes(fit: Any) -> list[Finding]:
     found = about("data", _check_sets(fit.likelihood.model.data))
     if fit.draws is not None:
         changes = find_changes_of_modes(fit.draws, fit.deviations)
-        explained = any(each.kind in ("sign", "swap") or each.names[0] in fit.draws.data.sensors for each in changes)
-        strange = [] if explained else _check_shapes(fit.draws)
-        # a mode that the model lacks has no value that could be expected
-        named = [finding_of(each, fit.title) for each in changes if each.kind != "value" or not strange]
+        of_sensor = any(each.kind != "value" and each.names[0] in fit.draws.data.sensors for each in changes)
+        strange = [] if of_sensor else _check_shapes(fit.draws)
+        # a mode that the model lacks has no frequency that could be expected
+        named = [finding_of(each, fit.title) for each in changes if each.names[0] != "frequency" or not strange]
         found += about("data", named + strange or _check_reach(fit.draws))
     if any(each.severity == WRONG for each in found) or fit.samples is None:
         return found
@@ -101,22 +102,21 @@ def _check_errors(fit: Any) -> list[Finding]:
     sums = likelihood.simulator.statistics(fit.points[:, : len(likelihood.model.parameter_names)])
     deviations = np.repeat(np.concatenate(noise.deviations(np.zeros((1, 0))), axis=1), noise.n_sets, axis=1)
     squares = sums[:, len(noise.channels) :] / np.square(deviations)
-    n_modes, best = fit.samples.data.n_modes, squares[np.nanargmin(squares.sum(axis=1))]
-    places = []
-    for k in np.argsort(-np.nan_to_num(best))[:2]:
-        what = "shape" if k // (n_modes * noise.n_sets) else "frequency"
-        of_set = f" in set {k % noise.n_sets + 1}" if noise.n_sets > 1 else ""
-        places.append(f"the {what} of mode {_number(fit.samples, k // noise.n_sets % n_modes)}{of_set}")
-    action = (
-        f"The largest: {listed(places)}. Look for a wrong number or sensor, and at the model. If both are right, add "
-        'an unknown error: frequency_error="common", shape_error="common" (unknown_errors in a TOML file).'
-    )
-    what, data = "At the best sample, frequencies and shapes", sum(map(sum, noise.counts))
-    return check_squares(float(best.sum()), data, what, action)
+    best, samples = squares[np.nanargmin(squares.sum(axis=1))], fit.samples
+    names = [
+        f"the {what} of mode {_number(samples, mode)}{f' in set {k + 1}' if noise.n_sets > 1 else ''}"
+        for what in ("frequency", "shape")
+        for mode in range(samples.data.n_modes)
+        for k in range(noise.n_sets)
+    ]
+    more = 'add an unknown error: frequency_error="common", shape_error="common" (unknown_errors in a TOML file).'
+    what, n = "At the best sample, frequencies and shapes", sum(map(sum, noise.counts))
+    return check_squares(best, n, names, what, more)
 
 
-def check_squares(square: float, n: int, what: str, action: str) -> list[Finding]:
-    """Whether the sum of the squares of n residuals, each by its stated error, is larger than errors explain."""
+def check_squares(squares: np.ndarray, n: int, names: Sequence[str], what: str, more: str) -> list[Finding]:
+    """Whether squares (m,) of residuals by their stated errors, NaN where unknown, are larger than n errors explain."""
+    square = float(np.nansum(squares))
     factor = float(np.sqrt(square / n))
     if not chi2.sf(square, n) < SMALL_PROBABILITY:
         return []
@@ -124,7 +124,11 @@ def check_squares(square: float, n: int, what: str, action: str) -> list[Finding
         f"{what} differ from the model by {factor:.2g} times their stated errors (root mean square): intervals of the "
         "parameters are too narrow."
     )
-    severity = WRONG if factor > np.hypot(1.0, LARGE_SHIFT) else CARE
+    largest = listed([names[k] for k in np.argsort(-np.nan_to_num(squares))[:2]])
+    action = (
+        f"The largest: {largest}. Look for a wrong number, sensor or place, and at the model. If all are right, {more}"
+    )
+    severity = WRONG if factor > np.hypot(1.0, LARGE_SHIFT) else CARE  # of a mean square that is five times as stated
     return [Finding("Values differ more than their stated errors", severity, text, action, {"factor": factor}, "fit")]
 
 

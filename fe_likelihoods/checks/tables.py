@@ -169,6 +169,8 @@ def find_changes_of_modes(modes: Any, deviations: np.ndarray) -> tuple[Fault, ..
             other = replace(data, shapes=data.shapes * np.where(np.arange(n) == j, -1.0, 1.0))
             others["sign", name] = table_of_modes(modes.against(other), deviations)
     change = find_change(table, factors, others)
-    if change is None or (change.kind == "value" and (data.n_modes < 3 or abs(np.log(abs(change.value))) < TAIL)):
-        return tuple(found)  # such a small one may be the error of the model as well
+    # a small one may be the error of the model as well, and one of two frequencies be right
+    small = change is not None and change.kind == "value" and np.exp(-TAIL) < change.value < np.exp(TAIL)
+    if change is None or small or (change.names[0] == "frequency" and data.n_modes < 3):
+        return tuple(found)
     return (*found, change)
