@@ -22,7 +22,7 @@ import numpy as np
 
 from ..signals.channels import Measurements
 from ..signals.error_measures import relative_errors
-from ..units import UNITS
+from ..units import find_unit
 from .sensor_faults import runs_of
 
 __all__ = ["FACTOR", "FEWEST_DRAWS", "Fault", "find_faults", "slow_motion", "support_gains", "supports_apart"]
@@ -147,7 +147,7 @@ def _hypotheses(
     timed = [(measurements.steps[k], measurements.starts[k]) for k in usable]
     for i, j in combinations(range(len(y)), 2):
         if timed[i] == timed[j]:  # each is read with the unit of the other
-            one, other = (UNITS[channels[k].unit].factor for k in (i, j))
+            one, other = (find_unit(channels[k].unit).factor for k in (i, j))
             ratio = 1.0 if channels[i].dimension == channels[j].dimension else one / other
             yield "swap", [i, j], np.full(len(r), np.nan), r[:, [j, i]] * [[ratio], [1.0 / ratio]]
 

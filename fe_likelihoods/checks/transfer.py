@@ -9,6 +9,7 @@ from .finding import CARE, Finding
 
 __all__ = [
     "check_bandwidth",
+    "check_common",
     "check_final_values",
     "check_most",
     "check_normal",
@@ -27,6 +28,9 @@ HARMLESS_ERROR = 0.15  # of the means [posterior sd], up to which uneven weights
 # Skewness and excess kurtosis of the logarithms in any direction, assumed: a uniform distribution has the excess
 # kurtosis -1.2, a double exponential one 3, and an exponential one the skewness 2.
 NORMAL = (-1.0, 1.0), (-1.2, 3.0)
+# Standard deviations of the prior by which the median of a common factor may differ from its mean: named in 1 of 120
+# right cases, and in 120 of 120 in which all stiffnesses, known to 2 %, have lost 14 or 20 %.
+COMMON = 1.96
 
 
 class _Reweighted(Protocol):
@@ -111,6 +115,19 @@ def check_normal(skewness: np.ndarray, kurtosis: np.ndarray) -> list[Finding]:
     shown = f"skewness {np.max(np.abs(skewness)):.1f}, excess kurtosis {np.min(kurtosis):.1f} to {np.max(kurtosis):.1f}"
     text = f"The logarithms of the stiffnesses are not normal ({shown}): ridges and several modes are not represented."
     return [Finding("A calibration is not normal", CARE, text, "Use narrower priors, or fix what is not identified.")]
+
+
+def check_common(factors: np.ndarray, expected: float, sd: float) -> list[Finding]:
+    """Whether a common factor, by draws (n,), is the `expected` one of a prior with the log standard deviation `sd`."""
+    factor = float(np.median(factors))
+    if abs(np.log(factor / expected)) <= COMMON * sd:
+        return []
+    text = (
+        f"The factor that all share is {factor:.3g}, where {expected:.3g} is expected, with a standard deviation of "
+        f"{sd:.1%}: the losses leave it out, and it may be a damage of all."
+    )
+    action = "State what else has changed, such as temperature or mass (slopes=, common=), or take it as a loss of all."
+    return [Finding("All stiffnesses have changed", CARE, text, action, {"factor": factor})]
 
 
 def check_most(counts: np.ndarray, most: int, stiffnesses: int) -> list[Finding]:

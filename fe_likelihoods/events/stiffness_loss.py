@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..checks.finding import Finding, judge, labelled
-from ..checks.transfer import check_most, check_normal
+from ..checks.transfer import check_common, check_most, check_normal
 from ..priors.distributions import Distribution, HalfNormal, LogNormal
 from ..text_tables import text_table
 from .scales import Scales
@@ -174,7 +174,7 @@ def stiffness_loss(
         for each in state.findings
     ]
     factors, common_factor = np.array([node.error for node in nodes])[of_node], np.exp(change[:, -1] + shift)
-    findings += check_most(count, most, d)
+    findings += check_common(common_factor, float(np.exp(shift)), common) + check_most(count, most, d)
     return StiffnessLoss(names, -np.expm1(change[:, :-1]), common_factor, count, factors, tuple(findings))
 
 

@@ -5,6 +5,7 @@ nominal values, and noise parameters in SI units. `Parameter` says how to show s
 """
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ from ..noise.marginal import sampled_noise
 from ..noise.protocol import Noise, noise_channels
 from ..signals.channels import Channel
 from ..simulation.model import Model
-from ..units import UNITS, find_unit
+from ..units import find_unit
 
 __all__ = ["Parameter", "channels_of_deviations", "describe_parameters"]
 
@@ -75,8 +76,9 @@ def _of_model(model: Model, name: str) -> Parameter:
     if not isinstance(nominal, Mapping) or name not in nominal:
         return Parameter(name)
     unit = str(getattr(model, "nominal_units", {}).get(name, ""))
-    value = nominal[name] / (find_unit(unit).factor if unit in UNITS else 1.0)
-    # the nominal value itself where its unit is not known
+    value = nominal[name]
+    with suppress(ValueError):  # the nominal value itself where its unit is not known
+        value = value / find_unit(unit).factor
     return Parameter(name, "-", 1.0, 1.0, f"{value:.4g} {unit}".rstrip(" -"))
 
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from fe_likelihoods import LinearOscillator, Measurements
+from fe_likelihoods import Channel, LinearOscillator, Measurements
 from fe_likelihoods.checks.fault_words import describe_unit
 from fe_likelihoods.checks.faults import find_faults
 from fe_likelihoods.problems import table_motion
@@ -80,6 +80,11 @@ def test_signs_lags_and_exchanged_channels_are_named():
     values = np.stack([np.roll(TRUE[0], 60), TRUE[0]])
     (fault,) = find_faults(Measurements(two, MODEL.dt, values), pairs)
     assert fault.kind == "swap" and fault.names == ("acceleration", "other")
+
+
+def test_channels_may_have_other_spellings_of_their_units():
+    channels = [Channel("a", "acceleration", "m/s²"), Channel("d", "displacement", "µm")]
+    assert find_faults(Measurements(channels, MODEL.dt, TRUE), RESPONSES) == ()
 
 
 def test_two_faults_are_found_one_after_the_other():

@@ -276,6 +276,13 @@ def test_contradictions_enlarge_the_errors_and_many_damaged_stiffnesses_are_foun
     assert stiffness_loss(*states, NAMES, most=5, **KNOWN).findings == ()
 
 
+@pytest.mark.parametrize(("factor", "expected"), [(0.95, 0), (0.8, 1), (1.25, 1)])
+def test_a_change_of_all_stiffnesses_beyond_the_prior_is_found(factor, expected):
+    states, _ = pair(np.full(D, np.log(factor)), noise=False)
+    found = stiffness_loss(*states, NAMES, **KNOWN)
+    assert [each.kind for each in found.findings] == ["All stiffnesses have changed"] * expected
+
+
 def test_joint_priors_of_the_stiffnesses():
     """A joint prior in logarithms has no such class: a joint normal prior of small variance is close to one."""
     values = np.random.default_rng(1).multivariate_normal(np.ones(2), 1e-4 * np.eye(2), 20_000)
