@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from samplers.judgement.checks import check_shares
+from samplers.judgement.checks import OF_MEAN, OF_SHARES, check_shares
 from samplers.proposals.mixture import Mixture, draw, invert_roots, log_density
 from samplers.tempering.anneal import check_population
 from samplers.tempering.mutation import VisitedPoints
@@ -44,6 +44,10 @@ def test_different_shares_are_reported(points, truth):
     for seed in range(5):
         (doubt,) = found_in(points, truth, seed)
         assert doubt.severity == "care" and "a mode has been lost or has a wrong weight" in doubt.text
+        assert doubt.numbers[OF_SHARES] == pytest.approx(abs(points - truth), abs=0.15)
+        apart = abs(points - truth) * np.abs(MEANS[0] - MEANS[1])
+        found = [doubt.numbers[f"{OF_MEAN} {j}"] for j in range(NDIM)]
+        np.testing.assert_allclose(found, apart, atol=0.15 * np.abs(MEANS[0] - MEANS[1]).max() + 0.3)
 
 
 class Modes:
