@@ -285,7 +285,7 @@ class Climb:
                 continue
             failures += 1
             damping = max(30.0 * damping, _FIRST_DAMPING)
-            # the first time, the run that gain nothing has corrected the secants
+            # the first time, the run that gained nothing has corrected the secants
             if failures > 1 and not self._known_here():
                 yield from self._own_differences(at, failures)
         return None
