@@ -63,9 +63,9 @@ DRAWS_PER_TARGET = 3.0
 # Draws that find narrow modes, which hold few points at small beta: draws of the prior, and further draws, spread over
 # the stages below beta = 1. They are a multiple of the walkers; from 250 on, at least 1000 of each kind: modes are as
 # narrow for few walkers. Widths 1:6 and 1:8 in three dimensions and 1:3 in five, 250 walkers: recycling lost a mode in
-# 21 of 72 runs with 250 and 1500, in 2 of 96 with 1000 and 1000 (7 % more evaluations);
-# of four modes in eight dimensions one in none and in 2 of 32, of two with volumes 1:100 in 4 to 10 dimensions one in 4
-# and in 4 of 30.
+# 21 of 72 runs with 250 and 1500, in 2 of 96 with 1000 and 1000 (7 % more evaluations); of four modes in eight
+# dimensions one in none and in 2 of 32; of two and three in 4 to 10 dimensions, with volumes 1:100 and 1:10, in 4 and
+# none, and in 4 and 3 of 30.
 # TMCMC lost or mis-weighted one in 13 of 48 runs of the first two, 7 without a warning, and in 6 of 64, none without a
 # warning, with 1.3 to 1.4 times the evaluations.
 DRAWS_SHARE, LEAST_DRAWS, FEWEST_TO_SEARCH = 4, 1000, 250
