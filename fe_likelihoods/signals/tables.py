@@ -1112,17 +1112,18 @@ def _times(table: Table) -> NDArray[np.float64]:
     if np.isnan(times).any():
         line = table.lines[int(np.argmax(np.isnan(times)))]
         raise ValueError(f"{table.file}, line {line}: expected a time, got an empty cell or NaN; write all times")
-    for place, other in enumerate(() if table.chosen or not table.named or own.kind == "clock" else table.columns):
-        by_name = _TIME.match(other.name)
-        if place == table.time or other.kind != "number" or not (by_name or _STAMP.match(other.name)):
+    for place, other in enumerate(() if table.chosen or not table.named else table.columns):
+        if place == table.time or other.kind != own.kind:
             continue
-        stated = stated_unit(table, place)  # T may be a temperature
-        if (
-            (not by_name or re.match(r"t(\b|_)", other.name, re.IGNORECASE))
-            if stated is None
-            else dimension_of(stated) != "time"
-        ):
-            continue
+        by_name, stated = _TIME.match(other.name), None
+        if own.kind == "number":
+            stated = stated_unit(table, place)  # T may be a temperature
+            if not (by_name or _STAMP.match(other.name)) or (
+                (not by_name or re.match(r"t(\b|_)", other.name, re.IGNORECASE))
+                if stated is None
+                else dimension_of(stated) != "time"
+            ):
+                continue
         others_unit = unit if stated is None else find_unit(stated, "time").factor
         ahead = other.values * others_unit - times
         ahead = ahead - ahead[0] if _is_unix(abs(ahead[0])) else ahead  # a Unix time beside an elapsed one

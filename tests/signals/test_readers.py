@@ -220,6 +220,15 @@ class TestCSV:
         path.write_text(names + "\n0.00,1,0.00,1\n0.01,2,0.01,2\n")
         assert read_columns(path, (channel,), ("b_g",), time_unit=None if "[" in names else "s").dt == 0.01
 
+    def test_two_clocks(self, tmp_path):
+        path, channel = tmp_path / "a.csv", Channel("b", "acceleration", "g")
+        path.write_text("pc,gps,b_g\n09:58:10.213,09:58:10.000,1\n09:58:10.223,09:58:10.010,2\n")
+        with pytest.raises(ValueError, match="the columns 'pc' and 'gps' have different times"):
+            read_columns(path, (channel,), ("b_g",), zero="09:58:10")
+        assert read_columns(path, (channel,), ("b_g",), zero="09:58:10", time="gps").start == 0.0
+        path.write_text(path.read_text().replace(".213", ".000").replace(".223", ".010"))
+        assert read_columns(path, (channel,), ("b_g",), zero="09:58:10").start == 0.0
+
     def test_a_temperature_is_no_column_of_times(self, tmp_path):
         path = tmp_path / "a.csv"
         path.write_text("time_s,acc_g,T [°C],T\n0.00,1,20,20\n0.01,2,20,20\n", encoding="utf-8")
