@@ -1,4 +1,4 @@
-"""Kills by signal 9, after which the same script is started again until it ends.
+"""Kills by signal 9, after which the same script is started again until it ends: ``python -m tests.faults.kills 12 7``.
 
 Kills come before, within or after a write to the record or to the HDF5 file (through a Python file), or in an
 evaluation. The outcome must be that of a run without kills, and only evaluations that were running are made again.
@@ -12,6 +12,7 @@ import pickle
 import random
 import shutil
 import signal
+import sys
 import tempfile
 import traceback
 import warnings
@@ -21,7 +22,7 @@ import h5py
 
 import samplers.evaluation.evaluator
 import samplers.record
-from tests.faults.resumable_run import BURN_IN, STEPS, calls, go_on, make, outcome
+from tests.faults.resumable_run import BURN_IN, KINDS, STEPS, N, calls, go_on, make, outcome
 
 COMPARED = 2  # points by which a new sampler compares its function with the record
 
@@ -148,7 +149,7 @@ def whole_outcomes(kind, folder):
     return found, count
 
 
-def evaluated_again(log):
+def evaluated_again(log, kind):
     """Points that were evaluated again although they were known: each process may repeat what ran, and compare."""
     by_process: dict[int, list[list[bytes]]] = {}
     for process, points in calls(log):
@@ -157,7 +158,9 @@ def evaluated_again(log):
     for made in by_process.values():
         points = {point for call in made for point in call}
         lost += max(len((points & seen) - running) - COMPARED, 0)
-        running |= set(made[-1])
+        # all points of a submission, or those that have ended while the sampler computed proposals
+        last = {"asynchronous": 4 * N, "map": 8}.get(kind, 1)
+        running |= {point for call in made[-last:] for point in call}
         seen |= points
     return lost
 
@@ -183,7 +186,7 @@ def trial(kind, folder, whole, count, choose, number):
     if status != 0:
         return kills, f"stuck: {said.decode()}"
     found, steps = pickle.loads(said)
-    if lost := evaluated_again(folder / "log"):
+    if lost := evaluated_again(folder / "log", kind):
         return kills, f"lost: {lost} evaluations were made again"
     if kind == "reset":  # evaluations of a burn-in that was given up count, and so in the verdict
         found, whole = found[:5], [each[:5] for each in whole]
@@ -205,3 +208,10 @@ def kill(number, kind, seed):
             messages += [wrong] * bool(wrong)
             shutil.rmtree(where)
     return made, messages
+
+
+if __name__ == "__main__":  # kills of each kind of run, and a seed
+    results = {each: kill(int(sys.argv[1]), each, int(sys.argv[2])) for each in KINDS}
+    for each, (made, messages) in results.items():
+        print(f"{each}: {made} kills", *messages, sep="\n    ")
+    raise SystemExit(any(messages for _, messages in results.values()))
