@@ -46,6 +46,7 @@ from ..judgement.rounds import (
     UNSETTLED,
     all_impossible,
     describe_rounds,
+    grown,
     hardly_reached,
     hopeless,
     is_even,
@@ -293,7 +294,7 @@ def draw_rounds(
         if outcome is not None:
             outcome = _with_signed(outcome)
             unreached = hardly_reached(partial(log_mixture, rounds), guide.known_density)
-            if unreached <= LARGEST_UNREACHED:
+            if max(unreached, grown(outcome.pooled, rounds[-1].known, guide.known_density)) <= LARGEST_UNREACHED:
                 return outcome._replace(unreached=unreached)
             if len(rounds) == MOST_ROUNDS:
                 return outcome._replace(shortfall=UNSETTLED)
