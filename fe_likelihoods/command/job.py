@@ -124,7 +124,8 @@ def parse_job(text: str, file: Path, folder: Path) -> Job:
         content = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ValueError(
-            f"{file.name}: not a TOML file: {error}; a text needs quotes, a section is a line such as [record]"
+            f"{file.name}: not a TOML file: {error}; a text needs quotes, true and false have small letters, each key "
+            "stands once, a section is a line such as [record]"
         ) from error
     for name, value in content.items():
         if name not in (known := (*FREE_SECTIONS, *SECTIONS)):

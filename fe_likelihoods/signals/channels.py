@@ -354,7 +354,12 @@ def _values_array(values: Any, names: Sequence[str]) -> NDArray[np.float64]:
                 row[: samples.size] = samples
     if np.iscomplexobj(values):
         raise ValueError("values must be real numbers, got complex ones; give the real part if it is the data")
-    values = np.array(values, dtype=np.float64)
+    try:
+        values = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"values must be numbers, one row per channel ({error}); read tables by read_columns"
+        ) from None
     if values.ndim != 2 or values.shape[0] != len(names) or values.shape[1] < 1:
         raise ValueError(
             f"expected values of shape (n_channels, n_steps) = ({len(names)}, n_steps), got {values.shape}"

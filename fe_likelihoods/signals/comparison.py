@@ -85,7 +85,8 @@ def compare_with(measurements: Measurements, dt: float, n_steps: int) -> NDArray
         if known[0] < -_LATEST * dt:
             raise ValueError(
                 f"the samples of channel {channel.name!r} are from {known[0]:g} to {known[-1]:g} s, the response of "
-                f"the model is from 0 to {end:g} s; correct their start, or replace the samples before zero by NaN"
+                f"the model is from 0 to {end:g} s; correct their start, or replace the samples before zero "
+                f"by NaN (in a TOML file missing = [[{known[0]:g}, {-0.5 * step:g}]])"
             )
         # a missing sample may be outside the response: any place within serves
         places.append(make_interpolation(dt, n_steps, np.where(there, times, known[0])))

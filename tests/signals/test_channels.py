@@ -54,6 +54,7 @@ class TestMeasurements:
             ((TOP, DRIFT), 0.1, np.ones((3, 2)), r"= \(2, n_steps\), got \(3, 2\)"),
             ((TOP,), 0.1, np.ones(3), r"got \(3,\)"),
             ((TOP,), 0.1, np.ones((1, 3)) + 0j, "values must be real numbers, got complex ones"),
+            ((TOP,), 0.1, [["1,0", "2,0"]], "values must be numbers, one row per channel"),
             ((TOP,), 0.1, np.ones((1, 0)), r"got \(1, 0\)"),
             ((TOP, DRIFT), 0.1, [[0, np.nan], [np.nan, np.nan]], "all samples of 'drift' are missing"),
             ((TOP,), 0.0, np.ones((1, 3)), "positive number of seconds, got 0.0"),
