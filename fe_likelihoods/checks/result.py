@@ -104,7 +104,7 @@ def judge_run(run: FinishedRun) -> JudgedRun:
     tests = {
         "Sampling": "by the sampler" if run.tempered else alone,
         "Failed simulations": f"not tested: {failed.unknown}" if failed.unknown else f"{failed.attempts} simulations",
-        "Units, signs, clocks, swapped channels": f"{responses} responses were compared" if responses else "not tested",
+        "Faults of the data": f"{responses} responses were compared" if responses else "not tested",
         "Residuals": f"channels: {checked}" if checked else "not tested: there are none",
     }
     unique = dict.fromkeys(found)  # data sets may share a description or a motion

@@ -149,7 +149,7 @@ def whole_outcomes(kind, folder):
     return found, count
 
 
-def evaluated_again(log, kind):
+def evaluated_again(log, kind=""):
     """Points that were evaluated again although they were known: each process may repeat what ran, and compare."""
     by_process: dict[int, list[list[bytes]]] = {}
     for process, points in calls(log):
