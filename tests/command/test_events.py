@@ -120,14 +120,9 @@ def test_an_event_whose_simulations_all_fail_is_named_in_the_report(events, monk
         return one(self, theta)
 
     monkeypatch.setattr(LinearOscillator, "simulate", simulate)
-    said = call("run", "oscillator.toml", "--out", "r", "--quiet")
-    assert "CAUTION: event weaker: No prediction: All simulations failed" in said
+    call("run", "oscillator.toml", "--out", "r", "--quiet")
     report = read_page(events / "r" / "report.html")
-    assert (
-        "All simulations failed" in report.notes["weaker: No prediction"]
-        and "no motion" in report.notes["weaker: No prediction"]
-    )
-    assert "weaker: It could not be predicted." in report.text
+    assert "weaker: It could not be predicted: all simulations failed: " in report.text and "no motion" in report.text
     numbers = next(table for table in report.tables if table[0][1:3] == ["Quantity", "Median"])[1:]
     assert {row[0] for row in numbers} == {"after"}
 

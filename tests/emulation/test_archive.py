@@ -48,7 +48,7 @@ def _linear(theta):
 
 @pytest.mark.slow
 def test_a_run_does_not_hold_its_responses_in_memory():
-    """All responses have 310 MiB; all copies of them had 840."""
+    """The responses of 130 simulations have 200 MiB; all copies of them had nearly three times as much."""
     prior = {name: TruncatedNormal(1.0, 0.3) for name in ("a", "b")}
     posterior = HardPosterior("linear", prior, _linear, (1.1, 0.9), n_steps=5000, n_channels=40).posterior(1)
     posterior.likelihood.simulator.response_memory.most = 2**24
@@ -60,5 +60,5 @@ def test_a_run_does_not_hold_its_responses_in_memory():
         _, largest = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    assert sampler.verdict.simulations > 150
+    assert sampler.verdict.simulations > 120
     assert largest < 300 * 2**20  # three or four copies of the responses that are simulated together, 64 MiB each

@@ -213,7 +213,9 @@ def test_searches_and_guided_runs_find_the_storey(calibrated):
     for run, search in zip(runs, searches, strict=True):
         size = np.exp(run.log_weights)
         mean = size @ run.samples
-        np.testing.assert_allclose(search.samples.mean(axis=0), mean, atol=0.3 * search.samples.std(axis=0).max())
+        # an ascent ends where it would gain less than 0.1 of log-density
+        furthest = np.sqrt(2.0 * 0.1) * search.samples.std(axis=0).max()
+        np.testing.assert_allclose(search.samples.mean(axis=0), mean, atol=furthest)
         sd = np.sqrt(size @ np.square(run.samples - mean))
         np.testing.assert_allclose(search.samples.std(axis=0), sd, rtol=0.15)
 
