@@ -15,7 +15,6 @@ density can find it; other guides depend on their search (`findings`). Constants
 trials on posteriors with known answers.
 """
 
-import logging
 from collections.abc import Callable, Generator, Sequence
 from contextlib import suppress
 from functools import partial
@@ -68,7 +67,6 @@ __all__ = [
     "stopped_rounds",
 ]
 
-logger = logging.getLogger(__name__)
 
 # Draws in each later round, as a share of the number of walkers. After a reliable round, a round has as many draws as
 # are expected to suffice.
