@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["MemoryCache", "ResponseMemory", "distinct_keys", "thetas_of"]
+__all__ = ["MemoryCache", "ResponseMemory", "distinct_keys", "statistics_in", "thetas_of"]
 
 _NAN = np.array([np.nan]).tobytes()
 _ENTRY_BYTES = 250  # memory of one stored response, besides its numbers
@@ -30,14 +30,23 @@ def thetas_of(keys: Sequence[bytes], n_structural: int) -> np.ndarray:
     return np.frombuffer(b"".join(keys), dtype=float).reshape(len(keys), n_structural).copy()
 
 
-class _Memory:
-    """Outcomes by key, the oldest first, of at most `most` in size. Threads may share it.
+def statistics_in(outcomes: Iterable[bytes | str | None], width: int) -> np.ndarray:
+    """Statistics (n, width) of outcomes; NaN for failures and unknown ones."""
+    unknown = _NAN * width
+    # a bytearray makes a writable array
+    filled = bytearray().join([each if isinstance(each, bytes) else unknown for each in outcomes])
+    return np.frombuffer(filled, dtype=float).reshape(-1, width)
 
-    An outcome is a value, or a text: the reason of a failure. It is empty after unpickling, because its contents would
-    dominate the size of the pickle. ValueError if `most` is not a whole number of 0 or more.
+
+class MemoryCache:
+    """The most recently used outcomes of simulations, of at most `most` in size. Threads may share it.
+
+    An outcome is a value (bytes of statistics, by the bytes of structural parameters), or a text: the reason of a
+    failure. The object is empty after unpickling, because its contents would dominate the size of the pickle.
+    ValueError if `most` is not a whole number of 0 or more.
     """
 
-    _what = ""
+    _what = "memory_rows must be the number of simulations to cache in memory"
 
     def __init__(self, most: int) -> None:
         if isinstance(most, bool) or not isinstance(most, int | np.integer) or most < 0:
@@ -54,48 +63,44 @@ class _Memory:
     def clear(self) -> None:
         """Drop all outcomes."""
         self._outcomes: OrderedDict[Hashable, Any] = OrderedDict()
-        self._bytes = 0  # of responses
+        self._size = 0
 
-
-class MemoryCache(_Memory):
-    """The most recently used statistics of at most `most` simulations, by the bytes of structural parameters."""
-
-    _what = "memory_rows must be the number of simulations to cache in memory"
-
-    def look_up(self, keys: Sequence[bytes], width: int) -> tuple[np.ndarray, list[bool]]:
-        """Cached statistics (n, width) of n distinct keys, NaN if failed or not cached, and whether each is cached."""
-        found, unknown = [], _NAN * width
+    def look_up(self, keys: Iterable[Hashable]) -> list[Any]:
+        """Outcomes of keys; None where nothing is stored."""
+        found = []
         with self._lock:
             for key in keys:
-                outcome = self._outcomes.get(key)
-                if outcome is not None:
+                if (outcome := self._outcomes.get(key)) is not None:
                     self._outcomes.move_to_end(key)
                 found.append(outcome)
-        # a bytearray makes a writable array
-        filled = bytearray().join([each if isinstance(each, bytes) else unknown for each in found])
-        return np.frombuffer(filled, dtype=float).reshape(len(keys), width), [each is not None for each in found]
+        return found
+
+    def store(self, keys: Iterable[Hashable], outcomes: Iterable[Any]) -> None:
+        """Keep outcomes, which are not changed later."""
+        with self._lock:
+            for key, outcome in zip(keys, outcomes, strict=True) if self.most else ():
+                self._size += self._size_of(outcome) - self._size_of(self._outcomes.pop(key, None))
+                self._outcomes[key] = outcome
+                while self._size > self.most:
+                    self._size -= self._size_of(self._outcomes.popitem(last=False)[1])
 
     def successes(self, n_structural: int) -> np.ndarray:
         """Structural parameters (n, n_structural) of cached simulations that did not fail."""
         with self._lock:
-            keys = [key for key, outcome in self._outcomes.items() if isinstance(outcome, bytes)]
+            keys = [key for key, outcome in self._outcomes.items() if not isinstance(outcome, str)]
         return thetas_of(keys, n_structural)
-
-    def store(self, keys: Sequence[bytes], statistics: np.ndarray, reasons: Sequence[str]) -> None:
-        """Cache the statistics (n, width) of n distinct keys, and the reasons of failures; empty for others."""
-        outcomes = [reason or row.tobytes() for row, reason in zip(statistics, reasons, strict=True)]
-        with self._lock:
-            self._outcomes.update(zip(keys, outcomes, strict=True))
-            while len(self._outcomes) > self.most:
-                self._outcomes.popitem(last=False)
 
     def reason(self, key: bytes) -> str:
         """Reason of a cached failure; empty for others."""
         outcome = self._outcomes.get(key)
         return outcome if isinstance(outcome, str) else ""
 
+    @staticmethod
+    def _size_of(outcome: Any) -> int:
+        return outcome is not None
 
-class ResponseMemory(_Memory):
+
+class ResponseMemory(MemoryCache):
     """Responses (n_channels, n_steps) [SI], not to be changed, in at most `most` bytes, by fingerprint and parameters.
 
     Likelihoods with the same model or shortened versions of it share one.
@@ -103,23 +108,8 @@ class ResponseMemory(_Memory):
 
     _what = "memory_bytes must be the size of the responses to keep in memory [bytes]"
 
-    def look_up(self, keys: Iterable[Hashable]) -> list[np.ndarray | str | None]:
-        """Outcomes of keys; None where nothing is stored."""
-        with self._lock:
-            return [self._outcomes.get(key) for key in keys]
-
-    def store(self, keys: Sequence[Hashable], outcomes: Iterable[np.ndarray | str]) -> None:
-        """Store copies of responses, and reasons of failures."""
-        with self._lock:
-            for key, outcome in zip(keys, outcomes, strict=True) if self.most else ():
-                self._bytes += _size(outcome) - _size(self._outcomes.pop(key, None))
-                self._outcomes[key] = outcome if isinstance(outcome, str) else np.array(outcome)
-                while self._bytes > self.most:
-                    self._bytes -= _size(self._outcomes.popitem(last=False)[1])
-
-
-def _size(outcome: np.ndarray | str | None) -> int:
-    """Bytes of an outcome in the response memory."""
-    if outcome is None:
-        return 0
-    return _ENTRY_BYTES + (len(outcome) if isinstance(outcome, str) else outcome.nbytes)
+    @staticmethod
+    def _size_of(outcome: Any) -> int:
+        if outcome is None:
+            return 0
+        return _ENTRY_BYTES + (len(outcome) if isinstance(outcome, str) else outcome.nbytes)

@@ -25,13 +25,11 @@ __all__ = [
     "LAYOUT",
     "STORE",
     "STORE_LABEL",
-    "CachedRows",
     "Row",
     "is_undamaged",
     "is_undamaged_label",
     "pack_label",
     "pack_rows",
-    "reason_of",
     "select_rows",
     "simulation_keys",
     "source_number",
@@ -76,29 +74,10 @@ class Row(NamedTuple):
     crc: int
     size: int | None
 
-
-class CachedRows(NamedTuple):
-    """Stored rows for n simulations of `width` numbers each; None where nothing is stored."""
-
-    rows: list[Row | None]
-    width: int
-
     @property
-    def known(self) -> np.ndarray:
-        """Whether each simulation is stored (n,)."""
-        return np.array([row is not None for row in self.rows], dtype=bool)
-
-    @property
-    def reasons(self) -> list[str]:
-        """Reasons of n failures; empty otherwise."""
-        return ["" if row is None or not row.reason else reason_of(row) for row in self.rows]
-
-    @property
-    def values(self) -> np.ndarray:
-        """Statistics or responses (n, width); NaN where failed or not stored."""
-        nothing = np.full(self.width, np.nan).tobytes()
-        data = bytearray().join([(row and row.value) or nothing for row in self.rows])  # makes a writable array
-        return np.frombuffer(data, dtype="<f8").reshape(len(self.rows), self.width)
+    def outcome(self) -> bytes | str:
+        """The value, or the reason of a failure."""
+        return self.reason.decode("utf-8", "replace") if self.reason else self.value
 
 
 def simulation_keys(fingerprint: str, thetas: np.ndarray, generation: int = 1) -> list[bytes]:
@@ -170,11 +149,6 @@ def pack_label(source: int, code: str, files: dict[str, str], generation: int) -
 def is_undamaged_label(row: tuple) -> bool:
     """Whether the values of `LABEL_COLUMNS` match their checksum."""
     return row[4] == zlib.crc32(repr(row[:4]).encode())
-
-
-def reason_of(row: Row) -> str:
-    """Reason of a stored failure."""
-    return row.reason.decode("utf-8", "replace")
 
 
 @contextlib.contextmanager

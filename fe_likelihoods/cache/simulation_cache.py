@@ -14,7 +14,7 @@ import logging
 import os
 import secrets
 import sqlite3
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,11 +26,9 @@ from .rows import (
     COLUMNS,
     LABEL_COLUMNS,
     STORE,
-    CachedRows,
     Row,
     is_undamaged,
     pack_rows,
-    reason_of,
     select_rows,
     simulation_keys,
     source_number,
@@ -101,12 +99,6 @@ class SimulationCache:
         if the file cannot be read or created, is not a cache, belongs to another program, or has the layout of another
         release. Such a file is not changed.
 
-    Notes
-    -----
-    Methods for rows have the arguments `fingerprint`, the declared identity (`Simulator.simulation_key` for
-    statistics, the model's fingerprint for responses and failures); `thetas`, the structural parameters
-    (n, n_structural); and `generation`, by default the latest.
-
     Examples
     --------
     >>> cached = FELikelihood(model, measurements, cache=SimulationCache("oscillator.sqlite"))
@@ -165,12 +157,12 @@ class SimulationCache:
 
     # rows ---------------------------------------------------------------------------------------------------------
 
-    def look_up(self, fingerprint: str, thetas: np.ndarray, width: int, generation: int | None = None) -> CachedRows:
-        """Look up simulations of `width` numbers each, with few queries for the whole batch.
+    def look_up(self, fingerprint: str, thetas: np.ndarray, width: int, generation: int) -> list[Row | None]:
+        """Stored simulations of `width` numbers each, with few queries for the whole batch; None where none is stored.
 
         Rows of another width count as damaged.
         """
-        keys = self._keys(fingerprint, thetas, generation)
+        keys = simulation_keys(fingerprint, thetas, generation)
         with self.file.lock:
             good, bad = {}, []
             for row in map(Row._make, self._rows(keys)):
@@ -179,14 +171,7 @@ class SimulationCache:
                 else:
                     bad.append(row.key)
             self._drop(bad)
-        return CachedRows([good.get(key) for key in keys], width)
-
-    def store(
-        self, fingerprint: str, thetas: np.ndarray, values: np.ndarray, reasons: Sequence[str], of_model: bool = False
-    ) -> None:
-        """Store simulations of the latest generation, see `pack_rows`."""
-        generation = self._given_or_latest(fingerprint, None)
-        self.write(pack_rows(fingerprint, thetas, values, reasons, generation, of_model=of_model))
+        return [good.get(key) for key in keys]
 
     def write(self, rows: list[Row]) -> None:
         """Store rows, and those that wait, and evict the oldest, in one transaction."""
@@ -250,7 +235,7 @@ class SimulationCache:
     def look_up_remark(self, model: Model) -> str:
         """The stored remark of a model; empty if there is none."""
         rows = self.rows_of(simulation_keys(model.fingerprint, np.zeros((1, 0)), 0))
-        return reason_of(rows[0]) if rows else ""
+        return str(rows[0].outcome) if rows else ""
 
     def repeat_remark(self, model: Model, fingerprint: str) -> None:
         """Log a model's stored remark, once per process, unless the model has just made a remark itself.
@@ -326,9 +311,9 @@ class SimulationCache:
             delete, rows = "DELETE FROM rows WHERE source = ?", [(source,) for source in sources]
             return self.file.insist(lambda connection: connection.executemany(delete, rows).rowcount)
 
-    def discard(self, thetas: np.ndarray, *fingerprints: str, generation: int | None = None) -> None:
+    def discard(self, thetas: np.ndarray, *fingerprints: str, generation: int) -> None:
         """Delete the rows of some simulations, if possible."""
-        keys = {key for fingerprint in fingerprints for key in self._keys(fingerprint, thetas, generation)}
+        keys = {key for fingerprint in fingerprints for key in simulation_keys(fingerprint, thetas, generation)}
         with self.file.lock:
             self._waiting = [row for row in self._waiting if row.key not in keys]
             self._delete(keys)
@@ -339,12 +324,6 @@ class SimulationCache:
             self.file.retry_times.clear()
             self.write([])
             self.file.close()
-
-    def _given_or_latest(self, fingerprint: str, generation: int | None) -> int:
-        return next(iter(self.generations_of(fingerprint)), 1) if generation is None else generation
-
-    def _keys(self, fingerprint: str, thetas: np.ndarray, generation: int | None) -> list[bytes]:
-        return simulation_keys(fingerprint, thetas, self._given_or_latest(fingerprint, generation))
 
     def _rows(self, keys: list[bytes]) -> list[tuple]:
         """Stored rows with given keys."""

@@ -26,7 +26,7 @@ import secrets
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from hashlib import blake2b
 from itertools import islice
@@ -49,15 +49,14 @@ from ..simulation.model import (
     simulate_batch,
 )
 from .comparison import Simulated, difference_in_words
+from .memory import MemoryCache, ResponseMemory, statistics_in
 from .rows import (
     LABEL_COLUMNS,
     STORE_LABEL,
-    CachedRows,
     Row,
     is_undamaged_label,
     pack_label,
     pack_rows,
-    reason_of,
     source_number,
 )
 from .simulation_cache import TOLERANCE, SimulationCache
@@ -178,6 +177,8 @@ class VerifiedModel:
     """
 
     _key: str
+    memory_cache: MemoryCache
+    response_memory: ResponseMemory
 
     def __init__(
         self,
@@ -289,27 +290,34 @@ class VerifiedModel:
         if changed:
             self._label_model()
 
-    def _check_after(
-        self,
-        thetas: np.ndarray,
-        misfit: np.ndarray,
-        reasons: list[str],
-        earlier: Callable[[], list[tuple[np.ndarray, np.ndarray]]],
-    ) -> None:
+    def _check_after(self, thetas: np.ndarray, misfit: np.ndarray, reasons: list[str]) -> None:
         """Compare the model after simulations, unless the last comparison was too recent.
 
-        `earlier` returns parameters and statistics of a known simulation, to repeat if none was seen here. Raises
-        `ChangedModel`; the simulations at `_unchecked` may be from before or after the change.
+        Raises `ChangedModel`; what was simulated since the last comparison, on either side of the change, is dropped.
         """
         self._unchecked.append(thetas)
         succeeded = [row for row, reason in enumerate(reasons) if not reason]
         points = [(thetas[row].copy(), misfit[row].copy()) for row in succeeded[:1] + succeeded[-1:]]
-        known = self._points or earlier()
+        if not (known := self._points):  # a known simulation, if none was run here
+            earlier = self.memory_cache.successes(thetas.shape[1])[:1]
+            outcomes = self.memory_cache.look_up([theta.tobytes() for theta in earlier])
+            known = list(zip(earlier, statistics_in(outcomes, self.n_numbers), strict=True))
         self._points = (known or points)[:1] + points[-1:]
         if self._points and (start := time.monotonic()) >= self._not_before:
-            self._require_same(is_first=not known and self.pool is None)
+            try:
+                self._require_same(is_first=not known and self.pool is None)
+            except ChangedModel:
+                self._clear()
+                for generation in set(self._trust.generations.values()) if self.cache is not None else ():
+                    places = self._key, self.model.fingerprint
+                    self.cache.discard(np.concatenate(self._unchecked), *places, generation=generation)
+                raise
             now = time.monotonic()
             self._not_before = now + max(0.0, now - start - NO_TIME) / SHARE_OF_TIME
+
+    def _clear(self) -> None:
+        self.memory_cache.clear()
+        self.response_memory.clear()
 
     def _changes(self) -> set[str]:
         """Names of what has changed; a file counts from when a simulation opened it."""
@@ -382,39 +390,27 @@ class VerifiedModel:
             rows += pack_rows(fingerprint, thetas[chosen], values[chosen], why, generation, trust.session, True)
         self.cache.write(rows)
 
-    def _discard_unchecked(self, fingerprint: str) -> None:
-        """Delete rows that were stored here since the last comparison of the model."""
-        if self.cache is not None and self._unchecked:
-            thetas = np.concatenate(self._unchecked)
-            for generation in set(self._trust.generations.values()):
-                self.cache.discard(thetas, self._key, fingerprint, generation=generation)
+    def _stored(self, identity: str, thetas: np.ndarray, fingerprint: str, width: int) -> list[Row | None]:
+        """Stored rows, None where there is none; some are verified. `StaleCache` if one differs and the label is known.
 
-    def _stored_statistics(self, thetas: np.ndarray, fingerprint: str) -> CachedRows:
-        """Statistics that are stored, some verified; `StaleCache` if one differs although the label is known."""
-        return self._look_up_rows(self._key, thetas, fingerprint, self.n_numbers)
-
-    def _stored_responses(self, thetas: np.ndarray, fingerprint: str) -> list[np.ndarray | str | None]:
-        """Responses (n_channels, n_steps) [SI], or reasons of failures for any measurements; None if not stored.
-
-        Some are verified by their statistics, as in `_stored_statistics`.
+        The `identity` is that of statistics, or the model's `fingerprint` for responses.
         """
-        shape = len(self.model.channels), self.model.n_steps
-        rows = self._look_up_rows(fingerprint, thetas, fingerprint, shape[0] * shape[1]).rows
-        return [
-            row and (reason_of(row) if row.reason else np.frombuffer(row.value, dtype="<f8").reshape(shape))
-            for row in rows
-        ]
-
-    def _look_up_rows(self, identity: str, thetas: np.ndarray, fingerprint: str, width: int) -> CachedRows:
         trust, source = self._trust, source_number(fingerprint)
         while True:
             with trust.lock:
                 generation = trust.generations.get(source) or self._find_generation(source, identity, width)
             if generation is None:
-                return CachedRows([None] * len(thetas), width)
+                return [None] * len(thetas)
             rows = self.cache.look_up(identity, thetas, width, generation)
-            if not self.cache.verify or self._verify(identity, rows.rows, generation, source, width):
+            if not self.cache.verify or self._verify(identity, rows, generation, source, width):
                 return rows
+
+    def _stored_responses(self, thetas: np.ndarray, fingerprint: str) -> list[np.ndarray | str | None]:
+        """Responses (n_channels, n_steps) [SI], or reasons of failures for any measurements; None if not stored."""
+        shape = len(self.model.channels), self.model.n_steps
+        rows = self._stored(fingerprint, thetas, fingerprint, shape[0] * shape[1])
+        outcomes = [row and row.outcome for row in rows]
+        return [np.frombuffer(each, "<f8").reshape(shape) if isinstance(each, bytes) else each for each in outcomes]
 
     # generations --------------------------------------------------------------------------------------------------
 
@@ -547,7 +543,7 @@ class VerifiedModel:
 
     def _row_difference(self, row: Row, new: Simulated) -> tuple[str, float]:
         """How a simulation differs from a stored one, as `_difference`."""
-        misfit, reason = np.frombuffer(row.value, dtype="<f8"), reason_of(row)
+        misfit, reason = np.frombuffer(row.value, dtype="<f8"), row.outcome if row.reason else ""
         if not reason and row.size is not None:  # a response
             (misfit,), (reason,) = self.statistics_of(misfit.reshape(1, len(self.model.channels), -1), [""])
         return self._difference(misfit, reason, new)

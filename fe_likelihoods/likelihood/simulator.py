@@ -22,7 +22,7 @@ import numpy as np
 
 from samplers.interrupts import interrupts_end_the_run
 
-from ..cache.memory import MemoryCache, ResponseMemory, distinct_keys, thetas_of
+from ..cache.memory import MemoryCache, ResponseMemory, distinct_keys, statistics_in, thetas_of
 from ..cache.simulation_cache import SimulationCache
 from ..cache.verification import StaleCache, VerifiedModel
 from ..noise.statistics import Statistic
@@ -30,7 +30,6 @@ from ..priors.points import as_rows
 from ..signals.channels import Measurements
 from ..signals.comparison import Comparison, compare_with
 from ..simulation.executors import as_executor
-from ..simulation.faults import ChangedModel
 from ..simulation.folder import Observed, unpack
 from ..simulation.local_pool import value_of
 from ..simulation.model import (
@@ -53,30 +52,32 @@ _ROUNDS_PER_CHUNK = 8  # simulations per worker and chunk: at the end of a chunk
 
 
 class _Request:
-    """Distinct simulations that were requested, whose results are filled in.
+    """Distinct simulations that were requested, and what is known of them, by key (see `distinct_keys`).
 
-    For n `keys` (see `distinct_keys`): `thetas` (n, n_structural), `statistics` (n, n_numbers), NaN where not known,
-    `reasons` of failures, `responses` (n, n_channels, n_steps) if requested, and whether the statistics are `known`,
-    and nothing is to be simulated (`done`). The model has one `fingerprint` for all of them.
+    `outcomes` are statistics in bytes, `responses` arrays (n_channels, n_steps) if `full` ones were requested; failures
+    have their reasons in both. The model has one `fingerprint` for all of them.
     """
 
-    def __init__(self, keys: list[bytes], full: bool, model: Model, statistics: np.ndarray, known: Any) -> None:
-        self.keys, self.model, self.statistics = keys, model, statistics
-        self.thetas = thetas_of(keys, len(model.parameter_names))
-        self.finite = np.isfinite(self.thetas).all(axis=1)
-        self.reasons = ["" if fine else "the parameters are not finite" for fine in self.finite]
-        self.known = np.array(known, dtype=bool) | ~self.finite
-        self.done = self.known & ~np.isfinite(statistics).all(axis=1) if full else self.known.copy()
-        self.responses = np.full((len(keys), len(model.channels), model.n_steps), np.nan) if full else None
+    def __init__(self, keys: list[bytes], full: bool, model: Model) -> None:
+        self.keys, self.full, self.model = keys, full, model
+        self.outcomes: dict[bytes, bytes | str] = {}
+        self.responses: dict[bytes, np.ndarray | str] = {}
 
     @cached_property
     def fingerprint(self) -> str:
         return self.model.fingerprint
 
     @property
-    def left(self) -> np.ndarray:
-        """Rows that are to be simulated."""
-        return (~self.done).nonzero()[0]
+    def left(self) -> list[bytes]:
+        """Keys that are to be simulated."""
+        done = self.responses if self.full else self.outcomes
+        return [key for key in self.keys if key not in done]
+
+    def enter(self, keys: Sequence[bytes], outcomes: Sequence[bytes | str]) -> None:
+        """Fill in outcomes."""
+        found = dict(zip(keys, outcomes, strict=True))
+        self.outcomes |= found
+        self.responses |= {key: reason for key, reason in found.items() if isinstance(reason, str)}
 
 
 class _Running:
@@ -186,11 +187,9 @@ class Simulator(VerifiedModel):
         simulations that have ended are cached, except after the model has changed.
         """
         keys, which = distinct_keys(thetas)
-        if not full:
-            statistics, known = self.memory_cache.look_up(keys, self.n_numbers)
-            if all(known):
-                self.cache_hits += len(which)
-                return statistics if len(keys) == len(which) else statistics[which]
+        if not full and None not in (outcomes := self.memory_cache.look_up(keys)):
+            self.cache_hits += len(which)
+            return self._rows(outcomes, which)
         if possible is not None and not (wanted := possible()).all():
             statistics = np.full((len(which), self.n_numbers), np.nan)
             if wanted.any():
@@ -198,15 +197,15 @@ class Simulator(VerifiedModel):
             return statistics
         request = self._run_in_pool(keys, which, full) if self.streams else self._look_up(keys, which, full)
         left = request.left
-        while len(left):
+        while left:
             self._check_model()
-            some, start = left[: self._chunk(len(left), full)], time.perf_counter()
+            some, start = left[: self._chunk(len(left))], time.perf_counter()
             with self._observed():
                 if self.pool is None or self._returns_responses(full):
-                    values, reasons = simulate_batch(self.model, request.thetas[some], self.pool)
+                    values, reasons = simulate_batch(self.model, self._thetas(some), self.pool)
                 else:
                     values, reasons = misfit_batch(
-                        self.model, request.thetas[some], self.measured, self.pool, self.statistic
+                        self.model, self._thetas(some), self.measured, self.pool, self.statistic
                     )
             self._record(request, some, values, reasons, time.perf_counter() - start)
             # the size grows by steps: the first simulations may be failures that took no time
@@ -214,10 +213,26 @@ class Simulator(VerifiedModel):
                 4 * len(some), 1 + int(_SECONDS_PER_CHUNK * len(some) / (time.perf_counter() - start))
             )
             left = left[len(some) :]
-        statistics = request.statistics if len(keys) == len(which) else request.statistics[which]
+        outcomes = [request.outcomes[key] for key in keys]
         if not full:
-            return statistics
-        return statistics, SimulationBatch(request.responses[which], [request.reasons[row] for row in which])
+            return self._rows(outcomes, which)
+        found = [request.responses[keys[place]] for place in which]
+        return self._rows(outcomes, which), SimulationBatch(self._as_responses(found), list(map(_reason, found)))
+
+    def _rows(self, outcomes: Sequence[bytes | str], which: Sequence[int]) -> np.ndarray:
+        """Statistics (n, n_numbers) of n rows, each of which has one of the outcomes."""
+        statistics = statistics_in(outcomes, self.n_numbers)
+        return statistics if len(outcomes) == len(which) else statistics[which]
+
+    def _as_responses(self, found: Sequence[np.ndarray | str]) -> np.ndarray:
+        """Responses (n, n_channels, n_steps); NaN for failures."""
+        responses = np.full((len(found), len(self.model.channels), self.model.n_steps), np.nan)
+        for row, each in zip(responses, found, strict=True):
+            row[...] = np.nan if isinstance(each, str) else each
+        return responses
+
+    def _thetas(self, keys: Sequence[bytes]) -> np.ndarray:
+        return thetas_of(keys, self.n_structural)
 
     def recall(self, thetas: np.ndarray, statistics: np.ndarray | None, reasons: Sequence[str]) -> None:
         """Cache statistics (n, n_numbers) of an earlier run in memory, at structural parameters (n, n_structural).
@@ -226,98 +241,84 @@ class Simulator(VerifiedModel):
         cache on disk. Without statistics, only failures are cached.
         """
         keys, which = distinct_keys(thetas)
-        known = self.memory_cache.look_up(keys, self.n_numbers)[1]
-        last = dict(zip(which, range(len(thetas)), strict=True))
-        rows = [row for place, row in last.items() if not known[place] and np.isfinite(thetas[row]).all()]
+        known, last = self.memory_cache.look_up(keys), dict(zip(which, range(len(thetas)), strict=True))
+        rows = [row for place, row in last.items() if known[place] is None and np.isfinite(thetas[row]).all()]
         new = [row for row in rows if keys[which[row]] not in self._recalled]
         self._recalled.update(keys[which[row]] for row in new)
         self.failures.count_outcomes(thetas[new], [reasons[row] for row in new])
         if statistics is None:
             rows = [row for row in rows if reasons[row]]
-            statistics = np.full((len(thetas), self.n_numbers), np.nan)
-        self.memory_cache.store([keys[which[row]] for row in rows], statistics[rows], [reasons[row] for row in rows])
+        outcomes = [reasons[row] or statistics[row].tobytes() for row in rows]
+        self.memory_cache.store([keys[which[row]] for row in rows], outcomes)
 
     # known simulations --------------------------------------------------------------------------------------------
 
     def _look_up(self, keys: list[bytes], which: Sequence[int], full: bool) -> _Request:
         """What is known of distinct keys, which is counted; `which` has the key of every requested row."""
+        finite = np.isfinite(self._thetas(keys)).all(axis=1)
         with self._running.lock:
-            request = _Request(keys, full, self.model, *self.memory_cache.look_up(keys, self.n_numbers))
-            for row in (request.done & request.finite).nonzero()[0] if full else ():
-                request.reasons[row] = self.memory_cache.reason(keys[row]) or "the simulation failed before"
+            request, known = _Request(keys, full, self.model), zip(keys, self.memory_cache.look_up(keys), strict=True)
+            known = {key: outcome for key, outcome in known if outcome is not None}
+            request.enter(list(known), list(known.values()))
+            skipped = [key for key, fine in zip(keys, finite, strict=True) if not fine]
+            request.enter(skipped, ["the parameters are not finite"] * len(skipped))
             try:
-                on_disk = self._take_statistics(request) + self._take_responses(request)
+                on_disk = {*self._take_statistics(request), *self._take_responses(request)}
             except StaleCache:  # results in memory may belong to another model
                 self._clear()
                 raise
-            counts = np.bincount(which, minlength=len(keys))
-            self.cache_hits += int(counts[request.done & request.finite].sum())
-            self.disk_hits += int(counts[on_disk].sum())
+            new = {*skipped, *request.left}
+            self.cache_hits += sum(keys[place] not in new for place in which)
+            self.disk_hits += sum(keys[place] in on_disk for place in which)
         return request
 
-    def _take_statistics(self, request: _Request) -> list[int]:
-        """Fill in stored statistics, unless responses are wanted, and return their rows; some are verified by runs."""
-        if self.cache is None or request.responses is not None or self._responses_only:
+    def _take_statistics(self, request: _Request) -> list[bytes]:
+        """Fill in stored statistics, unless responses are wanted; returns their keys. Some are verified by runs."""
+        if self.cache is None or request.full or self._responses_only or not (left := request.left):
             return []
-        if not len(new := request.left):
-            return []
-        rows = self._stored_statistics(request.thetas[new], request.fingerprint)
-        found, reasons = rows.known.nonzero()[0], rows.reasons
-        if len(found):
-            self._enter_known(request, new[found], rows.values[found], [reasons[place] for place in found])
-        return new[found].tolist()
+        rows = self._stored(self._key, self._thetas(left), request.fingerprint, self.n_numbers)
+        found = {key: row.outcome for key, row in zip(left, rows, strict=True) if row is not None}
+        self._enter_known(request, list(found), list(found.values()))
+        return list(found)
 
-    def _take_responses(self, request: _Request) -> list[int]:
-        """Fill in rows whose responses are cached, and statistics that are not known; returns rows from the disk."""
-        memory, full, on_disk = self.response_memory, request.responses is not None, []
+    def _take_responses(self, request: _Request) -> list[bytes]:
+        """Fill in stored responses, and statistics that are not known; returns keys of responses from the disk."""
+        memory, on_disk, left, size = self.response_memory, [], request.left, most_responses(self.model)
         if self.cache is None and not len(memory):
             return []
-        left, size = request.left.tolist(), most_responses(self.model)
         for start in range(0, len(left), size):
-            rows, fingerprint = left[start : start + size], request.fingerprint
-            known = dict(zip(rows, memory.look_up([(fingerprint, request.keys[row]) for row in rows]), strict=True))
-            missing = [row for row in rows if known[row] is None]
+            keys, fingerprint = left[start : start + size], request.fingerprint
+            found = dict(zip(keys, memory.look_up([(fingerprint, key) for key in keys]), strict=True))
+            missing = [key for key in keys if found[key] is None]
             if self.cache is not None and missing:
-                read = dict(zip(missing, self._stored_responses(request.thetas[missing], fingerprint), strict=True))
-                known |= read
-                new = [row for row in missing if read[row] is not None]
-                on_disk += new
-                if full:
-                    memory.store([(fingerprint, request.keys[row]) for row in new], [read[row] for row in new])
-            known = {row: outcome for row, outcome in known.items() if outcome is not None}
-            for row, outcome in known.items() if full else ():
-                request.responses[row] = np.nan if isinstance(outcome, str) else outcome
-            request.done[list(known)] = True
-            if new := [row for row in known if not request.known[row]]:
-                nothing = np.full((len(self.model.channels), self.model.n_steps), np.nan)
-                failed = [known[row] if isinstance(known[row], str) else "" for row in new]
-                responses = [nothing if reason else known[row] for row, reason in zip(new, failed, strict=True)]
-                statistics, reasons = self.statistics_of(np.array(responses), failed)
-                self._enter_known(request, new, statistics, reasons)
+                read = dict(zip(missing, self._stored_responses(self._thetas(missing), fingerprint), strict=True))
+                found |= read
+                on_disk += (new := [key for key in missing if read[key] is not None])
+                if request.full:
+                    memory.store([(fingerprint, key) for key in new], [read[key] for key in new])
+            found = {key: outcome for key, outcome in found.items() if outcome is not None}
+            if request.full:
+                request.responses |= found
+            if new := [key for key in found if key not in request.outcomes]:
+                batch = self._as_responses([found[key] for key in new]), [_reason(found[key]) for key in new]
+                statistics, reasons = self.statistics_of(*batch)
+                self._enter_known(request, new, _outcomes(statistics, reasons))
                 if self.cache is not None and not self._responses_only:
-                    self._store(request.thetas[new], statistics, reasons, None, fingerprint)
+                    self._store(self._thetas(new), statistics, reasons, None, fingerprint)
         return on_disk
 
-    def _enter_known(self, request: _Request, rows: Sequence[int], statistics: np.ndarray, reasons: list[str]) -> None:
+    def _enter_known(self, request: _Request, keys: list[bytes], outcomes: list[bytes | str]) -> None:
         """Enter known statistics, and log the remark that is stored with them."""
-        if self.cache is not None:
+        if keys and self.cache is not None:
             self.cache.repeat_remark(self.model, request.fingerprint)
-        self.failures.count_outcomes(request.thetas[rows], reasons)
-        self._enter(request, rows, statistics, reasons)
+        self.failures.count_outcomes(self._thetas(keys), list(map(_reason, outcomes)))
+        self._enter(request, keys, outcomes)
 
-    def _enter(self, request: _Request, rows: Sequence[int], statistics: np.ndarray, reasons: list[str]) -> None:
-        """Fill in statistics (n, n_numbers) and reasons of failures, and cache them in memory."""
-        request.statistics[rows], request.known[rows], request.done[rows] = statistics, True, True
-        for row, reason in zip(rows, reasons, strict=True):
-            request.reasons[row] = reason
-            if reason and request.responses is not None:
-                request.responses[row] = np.nan
-        self.memory_cache.store([request.keys[row] for row in rows], statistics, reasons)
-        self.has_results = True
-
-    def _clear(self) -> None:
-        self.memory_cache.clear()
-        self.response_memory.clear()
+    def _enter(self, request: _Request, keys: Sequence[bytes], outcomes: list[bytes | str]) -> None:
+        """Fill in statistics and reasons of failures, and cache them in memory."""
+        request.enter(keys, outcomes)
+        self.memory_cache.store(keys, outcomes)
+        self.has_results = self.has_results or bool(keys)
 
     # simulations --------------------------------------------------------------------------------------------------
 
@@ -332,9 +333,9 @@ class Simulator(VerifiedModel):
             self._in_pool = _Running()
         return self._in_pool
 
-    def _chunk(self, n: int, full: bool) -> int:
+    def _chunk(self, n: int) -> int:
         """Number of simulations, of n, between two writes to the cache on disk, or two reports of progress."""
-        most = most_responses(self.model) if self.pool is None or self._returns_responses(full) else n
+        most = most_responses(self.model)
         if self.cache is None and (self.when_simulated is None or self.pool is not None):
             return min(n, most)
         workers = (os.cpu_count() or 1) if self.pool is None else self.pool.n_workers or n
@@ -349,7 +350,7 @@ class Simulator(VerifiedModel):
         with running.lock:  # so that nothing arrives between the two
             running.lock.wait_for(lambda: running.keys.isdisjoint(keys))
             request = self._look_up(keys, which, full)
-            left = self._send(request, request.left.tolist(), arrived)
+            left = self._send(request, arrived)
         try:
             while left:
                 self._receive(request, left, take_all(arrived))
@@ -360,51 +361,51 @@ class Simulator(VerifiedModel):
             raise
         finally:
             with running.lock:
-                running.keys -= {keys[row] for row in left.values()}
+                running.keys -= set(left.values())
                 running.lock.notify_all()
         return request
 
-    def _send(self, request: _Request, rows: Sequence[int], arrived: SimpleQueue) -> dict[Future, int]:
-        """Submit rows of a request to the pool; their futures will come through a queue."""
-        if not rows:
+    def _send(self, request: _Request, arrived: SimpleQueue) -> dict[Future, bytes]:
+        """Submit what is left of a request to the pool; the futures, whose keys are returned, come through a queue."""
+        if not (keys := request.left):
             return {}
         self._check_model()
         running = self._running
         if not running.keys:
             running.counted_until = time.perf_counter()
-        measured = () if self._returns_responses(request.responses is not None) else (self.measured, self.statistic)
+        measured = () if self._returns_responses(request.full) else (self.measured, self.statistic)
         function = Observed(sent_simulation(self.model, *measured))
-        futures = self.pool.submit_all(function, list(request.thetas[rows]))
-        running.keys |= {request.keys[row] for row in rows}
+        futures = self.pool.submit_all(function, list(self._thetas(keys)))
+        running.keys |= set(keys)
         for future in futures:
             future.add_done_callback(arrived.put)
-        return dict(zip(futures, rows, strict=True))
+        return dict(zip(futures, keys, strict=True))
 
-    def _receive(self, request: _Request, left: dict[Future, int], ended: Sequence[Future]) -> None:
+    def _receive(self, request: _Request, left: dict[Future, bytes], ended: Sequence[Future]) -> None:
         """Record simulations that have ended, which are taken from those that are `left`; raises the error of one.
 
         `ChangedModel` if the model has changed; these simulations, and all since the last comparison, are not stored.
         """
-        rows, results, reasons, error = [], [], [], None
+        keys, results, reasons, error = [], [], [], None
         with self._running.lock:
             for future in ended:
-                row = left.pop(future)
-                self._running.keys.discard(request.keys[row])
+                key = left.pop(future)
+                self._running.keys.discard(key)
                 try:
                     (result, reason), opened = unpack(value_of(future.result()), self.pool)
                     self.label.add(opened)
-                    rows, results, reasons = [*rows, row], [*results, result], [*reasons, reason]
+                    keys, results, reasons = [*keys, key], [*results, result], [*reasons, reason]
                 except CancelledError:
                     error = error or RuntimeError("the pool was closed before a simulation had finished")
                 except BaseException as raised:
                     error = error or raised
-            if rows:
+            if keys:
                 now = time.perf_counter()
                 seconds, self._running.counted_until = now - self._running.counted_until, now
-                responses = self._returns_responses(request.responses is not None)
+                responses = self._returns_responses(request.full)
                 shape = (len(self.model.channels), self.model.n_steps) if responses else (self.n_numbers,)
                 values = np.array([np.full(shape, np.nan) if each is None else each for each in results])
-                self._record(request, rows, values, reasons, seconds)
+                self._record(request, keys, values, reasons, seconds)
             self._running.lock.notify_all()
         if error is not None:
             raise error
@@ -413,17 +414,16 @@ class Simulator(VerifiedModel):
         return full or has_jacobian(self.model) or (self.cache is not None and self.cache.responses)
 
     def _record(
-        self, request: _Request, rows: Sequence[int], values: np.ndarray, reasons: list[str], seconds: float
+        self, request: _Request, keys: Sequence[bytes], values: np.ndarray, reasons: list[str], seconds: float
     ) -> None:
         """Count new simulations, record failures, compare the model if that is due, and cache the results.
 
         The values are responses or statistics; responses are kept if they were requested, if a gradient may follow, or
         if they are stored on disk.
         """
-        thetas, full = request.thetas[rows], request.responses is not None
-        responses, statistics, why = None, values, reasons
+        thetas, statistics, why = self._thetas(keys), values, reasons
+        keeps = request.full or has_jacobian(self.model)
         if values.ndim == 3:
-            responses = values
             statistics, why = self.statistics_of(values, reasons)
         with self._running.lock:
             self.seconds += seconds
@@ -431,42 +431,35 @@ class Simulator(VerifiedModel):
             self.failures.count_outcomes(thetas, why)
             if self.when_simulated is not None:
                 self.when_simulated(len(thetas))
-            self._drop_if_changed(self._check_after, thetas, statistics, why, self._earlier_point)
-            if full:
-                request.responses[rows] = responses
-            self._enter(request, rows, statistics, why)
-            if full or has_jacobian(self.model) or self.cache is not None:  # the model may have been replaced
+            self._check_after(thetas, statistics, why)
+            if keeps or self.cache is not None:  # the model may have been replaced
                 fingerprint = request.fingerprint if request.model is self.model else self.model.fingerprint
-            if full or has_jacobian(self.model):
-                outcomes = [reason or response for reason, response in zip(reasons, responses, strict=True)]
-                self.response_memory.store([(fingerprint, request.keys[row]) for row in rows], outcomes)
+            if keeps:
+                outcomes = [reason or response.copy() for reason, response in zip(reasons, values, strict=True)]
+                self.response_memory.store([(fingerprint, key) for key in keys], outcomes)
+            if request.full:
+                request.responses |= zip(keys, values, strict=True)
+            self._enter(request, keys, _outcomes(statistics, why))
             if self.cache is not None:
                 kept = None if self._responses_only else statistics
-                stored = responses if full or self.cache.responses else None
+                stored = values if request.full or self.cache.responses else None
                 self._store(thetas, kept, why, stored, fingerprint)
                 self.cache.store_remark(self.model)
-
-    # the model ----------------------------------------------------------------------------------------------------
 
     def _check_model(self) -> None:
         """Look at the model before simulations, so that finished simulations are stored."""
         with self._running.lock:
-            self._drop_if_changed(self._check_before)
+            self._check_before()
 
-    def _earlier_point(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Parameters and statistics of a successful simulation in memory, if there is one, to be run again."""
-        thetas = self.memory_cache.successes(self.n_structural)[:1]
-        statistics, _ = self.memory_cache.look_up([each.tobytes() for each in thetas], self.n_numbers)
-        return list(zip(thetas, statistics, strict=True))
 
-    def _drop_if_changed(self, compare: Callable[..., None], *arguments: Any) -> None:
-        """Compare the model; if it has changed, drop what was simulated since the last comparison, on either side."""
-        try:
-            compare(*arguments)
-        except ChangedModel:
-            self._clear()
-            self._discard_unchecked(self.model.fingerprint)
-            raise
+def _outcomes(statistics: np.ndarray, reasons: Sequence[str]) -> list[bytes | str]:
+    """Outcomes of simulations with statistics (n, n_numbers), and reasons of failures; empty for others."""
+    return [reason or row.tobytes() for row, reason in zip(statistics, reasons, strict=True)]
+
+
+def _reason(outcome: Any) -> str:
+    """The reason of a failure; empty for others."""
+    return outcome if isinstance(outcome, str) else ""
 
 
 def take_all(arrived: SimpleQueue) -> list[Future]:

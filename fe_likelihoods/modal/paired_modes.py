@@ -129,7 +129,7 @@ class PairedModes:
     def _response(self, modes: np.ndarray, theta: np.ndarray) -> np.ndarray:
         if self.memory is not None:  # for predictions: samples are simulated as modes no second time
             key = (theta[: len(self.model.parameter_names)] + 0.0).tobytes()
-            self.memory.store([(self.model.fingerprint, key)], [modes])
+            self.memory.store([(self.model.fingerprint, key)], [modes.copy()])
         paired = self.pair(modes)
         return self._joined(self._ratios(paired.frequencies) * self.factors(theta[None]).T, paired.shapes)
 

@@ -230,12 +230,7 @@ def misfit_batch(
     Measured values are (n_channels, n_steps) [SI]; pools are as for `simulate_batch`.
     """
     if pool is None or hasattr(model, "simulate_together"):
-        size, parts = most_responses(model), []
-        for start in range(0, max(1, len(thetas)), size):
-            batch = simulate_batch(model, thetas[start : start + size], pool)
-            parts.append(misfit_of_responses(model, batch, measured, statistic))
-        reasons = [reason for part in parts for reason in part.reasons]
-        return MisfitBatch(np.concatenate([part.misfit for part in parts]), reasons)
+        return misfit_of_responses(model, simulate_batch(model, thetas, pool), measured, statistic)
     shape = (statistic_width(measured, statistic),)
     return MisfitBatch(*_run_each(sent_simulation(model, measured, statistic), thetas, shape, pool))
 

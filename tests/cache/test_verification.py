@@ -107,7 +107,8 @@ def test_the_row_that_was_stored_last_is_verified_even_if_it_is_not_requested(fi
 def test_a_difference_remains_an_error_for_all_rows(filled, thetas):
     """Also for those that are right: a client that tries each point alone must not go on with half of them."""
     other = likelihood_of(Scaled(2.0), SimulationCache(filled, verify=False))
-    other.simulator.cache.discard(thetas[-1:], *other.simulator.cache_keys)
+    cache, keys = other.simulator.cache, other.simulator.cache_keys
+    cache.discard(thetas[-1:], *keys, generation=cache.generations_of(keys[0])[0])
     other.misfit(thetas[-1:])
     likelihood = likelihood_of(Scaled(), filled)
     runs = []

@@ -22,6 +22,7 @@ from fe_likelihoods.signals.channels import Measurements
 from fe_likelihoods.signals.records import Record
 from fe_likelihoods.simulation.executors import LocalPool
 from fe_likelihoods.simulation.faults import ChangedModel
+from tests.cache.stored import look_up
 from tests.faults.treacherous import Gated, Treacherous, posterior_of
 
 SECONDS = 60.0  # after which a test gives up
@@ -197,8 +198,8 @@ def test_a_closed_queue_cancels_what_waits_and_caches_what_runs(tmp_path, shared
                 call()
         (tmp_path / "go").touch()
         stored, key = SimulationCache(path), posterior.likelihood.simulator.simulation_key
-        wait_until(lambda: stored.look_up(key, LONG[:1, :2], 1).known.all())
-        assert not stored.look_up(key, SHORT[:, :2], 1).known.any()
+        wait_until(lambda: look_up(stored, key, LONG[:1, :2], 1)[0] is not None)
+        assert not any(each is not None for each in look_up(stored, key, SHORT[:, :2], 1))
         assert posterior.likelihood.simulations == 1
         np.testing.assert_array_equal(posterior(SHORT), posterior_of(Treacherous())(SHORT))
 
@@ -219,7 +220,7 @@ def test_a_killed_queue_has_stored_what_has_ended(tmp_path):
     process.start()
     again = posterior_of(Gated(tmp_path), cache=path)
     stored, key = SimulationCache(path), again.likelihood.simulator.simulation_key
-    wait_until(lambda: stored.look_up(key, SHORT[:, :2], 1).known.all())
+    wait_until(lambda: all(each is not None for each in look_up(stored, key, SHORT[:, :2], 1)))
     process.kill()
     process.join(SECONDS)
     assert process.exitcode == -signal.SIGKILL
@@ -236,7 +237,7 @@ def test_an_interrupt_loses_no_run_that_has_ended(asynchronous, tmp_path):
         stored, key = SimulationCache(path), posterior.likelihood.simulator.simulation_key
 
         def interrupt():
-            wait_until(lambda: stored.look_up(key, SHORT[:, :2], 1).known.all())
+            wait_until(lambda: all(each is not None for each in look_up(stored, key, SHORT[:, :2], 1)))
             os.kill(os.getpid(), signal.SIGINT)
 
         x = np.concatenate([LONG[:1], SHORT])
