@@ -65,7 +65,7 @@ from .signals.error_measures import rrmse
 from .signals.events import Events
 from .signals.read import read_columns, read_imposed_test, read_record
 from .signals.records import DisplacementHistory, Record
-from .simulation.dask_executor import DaskExecutor
+from .simulation.executors import DaskExecutor
 from .simulation.model import SimulationFailed
 from .units import from_si, to_si
 

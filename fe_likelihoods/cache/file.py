@@ -31,7 +31,6 @@ logger = logging.getLogger(__name__)
 
 APPLICATION_ID = 0x46454C43  # "FELC"
 SCHEMA_VERSION = 6
-CHECK_SECONDS = 2.0  # limit for the integrity check on opening; each row has a checksum
 SQLITE_SIGNATURE = b"SQLite format 3\0"
 ID_START = 68  # place of the application id in SQLite's header [bytes]
 PAGE_SIZE = 4096  # SQLite's default [bytes]
@@ -94,10 +93,7 @@ class CacheFile:
             self._connection.close()
 
     def check(self) -> None:
-        """Open the file and check its integrity, before any costly work; see `SimulationCache` for the errors.
-
-        A damaged cache is moved aside with a warning, and a new one is created.
-        """
+        """Open the file, before any costly work; see `SimulationCache` for the errors."""
         folder = self.path.parent
         if self.path.is_dir() or not folder.is_dir():
             raise ValueError(f"{self.path}: expected the path of a file in an existing folder, as 'cache.sqlite'")
@@ -108,21 +104,26 @@ class CacheFile:
             raise ValueError(
                 f"{self.path} or its folder is not writable or readable for this user; give another path, or copy it"
             )
+        try:
+            self._use(lambda connection: None)
+        except (OSError, sqlite3.Error) as error:
+            raise ValueError(f"{self.path} cannot be opened as a cache: {error}; give another path") from error
+
+    def _use(self, action: Callable[[sqlite3.Connection], Any]) -> Any:
+        """Result of an action on the connection; a file that turns out to be damaged is set aside before."""
         with _lock:
             try:
-                self._check_integrity(self.connection())
-            except (sqlite3.Error, UnicodeDecodeError) as error:
-                self.close()
-                if not _is_damage(error):
-                    raise ValueError(f"{self.path} cannot be opened as a cache: {error}; give another path") from error
                 try:
+                    return action(self.connection())
+                except (sqlite3.Error, UnicodeDecodeError) as error:
+                    self.close()
+                    if not _is_damage(error):
+                        raise
                     self.set_aside(str(error))
-                    self.connection()
-                except (OSError, sqlite3.Error) as failure:
-                    raise ValueError(
-                        f"{self.path} is damaged ({error}) and cannot be moved aside ({failure}); remove it, or give "
-                        "another path"
-                    ) from failure
+                    return action(self.connection())
+            except BaseException:
+                self.close()  # also ends a transaction
+                raise
 
     def attempt(self, what: str, action: Callable[[sqlite3.Connection], Any], otherwise: Any) -> Any:
         """Result of an action on the connection; `otherwise`, with a warning, if the action fails.
@@ -133,18 +134,8 @@ class CacheFile:
             if time.monotonic() < self.retry_times.get(what, -math.inf):
                 return otherwise
             try:
-                try:
-                    result = action(self.connection())
-                except (sqlite3.Error, UnicodeDecodeError) as error:
-                    self.close()
-                    if not _is_damage(error):
-                        raise
-                    self.set_aside(str(error))
-                    result = action(self.connection())
-            except BaseException as failure:
-                self.close()  # also ends a transaction
-                if not isinstance(failure, sqlite3.Error | OSError | ValueError | MemoryError):
-                    raise  # a damaged size may need too much memory
+                result = self._use(action)
+            except (sqlite3.Error, OSError, ValueError, MemoryError) as failure:  # a damaged size may need much memory
                 if what not in self.retry_times:
                     text = "%s cannot be %s (%s); the run continues without it and tries again after %g s"
                     logger.warning(text, self.path, what, failure, RETRY_SECONDS)
@@ -155,14 +146,10 @@ class CacheFile:
 
     def insist(self, action: Callable[[sqlite3.Connection], Any]) -> Any:
         """Result of an action that the user has called explicitly; OSError if the file cannot be used."""
-        with _lock:
-            try:
-                return action(self.connection())
-            except BaseException as error:
-                self.close()
-                if isinstance(error, sqlite3.Error | ValueError):
-                    raise OSError(f"{self.path} cannot be used: {error}") from error
-                raise
+        try:
+            return self._use(action)
+        except (sqlite3.Error, ValueError) as error:
+            raise OSError(f"{self.path} cannot be used: {error}") from error
 
     def select(self, query: str, values: tuple = ()) -> list[tuple]:
         """Rows of a query; none if the file cannot be read."""
@@ -177,8 +164,7 @@ class CacheFile:
                     connection.executemany(statement, rows)
             return True
 
-        with _lock:
-            return self.attempt(what, execute, False)
+        return self.attempt(what, execute, False)
 
     def connection(self) -> sqlite3.Connection:
         """Connection of this process, opened if there is none.
@@ -250,12 +236,10 @@ class CacheFile:
         try:
             if self._is_empty(connection):
                 with transaction(connection):
-                    for statement in (
-                        LAYOUT if self._is_empty(connection) else ()
-                    ):  # another process may have been first
+                    identity = f"PRAGMA application_id = {APPLICATION_ID}", f"PRAGMA user_version = {SCHEMA_VERSION}"
+                    # another process may have been first
+                    for statement in (*LAYOUT, *identity) if self._is_empty(connection) else ():
                         connection.execute(statement)
-                    connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-                    connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
             self._identify(connection)
             connection.execute("PRAGMA journal_mode = WAL")
             connection.execute("PRAGMA synchronous = NORMAL")
@@ -287,22 +271,6 @@ class CacheFile:
             )
         if Counter(sql for sql, _ in layout) != Counter(statement.encode() for statement in LAYOUT):
             raise _Damaged("its tables are not those of a cache")
-
-    @staticmethod
-    def _check_integrity(connection: sqlite3.Connection) -> None:
-        """SQLite's integrity check, stopped after some seconds."""
-        stop = time.monotonic() + CHECK_SECONDS
-        connection.set_progress_handler(lambda: time.monotonic() > stop, 100_000)
-        try:
-            (answer,) = connection.execute("PRAGMA quick_check(1)").fetchone()
-        except sqlite3.OperationalError as error:
-            if error.sqlite_errorcode != sqlite3.SQLITE_INTERRUPT:
-                raise
-            return
-        finally:
-            connection.set_progress_handler(None, 0)
-        if answer != b"ok":
-            raise _Damaged(answer.decode("utf-8", "replace"))
 
     def _refuse_other_files(self) -> None:
         """ValueError if a damaged file may be a user's file, such as a table, and not a cache.

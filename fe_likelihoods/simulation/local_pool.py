@@ -32,9 +32,7 @@ Outcome = tuple[Any, str]
 
 
 class Submitting:
-    """Base class of executors: `map` and `submit` by `submit_all`, which `map` may give options, and `give_up`."""
-
-    _of_map: dict[str, Any] = {}
+    """Base class of executors: `map` and `submit` by `submit_all` and `give_up`."""
 
     def map(self, function: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
         """Results of a function for every item, in order; ``(None, reason)`` for one that kills all its processes.
@@ -43,7 +41,7 @@ class Submitting:
         in succession die before they are given an item, or the first exception of the function: no further items are
         started then.
         """
-        futures = self.submit_all(function, list(items), **self._of_map)
+        futures = self.submit_all(function, list(items))
         try:
             done, left = wait_for(futures, return_when=FIRST_EXCEPTION)
             for future in done if left else ():
@@ -92,13 +90,12 @@ class Threads:
         function: Callable[[Any], Any],
         items: Sequence[Any],
         futures: Sequence[Future] | None = None,
-        first: bool = False,
     ) -> Sequence[Future]:
-        """A future for each item, which `cancel` prevents until a thread takes it; with `first`, before others."""
+        """A future for each item, which `cancel` prevents until a thread takes it."""
         futures, most = [Future() for _ in items] if futures is None else futures, self._most()
         calls = list(zip(futures, repeat(function), items))  # noqa: B905
         with self._changed:
-            self._waiting.extendleft(calls[::-1]) if first else self._waiting.extend(calls)
+            self._waiting.extend(calls)
             self._changed.notify(len(calls))
             for _ in range(min(most - len(self._threads), len(self._waiting) - self._n_idle)):
                 thread = threading.Thread(target=self._work, args=(_LINGER,), name="fe_likelihoods", daemon=True)
@@ -175,7 +172,6 @@ class LocalPool(Submitting):
 
     other_processes = True
     submits = True
-    _of_map = {"first": True}  # a verification does not wait for a batch of long runs
 
     def __init__(self, workers: int) -> None:
         if not isinstance(workers, Integral) or isinstance(workers, bool) or workers < 1:
@@ -214,12 +210,12 @@ class LocalPool(Submitting):
         self.give_up(self._threads.pending)
         self._workers.close()
 
-    def submit_all(self, function: Callable[[Any], Any], items: Sequence[Any], first: bool = False) -> list[Future]:
+    def submit_all(self, function: Callable[[Any], Any], items: Sequence[Any]) -> list[Future]:
         """Futures as from `submit`, for several items; ValueError if the function cannot be sent to the processes."""
         self._notice_fork()
         pickled = Pickled.of(function)  # each time: the values that it uses may have changed
         jobs = [_Job(pickled, item) for item in items]
-        return list(self._threads.submit_all(self._result, jobs, jobs, first))
+        return list(self._threads.submit_all(self._result, jobs, jobs))
 
     def give_up(self, futures: Sequence[Future], running: bool = True) -> None:
         """Cancel items; with `running`, also kill the processes that run them. Items with results keep them."""

@@ -219,17 +219,6 @@ def test_the_function_is_sent_once_to_each_process(shared_pool):
         assert {future.result()[0][0, 0] for future in futures} == {1.0}
 
 
-def test_map_goes_before_items_that_wait(function, tmp_path, shared_pool):
-    """A verification does not wait for a batch of long runs."""
-    with shared_pool(1) as pool:
-        first = pool.submit_all(function, [SHORT[0], LONG])
-        first[0].result()
-        waiting = pool.submit_all(function, [LONG + 0.01])
-        (tmp_path / "go").touch()
-        assert pool.map(abs, [-1, -2]) == [1, 2]
-        assert all(future.result()[1] == "" for future in [*first, *waiting])
-
-
 def test_items_are_given_up(function, tmp_path):
     with LocalPool(1) as pool:
         (pid,) = pool.map(os.getsid, [0])
