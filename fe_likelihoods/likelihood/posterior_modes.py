@@ -13,7 +13,8 @@ slope.
 """
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from itertools import zip_longest
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
@@ -23,9 +24,6 @@ from ..emulation.modes import Mode, find_modes
 from ..simulation.model import SimulationFailed, derivatives_batch, has_jacobian
 from ..text_tables import text_table
 from .likelihood import FELikelihood
-
-if TYPE_CHECKING:
-    import pandas
 
 __all__ = ["PosteriorMode", "PosteriorModes", "posterior_modes"]
 
@@ -85,18 +83,6 @@ class PosteriorModes(NamedTuple):
     def log_evidence(self) -> float:
         """Logarithm of the evidence, the sum over the modes."""
         return float(logsumexp([mode.log_evidence for mode in self.modes])) if self.modes else -np.inf
-
-    def to_dataframe(self) -> "pandas.DataFrame":
-        """The modes as rows of a `pandas.DataFrame`: parameters, their standard deviations, log_prob, log_evidence."""
-        import pandas
-
-        rows = []
-        for mode in self.modes:
-            sd = np.sqrt(np.diag(mode.covariance))
-            row = dict(zip(self.parameter_names, mode.parameters, strict=True))
-            row |= {f"sd_{name}": each for name, each in zip(self.parameter_names, sd, strict=True)}
-            rows.append(row | {name: getattr(mode, name) for name in ("log_prob", "log_evidence", "converged")})
-        return pandas.DataFrame(rows)
 
     def __str__(self) -> str:
         rows = [["parameter", *(f"mode {k + 1}" for k in range(len(self.modes)))]]
@@ -172,56 +158,33 @@ def _refined(posterior: Any, mode: Mode) -> PosteriorMode:
         value, x = reached
         if gain < _GAIN:
             break
-        tangents = _moved(posterior.likelihood, tangents, x)
+        tangents = _tangents(posterior.likelihood, x, sd, tangents)
     return _laplace(linear, x, float(value), sd, bounds, bool(mode.converged and gain < _GAIN))
 
 
-class _Tangent(NamedTuple):
-    """A response of one data set, and its derivatives, at structural parameters."""
+def _tangents(likelihood: Any, x: np.ndarray, sd: np.ndarray, before: Sequence[_Linear] = ()) -> list[_Linear]:
+    """Responses and derivatives of all data sets at parameters (ndim,).
 
-    at: np.ndarray
-    response: np.ndarray
-    slopes: np.ndarray
-
-
-def _tangents(likelihood: Any, x: np.ndarray, sd: np.ndarray) -> list[_Tangent]:
-    """Responses and derivatives of all data sets at parameters (ndim,), by differences where a model has none."""
+    Where a model has no derivatives, they are differences, or a rank-one correction of those at the point `before`.
+    """
     found = []
-    for part, columns in likelihood.parts():
-        d = part.simulator.n_structural
+    for (part, columns), old in zip_longest(likelihood.parts(), before):
+        d, slopes = part.simulator.n_structural, None if old is None else old.slopes
         at, steps = x[columns][:d], _DIFFERENCE * sd[columns][:d]
         (response,) = _responses(part, at[None])
         if has_jacobian(part.model):
-            slopes = _own_slopes(part, at)
-        else:
+            slopes = derivatives_batch(part.model, at[None], part.simulator.pool)[0]
+        elif old is None:
             others, reasons = part.simulate(at + np.diag(steps))
             if (failed := np.array([bool(reason) for reason in reasons])).any():  # beside failures: behind
                 steps[failed] *= -1.0
                 others[failed] = _responses(part, at + np.diag(steps)[failed])
             slopes = (others - response) / steps[:, None, None]
-        found.append(_Tangent(at, response, slopes))
-    return found
-
-
-def _moved(likelihood: Any, tangents: Sequence[_Tangent], x: np.ndarray) -> list[_Tangent]:
-    """Tangents at other parameters: one simulation each, and a rank-one correction where a model has no derivatives."""
-    found = []
-    for (part, columns), (old, before, slopes) in zip(likelihood.parts(), tangents, strict=True):
-        at = x[columns][: part.simulator.n_structural]
-        (response,) = _responses(part, at[None])
-        step = at - old
-        if has_jacobian(part.model):
-            slopes = _own_slopes(part, at)
-        elif step.any():
-            missed = response - before - np.tensordot(step, slopes, 1)
+        elif (step := at - old.at).any():
+            missed = response - old.response - np.tensordot(step, slopes, 1)
             slopes = slopes + step[:, None, None] * missed / (step @ step)
-        found.append(_Tangent(at, response, slopes))
+        found.append(_Linear(part.model, at, response, slopes))
     return found
-
-
-def _own_slopes(part: Any, at: np.ndarray) -> np.ndarray:
-    """Derivatives (d, n_channels, n_steps) by the model's own ``jacobian``."""
-    return derivatives_batch(part.model, at[None], part.simulator.pool)[0]
 
 
 def _responses(part: Any, thetas: np.ndarray) -> np.ndarray:
@@ -231,10 +194,10 @@ def _responses(part: Any, thetas: np.ndarray) -> np.ndarray:
     return batch.response
 
 
-def _linear_posterior(posterior: Any, tangents: Sequence[_Tangent]) -> Any:
+def _linear_posterior(posterior: Any, tangents: Sequence[_Linear]) -> Any:
     """The posterior with linear models in place of its own: nothing is simulated."""
     parts = {
-        key: FELikelihood(_Linear(part.model, *tangent), part.measurements, part.noise)
+        key: FELikelihood(tangent, part.measurements, part.noise)
         for (key, part), tangent in zip(posterior.likelihood.likelihoods.items(), tangents, strict=True)
     }
     return type(posterior)(posterior.likelihood.with_likelihoods(parts), posterior.prior)
