@@ -106,18 +106,17 @@ class StaleCache(ValueError):
 class Trust:
     """The label of a model, and which rows of a file this process trusts; likelihoods with one `key` share it.
 
-    `generations` and `written` labels are by the source number of the model; `left` has the rows that may be used until
-    the next verification, by identity and whether any row is a success; `used` counts rows. Rows with the number of
-    the `session` were stored here and need no verification. `stale` is the error of a row that differed; `is_blocked`
-    says that rows could not be compared, since no simulation ended.
+    `labels` has the rows of the file (see `pack_label`) by the source number of the model; `left` has the rows that may
+    be used until the next verification, by identity and whether any row is a success; `used` counts rows. Rows with the
+    number of the `session` were stored here and need no verification. `stale` is the error of a row that differed;
+    `is_blocked` says that rows could not be compared, since no simulation ended.
     """
 
     _known: "OrderedDict[str, Trust]" = OrderedDict()  # of this process, the most recently used last
 
     def __init__(self, label: ModelLabel, key: str) -> None:
         self.label, self.key = label, key
-        self.generations: dict[int, int] = {}
-        self.written: dict[int, tuple] = {}
+        self.labels: dict[int, tuple] = {}
         self.is_blocked = False
         self._lock, self._owner = threading.RLock(), os.getpid()
         self.start_again()
@@ -139,6 +138,10 @@ class Trust:
         if self._owner != os.getpid():
             self._lock, self._owner, self.session = threading.RLock(), os.getpid(), secrets.randbits(62)
         return self._lock
+
+    def generation(self, source: int) -> int | None:
+        """Generation to which the label of a model belongs; None if it is not known yet."""
+        return self.labels[source][3] if source in self.labels else None
 
     def start_again(self) -> None:
         """Verify all rows again, including rows that this process has stored."""
@@ -308,7 +311,7 @@ class VerifiedModel:
                 self._require_same(is_first=not known and self.pool is None)
             except ChangedModel:
                 self._clear()
-                for generation in set(self._trust.generations.values()) if self.cache is not None else ():
+                for *_, generation, _ in self._trust.labels.values() if self.cache is not None else ():
                     places = self._key, self.model.fingerprint
                     self.cache.discard(np.concatenate(self._unchecked), *places, generation=generation)
                 raise
@@ -375,7 +378,7 @@ class VerifiedModel:
         with trust.lock:
             is_blocked = trust.is_blocked
             trust.is_blocked = is_blocked and all(isinstance(reason, TransientReason) for reason in reasons)
-            generation = trust.generations.get(source) or self._known_generation(source)
+            generation = trust.generation(source) or self._known_generation(source)
             if generation is None and is_blocked:  # it is not known which rows agree
                 return
             generation = self._use(source, generation or self._new_generation([]))
@@ -398,7 +401,7 @@ class VerifiedModel:
         trust, source = self._trust, source_number(fingerprint)
         while True:
             with trust.lock:
-                generation = trust.generations.get(source) or self._find_generation(source, identity, width)
+                generation = trust.generation(source) or self._find_generation(source, identity, width)
             if generation is None:
                 return [None] * len(thetas)
             rows = self.cache.look_up(identity, thetas, width, generation)
@@ -417,7 +420,7 @@ class VerifiedModel:
     def _find_generation(self, source: int, identity: str, width: int) -> int | None:
         """The generation of a known label, or one that new simulations agree with, or a new one; None: cannot tell."""
         trust, cache = self._trust, self.cache
-        generation = self._known_generation(source) or next(iter(trust.generations.values()), None)
+        generation = self._known_generation(source) or next((row[3] for row in trust.labels.values()), None)
         if generation is None and not trust.is_blocked and (stored := cache.generations_of(identity)):
             generation = self._adopted(stored, identity, width) if cache.verify else stored[0]
         return generation and self._use(source, generation)
@@ -460,7 +463,7 @@ class VerifiedModel:
         for row in rows:
             files = json.loads(row[2])
             if row[1] == label.code.encode() and Opened(files).read_again().files == files:
-                self._trust.written[source], known = row, row[3]
+                self._trust.labels[source], known = row, row[3]
         return known
 
     def _new_generation(self, used: Iterable[int]) -> int:
@@ -473,7 +476,7 @@ class VerifiedModel:
         """Store to which generation the label belongs, with the files that simulations have opened by now."""
         label, trust = self.label, self._trust
         row = pack_label(source, label.code, label.opened.files, generation)
-        before, trust.generations[source], trust.written[source] = trust.written.get(source), generation, row
+        before, trust.labels[source] = trust.labels.get(source), row
         if before != row:
             delete = "DELETE FROM labels WHERE source = ? AND code = ? AND files = ?"
             self.cache.file.write((delete, [before[:3]] if before else []), (STORE_LABEL, [row]))
@@ -556,7 +559,7 @@ class VerifiedModel:
         if self.cache.file.select(query, (source, generation)) > [(1,)]:
             # the model has changed in a part of the space where no row was compared, or by what no label contains
             new_generation = self._new_generation([generation])
-            for each in {source, *trust.generations}:
+            for each in {source, *trust.labels}:
                 self._use(each, new_generation)
             self._say(DIFFER, type(self.model).__name__)
             if not used:

@@ -76,6 +76,11 @@ class FailureLog:
                 self.records[-1]["transient"] = True
         self.reasons[self._counted_under(reason)] += 1
 
+    def report(self) -> dict:
+        """The entries of `Posterior.report` on failures."""
+        counts = {"failure_count": self.count, "transient_failures": self.transient}
+        return counts | {"failures": list(self.records), "failure_reasons": dict(self.reasons)}
+
     def _counted_under(self, reason: str) -> str:
         """The text under which a reason is counted."""
         for text, most in ((reason, _MAX_REASONS), (reason_without_numbers(reason), 2 * _MAX_REASONS)):

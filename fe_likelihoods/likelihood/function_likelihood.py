@@ -1,6 +1,5 @@
 """Log-likelihood of one's own, without a model: for priors, samplers, reports and clients of this package."""
 
-from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -123,10 +122,4 @@ class FunctionLikelihood(SumOfParts):
 
     def report(self) -> dict:
         """Counts of evaluations and failures, see `Posterior.report`."""
-        log = self._failures
-        counts = dict.fromkeys(COUNTS, 0) | {
-            "simulations": self._evaluations,
-            "failure_count": log.count,
-            "seconds": 0.0,
-        }
-        return counts | {"failures": log.records, "failure_reasons": Counter(log.reasons)}
+        return dict.fromkeys(COUNTS, 0) | {"simulations": self._evaluations} | self._failures.report()

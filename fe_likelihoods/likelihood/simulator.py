@@ -132,14 +132,8 @@ class Simulator(VerifiedModel):
 
     def report(self) -> dict:
         """Summary of the simulations that were requested in this process, see `Posterior.report`."""
-        names = ("simulations", "verifications", "unverified", "cache_hits", "disk_hits")
-        return {name: getattr(self, name) for name in names} | {
-            "failures": list(self.failures.records),
-            "failure_count": self.failures.count,
-            "transient_failures": self.failures.transient,
-            "failure_reasons": dict(self.failures.reasons),
-            "seconds": self.seconds,
-        }
+        names = ("simulations", "verifications", "unverified", "cache_hits", "disk_hits", "seconds")
+        return {name: getattr(self, name) for name in names} | self.failures.report()
 
     @property
     def fingerprint(self) -> str:
