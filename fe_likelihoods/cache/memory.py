@@ -90,11 +90,6 @@ class MemoryCache:
             keys = [key for key, outcome in self._outcomes.items() if not isinstance(outcome, str)]
         return thetas_of(keys, n_structural)
 
-    def reason(self, key: bytes) -> str:
-        """Reason of a cached failure; empty for others."""
-        outcome = self._outcomes.get(key)
-        return outcome if isinstance(outcome, str) else ""
-
     @staticmethod
     def _size_of(outcome: Any) -> int:
         return outcome is not None

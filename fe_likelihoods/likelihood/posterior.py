@@ -20,6 +20,7 @@ from samplers.evaluation.point_queue import PointQueue
 from ..priors.distributions import Distribution, RandomState
 from ..priors.points import as_points, complete_repr
 from ..priors.priors import Prior
+from ..simulation.faults import TransientReason
 from ..simulation.model import has_jacobian
 from .evaluation_queue import evaluation_queue
 from .gradient import likelihood_gradient, slopes_along
@@ -537,7 +538,8 @@ class Posterior:
         Such as a worker that was killed; empty where there was none. Samplers record it where they evaluate points in
         other processes.
         """
-        return self.likelihood.fault(x)
+        (reason,) = self.likelihood.failures_at(x)
+        return reason if isinstance(reason, TransientReason) else ""
 
     def failures_at(self, x: Any) -> list[str]:
         """Reasons of the failed simulations at points (n, ndim) evaluated in this process, empty for others.

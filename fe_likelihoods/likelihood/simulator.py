@@ -245,6 +245,10 @@ class Simulator(VerifiedModel):
         outcomes = [reasons[row] or statistics[row].tobytes() for row in rows]
         self.memory_cache.store([keys[which[row]] for row in rows], outcomes)
 
+    def reason(self, point: np.ndarray) -> str:
+        """Reason of a failure that is cached at parameters (n,), the structural ones first; empty for others."""
+        return _reason(*self.memory_cache.look_up([(point[: self.n_structural] + 0.0).tobytes()]))
+
     # known simulations --------------------------------------------------------------------------------------------
 
     def _look_up(self, keys: list[bytes], which: Sequence[int], full: bool) -> _Request:

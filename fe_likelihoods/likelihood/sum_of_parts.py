@@ -14,7 +14,6 @@ from ..noise.marginal import MarginalNoise
 from ..priors.distributions import Distribution, RandomState, as_generator
 from ..priors.multivariate import as_distribution
 from ..priors.points import as_points
-from ..simulation.faults import TransientReason
 from .parameters import Parameter, describe_parameters
 
 __all__ = ["COUNTS", "SumOfParts"]
@@ -115,23 +114,14 @@ class SumOfParts:
         """Whether each of the points (n, ndim) is finite and has possible noise parameters; nothing is simulated."""
         return np.all([part.possible(rows[:, columns]) for part, columns in self.parts()], axis=0)
 
-    def fault(self, x: Any) -> str:
-        """Reason of a failed simulation whose cause is not the model, see `Posterior.fault`."""
-        _, reason = self._failure_at(as_points(x, self.parameter_names))
-        return reason if isinstance(reason, TransientReason) else ""
-
-    def _failure_at(self, point: np.ndarray) -> tuple[str, str]:
-        """The data set whose simulation has failed at a point (ndim,), and the reason; empty texts if none has."""
-        for key, part in self.likelihoods.items():
-            own = point[self._columns[key]][: part.simulator.n_structural] + 0.0
-            if reason := part.simulator.memory_cache.reason(own.tobytes()):
-                return key, reason
-        return "", ""
-
     def failures_at(self, x: Any) -> list[str]:
         """Reasons of failed simulations at points, after the name of the data set, see `Posterior.failures_at`."""
-        found = map(self._failure_at, np.atleast_2d(as_points(x, self.parameter_names)))
-        return [f"{key}: {reason}" if key else reason for key, reason in found]
+        found = []
+        for point in np.atleast_2d(as_points(x, self.parameter_names)):
+            reasons = {key: part.simulator.reason(point[self._columns[key]]) for key, part in self.likelihoods.items()}
+            key, reason = next(((key, reason) for key, reason in reasons.items() if reason), ("", ""))
+            found.append(type(reason)(f"{key}: {reason}") if key else reason)
+        return found
 
     def recall_failures(self, x: Any, reasons: Sequence[str]) -> None:
         """Count simulations of an earlier process, see `Posterior.recall_failures`."""
