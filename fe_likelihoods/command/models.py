@@ -23,7 +23,7 @@ from ..modal.modal_data import ModalData
 from ..modal.modal_likelihood import ModalLikelihood
 from ..modal.modal_readers import read_modal_data
 from ..modal.mode_models import FunctionModes, modal_channels
-from ..modal.paired_modes import SLOPE
+from ..modal.temperature import SLOPE
 from ..models.one_run import one_run
 from ..models.sensed import SensedModel, Sensor
 from ..noise.autoregressive import AutoregressiveNoise
@@ -182,7 +182,7 @@ def _load_test(job: Job, cache: SimulationCache | None) -> _DataSet:
     channels, given = user_channels(job), job.load_test
     errors = read_by_channel(given.errors or {}, channels, "errors")
     path = job.path("load_test", "file", given.file)
-    test = read_load_test(path, channels, errors=errors, **given.given("columns", "units", "cases"))
+    test = read_load_test(path, channels, errors=errors, **given.given("columns", "units", "cases", "temperatures"))
     size = len(test.cases)
     for key, value in (("dt", 1.0), ("n_steps", size)):
         if job.model.get(key, value) != value:
@@ -190,7 +190,7 @@ def _load_test(job: Job, cache: SimulationCache | None) -> _DataSet:
 
     def make_likelihood(model: Model, pool: Any) -> FELikelihood:
         noise = None if job.noise is None else job.located("noise", _make_noise, job, channels)
-        return FELikelihood(model, test.measurements, noise, pool, cache=cache)
+        return FELikelihood(test.at_temperatures(model), test.measurements, noise, pool, cache=cache)
 
     def make_model() -> Model:
         return user_model(job, channels, dt=1.0, n_steps=size)

@@ -142,6 +142,7 @@ class LoadTest(Section):
     units: Any = key("table of text", "Channel = unit, if the file does not state it")
     cases: Any = key("text", "Column with the names of the load cases, or with positions; by default the first one")
     errors: Any = key("table of quantity", 'Channel = known standard deviation of its sensor, such as "0.1 mm"')
+    temperatures: Any = key(NUMBERS, "Temperature of each load case [°C]; adds the parameter temperature_slope")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -122,8 +122,8 @@ class DataSets:
         for part in self._parts:
             residuals[:, part.channels, part.samples] = np.nan
             if len(left) > 0:
-                own, simulator = thetas[np.ix_(left, part.structural)], part.likelihood.simulator
-                statistics[left, part.numbers], batch = simulator.run(own, full=True)
+                own = thetas[np.ix_(left, part.structural)]
+                statistics[left, part.numbers], batch = part.likelihood.run(own)
                 with np.errstate(over="ignore"):
                     residuals[left, part.channels, part.samples] = part.residuals(batch.response)
                 for row, reason in zip(left, batch.reasons, strict=True):

@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from ..simulation.model import derivatives_batch
+from ..noise.protocol import noise_statistic
+from ..simulation.model import SimulationBatch, derivatives_batch, misfit_of_responses
 
 __all__ = ["likelihood_gradient", "slopes_along"]
 
@@ -77,13 +78,19 @@ def _of_part(part: Any, rows: np.ndarray, sd: np.ndarray, bounds: np.ndarray) ->
         noise, response = rows[k, d:], batch.response[k]
         slopes[k, :d] = _along_responses(part, response, along, noise)
         if d < rows.shape[1]:
-            here = part.simulator.statistics_of(response[None], [""]).misfit
+            here = _statistics(part, response[None])
 
             def of_noise(values: np.ndarray, here: np.ndarray = here) -> np.ndarray:
                 return part.noise.log_likelihood(np.repeat(here, len(values), 0), part.n_samples, values)
 
             slopes[k, d:] = slopes_along(of_noise, noise, sd[d:], bounds[d:])
     return slopes, good
+
+
+def _statistics(part: Any, responses: np.ndarray) -> np.ndarray:
+    """Statistics (n, n_numbers) of responses (n, n_channels, n_steps) [SI]."""
+    batch = SimulationBatch(responses, [""] * len(responses))
+    return misfit_of_responses(part.model, batch, part.measured, noise_statistic(part.noise)).misfit
 
 
 def _along_responses(part: Any, response: np.ndarray, along: np.ndarray, noise: np.ndarray) -> np.ndarray:
@@ -98,7 +105,8 @@ def _along_responses(part: Any, response: np.ndarray, along: np.ndarray, noise: 
     slopes = np.empty(len(along))
     for j, (step, direction) in enumerate(zip(steps, along, strict=True)):
         moved = response + step * offsets[:, None, None] * direction
-        statistics = part.simulator.statistics_of(moved, [""] * len(moved)).misfit
-        values = part.noise.log_likelihood(statistics, part.n_samples, np.repeat(noise[None], len(offsets), 0))
+        values = part.noise.log_likelihood(
+            _statistics(part, moved), part.n_samples, np.repeat(noise[None], len(offsets), 0)
+        )
         slopes[j] = weights @ values / step
     return slopes

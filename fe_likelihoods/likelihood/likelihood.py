@@ -6,6 +6,7 @@ residuals, see `fe_likelihoods.noise.gaussian`.) A `Simulator` runs and caches t
 (`fe_likelihoods.likelihood.simulator`). The equations are on the page ``docs/theory/likelihood.rst``.
 """
 
+import copy
 import math
 import os
 from collections.abc import Mapping
@@ -17,7 +18,7 @@ from ..cache.simulation_cache import SimulationCache
 from ..noise.gaussian import GaussianNoise
 from ..noise.protocol import Noise, noise_of_part, noise_statistic, noise_under
 from ..noise.sample_counts import count_samples
-from ..priors.points import complete_repr
+from ..priors.points import as_rows, complete_repr
 from ..signals.channels import Measurements
 from ..signals.comparison import Comparison
 from ..signals.events import join_measurements
@@ -127,17 +128,13 @@ class FELikelihood(SumOfParts):
             raise ValueError(f"the names of model and noise must differ; got {', '.join(self.parameter_names)}")
         self._columns = {"": list(range(len(self.parameter_names)))}
         self.fast_parameters = tuple(self._columns[""][len(structural) :])
-        self.simulator = Simulator(
-            model,
-            measurements,
-            noise_statistic(self.noise),
-            pool=pool,
-            cache=cache,
-            memory_rows=memory_rows,
-            memory_bytes=memory_bytes,
-        )
+        options = {"pool": pool, "cache": cache, "memory_rows": memory_rows, "memory_bytes": memory_bytes}
+        self.simulator = self._make_simulator(model, measurements, **options)
         self.n_samples = count_samples(getattr(self.measured, "values", self.measured))
         self.shortened: list[FELikelihood] = []
+
+    def _make_simulator(self, model: Model, measurements: Measurements, **options: Any) -> Simulator:
+        return Simulator(model, measurements, noise_statistic(self.noise), **options)
 
     def __getstate__(self) -> dict:
         return self.__dict__ | {"shortened": []}
@@ -253,7 +250,11 @@ class FELikelihood(SumOfParts):
 
     def simulate(self, thetas: np.ndarray) -> SimulationBatch:
         """Responses (n, n_channels, n_steps) at structural parameters, which are cached, see `Simulator.simulate`."""
-        return self.simulator.simulate(thetas)
+        return self.run(thetas)[1]
+
+    def run(self, thetas: np.ndarray) -> tuple[np.ndarray, SimulationBatch]:
+        """Statistics (n, n_numbers) and responses at structural parameters, see `Simulator.run`."""
+        return self.simulator.run(as_rows(thetas, self.model.parameter_names), full=True)
 
     def of_statistics(self, rows: np.ndarray, misfit: np.ndarray) -> np.ndarray:
         """Log-likelihood (n,) of points (n, ndim) from the statistics (n, n_numbers) of their simulations.
@@ -308,14 +309,8 @@ class FELikelihood(SumOfParts):
 
     def _with(self, model: Model, measurements: Measurements, noise: Noise) -> "FELikelihood":
         own = self.simulator
-        other = FELikelihood(
-            model,
-            measurements,
-            noise,
-            own.pool,
-            cache=own.cache,
-            memory_rows=own.memory_cache.most,
-            memory_bytes=own.response_memory.most,
-        )
+        options = {"memory_rows": own.memory_cache.most, "memory_bytes": own.response_memory.most}
+        other = copy.copy(self)
+        FELikelihood.__init__(other, model, measurements, noise, own.pool, cache=own.cache, **options)
         other.simulator.share(own)
         return other

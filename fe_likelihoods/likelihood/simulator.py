@@ -97,8 +97,11 @@ class Simulator(VerifiedModel):
     count simulations run by this object in this process, cached rows, and rows from the disk; `failures` include known
     ones from the disk. `chunk_size` simulations are run between two writes to the disk, adapted to their duration;
     `when_simulated` is called with the number that have ended, in this process only. With `responses_only` nothing was
-    measured: a cache on disk gets the responses alone.
+    measured: a cache on disk gets the responses alone. A subclass keeps all responses, in memory and on disk, if they
+    are small (`stores_responses`).
     """
+
+    stores_responses = False
 
     def __init__(
         self,
@@ -409,7 +412,12 @@ class Simulator(VerifiedModel):
             raise error
 
     def _returns_responses(self, full: bool) -> bool:
-        return full or has_jacobian(self.model) or (self.cache is not None and self.cache.responses)
+        return full or self._keeps_responses or (self.cache is not None and self.cache.responses)
+
+    @property
+    def _keeps_responses(self) -> bool:
+        """Whether responses that were not requested are kept in memory: gradients or predictions may follow."""
+        return self.stores_responses or has_jacobian(self.model)
 
     def _record(
         self, request: _Request, keys: Sequence[bytes], values: np.ndarray, reasons: list[str], seconds: float
@@ -420,7 +428,7 @@ class Simulator(VerifiedModel):
         if they are stored on disk.
         """
         thetas, statistics, why = self._thetas(keys), values, reasons
-        keeps = request.full or has_jacobian(self.model)
+        keeps = request.full or self._keeps_responses
         if values.ndim == 3:
             statistics, why = self.statistics_of(values, reasons)
         with self._running.lock:
@@ -440,7 +448,7 @@ class Simulator(VerifiedModel):
             self._enter(request, keys, _outcomes(statistics, why))
             if self.cache is not None:
                 kept = None if self._responses_only else statistics
-                stored = values if request.full or self.cache.responses else None
+                stored = values if request.full or self.stores_responses or self.cache.responses else None
                 self._store(thetas, kept, why, stored, fingerprint)
                 self.cache.store_remark(self.model)
 

@@ -13,6 +13,7 @@ from ..signals.channels import Channel, Measurements
 from ..signals.read import units_of
 from ..signals.tables import read_table, table_values
 from ..units import to_si
+from .temperature import StaticAtTemperatures, check_temperatures
 
 __all__ = ["LoadTest", "read_load_test"]
 
@@ -35,6 +36,9 @@ class LoadTest:
         Measured values [SI]; NaN where one is missing.
     errors : mapping of str to float, optional
         Known standard deviations of sensors [SI], by the names of channels.
+    temperatures : float or (n_cases,) array_like, optional
+        Temperature of the structure under each load case [°C]. `model` and `at_temperatures` then have the parameter
+        ``temperature_slope`` [1/K], that of frequencies (`fe_likelihoods.modal.temperature`); models are at 20 °C.
     axis : str
         What the load cases are, for figures, such as "position of the truck [m]".
     description : str
@@ -43,7 +47,7 @@ class LoadTest:
     Raises
     ------
     ValueError
-        If names repeat, the shape does not fit, or an error is of no channel or not positive.
+        If names repeat, a shape does not fit, or an error or a temperature is not possible.
 
     Examples
     --------
@@ -60,6 +64,7 @@ class LoadTest:
     values: Any
     _: KW_ONLY
     errors: Mapping[str, float] | None = None
+    temperatures: Any = None
     axis: str = "load case"
     description: str = "load test"
 
@@ -74,6 +79,8 @@ class LoadTest:
             )
         measurements = Measurements(channels, 1.0, self.values, self.description, axis=self.axis, points=cases)
         found = {"channels": channels, "cases": cases, "values": measurements.values, "errors": errors}
+        if self.temperatures is not None:
+            found["temperatures"] = check_temperatures("LoadTest", self.temperatures, len(cases), "load cases")
         for name, value in (found | {"measurements": measurements}).items():
             object.__setattr__(self, name, value)
 
@@ -82,9 +89,14 @@ class LoadTest:
         """Known errors as numbers for the mapping of priors: ``{"sigma_<channel>": error}``."""
         return {f"sigma_{name}": float(error) for name, error in self.errors.items()}
 
-    def model(self, function: Callable[..., Any], parameter_names: Sequence[str], **options: Any) -> FunctionModel:
+    def model(self, function: Callable[..., Any], parameter_names: Sequence[str], **options: Any) -> Any:
         """Model of a function of theta that returns (n_channels, n_cases) [SI], options of `FunctionModel`."""
-        return FunctionModel(function, parameter_names, self.channels, 1.0, len(self.cases), **options)
+        model = FunctionModel(function, parameter_names, self.channels, 1.0, len(self.cases), **options)
+        return self.at_temperatures(model)
+
+    def at_temperatures(self, model: Any) -> Any:
+        """The model at the temperatures of the load cases, or as it is if there are none."""
+        return model if self.temperatures is None else StaticAtTemperatures(model, self.temperatures)
 
 
 def read_load_test(
@@ -94,14 +106,15 @@ def read_load_test(
     units: str | Sequence[str] | Mapping[str, str] | None = None,
     cases: str | None = None,
     errors: Mapping[str, float] | None = None,
+    temperatures: float | Sequence[float] | None = None,
 ) -> LoadTest:
     """Read a load test from a CSV file or workbook with a header line and a line for each load case.
 
     `columns` has names of columns by the names of channels, where the column has not the name of the channel (with or
     without a unit); `units` are for files that state none, as in `read_columns`. `cases` is the column with the
     names of the load cases, or with numbers such as positions; default: the first column, if it is no channel, else
-    numbers from 1. `errors` are those of `LoadTest`. Raises ValueError if a column is missing, or a unit is unknown or
-    not stated.
+    numbers from 1. `errors` and `temperatures` are those of `LoadTest`. Raises ValueError if a column is missing, or a
+    unit is unknown or not stated.
     """
     table = read_table(path, labels=cases or "")
     names = [column.name for column in table.columns]
@@ -115,7 +128,7 @@ def read_load_test(
     wanted = [(column_of(each), each.dimension, unit, each.name) for each, unit in given]
     values = [to_si(*each) for each in table_values(table, wanted, None, stacklevel=2)]
     chosen = cases or next((name for name in names[:1] if name not in [each[0] for each in wanted]), None)
-    options = {"errors": errors, "description": f"load test of {Path(path).name}"}
+    options = {"errors": errors, "temperatures": temperatures, "description": f"load test of {Path(path).name}"}
     if chosen is None:
         return LoadTest(channels, [str(k + 1) for k in range(len(table.lines))], values, **options)
     if chosen not in names:

@@ -10,6 +10,7 @@ from ..models.base import digest
 from ..signals.sampling import array_digest
 from ..text_tables import text_table
 from .pairing import close_groups
+from .temperature import check_temperatures
 
 __all__ = ["ModalData", "real_shapes"]
 
@@ -100,17 +101,17 @@ class ModalData:
         values |= {"n_sets": n_sets, "n_modes": m, "n_sensors": len(sensors)}
         values["mode_numbers"] = tuple(int(number) for number in numbers)
         share = f"one number, or one for each of {m} modes, between 0 and {_LARGEST_SHARE}, such as"
-        day = f"a number [°C] for each of {n_sets} identifications, from -80 to 80"
         ratios = "ratios from 0 to below 1, of the shape of frequencies, such as 0.015 for 1.5 % (in a file damping_%)"
         for what, shape, limits, expected in (
             ("frequency_cv", (m,), (_ABOVE_ZERO, _LARGEST_SHARE), f"{share} 0.005 for 0.5 %"),
             ("shape_error", (m,), (_ABOVE_ZERO, _LARGEST_SHARE), f"{share} 0.02, for shapes with a norm of 1"),
-            ("temperatures", (n_sets,), (-80.0, 80.0), day),
             ("damping", (n_sets, m), (0.0, 1.0), ratios),
             ("covariance", (m, m), (-np.inf, np.inf), f"a matrix ({m}, {m}) [Hz²], symmetric positive definite"),
         ):
             if (given := getattr(self, what)) is not None:
                 values[what] = _numbers(what, given, shape, limits, expected)
+        if self.temperatures is not None:
+            values["temperatures"] = check_temperatures("ModalData", self.temperatures, n_sets, "identifications")
         if (covariance := values.get("covariance")) is not None and (
             self.frequency_cv is not None
             or not known.all()

@@ -6,18 +6,21 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import ndtri
 
+from ..cache.comparison import Simulated, difference_in_words
+from ..cache.simulation_cache import TOLERANCE
 from ..likelihood.likelihood import FELikelihood
 from ..likelihood.simulator import Simulator
 from ..models.linear_structure import LinearStructure
 from ..noise.protocol import Noise
 from ..priors.points import as_points
 from ..signals.channels import Measurements
-from ..simulation.model import Model, SimulationFailed
+from ..simulation.model import Model, SimulationBatch, SimulationFailed
 from ..text_tables import text_table
 from .modal_data import ModalData
 from .modal_noise import modal_noise
 from .mode_models import StructureModes
-from .paired_modes import PairedModes, sensor_rows
+from .paired_modes import PairedModes, PairedStatistic, sensor_rows
+from .temperature import ModesWithSlope
 
 __all__ = ["ModalLikelihood", "PredictedModes"]
 
@@ -88,24 +91,39 @@ class ModalLikelihood(FELikelihood):
             raise ValueError(f"ModalLikelihood: expected ModalData; got {type(data).__name__}")
         if not 0.0 <= close < 1.0:
             raise ValueError(f"ModalLikelihood: close must be a share from 0 to 1, such as {_CLOSE}; got {close!r}")
-        paired = PairedModes(_with_modes(model), data, close)
-        noise = modal_noise(paired, (frequency_error, shape_error), student_t)
+        model = _with_modes(model)
+        self._paired = PairedModes(model if data.temperatures is None else ModesWithSlope(model), data, close)
+        noise = modal_noise(self._paired, (frequency_error, shape_error), student_t)
         self.held_out = held_out
         if held_out is not None:
-            sensor_rows(paired.model, held_out)  # refuses what cannot be predicted
-        super().__init__(paired, paired.measurements, noise, pool, **options)
-        modes, own = paired.model, self.simulator
-        nothing = Measurements(modes.channels, modes.dt, np.zeros((len(modes.channels), modes.n_steps)))
-        cheap = isinstance(modes, StructureModes)
-        self._modes = Simulator(modes, nothing, pool=None if cheap else own.pool, cache=own.cache, responses_only=True)
-        self._modes.response_memory = own.response_memory
-        paired.memory = None if cheap else own.response_memory
+            sensor_rows(model, held_out)  # refuses what cannot be predicted
+        super().__init__(self._paired, self._paired.measurements, noise, pool, **options)
 
-    def with_noise(self, noise: Noise) -> "ModalLikelihood":
-        """The same likelihood with other errors, as `FELikelihood.with_noise`."""
-        other = object.__new__(type(self))
-        vars(other).update(vars(super().with_noise(noise)) | {"held_out": self.held_out, "_modes": self._modes})
-        return other
+    def _make_simulator(self, model: PairedModes, measurements: Measurements, **options: Any) -> Simulator:
+        return _ModesSimulator(model, self.noise, measurements, **options)
+
+    @property
+    def model(self) -> PairedModes:
+        """The model of the measured modes."""
+        return self._paired
+
+    @property
+    def measurements(self) -> Measurements:
+        """The data as measurements of the channels of the model."""
+        return self._paired.measurements
+
+    @property
+    def measured(self) -> np.ndarray:
+        """What responses are compared with (m, n_sets (1 + n_sensors))."""
+        return self.simulator.statistic.measured
+
+    def run(self, thetas: np.ndarray) -> tuple[np.ndarray, SimulationBatch]:
+        """Statistics and responses of the paired modes at structural parameters, as `FELikelihood.run`."""
+        statistics, batch = super().run(thetas)
+        found = np.full((len(batch.reasons), *self.measured.shape), np.nan)
+        for row in [row for row, reason in enumerate(batch.reasons) if not reason]:
+            found[row] = self._paired.response(batch.response[row])
+        return statistics, SimulationBatch(found, batch.reasons)
 
     def predict_modes(self, samples: Any, data: ModalData | None = None, most: int = 400) -> "PredictedModes":
         """Modes that samples of a posterior predict, beside measured ones, which may be others than the data.
@@ -133,13 +151,29 @@ class ModalLikelihood(FELikelihood):
             known = np.zeros(1) if self.model.frequency_cv is None else self.model.frequency_cv
             squares = np.square(self.noise.standard_deviations(parameters)) - np.square(known)
             errors = np.sqrt(np.maximum(squares.mean(axis=1), 0.0))  # of the modes of the data, for any modes
-        batch = self._modes.simulate(rows[:, : len(paired.model.parameter_names)])
-        batch.response[:, 0] *= paired.factors(rows).mean(axis=1, keepdims=True)
+        batch = self.simulator.simulate(rows)
+        batch.response[:, 0] *= paired.factors(batch.response).mean(axis=1, keepdims=True)
         good = (batch.response[:, 0] > 0.0).all(axis=1)
         if not good.any():
             reason = batch.reasons[0] or "a frequency is not positive"
             raise SimulationFailed(f"none of {len(rows)} samples can be simulated; the first reason: {reason}")
         return PredictedModes.of(paired, batch.response[good], errors[good])
+
+
+class _ModesSimulator(Simulator):
+    """Simulator of a model that has modes, compared as paired ones; the modes are kept, for predictions."""
+
+    stores_responses = True
+
+    def __init__(self, paired: PairedModes, noise: Noise, measurements: Measurements, **options: Any) -> None:
+        modes = paired.model
+        anything = Measurements(modes.channels, modes.dt, np.ones((len(modes.channels), modes.n_steps)))
+        super().__init__(modes, anything, PairedStatistic(paired, noise.statistic), **options)
+
+    def _difference(self, earlier: np.ndarray, reason: str, new: Simulated) -> tuple[str, float]:
+        paired, tolerance = self.statistic.paired, TOLERANCE if self.cache is None else self.cache.tolerance
+        names, norm = [each.name for each in paired.channels], np.linalg.norm(self.statistic.measured, axis=1)
+        return difference_in_words(earlier, reason, new._replace(norm=norm), names, tolerance, False)
 
 
 def _with_modes(model: Any) -> Model:

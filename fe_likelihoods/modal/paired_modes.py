@@ -4,33 +4,26 @@ Each measured mode is a channel. Its samples are, for each identification, the c
 measured one, and the projection of the measured shape on the computed one, at all sensors. They are smooth functions of
 the parameters as long as the pairing stays, so emulators and searches of modes of the posterior need nothing else. The
 residuals are the relative frequency errors and the vectors of squared length 1 - MAC.
-
-With temperatures T of the identifications there is one more parameter, ``temperature_slope`` s [1/K], common to all
-modes: frequencies are f (1 + s (T - 20 °C)).
 """
-
-from typing import Any
 
 import numpy as np
 
-from ..cache.memory import ResponseMemory
 from ..models.base import digest
+from ..noise.statistics import Statistic
 from ..signals.channels import Channel, Measurements
 from ..signals.sampling import array_digest
-from ..simulation.model import Model, SimulationBatch, SimulationFailed, has_jacobian
-from ..simulation.user_code import is_of_user
+from ..simulation.model import Model, SimulationFailed, has_jacobian
 from .modal_data import ModalData
 from .mode_models import ABSENT
 from .pairing import Paired, pair_modes
+from .temperature import REFERENCE_TEMPERATURE, ModesWithSlope
 
-__all__ = ["SLOPE", "PairedModes", "sensor_rows"]
-
-SLOPE = "temperature_slope"
-_REFERENCE_TEMPERATURE = 20.0  # [°C], of the frequencies of the model
+__all__ = ["PairedModes", "PairedStatistic", "sensor_rows"]
 
 
 def sensor_rows(model: Model, data: ModalData) -> list[int]:
     """Rows of a model's response that are the sensors of the data; ValueError if the model has no modes at them."""
+    model = model.model if isinstance(model, ModesWithSlope) else model
     names, kind = [channel.name for channel in model.channels], type(model).__name__
     if model.channels[0].dimension != "frequency":
         raise ValueError(
@@ -51,12 +44,11 @@ def sensor_rows(model: Model, data: ModalData) -> list[int]:
 
 
 class PairedModes:
-    """Model of the measured modes: the modes of another model, which are kept in `memory`, paired with them."""
+    """Model of the measured modes: the modes of another model, paired with them."""
 
     dt = 1.0
     path_dependent = False
     axis = "frequency, then components of the shape"
-    memory: ResponseMemory | None = None
 
     def __init__(self, model: Model, data: ModalData, close: float) -> None:
         self.model, self.data, self.close, self.groups = model, data, close, data.groups(close)
@@ -67,39 +59,32 @@ class PairedModes:
             factor = np.linalg.cholesky(data.covariance / np.outer(data.mean_frequencies, data.mean_frequencies))
             self.frequency_cv = np.diag(factor).copy()
             self._whitening = self.frequency_cv[:, None] * np.linalg.inv(factor)
-        self._warmer, own = None, {}
-        if data.temperatures is not None:
-            self._warmer, own = data.temperatures - _REFERENCE_TEMPERATURE, {SLOPE: "1/K"}
-        self.parameter_names = (*model.parameter_names, *own)
-        self.parameter_units = dict(getattr(model, "parameter_units", {})) | own
+        self._warmer = np.zeros(data.n_sets)
+        if data.temperatures is not None and isinstance(model, ModesWithSlope):
+            self._warmer = data.temperatures - REFERENCE_TEMPERATURE
+        self.parameter_names = tuple(model.parameter_names)
         self.channels = tuple(Channel(f"mode {number}", "dimensionless", "1") for number in data.mode_numbers)
         self.n_steps = data.n_sets * (1 + data.n_sensors)
-        for name in ("nominal", "nominal_units", "time_limit"):
+        for name in ("nominal", "nominal_units", "parameter_units", "time_limit"):
             if hasattr(model, name):
                 setattr(self, name, getattr(model, name))
         if has_jacobian(model):
             self.jacobian = self._differentiate
-        if hasattr(model, "simulate_together"):
-            self.simulate_together = self._simulate_together
-        if hasattr(model, "code_parts") or is_of_user(type(model).__module__):
-            self.code_parts = self._code_parts
 
-    def _code_parts(self) -> dict[str, Any]:
-        own = {"model": self.model} if is_of_user(type(self.model).__module__) else {}
-        return own | (self.model.code_parts() if hasattr(self.model, "code_parts") else {})
+    @property
+    def identity(self) -> str:
+        """Digest of the data and the groups of close modes."""
+        arrays = map(array_digest, (self._whitening, self._warmer))
+        return digest(type(self).__name__, self.data.fingerprint, repr(self.groups), *arrays)
 
     @property
     def fingerprint(self) -> str:
         """Digest of the model, the data and the groups of close modes."""
-        arrays = [self._whitening] if self._warmer is None else [self._whitening, self._warmer]
-        parts = type(self).__name__, self.model.fingerprint, self.data.fingerprint, repr(self.groups)
-        return digest(*parts, *map(array_digest, arrays))
+        return digest(self.model.fingerprint, self.identity)
 
-    def factors(self, thetas: np.ndarray) -> np.ndarray:
-        """Factors of frequencies (n, n_sets) by temperature, at parameters (n, n_parameters)."""
-        return 1.0 + (
-            np.zeros((len(thetas), self.data.n_sets)) if self._warmer is None else thetas[:, -1:] * self._warmer
-        )
+    def factors(self, modes: np.ndarray) -> np.ndarray:
+        """Factors (..., n_sets) of frequencies by temperature, of modes (..., 1 + n_sensors, n_modes)."""
+        return 1.0 + modes[..., -1, :1] * self._warmer
 
     @property
     def measurements(self) -> Measurements:
@@ -112,26 +97,12 @@ class PairedModes:
 
     def simulate(self, theta: np.ndarray) -> np.ndarray:
         """Response (m, n_sets (1 + n_sensors)) at the parameters (n_parameters,)."""
-        theta = np.asarray(theta, dtype=float)
-        return self._response(self.model.simulate(theta[: len(self.model.parameter_names)]), theta)
+        return self.response(np.asarray(self.model.simulate(np.asarray(theta, dtype=float))))
 
-    def _simulate_together(self, thetas: np.ndarray, pool: Any = None) -> SimulationBatch:
-        """Responses at parameters (n, n_parameters), from a run that answers other data sets too."""
-        batch = self.model.simulate_together(thetas[:, : len(self.model.parameter_names)], pool)
-        found, reasons = np.full((len(thetas), len(self.channels), self.n_steps), np.nan), list(batch.reasons)
-        for row in [row for row, reason in enumerate(reasons) if not reason]:
-            try:
-                found[row] = self._response(batch.response[row], thetas[row])
-            except SimulationFailed as error:
-                reasons[row] = error.reason
-        return SimulationBatch(found, reasons)
-
-    def _response(self, modes: np.ndarray, theta: np.ndarray) -> np.ndarray:
-        if self.memory is not None:  # for predictions: samples are simulated as modes no second time
-            key = (theta[: len(self.model.parameter_names)] + 0.0).tobytes()
-            self.memory.store([(self.model.fingerprint, key)], [modes.copy()])
+    def response(self, modes: np.ndarray) -> np.ndarray:
+        """Response (m, n_sets (1 + n_sensors)) of modes (1 + n_sensors, n_modes), a response of the other model."""
         paired = self.pair(modes)
-        return self._joined(self._ratios(paired.frequencies) * self.factors(theta[None]).T, paired.shapes)
+        return self._joined(self._ratios(paired.frequencies) * self.factors(modes)[:, None], paired.shapes)
 
     def pair(self, modes: np.ndarray) -> Paired:
         """Pair modes (1 + n_sensors, n_modes), a response of the model, with the measured ones."""
@@ -157,8 +128,7 @@ class PairedModes:
     def _differentiate(self, theta: np.ndarray) -> np.ndarray:
         """Derivatives (n_parameters, m, n_steps) of the response while the pairing stays."""
         theta = np.asarray(theta, dtype=float)
-        own = theta[: len(self.model.parameter_names)]
-        modes, slopes = self.model.simulate(own), np.asarray(self.model.jacobian(own))
+        modes, slopes = self.model.simulate(theta), np.asarray(self.model.jacobian(theta))
         paired = self.pair(modes)
         shapes = np.zeros((len(slopes), *paired.shapes.shape))
         for mode, space in enumerate(paired.spaces):
@@ -170,8 +140,22 @@ class PairedModes:
                 moved = turned @ (inverse @ target)
                 moved = moved - moved @ inverse.T @ basis.T
                 shapes[:, k, mode] = moved + (target - projected) @ turned @ inverse
-        ratios = self._ratios(slopes[:, 0, paired.columns]) * self.factors(theta[None]).T
-        if self._warmer is not None:
-            ratios = np.concatenate([ratios, (self._ratios(paired.frequencies) * self._warmer[:, None])[None]])
-            shapes = np.concatenate([shapes, np.zeros((1, *shapes.shape[1:]))])
+        ratios = self._ratios(slopes[:, 0, paired.columns]) * self.factors(modes)[:, None]
+        ratios += self._ratios(paired.frequencies) * (self.factors(slopes) - 1.0)[..., None]
         return self._joined(ratios, shapes)
+
+
+class PairedStatistic:
+    """Statistic of modes: that of the residuals of the paired ones."""
+
+    of_response = True
+
+    def __init__(self, paired: PairedModes, statistic: Statistic) -> None:
+        self.paired, self.statistic, self.measured = paired, statistic, paired.measurements.values
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.paired.identity}, {self.statistic!r})"
+
+    def __call__(self, residuals: np.ndarray, modes: np.ndarray) -> np.ndarray:
+        """Numbers (n_numbers,) of modes (1 + n_sensors, n_modes)."""
+        return self.statistic(self.paired.response(modes) - self.measured)

@@ -1,6 +1,7 @@
 """What a report says and draws of modes, load tests and histories of one structure."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -78,31 +79,29 @@ def test_load_cases_are_bars_and_nothing_is_said_of_time(rng, tmp_path):
     assert "Predicted values" in text and not OF_TIME.findall(text)
 
 
-def test_predicted_modes_are_simulated_once_for_all_reports_also_of_another_process(rng, tmp_path):
-    made = []
+def matrices(theta):
+    stiffness = 30e6 * np.array([[theta[0] + theta[1], -theta[1]], [-theta[1], theta[1]]])
+    return stiffness, np.diag([20e3, 20e3])
 
-    def matrices(theta):
-        made.append(tuple(theta))
-        stiffness = 30e6 * np.array([[theta[0] + theta[1], -theta[1]], [-theta[1], theta[1]]])
-        return stiffness, np.diag([20e3, 20e3])
+
+@pytest.mark.parametrize("workers", [None, 2])
+def test_a_sample_is_simulated_once_for_all_reports_also_with_a_pool_and_after_a_restart(workers, rng, tmp_path):
+    """Statistics of the likelihood and modes that are predicted are of the same simulations."""
 
     def posterior():
         model = FunctionModes(matrices, tuple(PRIOR), {"floor 1": 0, "roof": 1}, n_modes=2)
-        return Posterior(ModalLikelihood(model, data, cache=tmp_path / "cache"), PRIOR)
+        return Posterior(ModalLikelihood(model, data, pool=workers, cache=tmp_path / "cache"), PRIOR)
 
     data, theta = modal_likelihood(rng).model.data, np.exp(0.2 * rng.normal(size=(300, 2)))
     sampled = posterior()
-    sampled.log_prob(theta)  # as in a run
-    count = len(made)
-    sampled.likelihood.predict_modes(theta)
-    assert len(made) == count
-    made.clear()
-    first = posterior()
-    found = str(first.likelihood.predict_modes(theta)), [str(each) for each in check_fit(first, theta)]
-    count = len(made)
-    assert count >= 300
-    assert (str(first.likelihood.predict_modes(theta)), [str(each) for each in check_fit(first, theta)]) == found
-    assert len(made) == count
-    again = posterior()  # which verifies a few rows
+    logs = sampled.log_prob(theta)  # as in a run
+    found = str(sampled.likelihood.predict_modes(theta)), [str(each) for each in check_fit(sampled, theta)]
+    draws = sampled.report()["simulations"] - 300  # of the prior
+    assert 0 < draws <= 100
+    again = posterior()
     assert (str(again.likelihood.predict_modes(theta)), [str(each) for each in check_fit(again, theta)]) == found
-    assert len(made) < 1.5 * count
+    assert (again.log_prob(theta) == logs).all() and again.report()["simulations"] == 0
+    assert again.report()["verifications"] < 20
+    other = replace(data, frequencies=data.frequencies * 1.01)  # other data of the same model
+    changed = ModalLikelihood(again.likelihood.model.model, other, cache=tmp_path / "cache")
+    assert np.isfinite(changed(theta)).all() and changed.simulations == 0
