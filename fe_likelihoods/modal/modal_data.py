@@ -164,8 +164,16 @@ class ModalData:
         )
 
     def at(self, sensors: Sequence[str]) -> "ModalData":
-        """Return the shapes at some of the sensors; ValueError for an unknown one."""
-        return replace(self, shapes=self.shapes[:, :, _places("sensors", sensors, self.sensors)], sensors=sensors)
+        """Return the shapes at some of the sensors; ValueError for an unknown one.
+
+        A known `shape_error` is that of the same measurements, for shapes whose norm at these sensors is 1.
+        """
+        shapes, error = self.shapes[:, :, _places("sensors", sensors, self.sensors)], self.shape_error
+        if error is not None:
+            norms = np.sqrt(np.nansum(np.square(shapes), axis=(0, 2)) / np.maximum(self.has_shape.sum(axis=0), 1))
+            # at most half, with which a shape tells nothing
+            error = np.minimum(error / np.maximum(norms, _ABOVE_ZERO), np.nextafter(_LARGEST_SHARE, 0.0))
+        return replace(self, shapes=shapes, sensors=sensors, shape_error=error)
 
     def mean(self) -> "ModalData":
         """Return the mean of several identifications, with their scatter as the errors `frequency_cv`, `shape_error`.

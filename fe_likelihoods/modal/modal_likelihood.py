@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import ndtri
+from scipy.special import ndtri, stdtrit
 
 from ..cache.comparison import Simulated, difference_in_words
 from ..cache.simulation_cache import TOLERANCE
@@ -24,7 +24,7 @@ from .temperature import ModesWithSlope
 
 __all__ = ["ModalLikelihood", "PredictedModes"]
 
-_NORMAL_QUANTILES = ndtri((np.arange(32) + 0.5) / 32)  # of an error, for each sample
+_PROBABILITIES = (np.arange(32) + 0.5) / 32  # of an error, for each sample
 _CLOSE = 0.02  # ratio of frequencies, less 1, below which an identification finds the plane of two shapes only
 
 
@@ -94,7 +94,7 @@ class ModalLikelihood(FELikelihood):
         model = _with_modes(model)
         self._paired = PairedModes(model if data.temperatures is None else ModesWithSlope(model), data, close)
         noise = modal_noise(self._paired, (frequency_error, shape_error), student_t)
-        self.held_out = held_out
+        self.held_out, self._student = held_out, noise.student
         if held_out is not None:
             sensor_rows(model, held_out)  # refuses what cannot be predicted
         super().__init__(self._paired, self._paired.measurements, noise, pool, **options)
@@ -157,7 +157,7 @@ class ModalLikelihood(FELikelihood):
         if not good.any():
             reason = batch.reasons[0] or "a frequency is not positive"
             raise SimulationFailed(f"none of {len(rows)} samples can be simulated; the first reason: {reason}")
-        return PredictedModes.of(paired, batch.response[good], errors[good])
+        return PredictedModes.of(paired, batch.response[good], errors[good], self._student)
 
 
 class _ModesSimulator(Simulator):
@@ -195,16 +195,17 @@ class PredictedModes(NamedTuple):
     numbers: np.ndarray  # (n, m) numbers of the computed modes, from 1
     shapes: np.ndarray  # (n, m, n_sensors)
     unknown: np.ndarray  # (n,) unknown relative error of a frequency, as of the model; 0 if there is none
+    student: float  # degrees of freedom of Student-t errors; 0 for Gaussian ones
 
     @classmethod
-    def of(cls, paired: PairedModes, computed: np.ndarray, unknown: np.ndarray | float = 0.0) -> "PredictedModes":
+    def of(cls, paired: PairedModes, computed: np.ndarray, unknown: Any, student: float) -> "PredictedModes":
         """Pair computed modes (n, 1 + n_sensors, n_modes) with the measured ones; ValueError if n is zero."""
         found, first = [paired.pair(modes) for modes in computed], paired.data.has_shape.argmax(axis=0)
         frequencies, assurance = (np.stack([getattr(each, x) for each in found]) for x in ("frequencies", "assurance"))
         numbers = np.stack([each.columns for each in found]) + 1
         shapes = np.stack([each.shapes[first, np.arange(len(first))] for each in found])
         unknown = np.broadcast_to(unknown, len(found))
-        return cls(paired, computed, frequencies, assurance, numbers, shapes, unknown)
+        return cls(paired, computed, frequencies, assurance, numbers, shapes, unknown, student)
 
     @property
     def data(self) -> ModalData:
@@ -213,11 +214,12 @@ class PredictedModes(NamedTuple):
 
     def against(self, data: ModalData) -> "PredictedModes":
         """The same computed modes beside other measured ones; nothing is simulated."""
-        return self.of(PairedModes(self.paired.model, data, self.paired.close), self.computed, self.unknown)
+        paired = PairedModes(self.paired.model, data, self.paired.close)
+        return self.of(paired, self.computed, self.unknown, self.student)
 
     @property
     def errors(self) -> np.ndarray:
-        """Known and unknown relative errors (n, m) of an identified frequency, together."""
+        """Known and unknown relative errors (n, m) of an identified frequency, together; scales if Student-t."""
         known = 0.0 if self.data.frequency_cv is None else self.data.frequency_cv
         if self.data.covariance is not None:
             known = np.sqrt(np.diag(self.data.covariance)) / self.data.mean_frequencies
@@ -225,7 +227,8 @@ class PredictedModes(NamedTuple):
 
     def interval(self, level: float = 0.9) -> np.ndarray:
         """Central intervals (2, m) of an identified frequency [Hz], with its errors."""
-        drawn = self.frequencies * (1.0 + self.errors * _NORMAL_QUANTILES[:, None, None])
+        errors = stdtrit(self.student, _PROBABILITIES) if self.student else ndtri(_PROBABILITIES)
+        drawn = self.frequencies * (1.0 + self.errors * errors[:, None, None])
         return np.quantile(drawn, [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=(0, 1))
 
     def rows(self) -> list[list[str]]:

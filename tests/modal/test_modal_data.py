@@ -110,3 +110,11 @@ def test_close_modes_are_a_group_unless_their_plane_takes_up_all_sensors():
     data = ModalData([2.01, 1.0, 2.0], [*SHAPES, [1.0, 0.0, 0.0]], FLOORS)
     assert data.groups(0.02) == ((1,), (2, 0)) and data.groups(0.0) == ((1,), (2,), (0,))
     assert len(data.at(FLOORS[:2]).groups(0.02)) == 3
+
+
+def test_a_known_error_is_that_of_the_same_components_at_fewer_sensors():
+    """Else shapes at sensors near a node would have errors of a tenth of the true ones."""
+    data = ModalData([1.0, 3.0, 5.0], [*SHAPES, [np.nan] * 3], FLOORS, shape_error=0.02)
+    norms = np.linalg.norm(data.shapes[0, :2, :2], axis=1)
+    np.testing.assert_allclose(data.at(FLOORS[:2]).shape_error[:2], 0.02 / norms, rtol=1e-12)
+    np.testing.assert_allclose(data.at(FLOORS).shape_error[:2], 0.02, rtol=1e-12)

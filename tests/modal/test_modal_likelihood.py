@@ -124,6 +124,9 @@ def test_student_errors_have_the_density_of_scipy(rng):
         mac = (computed[1:, j] @ shapes[k, j]) ** 2 / (computed[1:, j] @ computed[1:, j])
         expected += multivariate_t.logpdf([np.sqrt(1.0 - mac), 0.0, 0.0], np.zeros(3), sigma**2 * np.eye(3), 4)
     assert found == pytest.approx(expected, rel=1e-10)
+    predicted = ModalLikelihood(FRAME, data, student_t=4).predict_modes([[*theta, 0.02, 0.04]] * 50)
+    half = 0.5 * np.diff(predicted.interval(0.9), axis=0)[0] / predicted.frequencies[0]
+    np.testing.assert_allclose(half, t.ppf(0.95, 4) * 0.02, rtol=0.05)
     with pytest.raises(ValueError, match="degrees of freedom above 2"):
         ModalLikelihood(FRAME, data, student_t=1)
 
