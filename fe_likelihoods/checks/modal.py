@@ -10,7 +10,7 @@ from scipy.stats import t as student
 
 from ..text_tables import listed
 from .fault_words import finding_of
-from .finding import CARE, HALF, SMALL_PROBABILITY, TAIL, WRONG, Finding, about
+from .finding import CARE, HALF, NOTE, SMALL_PROBABILITY, TAIL, WRONG, Finding, about, percent
 from .model import LARGE_SHIFT
 from .tables import find_changes_of_modes
 
@@ -31,7 +31,8 @@ def check_modes(fit: Any) -> list[Finding]:
         found += about("data", named + strange or _check_reach(fit.draws))
     if any(each.severity == WRONG for each in found) or fit.samples is None:
         return found
-    return found + _check_errors(fit) + ([] if fit.held_out is None else _check_held_out(fit.held_out))
+    found += _check_errors(fit) + _check_pairs(fit.samples)
+    return found + ([] if fit.held_out is None else _check_held_out(fit.held_out))
 
 
 def _number(modes: Any, k: int) -> str:
@@ -74,6 +75,19 @@ def _check_shapes(modes: Any) -> list[Finding]:
         text = f"No computed mode resembles the measured mode {_number(modes, k)}: its best MAC is {resembling[k]:.2f}."
         action = f"Leave it out, data.select({others}) or modes = {others} in a TOML file; or compute more modes."
         found.append(Finding("A mode has no counterpart", CARE, text, action, {"mac": float(resembling[k])}))
+    return found
+
+
+def _check_pairs(modes: Any) -> list[Finding]:
+    """Measured modes that are different computed modes in the posterior, which no result has to suffer from."""
+    found = []
+    for k, column in enumerate(modes.numbers.T):
+        numbers, counts = np.unique(column, return_counts=True)
+        if counts.max() < (1.0 - TAIL) * len(column):
+            shares = listed([f"{each} ({percent(n / len(column))})" for each, n in zip(numbers, counts, strict=True)])
+            text = f"The measured mode {_number(modes, k)} is paired with different computed modes: {shares}."
+            action = "Parameters may have several regions; more sensors tell the shapes apart."
+            found.append(Finding("The pairing of modes changes", NOTE, text, action))
     return found
 
 

@@ -386,7 +386,7 @@ def user_model(job: Job, channels: tuple[Channel, ...], record: Record | None = 
         for key in given.keys() & {"templates", "files"}:
             given[key] = {name: job.path("model", key, file) for name, file in given[key].items()}
         paths = [(word, job.folder / word) for word in given.pop("command")]
-        words = [str(path.resolve()) if path.is_file() else word for word, path in paths]
+        words = [str(path.absolute()) if path.is_file() else word for word, path in paths]  # a link to Python stays
         file = given.pop("output")
         return ExecutableModel(words, given.pop("templates", {}), output or file, names, channels, **given)
     from ..models.function import FunctionModel
