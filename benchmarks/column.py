@@ -9,7 +9,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from fe_likelihoods.models.rc_column import RCColumn
+from fe_likelihoods import ColumnAnalysis, RCColumn
 from fe_likelihoods.problems import BRIDGE_COLUMN_MEANS, bridge_column_data, bridge_column_prior
 from fe_likelihoods.simulation.executors import LocalPool, as_executor
 from fe_likelihoods.simulation.model import misfit_batch
@@ -40,7 +40,7 @@ def simulation(repeats: int) -> list[Row]:
     for case, (theta, scale) in CASES.items():
         record = bridge_column_data().record.scale(scale)
         usual = RCColumn.lhpost(record)
-        model = RCColumn.lhpost(record, tolerance=TOLERANCE * INCH)
+        model = RCColumn.lhpost(record, analysis=ColumnAnalysis(tolerance=TOLERANCE * INCH))
         fibers = sum(map(len, model.section.fibers()))
         peer = peer_of(model, theta)
         response = model.simulate(theta)  # compile before the measurement

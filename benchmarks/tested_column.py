@@ -28,8 +28,8 @@ SPREADS = {"Ec": 0.3, "ft": 0.5, "fc": 0.2, "Es": 0.1, "fy": 0.08, "Esh": 0.5, "
 
 def column(history: str, seed: int) -> Posterior:
     """Posterior of a column by the name of its file; the data do not depend on the seed."""
-    read, force, half = read_column(SHARED / "measured" / "rc_column_cyclic", f"{history}.csv", 6)
-    whole = replace(read, parameters=tuple(SPREADS), fatigue=None, geometry="corotational", units=(("force", "kip"),))
+    read, force, half = read_column(SHARED / "measured" / "rc_column_cyclic", f"{history}.csv", 6, "corotational")
+    whole = replace(read, parameters=tuple(SPREADS), fatigue=None, units=(("force", "kip"),))
     model = whole.with_record(DisplacementHistory(history, whole.loading.displacement[:half], whole.loading.source))
     measured = Measurements(model.channels, model.dt, force[None, :half], history)
     prior = {name: TruncatedNormal(1.0, spread) for name, spread in SPREADS.items()}

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from fe_likelihoods.data.ground_motion import stochastic_motion
 
-from fe_likelihoods import Events, Measurements, RCColumn, Record
+from fe_likelihoods import ColumnAnalysis, Events, Measurements, RCColumn, Record
 from fe_likelihoods.problems import BRIDGE_COLUMN_MEANS, BRIDGE_COLUMN_NOISE
 from fe_likelihoods.signals.datasets import write_dataset
 from fe_likelihoods.units import G0
@@ -65,7 +65,7 @@ def column_measurements(
 
     In the pauses of `Events` nothing is measured (NaN).
     """
-    model = RCColumn.lhpost(record, mesh=n_strips, substeps=substeps)
+    model = RCColumn.lhpost(record, analysis=ColumnAnalysis(mesh=n_strips, substeps=substeps))
     values = model.simulate([theta[name] for name in model.parameter_names])
     deviations = np.array([levels[channel.name] for channel in model.channels])
     values = values + deviations[:, None] * np.random.default_rng(seed).standard_normal(values.shape)

@@ -32,7 +32,7 @@ from .models.linear_structure_parts import BridgeDeck, ModalModel, ShearFrame
 from .models.opensees import OpenSeesModel
 from .models.rc_column import RCColumn
 from .models.rc_column_curves import material_curves, moment_curvature
-from .models.rc_column_parts import Bars, Concrete, Hoops, LowCycleFatigue, Steel
+from .models.rc_column_parts import Bars, ColumnAnalysis, Concrete, Hoops, LowCycleFatigue, Steel
 from .models.sensed import SensedModel, Sensor
 from .models.umbridge import UMBridgeModel
 from .noise.autoregressive import AutoregressiveNoise
@@ -74,6 +74,7 @@ __all__ = [
     "Bars",
     "BridgeDeck",
     "Channel",
+    "ColumnAnalysis",
     "Concrete",
     "DaskExecutor",
     "DisplacementHistory",

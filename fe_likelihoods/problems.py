@@ -166,9 +166,10 @@ def bridge_column(
     ['Ec', 'Es', 'a0', 'a1', 'ft', 'sigma_acceleration', 'sigma_displacement']
     """
     from .models.rc_column import RCColumn
+    from .models.rc_column_parts import ColumnAnalysis
 
     if data == "short":
-        changes = {"substeps": SHORT_SUBSTEPS} | changes
+        changes = {"analysis": ColumnAnalysis(substeps=SHORT_SUBSTEPS)} | changes
     record, measurements, _ = bridge_column_data(data) if isinstance(data, str) else data
     if duration is not None:
         record, measurements = record.trim(0.0, duration), measurements.trim(0.0, duration)

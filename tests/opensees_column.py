@@ -86,15 +86,18 @@ def peer_of(model: RCColumn, theta: np.ndarray) -> SimpleNamespace:
         fibers=np.concatenate(fibers).T,  # (3, n): y, area, material
         mass=(mass, mass, model.rotational_inertia / (KIP * INCH)),
         node_masses=tuple(
-            np.append(np.ones(model.n_elements - 1), 0.5) * model.column_mass / model.n_elements / TO_MASS
+            np.append(np.ones(model.analysis.n_elements - 1), 0.5)
+            * model.column_mass
+            / model.analysis.n_elements
+            / TO_MASS
         ),
         axial_load=(values["mass"] * G0 if model.axial_load is None else model.axial_load) / KIP,
         a0=values["a0"],
         a1=values["a1"],
         height=model.height / INCH,
-        n_elements=model.n_elements,
-        n_points=model.n_points,
-        geometry=model.geometry.capitalize(),
+        n_elements=model.analysis.n_elements,
+        n_points=model.analysis.n_points,
+        geometry=model.analysis.geometry.capitalize(),
     )
 
 

@@ -122,7 +122,7 @@ def test_measurements_must_fit(data, strong):
         ({"data": "eq2"}, "eq1"),
         ({"duration": 51.0}, "duration"),
         ({"every": 1.5, "duration": 2.0}, "factor"),
-        ({"duration": 2.0, "geometry": "lineal"}, "geometry"),
+        ({"duration": 2.0, "analysis": {}}, "ColumnAnalysis"),
     ):
         with pytest.raises(ValueError, match=message):
             bridge_column(**arguments)

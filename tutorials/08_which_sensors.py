@@ -17,7 +17,7 @@ ranks. ::
 import matplotlib.pyplot as plt
 import numpy as np
 
-from fe_likelihoods import RCColumn, peak, plot_ranking, plot_sensors, problems, rank_sensors
+from fe_likelihoods import ColumnAnalysis, RCColumn, peak, plot_ranking, plot_sensors, problems, rank_sensors
 
 plt.style.use("fe_likelihoods.plots.tutorials")
 
@@ -43,7 +43,7 @@ bar = RCColumn.lhpost(short).bar_circle_radius
 positions = [-bar, -0.5 * bar, 0.5 * bar, bar]
 gauges = {(height, x): f"strain@{height:g}:{x:.3f}" for x in positions for height in HEIGHTS}
 places = ("acceleration", "displacement", "base_moment", "rotation@0:0.6", "rotation@0:1.2", *gauges.values())
-column = RCColumn.lhpost(motions["EQ2"], outputs=places, substeps=2)
+column = RCColumn.lhpost(motions["EQ2"], outputs=places, analysis=ColumnAnalysis(substeps=2))
 design = column.with_record(motions["EQ2"].scale(1.5))
 prior = problems.bridge_column_prior(())
 

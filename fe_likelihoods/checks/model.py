@@ -190,13 +190,13 @@ def _under(model: Any, change: Callable[[Record], Record]) -> Any:
 def _finer(model: Any) -> Iterator[tuple[str, str, Any, int]]:
     """What is halved, its name, the finer model, and its response samples per sample of the model."""
     names = {each.name for each in fields(model)} if is_dataclass(model) else set()
-    if "substeps" in names:
-        yield "the integration step", STEP, replace(model, substeps=2 * model.substeps), 1
+    usual = model.analysis if "analysis" in names else None
+    if is_dataclass(usual) and {"substeps", "mesh"} <= {each.name for each in fields(usual)}:
+        yield "the integration step", STEP, replace(model, analysis=replace(usual, substeps=2 * usual.substeps)), 1
+        yield "the fibers of the section", MESH, replace(model, analysis=replace(usual, mesh=2 * usual.mesh)), 1
     elif "step" in names and hasattr(model, "integration_step"):
         yield "the integration step", STEP, replace(model, step=0.5 * model.integration_step), 1
     elif motions_to_replace(model):
         finer = _under(model, lambda each: each.resample(0.5 * each.dt))
         if (finer.n_steps - 1) == 2 * (model.n_steps - 1):
             yield "the time step", STEP, finer, 2
-    if "mesh" in names and isinstance(model.mesh, int):
-        yield "the fibers of the section", MESH, replace(model, mesh=2 * model.mesh), 1

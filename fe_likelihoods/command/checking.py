@@ -75,8 +75,8 @@ def _say_data(problem: Problem, say: Callable[[str], None]) -> None:
             what = "samples" if measured.is_history else "values"
             say(f"  {channel.name}: {len(shown)} {what}{missing}, peak {np.abs(shown).max():.3g} {channel.unit}")
         inner = getattr(model, "model", model) if modal else model
-        say(f"Model: {type(getattr(inner, 'parts', inner)).__name__}, {len(model.parameter_names)} parameters")
-    say(f"{posterior.ndim} parameters with the noise:")
+        say(f"Model: {type(getattr(inner, 'parts', inner)).__name__}, parameters: {len(model.parameter_names)}")
+    say(f"Parameters with those of the noise: {posterior.ndim}")
     width = max(len(parameter.label) for parameter in posterior.parameters)
     for parameter in posterior.parameters:
         mean, sd = (parameter.shown(value) for value in posterior.prior.distributions[parameter.name].moments)

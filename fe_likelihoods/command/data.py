@@ -12,7 +12,7 @@ from ..signals.datasets import Dataset, read_dataset
 from ..signals.read import read_columns, read_record
 from ..signals.records import Record
 from .job import HDF5, Job
-from .keys import did_you_mean, read_quantity
+from .keys import check_known, read_quantity
 from .sections import Measured
 
 __all__ = ["is_dataset", "read_base_motion", "read_measured", "read_supports", "reduce_data"]
@@ -110,8 +110,7 @@ def _read_columns(path: Path, given: Measured, channels: Sequence[Channel]) -> M
     by_name = {channel.name: channel for channel in channels}
     columns, units = given.columns or {name: name for name in by_name}, given.units or {}
     for key, names, known in (("columns", columns, tuple(by_name)), ("units", units, tuple(columns))):
-        if unknown := [name for name in names if name not in known]:
-            raise ValueError(f"{key}: unknown channel {unknown[0]!r}; {did_you_mean(unknown[0], known)}")
+        check_known(names, known, f"{key}:", "unknown channel")
     if lacking := [name for name in by_name if name not in columns]:
         raise ValueError(
             f"columns: expected a column for each channel of the model, {', '.join(by_name)}; there is none for "

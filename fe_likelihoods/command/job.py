@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from . import sections
-from .keys import did_you_mean, keys_of, read_keys
+from .keys import check_known, did_you_mean, keys_of, read_keys
 from .sections import FREE_SECTIONS, MODEL_KINDS, SECTIONS, USER_MODELS, model_keys, part_keys
 
 __all__ = ["HDF5", "Job", "parse_job", "read_job"]
@@ -127,9 +127,8 @@ def parse_job(text: str, file: Path, folder: Path) -> Job:
             f"{file.name}: not a TOML file: {error}; a text needs quotes, true and false have small letters, each key "
             "stands once, a section is a line such as [record]"
         ) from error
+    check_known(content, (*FREE_SECTIONS, *SECTIONS), f"{file.name}:", "unknown section")
     for name, value in content.items():
-        if name not in (known := (*FREE_SECTIONS, *SECTIONS)):
-            raise ValueError(f"{file.name}: [{name}]: unknown section; {did_you_mean(name, known)}")
         if not isinstance(value, dict):
             raise ValueError(f"{file.name}: {name}: expected a section [{name}]; got {value!r}")
     if "model" not in content:
@@ -179,9 +178,8 @@ def _read_model(given: dict[str, Any], where: str) -> tuple[str, dict[str, Any]]
         known = did_you_mean(kind, MODEL_KINDS) if isinstance(kind, str) else f"known are {', '.join(MODEL_KINDS)}"
         raise ValueError(f"{where}] kind: expected the kind of the structure; got {kind!r}; {known}")
     keys, parts = model_keys(kind), part_keys(kind)
-    known = (*(key.name for key in keys), *parts)  # the names of parts are proposed as well
-    if unknown := [name for name in given if name not in (*known, "kind")]:
-        raise ValueError(f"{where}] {unknown[0]}: unknown key of kind {kind}; {did_you_mean(unknown[0], known)}")
+    known = *(key.name for key in keys), *parts  # the names of parts are proposed as well
+    check_known([name for name in given if name != "kind"], known, f"{where}]", f"unknown key of kind {kind}")
     values = read_keys({name: given[name] for name in given if name not in (*parts, "kind")}, keys, f"{where}]")
     for name in given.keys() & parts.keys():
         if not isinstance(given[name], dict):

@@ -10,7 +10,7 @@ import functools
 import json
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from ..priors.distributions import Distribution, HalfNormal, LogNormal, TruncatedNormal, Uniform
@@ -20,10 +20,10 @@ from ..units import DIMENSIONS, to_si
 __all__ = [
     "FORMS",
     "Key",
+    "check_known",
     "did_you_mean",
     "key",
     "keys_of",
-    "keys_of_structure",
     "parse_prior",
     "read_by_channel",
     "read_keys",
@@ -49,19 +49,9 @@ class Key(NamedTuple):
 
 def key(kind: str, meaning: str, default: Any = None) -> Any:
     """A field of a section; without a default (None) it may be left out, and ``...`` means that it may not."""
+    shown = "" if default in (None, ...) else f" ({json.dumps(default)})"  # as TOML writes it
     given = {} if default is ... else {"default": default}
-    return dataclasses.field(metadata={"kind": kind, "meaning": meaning}, **given)
-
-
-@functools.cache
-def keys_of(section: type) -> tuple[Key, ...]:
-    """Keys of a section, from its fields; the meanings have the defaults as TOML writes them."""
-    found = []
-    for each in sorted(dataclasses.fields(section), key=lambda each: each.name in getattr(section, "READING", ())):
-        required = each.default is dataclasses.MISSING
-        given = "" if required or each.default is None else f" ({json.dumps(each.default)})"
-        found.append(Key(each.name, each.metadata["kind"], each.metadata["meaning"] + given, required))
-    return tuple(found)
+    return dataclasses.field(metadata={"kind": kind, "unit": "", "meaning": meaning + shown}, **given)
 
 
 _KINDS_OF_TYPES = {
@@ -76,13 +66,14 @@ _KINDS_OF_TYPES = {
 
 
 @functools.cache
-def keys_of_structure(owner: type, without: str = "", optional: bool = False) -> tuple[Key, ...]:
-    """Keys of the described fields of a structure or of one of its parts, but of names that blanks separate.
+def keys_of(owner: type, without: str = "", optional: bool = False) -> tuple[Key, ...]:
+    """Keys of a section, or of the described fields of a structure or one of its parts, but for names in `without`.
 
-    They may all be left out where they have the values of a built-in structure (`optional`).
+    Kinds follow from unit and type where they are not stated. All keys may be left out where they have the values of a
+    built-in structure (`optional`).
     """
     found = []
-    for each in dataclasses.fields(owner):
+    for each in sorted(dataclasses.fields(owner), key=lambda each: each.name in getattr(owner, "READING", ())):
         about, unit = each.metadata, each.metadata["unit"]
         kind = about["kind"] or next((name for name, si in DIMENSIONS.items() if si == unit), "")
         meaning, mark, rest = about["meaning"].partition("; ")
@@ -139,23 +130,19 @@ def _check_of(kind: str) -> _Check:
     """The same for kinds such as "list of number", "table of text or number" (by name), and "text, or list of text"."""
     if kind in _ONE:
         return _ONE[kind]
-    first, _, second = kind.partition(", or ")
-    if not second and kind.startswith(("list of ", "table of ")):
-        fits, expected, example = _check_of(kind.partition(" of ")[2])
-        if kind.startswith("list of "):
-            return (
-                lambda value: isinstance(value, list) and all(map(fits, value)),
-                f"list, each a {expected}",
-                f"[{example}]",
-            )
+    container, _, inner = kind.partition(" of ")
+    mark = ", or " if ", or " in kind else " or "
+    if mark == ", or " or container not in ("list", "table"):
+        (fits, expected, _), (other, further, example) = map(_check_of, kind.split(mark, 1))
+        return lambda value: fits(value) or other(value), f"{expected}, or a {further}", example
+    fits, expected, example = _check_of(inner)
+    holds, form, brackets = (list, "list", "[{}]") if container == "list" else (dict, "table by name", "{{top = {}}}")
 
-        def is_table(value: Any) -> bool:
-            return isinstance(value, dict) and bool(value) and all(map(fits, value.values()))
+    def are_all(value: Any) -> bool:
+        values = value.values() if holds is dict and isinstance(value, dict) else value
+        return isinstance(value, holds) and all(map(fits, values)) and (holds is list or bool(value))
 
-        return is_table, f"table by name, each a {expected}", f"{{top = {example}}}"
-    first, second = (first, second) if second else kind.split(" or ", 1)
-    (fits, expected, _), (other, further, example) = _check_of(first), _check_of(second)
-    return lambda value: fits(value) or other(value), f"{expected}, or a {further}", example
+    return are_all, f"{form}, each a {expected}", brackets.format(example)
 
 
 def did_you_mean(given: str, known: Sequence[str]) -> str:
@@ -163,6 +150,13 @@ def did_you_mean(given: str, known: Sequence[str]) -> str:
     lower = {name.lower(): name for name in reversed(known)}
     near = difflib.get_close_matches(given.lower(), [*lower], n=1, cutoff=0.55)
     return f"did you mean {lower[near[0]]}?" if near else f"known are {', '.join(known)}"
+
+
+def check_known(given: Iterable[str], known: Iterable[str], where: str, what: str) -> None:
+    """ValueError for the first name that is not known, with the nearest known one."""
+    known = tuple(known)
+    if unknown := [name for name in given if name not in known]:
+        raise ValueError(f"{where} {unknown[0]}: {what}; {did_you_mean(unknown[0], known)}")
 
 
 def _split_number(text: str) -> tuple[str, str]:
@@ -209,9 +203,8 @@ def read_quantity(value: Any, dimension: str) -> float:
 def read_by_channel(given: Mapping[str, Any], channels: Sequence[Any], key: str) -> dict[str, float]:
     """Standard deviations [SI] by the names of `channels`; ValueError, which names the key and the channel."""
     known, values = {channel.name: channel for channel in channels}, {}
+    check_known(given, known, f"{key}:", "unknown channel")
     for name, value in given.items():
-        if name not in known:
-            raise ValueError(f"{key}: unknown channel {name!r}; {did_you_mean(name, [*known])}")
         try:
             values[name] = read_quantity(value, known[name].dimension)
         except ValueError as error:
@@ -227,8 +220,7 @@ def read_keys(given: Mapping[str, Any], keys: Sequence[Key], where: str) -> dict
     ValueError, which names file and section (`where`), for an unknown or missing key, or a value of another kind.
     """
     known = {each.name: each for each in keys}
-    if unknown := [name for name in given if name not in known]:
-        raise ValueError(f"{where} {unknown[0]}: unknown key; {did_you_mean(unknown[0], tuple(known))}")
+    check_known(given, known, where, "unknown key")
     if missing := [each for each in keys if each.required and each.name not in given]:
         raise ValueError(f"{where} {missing[0].name}: this key is missing: {missing[0].meaning}")
     return {name: _read_value(value, known[name].kind, f"{where} {name}") for name, value in given.items()}

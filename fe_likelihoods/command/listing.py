@@ -48,6 +48,8 @@ def describe_data(path: Path) -> str:
 
     It is a table, a ground motion in a supported format, a zip archive of V2 files, or a data set (.h5).
     """
+    if path.suffix.lower() == ".toml":
+        raise ValueError(f"{path} names data: `fe-likelihoods check {path}` reads it; give the files that it names")
     if path.suffix.lower() in (".h5", ".hdf5"):
         found = _dataset(path)
     else:
@@ -168,11 +170,13 @@ def _table(path: Path) -> _Lines:
     except ValueError as error:
         if "unit of its frequency" in str(error) and table.clock is None:
             return _Lines(["a table of modes"], {"modes": ['unit = "?"    # write it: the file does not state it']})
-    options, remarks, step = _sampling(table)
+    names = [column.name for column in table.columns]
+    places = re.search(r"case|load|truck|position|place", names[0], re.IGNORECASE)
+    cases = table.time is None and len(names) > 1 and (table.columns[0].kind == "text" or places)
+    options, remarks, step = ([], ["a line for each load case"], None) if cases else _sampling(table)
     remarks += said
     rows: list[tuple[str, ...]] = [("column", "unit", "numbers", "missing", "smallest", "largest")]
     columns, unstated, marks, screened = dict[str, object](), dict[str, str](), set[float](), list[Screened]()
-    names = [column.name for column in table.columns]
     for k in value_columns(table):
         name, values = names[k], table.columns[k].values
         try:
@@ -203,14 +207,12 @@ def _table(path: Path) -> _Lines:
     repairs = ([] if any(each.startswith("missing") for each in repairs) else missing) + repairs
     if not columns:
         return _Lines(text, {})
-    places = re.search(r"case|load|truck|position|place", names[0], re.IGNORECASE)
-    cases = table.time is None and len(names) > 1 and (table.columns[0].kind == "text" or places)
     columns = {name: column for name, column in columns.items() if not cases or column != names[0]}
-    measured = [f"columns = {_toml(columns)}    # channel of the model = column", *([] if cases else options)]
+    measured = [f"columns = {_toml(columns)}    # channel of the model = column", *options]
     if unknown := {name: unit for name, unit in unstated.items() if name in columns}:
         measured.append(f"units = {_toml(unknown)}    # write them: the file does not state them")
     if cases:
-        return _Lines([*text, "a line for each load case"], {"load_test": measured})
+        return _Lines(text, {"load_test": measured})
     if table.clock is not None:
         zero = _toml(clock_text(table.clock))
         measured.append(f"zero = {zero}    # or when the base motion begins, if it is in another file")

@@ -7,7 +7,7 @@ import re
 import sys
 from collections import defaultdict
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,7 +34,7 @@ from ..signals.records import Record
 from ..simulation.model import Model
 from .data import is_dataset, read_base_motion, read_measured, read_supports, reduce_data
 from .job import Job
-from .keys import did_you_mean, parse_prior, read_by_channel
+from .keys import check_known, did_you_mean, parse_prior, read_by_channel
 from .sections import USER_MODELS, part_keys
 
 __all__ = ["Problem", "make_problem", "noise_channels_of", "runs_code_of_user"]
@@ -260,9 +260,8 @@ def _make_priors(
     channels = {name: channel for part in parts for name, channel in noise_channels_of(part).items()}
     measured = {channel.name: part.measurements for part in parts for channel in part.model.channels}
     given = {}
+    check_known(job.priors, names, where, "the model has no such parameter")
     for name, text in job.priors.items():
-        if name not in names:
-            raise ValueError(f"{where} {name}: the model has no such parameter; {did_you_mean(name, names)}")
         try:
             given[name] = parse_prior(text, channels[name].dimension if name in channels else None)
         except ValueError as error:
@@ -305,6 +304,8 @@ def built_in(job: Job, record: Record, names: tuple[str, ...] | None, measured: 
         from ..models.rc_column_parts import LowCycleFatigue
 
         usual = RCColumn.lhpost(record)
+        analysis = {each.name: values.pop(each.name) for each in fields(usual.analysis) if each.name in values}
+        values["analysis"] = replace(usual.analysis, **analysis)
         for part in values.keys() & part_keys("column").keys():  # a section of fatigue switches it on
             values[part] = _changed(job, part, getattr(usual, part) or LowCycleFatigue(), values[part])
         if "units" in values:

@@ -8,7 +8,7 @@ import importlib
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
-from .keys import CLOCK, Key, key, keys_of_structure
+from .keys import CLOCK, Key, key, keys_of
 
 __all__ = [
     "FREE_SECTIONS",
@@ -246,10 +246,10 @@ _OSCILLATOR = (
 _COLUMN_PARTS = dict(concrete="Concrete", steel="Steel", bars="Bars", hoops="Hoops", fatigue="LowCycleFatigue")
 _BRIDGE_PARTS = {f"{name.lower()}_{i}": name for name in ("Pier", "Bearing", "Damper") for i in (1, 2)}
 _BUILT_IN = {  # modules, classes, and fields that are no keys
-    "column": ("rc_column", "RCColumn", "outputs max_increment"),
-    "bridge": ("isolated_bridge", "IsolatedBridge", "outputs every"),
-    "frame": ("linear_structure_parts", "ShearFrame", ""),
-    "bridge deck": ("linear_structure_parts", "BridgeDeck", ""),
+    "column": (("rc_column", "RCColumn", "outputs"), ("rc_column_parts", "ColumnAnalysis", "max_increment")),
+    "bridge": (("isolated_bridge", "IsolatedBridge", "outputs every"),),
+    "frame": (("linear_structure_parts", "ShearFrame", ""),),
+    "bridge deck": (("linear_structure_parts", "BridgeDeck", ""),),
 }
 _PARTS = {"column": _COLUMN_PARTS, "bridge": _BRIDGE_PARTS}
 MODEL_KINDS = (*_BUILT_IN, "oscillator", *_OWN)
@@ -261,16 +261,16 @@ USER_MODELS = tuple(_OWN)
 def _keys_of(module: str, name: str, without: str, optional: bool) -> tuple[Key, ...]:
     """Keys of a class of `fe_likelihoods.models`, imported where a file needs it: some import numba."""
     owner = getattr(importlib.import_module(f"fe_likelihoods.models.{module}"), name)
-    return keys_of_structure(owner, without, optional)
+    return keys_of(owner, without, optional)
 
 
 def model_keys(kind: str) -> tuple[Key, ...]:
     """Keys of ``[model]`` for one of `MODEL_KINDS`."""
     own = _OWN | {"oscillator": _OSCILLATOR}
-    return own[kind] if kind in own else _keys_of(*_BUILT_IN[kind], kind in _PARTS)
+    return own[kind] if kind in own else sum((_keys_of(*each, kind in _PARTS) for each in _BUILT_IN[kind]), ())
 
 
 def part_keys(kind: str) -> dict[str, tuple[Key, ...]]:
     """Keys of the tables below ``[model]`` by name; a key that is left out has the value of the built-in structure."""
-    names, module = _PARTS.get(kind, {}), f"{_BUILT_IN[kind][0]}_parts" if kind in _PARTS else ""
+    names, module = _PARTS.get(kind, {}), f"{_BUILT_IN[kind][0][0]}_parts" if kind in _PARTS else ""
     return {part: _keys_of(module, name, "", True) for part, name in names.items()}

@@ -179,7 +179,7 @@ def _of_matlab(
 
     try:
         content = {name: each for name, each in loadmat(path).items() if not name.startswith("__")}
-    except (NotImplementedError, OSError, ValueError) as error:
+    except Exception as error:  # a damaged file may raise anything
         raise ValueError(f"{path} is no MATLAB file up to version 7.2 ({error}): save it again with '-v7'") from None
     wanted = {"frequencies"} <= set(variables) <= {"frequencies", "shapes", "damping"}
     if not wanted or not set(variables.values()) <= set(content):

@@ -40,6 +40,7 @@ from .rc_column_analysis import ColumnHistory, PreparedColumn, check_loading, ru
 from .rc_column_outputs import Output, Sections, check_units, display_channels, parse_outputs, section_heights
 from .rc_column_parts import (
     Bars,
+    ColumnAnalysis,
     Concrete,
     Confinement,
     Hoops,
@@ -50,7 +51,6 @@ from .rc_column_parts import (
 )
 from .validation import (
     check_described,
-    check_integer,
     check_names,
     check_nominal,
     check_theta,
@@ -172,24 +172,10 @@ class RCColumn(BuiltInModel):
     fatigue: LowCycleFatigue | None = described(
         "", "Low-cycle fatigue of the bars; default: they neither lose strength nor fracture", default=None
     )
-    collapse_drift: float = described(
-        "",
-        'Displacement of the top by the height at which the simulation ends with the reason "collapse"',
-        "positive",
-        0.2,
-        "Tested columns have lost their strength at 0.05 to 0.15; bars that do not fracture would come back from more.",
-    )
     parameters: tuple[str, ...] = described(
         "", "Names of the parameters in theta (``RCColumn`` lists them)", default=("Ec", "Es", "a0", "a1", "ft")
     )
-    n_elements: int = described("", "Number of elements", default=2)
-    n_points: int = described("", "Number of Gauss-Lobatto points per element, 2 to 7", default=3)
-    mesh: int = described("", "Number of strips of the section (even)", default=40)
-    geometry: str = described("", '"corotational" or "linear"', default="corotational")
-    substeps: int = described("", "Integration steps per step of the record", default=1)
-    max_increment: float | None = described(
-        "m", "Largest increment of an imposed displacement; default: height/5000", "positive", None
-    )
+    analysis: ColumnAnalysis = described("", "Mesh, integration and end of a simulation", default=ColumnAnalysis())
     outputs: tuple[str, ...] | None = described(
         "", "Names of the channels, that is, of the sensors (see the notes); default: those at the top", default=None
     )
@@ -197,7 +183,6 @@ class RCColumn(BuiltInModel):
         "", "Channel, or the part of its name before the @, = display unit", default=(), kind="table of text"
     )
     nominal_units: ClassVar[dict[str, str]] = _NOMINAL_UNITS
-    tolerance: float = described("m and rad", "Norm of the last Newton correction", "positive", 1e-8)
 
     @classmethod
     def lhpost(cls, loading: Record | DisplacementHistory, **changes) -> RCColumn:
@@ -210,7 +195,7 @@ class RCColumn(BuiltInModel):
 
         Examples
         --------
-        >>> RCColumn.lhpost(record, substeps=2, outputs=("displacement", "base_shear")).simulate(np.ones(5)).shape
+        >>> RCColumn.lhpost(record, outputs=("displacement", "base_shear")).simulate(np.ones(5)).shape
         (2, 200)
         """
         ksi, inch = to_si(1.0, "ksi").item(), to_si(1.0, "in").item()
@@ -240,7 +225,7 @@ class RCColumn(BuiltInModel):
 
     def _warn_of_coarse_steps(self) -> None:
         """Accelerations below the top contain vibrations of the column's own mass, which need short steps."""
-        step = self.dt / self.substeps
+        step = self.dt / self.analysis.substeps
         heights = {name: float(name.partition("@")[2]) for name in self.outputs if "acceleration@" in name}
         below = [name for name, height in heights.items() if height < self.height * (1.0 - 1e-6)]
         if isinstance(self.loading, Record):
@@ -279,7 +264,7 @@ class RCColumn(BuiltInModel):
     @cached_property
     def section(self) -> ReinforcedSection:
         """Cross-section: dimensions, fibers and confinement."""
-        return ReinforcedSection(self.diameter, self.cover, self.bars, self.hoops, self.mesh)
+        return ReinforcedSection(self.diameter, self.cover, self.bars, self.hoops, self.analysis.mesh)
 
     @property
     def core_diameter(self) -> float:
@@ -346,8 +331,8 @@ class RCColumn(BuiltInModel):
 
     @property
     def _sections(self) -> Sections:
-        points = gauss_lobatto(self.n_points)[0]
-        return Sections(self.height, 0.5 * self.diameter, self.n_elements, points, self.section, self.column_mass > 0.0)
+        n_elements, points = self.analysis.n_elements, gauss_lobatto(self.analysis.n_points)[0]
+        return Sections(self.height, 0.5 * self.diameter, n_elements, points, self.section, self.column_mass > 0.0)
 
     @cached_property
     def _channels(self) -> tuple[Channel, ...]:
@@ -364,19 +349,14 @@ class RCColumn(BuiltInModel):
 
     def _check_arguments(self) -> None:
         """Raise ValueError for arguments from which no column can be built."""
-        parts = {"concrete": Concrete, "steel": Steel, "bars": Bars, "hoops": Hoops}
+        parts = {"concrete": Concrete, "steel": Steel, "bars": Bars, "hoops": Hoops, "analysis": ColumnAnalysis}
         for name, kind in (parts | {"fatigue": LowCycleFatigue}).items():
             part = getattr(self, name)
             if not isinstance(part, kind) and (part is not None or name in parts):
                 raise invalid(f"{kind.__name__}(...) as {name}", part, "import it from fe_likelihoods")
         check_described(self)
         check_loading(self.loading, self.height)
-        check_integer("n_elements", self.n_elements, 1, 50)
-        check_integer("n_points", self.n_points, 2, 7)
-        check_integer("substeps", self.substeps, 1, 1000)
         _ = self.section  # checks its dimensions
-        if self.geometry not in ("corotational", "linear"):
-            raise invalid('geometry "corotational" or "linear"', self.geometry, "the default is corotational")
 
     def _check_names(self) -> None:
         """Raise ValueError for unknown or repeated names of parameters, outputs and units."""

@@ -67,10 +67,10 @@ class PreparedColumn(NamedTuple):
         """Inputs for a column and its resolved outputs; both kinds of loading are linear between their samples."""
         loading = model.loading
         if isinstance(loading, Record):
-            instants = np.arange((loading.n_steps - 1) * model.substeps + 1) / model.substeps
+            instants = np.arange((loading.n_steps - 1) * model.analysis.substeps + 1) / model.analysis.substeps
             acceleration = np.interp(instants, np.arange(loading.n_steps), loading.acceleration)
-            return cls(acceleration, np.arange(0, len(instants), model.substeps), outputs)
-        finer = loading.subdivide(model.max_increment or model.height / 5000.0)
+            return cls(acceleration, np.arange(0, len(instants), model.analysis.substeps), outputs)
+        finer = loading.subdivide(model.analysis.max_increment or model.height / 5000.0)
         return cls(np.asarray(finer.history.displacement), np.asarray(finer.indices), outputs)
 
 
@@ -104,7 +104,7 @@ def make_column(model: Any, theta: np.ndarray, n_elements: int, n_points: int) -
     column = allocate(
         n_elements=n_elements,
         height=model.height,
-        corotational=model.geometry == "corotational",
+        corotational=model.analysis.geometry == "corotational",
         element_tolerance=ELEMENT_TOLERANCE,
         points=points,
         weights=weights,
@@ -124,7 +124,7 @@ def run_column(model: Any, prepared: PreparedColumn, theta: np.ndarray) -> tuple
     Raises SimulationFailed if the parameters describe no structure, the column collapses, or the solution does not
     converge.
     """
-    column, values = make_column(model, theta, model.n_elements, model.n_points)
+    column, values = make_column(model, theta, model.analysis.n_elements, model.analysis.n_points)
     shaken, excitation, kept = isinstance(model.loading, Record), prepared.excitation, prepared.kept
     fibers = tuple(dict.fromkeys(output.fiber for output in prepared.outputs if output.fiber is not None))
     names = HISTORY_ROWS if shaken else _IMPOSED_ROWS
@@ -136,19 +136,19 @@ def run_column(model: Any, prepared: PreparedColumn, theta: np.ndarray) -> tuple
         motion=(3 if shaken else 1) * any(output.motion is not None for output in prepared.outputs),
         fibers=fibers,
     )
-    iteration = Iteration(float(model.tolerance), MAX_ITERATIONS, HALVINGS)
-    own = np.full(model.n_elements, model.column_mass / model.n_elements)  # at the nodes
+    iteration = Iteration(float(model.analysis.tolerance), MAX_ITERATIONS, HALVINGS)
+    own = np.full(model.analysis.n_elements, model.column_mass / model.analysis.n_elements)  # at the nodes
     own[-1] *= 0.5
-    gravity = np.zeros(3 * model.n_elements)
+    gravity = np.zeros(3 * model.analysis.n_elements)
     gravity[1::3] = -own * G0
     gravity[-2] -= model.axial_load if model.axial_load is not None else values["mass"] * G0
     if shaken:
         own[-1] += values["mass"]
-        mass = np.zeros((model.n_elements, 3))
+        mass = np.zeros((model.analysis.n_elements, 3))
         mass[:, 0], mass[:, 1], mass[-1, 2] = own, own, model.rotational_inertia
-        dt, limit = model.dt / model.substeps, model.collapse_drift * model.height
+        dt, limit = model.dt / model.analysis.substeps, model.analysis.collapse_drift * model.height
         dynamics = Dynamics(gravity, mass.ravel(), float(values["a0"]), float(values["a1"]), limit)
-        status, retries = newmark(column, dynamics, excitation, dt, model.substeps, iteration, history, out)
+        status, retries = newmark(column, dynamics, excitation, dt, model.analysis.substeps, iteration, history, out)
         if status < -1:
             raise SimulationFailed(
                 f"collapse: at t = {-(status + 1) * dt:.4g} s, the displacement of the top exceeded the limit of "

@@ -24,10 +24,11 @@ import numpy as np
 
 from ..kernels import reinforcing_steel
 from ..priors.distributions import LogNormal
-from .validation import check_described, described, invalid, structure
+from .validation import check_described, check_integer, described, invalid, structure
 
 __all__ = [
     "Bars",
+    "ColumnAnalysis",
     "Concrete",
     "Confinement",
     "Hoops",
@@ -267,6 +268,42 @@ class Hoops:
     def area_each(self) -> float:
         """Area of one set [m²]."""
         return self.area if self.area is not None else 0.25 * math.pi * self.diameter**2
+
+
+@structure
+@dataclass(frozen=True)
+class ColumnAnalysis:
+    """Mesh of a column, integration of its response, and the end of a simulation.
+
+    Examples
+    --------
+    >>> finer = RCColumn.lhpost(record, analysis=ColumnAnalysis(n_elements=4, substeps=2))
+    """
+
+    n_elements: int = described("", "Number of elements", default=2)
+    n_points: int = described("", "Number of Gauss-Lobatto points per element, 2 to 7", default=3)
+    mesh: int = described("", "Number of strips of the section (even)", default=40)
+    geometry: str = described("", '"corotational" or "linear"', default="corotational")
+    substeps: int = described("", "Integration steps per step of the record", default=1)
+    max_increment: float | None = described(
+        "m", "Largest increment of an imposed displacement; default: height/5000", "positive", None
+    )
+    collapse_drift: float = described(
+        "",
+        'Displacement of the top by the height at which the simulation ends with the reason "collapse"',
+        "positive",
+        0.2,
+        "Tested columns have lost their strength at 0.05 to 0.15; bars that do not fracture would come back from more.",
+    )
+    tolerance: float = described("m and rad", "Norm of the last Newton correction", "positive", 1e-8)
+
+    def __post_init__(self) -> None:
+        check_described(self)
+        check_integer("n_elements", self.n_elements, 1, 50)
+        check_integer("n_points", self.n_points, 2, 7)
+        check_integer("substeps", self.substeps, 1, 1000)
+        if self.geometry not in ("corotational", "linear"):
+            raise invalid('geometry "corotational" or "linear"', self.geometry, "the default is corotational")
 
 
 def _slice_moments(radius: float, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

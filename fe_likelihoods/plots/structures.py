@@ -61,9 +61,9 @@ def plot_section(column: RCColumn, axes: Axes | None = None) -> Axes:
         f"core concrete, hoops {from_si(hoops.diameter, unit):.3g} {unit} at {from_si(hoops.spacing, unit):.3g} {unit}"
     )
     core = axes.add_patch(Circle((0.0, 0.0), core_radius, facecolor=_CORE, edgecolor=BLUE, linewidth=2.0, label=ring))
-    lines = _mesh_lines(column.mesh, radius)
+    lines = _mesh_lines(column.analysis.mesh, radius)
     axes.add_collection(LineCollection(lines, colors="white", linewidths=0.9))
-    mesh = Patch(facecolor=_CORE, edgecolor="white", hatch="|||", label=f"{column.mesh} strips")
+    mesh = Patch(facecolor=_CORE, edgecolor="white", hatch="|||", label=f"{column.analysis.mesh} strips")
     bars = column.bars
     angles = bars.first_angle + 2.0 * np.pi * np.arange(bars.number) / bars.number
     place = float(from_si(column.bar_circle_radius, unit))

@@ -212,7 +212,7 @@ def displacement_before_failure(force: str, displacement: str | ArrayLike) -> Ch
     any before it, comes after the largest force, and reaches less than 80 % of this force. A structure that
     does not fail has the largest displacement of the whole history: continue the history to see more. Under a large
     axial load the force also falls by P-Delta, without any damage: use the base moment divided by the height
-    (``geometry="linear"`` of `RCColumn`).
+    (``geometry="linear"`` of `ColumnAnalysis`).
 
     Parameters
     ----------

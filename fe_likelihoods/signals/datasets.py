@@ -107,13 +107,15 @@ def read_dataset(path: str | Path) -> Dataset:
     """
     import h5py
 
+    if not Path(path).is_file():
+        raise ValueError(f"cannot read {path}: there is no such file; check the path")
     try:
         with h5py.File(path, "r") as file:
             schema, version = file.attrs.get("schema"), file.attrs.get("schema_version")
             if schema != SCHEMA or version != SCHEMA_VERSION:
                 raise ValueError(
-                    f"{path}: expected schema {SCHEMA!r} version {SCHEMA_VERSION}, got {schema!r} version {version}; "
-                    f"write the data set again with this release"
+                    f"{path}: expected schema {SCHEMA!r} version {SCHEMA_VERSION}, got {schema!r} version {version}; a "
+                    "data set of another release is to be written again with this one"
                 )
             samples, values = file["record/acceleration"], file["measurements/values"]
             text, checksum = file.attrs["attributes"], file.attrs["checksum"]

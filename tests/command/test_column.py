@@ -49,7 +49,7 @@ def column(tmp_path):
 def test_a_column_of_ones_own(column):
     found = column([f"{0.01 * k:.2f},{k % 89}" for k in range(201)])
     model = found.posterior.likelihood.model
-    assert model.height == 5.0 and model.mesh == 10 and model.cover == pytest.approx(0.0508)
+    assert model.height == 5.0 and model.analysis.mesh == 10 and model.cover == pytest.approx(0.0508)
     assert found.record.acceleration[10] == pytest.approx(1.1 * np.sin(1.0))
     assert found.posterior.parameter_names == ["Ec", "Es", "a0", "a1", "ft", "sigma_displacement"]
     assert list(found.assumed) == ["sigma_displacement"]

@@ -313,7 +313,7 @@ def test_another_file_of_the_same_name_is_refused(finished):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("[record]", "[recrd]", r"oscillator.toml: [recrd]: unknown section; did you mean record?"),
+        ("[record]", "[recrd]", r"oscillator.toml: recrd: unknown section; did you mean record?"),
         ("[model]", "[model", "not a TOML file"),
         ('"oscillator"', '"osculator"', "[model] kind: expected the kind of the structure; got 'osculator'; did you"),
         ("period", "perod", "oscillator.toml: [model] perod: unknown key of kind oscillator; did you mean period?"),
@@ -321,7 +321,7 @@ def test_another_file_of_the_same_name_is_refused(finished):
         ('"0.8 s"', "-0.8", "[model] LinearOscillator: period"),
         ("base.csv", "bse.csv", "[record] file: there is no file"),
         ("top [mm]", "top [in]", "[measurements] top.csv: expected one column of values named 'top [in]', the columns"),
-        ("displacement =", "displ =", "[measurements] columns: unknown channel 'displ'; did you mean displacement?"),
+        ("displacement =", "displ =", "[measurements] columns: displ: unknown channel; did you mean displacement?"),
         ('acceleration = "top [g]", ', "", "[measurements] columns: expected a column for each channel of the model"),
         ("walkers = 20", "walkers = 2", "[sampler]"),
         ("draws = 10", "draws = -5", "[prediction] draws: expected a whole number of 0 or more, such as 1; got -5"),

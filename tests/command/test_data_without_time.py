@@ -160,11 +160,11 @@ def test_a_bridge_deck_has_a_mode(tmp_path):
         ("modal", [("[sampler]", '[noise]\nlevel = "si"\n[sampler]')], "modes have no such errors"),
         ("modal", [("floor_4 = 4}", "roof = 4}")], "the model has no sensors floor_4"),
         ("modal", [("synthetic_modes", "synthetic_mode")], "did you mean synthetic_modes.csv"),
-        ("load-test", [("errors = {quarter", "errors = {third")], "unknown channel 'third'"),
+        ("load-test", [("errors = {quarter", "errors = {third")], "third: unknown channel"),
         ("load-test", [("[model.channels]", "dt = 0.1\n[model.channels]")], "no time: leave it out"),
         ("load-test", [("[priors]", "[priors]\nsigma_midspan = 'half-normal(1 mm)'")], "is known from"),
         ("load-test", [("[model.channels]", "sensors = ['a']\n[model.channels]")], "sensors are for"),
-        ("load-test", [('midspan = "displacement [mm]"', 'top = "displacement [mm]"')], "unknown channel 'midspan'"),
+        ("load-test", [('midspan = "displacement [mm]"', 'top = "displacement [mm]"')], "midspan: unknown channel"),
         (
             "load-test",
             [("[load_test]", "[load_test]\ncolumns = {midspan = 'top'}")],

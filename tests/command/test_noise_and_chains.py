@@ -58,7 +58,7 @@ def test_noises_are_those_of_python(folder, keys, parameters, options):  # noqa:
         ("groups = true\n" + SENSOR, "[noise] groups: expected one of channel, all, event"),
         ('marginal = true\nlevel = "measured"', "[noise] marginal() integrates out the standard deviations"),
         ('sensor = {acceleration = "1 mm"}', "[noise] sensor: acceleration: expected a number in m/s"),
-        ('sensor = {accelaration = "1 g"}', "sensor: unknown channel 'accelaration'; did you mean acceleration?"),
+        ('sensor = {accelaration = "1 g"}', "sensor: accelaration: unknown channel; did you mean acceleration?"),
         ('sensor = {acceleration = "-1 g"}', "[noise] sensor: acceleration: expected a standard deviation"),
         (
             'sensor = "1 g"',

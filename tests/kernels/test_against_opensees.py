@@ -11,20 +11,27 @@ import pytest
 
 from fe_likelihoods import rrmse
 from fe_likelihoods.models.rc_column import RCColumn
+from fe_likelihoods.models.rc_column_parts import ColumnAnalysis
 from fe_likelihoods.problems import BRIDGE_COLUMN_MEANS, bridge_column_data
 from fe_likelihoods.signals.records import DisplacementHistory
 from tests.opensees_column import CORE, INCH, KIP, STEEL, peer_of, push, require_opensees, shake
 
 NOMINAL, PAPER = np.ones(5), np.array(list(BRIDGE_COLUMN_MEANS.values()))
-TIGHT = dict(tolerance=1e-11)
+
+
+def tight(**given):
+    """Arguments of a column."""
+    return dict(analysis=ColumnAnalysis(tolerance=1e-11, **given))
+
+
 TOLERANCE = 1e-10  # OpenSees', in inch and radian
 CASES = {
     "nominal": (NOMINAL, 1.0, {}),
     "paper": (PAPER, 1.0, {}),
     "strong": (PAPER, 4.0, {}),
-    "linear geometry": (NOMINAL, 1.0, dict(geometry="linear")),
-    "one element of five points": (NOMINAL, 1.0, dict(n_elements=1, n_points=5)),
-    "four elements of four points": (PAPER, 1.0, dict(n_elements=4, n_points=4)),
+    "linear geometry": (NOMINAL, 1.0, tight(geometry="linear")),
+    "one element of five points": (NOMINAL, 1.0, tight(n_elements=1, n_points=5)),
+    "four elements of four points": (PAPER, 1.0, tight(n_elements=4, n_points=4)),
     "rotational inertia": (NOMINAL, 1.0, dict(rotational_inertia=1e6)),
 }
 
@@ -43,7 +50,7 @@ def record():
 @pytest.mark.parametrize("case", CASES)
 def test_base_acceleration(record, case):
     theta, scale, changes = CASES[case]
-    model = RCColumn.lhpost(record.scale(scale), **(TIGHT | changes))
+    model = RCColumn.lhpost(record.scale(scale), **(tight() | changes))
     peer = shake(peer_of(model, theta), model.loading.acceleration / INCH, record.dt, TOLERANCE)
     assert peer.response.shape == (3, record.n_steps), "OpenSees did not finish"
     history = model.history(theta)
@@ -60,8 +67,8 @@ def sensors(model):
 
     The element of OpenSees has its second axis against the direction of loading, and counts rotations anticlockwise.
     """
-    per_element = model.n_points
-    half, radius = model.height / model.n_elements, 0.5 * model.diameter
+    per_element = model.analysis.n_points
+    half, radius = model.height / model.analysis.n_elements, 0.5 * model.diameter
     bar = model.bar_circle_radius
 
     def at(section, row):  # of all sections, from the base
@@ -88,7 +95,7 @@ def sensors(model):
         f"strain@{heights[1]}:{-inner}": ([fiber(1, -inner, CORE)], 1.0, 1.0),
         "strain@0:0": ([at(0, 0)], 1.0, 1.0),
         f"rotation@0:{half}": ([("nodeDisp", 2, 3)], -1.0, 1.0),
-        f"rotation@0:{model.height}": ([("nodeDisp", model.n_elements + 1, 3)], -1.0, 1.0),
+        f"rotation@0:{model.height}": ([("nodeDisp", model.analysis.n_elements + 1, 3)], -1.0, 1.0),
     }
 
 
@@ -103,7 +110,7 @@ def deviations(model, theta, recorded, wanted):
 
 def test_sensors_under_base_acceleration(record):
     """Forces, curvatures, strains of bars and concrete, and rotations are what OpenSees records."""
-    model = RCColumn.lhpost(record, **TIGHT)
+    model = RCColumn.lhpost(record, **tight())
     wanted = sensors(model)
     recorders = [recorder for column, _, _ in wanted.values() for recorder in column]
     peer = shake(peer_of(model, PAPER), record.acceleration / INCH, record.dt, TOLERANCE, recorders)
@@ -113,7 +120,7 @@ def test_sensors_under_base_acceleration(record):
 
 def test_motions_and_stresses_over_the_height(record):
     """Of a column with a mass: its nodes move, and its bars and its concrete are stressed, as in OpenSees."""
-    model = RCColumn.lhpost(record.scale(2.0), column_mass=2.05e4, n_elements=3, **TIGHT)
+    model = RCColumn.lhpost(record.scale(2.0), column_mass=2.05e4, **tight(n_elements=3))
     heights, bar = model.height / 3.0 * np.arange(1, 4), model.bar_circle_radius
     core = model.section.fibers()[0][-3, 0]
     wanted = {}
@@ -133,7 +140,7 @@ def test_motions_and_stresses_over_the_height(record):
 
 def test_a_wrong_material_is_detected(record):
     """Control: one per cent of one modulus changes far more than the two programs differ by."""
-    model = RCColumn.lhpost(record, **TIGHT)
+    model = RCColumn.lhpost(record, **tight())
     peer = shake(peer_of(model, NOMINAL), record.acceleration / INCH, record.dt, TOLERANCE)
     other = model.simulate(NOMINAL + np.array([0.01, 0, 0, 0, 0]))
     assert rrmse(other[1] / INCH, peer.response[0]) > 1e-3
@@ -147,7 +154,7 @@ def test_a_wrong_material_is_detected(record):
 def test_sensors_under_imposed_displacement(changes, limit):
     """Up to a drift of 2 %, with yielding bars; OpenSees stops the fit of their curves after reversals at 1e-4."""
     targets = np.concatenate([np.arange(0.0, 3.0, 0.05), np.arange(3.0, -6.0, -0.05), [-6.0]])
-    arguments = dict(parameters=("Ec", "Es", "ft"), max_increment=1.0) | changes | TIGHT
+    arguments = dict(parameters=("Ec", "Es", "ft"), **tight(max_increment=1.0, **changes))
     model = RCColumn.lhpost(DisplacementHistory("cycle", targets * INCH), **arguments)
     wanted = sensors(model)
     recorders = [recorder for column, _, _ in wanted.values() for recorder in column]
@@ -169,9 +176,7 @@ def test_imposed_displacement(theta, geometry):
     model = RCColumn.lhpost(
         DisplacementHistory("cycles", targets * INCH),
         parameters=("Ec", "Es", "ft"),
-        geometry=geometry,
-        max_increment=1.0,  # one step per target, as in OpenSees
-        **TIGHT,
+        **tight(geometry=geometry, max_increment=1.0),  # one step per target, as in OpenSees
     )
     peer = push(peer_of(model, theta[[0, 1, 4]]), targets, TOLERANCE)
     assert peer.response.shape == (5, len(targets)), "OpenSees did not finish"

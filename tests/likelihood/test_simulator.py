@@ -10,6 +10,7 @@ from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.models.linear_structure import LinearStructure
 from fe_likelihoods.models.linear_structure_parts import ShearFrame
 from fe_likelihoods.models.rc_column import RCColumn
+from fe_likelihoods.models.rc_column_parts import ColumnAnalysis
 from fe_likelihoods.noise.autoregressive import AutoregressiveNoise
 from fe_likelihoods.problems import isolated_bridge
 from fe_likelihoods.signals.channels import Channel, Measurements
@@ -25,7 +26,7 @@ def line(theta):
 
 
 def models():
-    column = RCColumn.lhpost(RECORD, mesh=10)
+    column = RCColumn.lhpost(RECORD, analysis=ColumnAnalysis(mesh=10))
     return [
         Line(),
         Batched(),

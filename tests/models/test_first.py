@@ -9,6 +9,7 @@ from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.models.linear_structure import LinearStructure
 from fe_likelihoods.models.linear_structure_parts import BridgeDeck, ShearFrame
 from fe_likelihoods.models.rc_column import RCColumn
+from fe_likelihoods.models.rc_column_parts import ColumnAnalysis
 from fe_likelihoods.noise.autoregressive import AutoregressiveNoise
 from fe_likelihoods.problems import bridge_column, isolated_bridge
 from fe_likelihoods.signals.channels import Channel, Measurements
@@ -22,7 +23,7 @@ THETA = {"frequency": 3.7, "damping": 0.05, "share": 0.8, "shape": 0.3}
 
 
 def cases():
-    column = RCColumn.lhpost(RECORD, mesh=10)
+    column = RCColumn.lhpost(RECORD, analysis=ColumnAnalysis(mesh=10))
     imposed = DisplacementHistory("cycles", np.array([0.0, 0.05, -0.05, 0.1, -0.1]))
     bridge = isolated_bridge(data="means").likelihood.model
     vertical = bridge.with_record(TABLE)
@@ -30,7 +31,7 @@ def cases():
     return {
         "oscillator": (LinearOscillator(RECORD), 5.003),
         "column": (column, 5.003),
-        "column, imposed": (RCColumn.lhpost(imposed, mesh=10, parameters=("Ec", "ft")), 3.2),
+        "column, imposed": (RCColumn.lhpost(imposed, analysis=ColumnAnalysis(mesh=10), parameters=("Ec", "ft")), 3.2),
         "bridge": (vertical, 1.2321),
         "bridge, vertical, every third": (
             type(bridge)(TABLE, vertical=TABLE.scale(0.5), every=3, outputs=bridge.outputs),

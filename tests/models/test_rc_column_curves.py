@@ -5,8 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fe_likelihoods import DisplacementHistory, RCColumn, SimulationFailed, material_curves, moment_curvature
+from fe_likelihoods import (
+    ColumnAnalysis,
+    DisplacementHistory,
+    RCColumn,
+    SimulationFailed,
+    material_curves,
+    moment_curvature,
+)
 
+ANALYSIS = ColumnAnalysis(geometry="linear", max_increment=1.0, tolerance=1e-11)
 REVERSALS = (0.05, -0.05, 0.1, -0.08)  # [m]; beyond, crushing cover has two states of equilibrium
 
 
@@ -14,7 +22,7 @@ REVERSALS = (0.05, -0.05, 0.1, -0.08)  # [m]; beyond, crushing cover has two sta
 def column():
     corners = np.array([0.0, *REVERSALS])
     history = np.interp(np.linspace(0.0, 4.0, 161), np.arange(5), corners)
-    arguments = dict(parameters=("Ec", "Es", "ft"), geometry="linear", max_increment=1.0, tolerance=1e-11)
+    arguments = dict(parameters=("Ec", "Es", "ft"), analysis=ANALYSIS)
     return RCColumn.lhpost(DisplacementHistory("cycles", history), **arguments)
 
 

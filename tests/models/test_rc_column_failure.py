@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import (
+    ColumnAnalysis,
     DisplacementHistory,
     EventRatios,
     LowCycleFatigue,
@@ -37,7 +38,8 @@ def cycles(*drifts, height=7.3152, points=30):
 @pytest.fixture(scope="module")
 def column():
     """Cycles to a drift of 7 %."""
-    return RCColumn.lhpost(cycles(0.01, 0.03, 0.05, 0.07), parameters=("Ec",), penetration=0.3, max_increment=0.01)
+    arguments = dict(parameters=("Ec",), penetration=0.3, analysis=ColumnAnalysis(max_increment=0.01))
+    return RCColumn.lhpost(cycles(0.01, 0.03, 0.05, 0.07), **arguments)
 
 
 def test_outer_bars_fracture_first(column):
@@ -53,7 +55,7 @@ def test_outer_bars_fracture_first(column):
 @pytest.mark.parametrize("cf", [0.036, 0.039])
 def test_the_column_goes_on_after_it_has_lost_bars(column, cf):
     """Steps in which bars fractured had no equilibrium nearby, and both simulations failed."""
-    model = replace(column, fatigue=LowCycleFatigue(cf=cf, cd=0.389), max_increment=0.02)
+    model = replace(column, fatigue=LowCycleFatigue(cf=cf, cd=0.389), analysis=ColumnAnalysis(max_increment=0.02))
     history = model.history([1.0])
     assert (history.bar_damage > 1.0).sum() >= 7
     np.testing.assert_allclose(history["displacement"], model.loading.displacement, atol=1e-12)
@@ -102,18 +104,20 @@ def test_a_drift_beyond_the_limit_is_a_collapse():
     whole = model.simulate(np.ones(5))
     drift = np.abs(whole[1]) / model.height
     with pytest.raises(SimulationFailed) as error:
-        replace(model, collapse_drift=0.5 * drift.max()).simulate(np.ones(5))
+        limited = replace(model, analysis=ColumnAnalysis(collapse_drift=0.5 * drift.max()))
+        limited.simulate(np.ones(5))
     first = np.argmax(drift > 0.5 * drift.max())
     assert is_collapse(error.value.reason)
     assert f"at t = {first * model.dt:.4g} s" in error.value.reason
-    before = replace(model, collapse_drift=0.5 * drift.max()).first((first - 1) * model.dt)
+    before = limited.first((first - 1) * model.dt)
     np.testing.assert_array_equal(before.simulate(np.ones(5)), whole[:, :first])
-    np.testing.assert_array_equal(replace(model, collapse_drift=1.001 * drift.max()).simulate(np.ones(5)), whole)
+    higher = replace(model, analysis=ColumnAnalysis(collapse_drift=1.001 * drift.max()))
+    np.testing.assert_array_equal(higher.simulate(np.ones(5)), whole)
 
 
 def test_a_column_without_its_bars_has_collapsed_and_one_with_most_of_them_has_failed(column):
     """The simulation that fails has lost three quarters of its bars; the reason is that of the larger part."""
-    model = replace(column, fatigue=LowCycleFatigue(cf=0.036, cd=0.389), max_increment=0.02)
+    model = replace(column, fatigue=LowCycleFatigue(cf=0.036, cd=0.389), analysis=ColumnAnalysis(max_increment=0.02))
     with pytest.raises(SimulationFailed, match="bars with 78% of the area") as error:
         replace(model, axial_load=16e6).simulate([1.0])
     assert is_collapse(error.value.reason)
@@ -127,7 +131,7 @@ def test_a_column_without_its_bars_has_collapsed_and_one_with_most_of_them_has_f
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (dict(collapse_drift=0.0), "positive"),
+        (dict(analysis=None), r"expected ColumnAnalysis\(...\) as analysis"),
         (dict(parameters=("Cf",)), "add fatigue=LowCycleFatigue"),
         (dict(fatigue=0.26), r"expected LowCycleFatigue\(...\) as fatigue"),
     ],

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fe_likelihoods import DisplacementHistory, RCColumn, material_curves
+from fe_likelihoods import ColumnAnalysis, DisplacementHistory, RCColumn, material_curves
 from fe_likelihoods.models.rc_column_outputs import Sections, parse_outputs
 from fe_likelihoods.models.rc_column_parts import gauss_lobatto
 from fe_likelihoods.problems import bridge_column, bridge_column_data
@@ -85,7 +85,8 @@ def test_elastic_cantilever(n_elements, n_points):
     heights = (0.0, 0.4, 2.0, 3.0, 3.6576, 5.5, height)
     outputs = ("force", "base_moment", "base_shear", *(f"curvature@{z}" for z in heights))
     outputs += ("rotation@0:0.5", "rotation@1:5", f"rotation@0:{height}", "strain@2:0.3", "strain@2:0")
-    column = pushed(0.0, 1e-6, n_elements=n_elements, n_points=n_points, geometry="linear", outputs=outputs)
+    analysis = ColumnAnalysis(n_elements=n_elements, n_points=n_points, geometry="linear")
+    column = pushed(0.0, 1e-6, analysis=analysis, outputs=outputs)
     values = dict(zip(outputs, column.simulate([1.0])[:, 1], strict=True))
     base, force = values["curvature@0.0"], values["force"]
     assert base > 0.0 and values["base_shear"] == pytest.approx(force, rel=1e-6)
@@ -110,7 +111,8 @@ def test_the_slope_of_the_deflected_shape_is_the_rotation(geometry, tolerance, p
     heights, step = (1e-3, 0.5, 3.0, 3.6576 - 0.001, 3.6576 + 0.001, 7.0), 1e-4
     pairs = [(f"displacement@{z - step}", f"displacement@{z + step}") for z in heights]
     outputs = (*(name for pair in pairs for name in pair), *(f"rotation@0:{z}" for z in heights))
-    column = pushed(0.0, 0.05, 0.15, outputs=outputs, geometry=geometry, penetration=penetration)
+    analysis = ColumnAnalysis(geometry=geometry)
+    column = pushed(0.0, 0.05, 0.15, outputs=outputs, analysis=analysis, penetration=penetration)
     values = column.simulate([1.0])[:, -1]
     slopes, rotations = (values[1:12:2] - values[0:12:2]) / (2.0 * step), values[12:]
     expected = np.sin(rotations) if geometry == "corotational" else rotations
@@ -136,7 +138,8 @@ def test_motions_below_the_top():
 
 
 def test_the_weight_of_the_column_acts():
-    column = pushed(0.0, 0.0, outputs=("axial_force",), axial_load=1e6, column_mass=3e4, n_elements=3)
+    analysis = ColumnAnalysis(n_elements=3)
+    column = pushed(0.0, 0.0, outputs=("axial_force",), axial_load=1e6, column_mass=3e4, analysis=analysis)
     assert column.simulate([1.0])[0, 0] == pytest.approx(-1e6 - 2.5e4 * G0, rel=1e-9)  # half an element is at the base
 
 
@@ -220,5 +223,6 @@ def test_accelerations_below_the_top_need_short_steps():
         RCColumn.lhpost(record, outputs=("acceleration", "acceleration@3.6576"), column_mass=2e4)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        RCColumn.lhpost(record, outputs=("acceleration@3.6576",), column_mass=2e4, substeps=16)
+        analysis = ColumnAnalysis(substeps=16)
+        RCColumn.lhpost(record, outputs=("acceleration@3.6576",), column_mass=2e4, analysis=analysis)
         RCColumn.lhpost(record, outputs=("acceleration", "acceleration@7.3152", "displacement@3.6576"), column_mass=2e4)

@@ -13,6 +13,7 @@ import numpy as np
 from fe_likelihoods import (
     Bars,
     Channel,
+    ColumnAnalysis,
     Concrete,
     DisplacementHistory,
     Hoops,
@@ -24,10 +25,10 @@ from fe_likelihoods import (
 )
 
 
-def read_column(folder: Path, history: str, every: int) -> tuple[RCColumn, np.ndarray, int]:
+def read_column(folder: Path, history: str, every: int, geometry: str = "linear") -> tuple[RCColumn, np.ndarray, int]:
     """Model, force (n,) [N] and half of n, at one sample in `every` and every turning point of a tested column.
 
-    The model has "linear" geometry, for a force that is the base moment divided by the height.
+    With "linear" geometry, the force is the base moment divided by the height.
     """
     with (folder / "properties_circular_columns.csv").open() as table:
         (row,) = (row for row in csv.DictReader(table) if f"{row['TSN']}_{row['Test']}.csv" == history)
@@ -53,9 +54,7 @@ def read_column(folder: Path, history: str, every: int) -> tuple[RCColumn, np.nd
         mass=1.0,  # unused in a quasi-static test, but must be positive
         axial_load=si("P (kips)", "kip", "{}"),
         penetration=si("Sy", "in", "{}") / float(row["esy"]),
-        geometry="linear",
-        mesh=20,
-        max_increment=si("L", "in") / 200.0,
+        analysis=ColumnAnalysis(geometry=geometry, mesh=20, max_increment=si("L", "in") / 200.0),
         parameters=("Cf",),
         fatigue=LowCycleFatigue(),
     )

@@ -8,6 +8,7 @@ import pytest
 from scipy import stats
 
 from fe_likelihoods import (
+    ColumnAnalysis,
     DisplacementHistory,
     EventRatios,
     Events,
@@ -191,7 +192,7 @@ def test_constants_of_the_index_are_those_of_the_pushed_column(column, caplog):
     assert constants.yield_force == pytest.approx(np.interp(at_yield, tension, force), rel=2e-3)
     assert "hoops" in constants.source
     bars, steel = replace(column.bars, number=6, first_angle=np.pi / 6), replace(column.steel, ultimate_strain=0.04)
-    other = replace(column, bars=bars, steel=steel, mesh=10)
+    other = replace(column, bars=bars, steel=steel, analysis=ColumnAnalysis(mesh=10))
     constants = park_ang_constants(other)
     assert "bars at their ultimate strain" in constants.source and not caplog.records
     force, tension = pushed(other, constants, -other.bar_circle_radius * np.cos(np.pi / 6))

@@ -92,7 +92,9 @@ class TestDataset:
     def test_other_files_are_refused(self, tmp_path, path):
         (tmp_path / "text.h5").write_text("not HDF5")
         (tmp_path / "cut.h5").write_bytes(path.read_bytes()[:3000])
-        for name in ("none.h5", "text.h5", "cut.h5"):
+        with pytest.raises(ValueError, match="there is no such file"):
+            read_dataset(tmp_path / "none.h5")
+        for name in ("text.h5", "cut.h5"):
             with pytest.raises(ValueError, match=f"{name}: not a complete data set"):
                 read_dataset(tmp_path / name)
 
