@@ -55,7 +55,7 @@ def test_from_a_table_of_modes_to_a_report(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     call("new", "modal", "a")
     said = call("check", "a/modal.toml", "--quiet")
-    assert "Model: ShearFrame, 4 parameters" in said and "mode  measured [Hz]  computed [Hz]" in said
+    assert "Model: ShearFrame, parameters: 4" in said and "mode  measured [Hz]  computed [Hz]" in said
     assert "CAUTION" not in said and (tmp_path / "check-modal.png").stat().st_size > 10_000
     said = call("run", "a/modal.toml", "--quiet")
     assert "Use." in said and "measured [Hz]" in said and "RRMSE" not in said
