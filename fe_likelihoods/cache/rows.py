@@ -2,8 +2,7 @@
 
 One table has the rows of all simulations, another one the labels of models with their generations. A row belongs to an
 identity, the `source`: that of a model against measurements, whose values are statistics, or that of a model, whose
-values are responses [SI] and whose failures are valid for any measurements. A row without values is a failure. The
-generation 0 of a model has its remark.
+values are responses [SI] and whose failures are valid for any measurements. A row without values is a failure.
 """
 
 import contextlib

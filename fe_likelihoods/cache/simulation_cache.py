@@ -20,7 +20,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..simulation.model import Model
 from .file import CacheFile
 from .rows import (
     COLUMNS,
@@ -28,7 +27,6 @@ from .rows import (
     STORE,
     Row,
     is_undamaged,
-    pack_rows,
     select_rows,
     simulation_keys,
     source_number,
@@ -43,8 +41,6 @@ MAX_WAITING_ROWS = 100_000  # rows kept in memory while the file cannot be writt
 MAX_CANDIDATES = 5000  # rows from which the rows to compare are chosen
 TOLERANCE = 1e-9
 TIMEOUT = 30.0  # how long to wait for another writer [s]
-
-_repeated: set[tuple[str, str]] = set()  # remarks by file and model, in this process
 
 
 class CacheInfo(NamedTuple):
@@ -133,7 +129,6 @@ class SimulationCache:
         self.damaged = 0
         self._rename()
         self._waiting: list[Row] = []
-        self._remark = ""  # that was stored last
 
     def _rename(self) -> None:
         self.name = secrets.token_hex(8)  # of the object, under which likelihoods share what they have verified
@@ -222,33 +217,6 @@ class SimulationCache:
         rows = {row[0]: Row._make(row) for row in self._rows(keys) if is_undamaged(row)}
         return [rows[key] for key in keys if key in rows]
 
-    # remarks ------------------------------------------------------------------------------------------------------
-
-    def store_remark(self, model: Model) -> None:
-        """Store a model's `range_remark` (a law was used beyond its range), unless it is empty or one is stored."""
-        text = getattr(model, "range_remark", "")
-        if text and text != self._remark:
-            nothing = np.zeros((1, 0))
-            self.write(pack_rows(model.fingerprint, nothing, nothing, [text], 0, of_model=True))
-            self._remark = text
-
-    def look_up_remark(self, model: Model) -> str:
-        """The stored remark of a model; empty if there is none."""
-        rows = self.rows_of(simulation_keys(model.fingerprint, np.zeros((1, 0)), 0))
-        return str(rows[0].outcome) if rows else ""
-
-    def repeat_remark(self, model: Model, fingerprint: str) -> None:
-        """Log a model's stored remark, once per process, unless the model has just made a remark itself.
-
-        A built-in model warns once if a simulation was beyond the range of its laws. Without the stored remark, a later
-        process that uses cached simulations would give no warning.
-        """
-        if hasattr(model, "range_remark") and (str(self.path), fingerprint) not in _repeated:
-            _repeated.add((str(self.path), fingerprint))
-            text = self.look_up_remark(model)
-            if text and not model.range_remark:
-                logger.warning("simulations of this model in %s: %s", self.path, text)
-
     # the file -----------------------------------------------------------------------------------------------------
 
     def copy(self, path: str | os.PathLike) -> int:
@@ -306,7 +274,6 @@ class SimulationCache:
         sources = {source_number(fingerprint) for fingerprint in fingerprints}
         with self.file.lock:
             self._waiting = [row for row in self._waiting if row.source not in sources]
-            self._remark = ""
             self._rename()
             delete, rows = "DELETE FROM rows WHERE source = ?", [(source,) for source in sources]
             return self.file.insist(lambda connection: connection.executemany(delete, rows).rowcount)

@@ -6,7 +6,6 @@ import numpy as np
 
 from samplers.judgement.failures import check_failed_region
 
-from ..cache.simulation_cache import SimulationCache
 from ..signals.events import find_events
 from ..simulation.model import SimulationBatch, simulate_batch
 from .compared import Fits, data_sets_of, fit_data_sets
@@ -218,11 +217,8 @@ def check_failures(run: FinishedRun, failed: Failures) -> list[Finding]:
 
 
 def _check_range(likelihood: Any) -> list[Finding]:
-    """What a model has said about simulations beyond the range of its laws, here or in a stored run."""
-    if not hasattr(likelihood.model, "range_remark"):
-        return []
-    text, cache = likelihood.model.range_remark, likelihood.simulator.cache
-    text = text or (cache.look_up_remark(likelihood.model) if isinstance(cache, SimulationCache) else "")
+    """What a model has said about simulations beyond the range of its laws, also those that verify stored rows."""
+    text = getattr(likelihood.model, "range_remark", "")
     action = "See whether samples of the posterior are concerned, or only draws far from it."
     title = "Beyond the range of a law of the model"
     return [Finding(title, CARE, f"{text[0].upper()}{text[1:]}.", action)] if text else []

@@ -309,9 +309,7 @@ class Simulator(VerifiedModel):
         return on_disk
 
     def _enter_known(self, request: _Request, keys: list[bytes], outcomes: list[bytes | str]) -> None:
-        """Enter known statistics, and log the remark that is stored with them."""
-        if keys and self.cache is not None:
-            self.cache.repeat_remark(self.model, request.fingerprint)
+        """Enter known statistics, whose failures are counted."""
         self.failures.count_outcomes(self._thetas(keys), list(map(_reason, outcomes)))
         self._enter(request, keys, outcomes)
 
@@ -450,7 +448,6 @@ class Simulator(VerifiedModel):
                 kept = None if self._responses_only else statistics
                 stored = values if request.full or self.stores_responses or self.cache.responses else None
                 self._store(thetas, kept, why, stored, fingerprint)
-                self.cache.store_remark(self.model)
 
     def _check_model(self) -> None:
         """Look at the model before simulations, so that finished simulations are stored."""
