@@ -34,6 +34,7 @@ SCHEMA_VERSION = 6
 SQLITE_SIGNATURE = b"SQLite format 3\0"
 ID_START = 68  # place of the application id in SQLite's header [bytes]
 PAGE_SIZE = 4096  # SQLite's default [bytes]
+TIMEOUT = 30.0  # how long to wait for another writer [s]
 RETRY_SECONDS = 60.0  # wait after a failed access to the file
 # results of SQLite whose cause is outside of the file: locks, rights, the disk, memory, wrong use
 OUTSIDE = {
@@ -71,15 +72,16 @@ def _is_damage(error: Exception) -> bool:
 class CacheFile:
     """A file (absolute `path` without links) and this process's connection to it. Hold `lock` while using it.
 
-    `timeout` [s] is how long to wait for another writer. `retry_times` has the actions that failed, with the monotonic
+    `timeout` [s] is how long to wait for another writer. A copy in another process opens the file when it is needed; if
+    that fails, a run continues without it. `retry_times` has the actions that failed, with the monotonic
     time [s] before which they are not tried again.
     """
 
     lock = _lock
 
-    def __init__(self, path: str | os.PathLike, timeout: float) -> None:
+    def __init__(self, path: str | os.PathLike) -> None:
         self.path = Path(path).resolve()  # SQLite keeps the log next to the target of a link
-        self.timeout = float(timeout)
+        self.timeout = TIMEOUT
         self.retry_times: dict[str, float] = {}
         self._connection: sqlite3.Connection | None = None
         self._inode: tuple[int, int] | None = None
@@ -87,6 +89,9 @@ class CacheFile:
         self._aside: Path | None = None  # a damaged file, whose rows are to be copied to the new file
         with _lock:
             _files.add(self)
+
+    def __reduce__(self) -> tuple:
+        return type(self), (self.path,)
 
     def __del__(self) -> None:
         if getattr(self, "_connection", None) is not None:

@@ -12,7 +12,7 @@ import sqlite3
 import struct
 import zlib
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,7 +29,6 @@ __all__ = [
     "is_undamaged_label",
     "pack_label",
     "pack_rows",
-    "select_rows",
     "simulation_keys",
     "source_number",
     "transaction",
@@ -55,7 +54,6 @@ STORE = (
 LABEL_COLUMNS = "source, code, files, generation, crc"
 STORE_LABEL = f"INSERT OR REPLACE INTO labels ({LABEL_COLUMNS}) VALUES (?, ?, ?, ?, ?)"
 KEY_BYTES = 16
-KEYS_PER_QUERY = 500  # keys in one SELECT
 MAX_REASON_LENGTH = 2000
 NUMBERS = struct.Struct("<qqq")
 
@@ -161,13 +159,3 @@ def transaction(connection: sqlite3.Connection) -> Iterator[sqlite3.Connection]:
         with contextlib.suppress(sqlite3.Error):  # SQLite itself may have ended it
             connection.execute("ROLLBACK")
         raise
-
-
-def select_rows(connection: sqlite3.Connection, keys: list[bytes], columns: str) -> list[tuple[Any, ...]]:
-    """Rows with given keys, in any order; keys that are not stored have no row."""
-    found = []
-    for start in range(0, len(keys), KEYS_PER_QUERY):
-        part = keys[start : start + KEYS_PER_QUERY]
-        marks = ",".join("?" * len(part))
-        found += connection.execute(f"SELECT {columns} FROM rows WHERE key IN ({marks})", part).fetchall()
-    return found

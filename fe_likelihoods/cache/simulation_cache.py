@@ -27,7 +27,6 @@ from .rows import (
     STORE,
     Row,
     is_undamaged,
-    select_rows,
     simulation_keys,
     source_number,
     transaction,
@@ -38,9 +37,9 @@ __all__ = ["TOLERANCE", "CacheInfo", "SimulationCache"]
 logger = logging.getLogger(__name__)
 
 MAX_WAITING_ROWS = 100_000  # rows kept in memory while the file cannot be written
+KEYS_PER_QUERY = 500  # keys in one SELECT
 MAX_CANDIDATES = 5000  # rows from which the rows to compare are chosen
 TOLERANCE = 1e-9
-TIMEOUT = 30.0  # how long to wait for another writer [s]
 
 
 class CacheInfo(NamedTuple):
@@ -121,26 +120,16 @@ class SimulationCache:
             raise ValueError(f"SimulationCache: tolerance must be a number of 0 or more; got {tolerance!r}")
         self.max_response_bytes, self.responses = int(max_response_bytes), bool(responses)
         self.verify, self.tolerance = bool(verify), tolerance
-        self._begin(CacheFile(path, TIMEOUT))
+        self.file = CacheFile(path)
         self.file.check()
-
-    def _begin(self, file: CacheFile) -> None:
-        self.file = file
-        self.damaged = 0
+        self.damaged, self._waiting = 0, list[Row]()
         self._rename()
-        self._waiting: list[Row] = []
 
     def _rename(self) -> None:
         self.name = secrets.token_hex(8)  # of the object, under which likelihoods share what they have verified
 
-    def __getstate__(self) -> tuple:
-        settings = ("max_response_bytes", "responses", "verify", "tolerance")
-        return self.path, self.file.timeout, {name: getattr(self, name) for name in settings}
-
-    def __setstate__(self, state: tuple) -> None:
-        path, timeout, settings = state
-        vars(self).update(settings)
-        self._begin(CacheFile(path, timeout))  # opened when it is needed; if that fails, a run continues without it
+    def __getstate__(self) -> dict:
+        return vars(self) | {"damaged": 0, "_waiting": []}
 
     def __repr__(self) -> str:
         return f"SimulationCache({str(self.path)!r})"
@@ -293,8 +282,13 @@ class SimulationCache:
             self.file.close()
 
     def _rows(self, keys: list[bytes]) -> list[tuple]:
-        """Stored rows with given keys."""
-        return self.file.attempt("read", lambda connection: select_rows(connection, keys, COLUMNS), [])
+        """Stored rows with given keys, in any order."""
+        found = []
+        for start in range(0, len(keys), KEYS_PER_QUERY):
+            part = keys[start : start + KEYS_PER_QUERY]
+            marks = ",".join("?" * len(part))
+            found += self.file.select(f"SELECT {COLUMNS} FROM rows WHERE key IN ({marks})", tuple(part))
+        return found
 
     def _delete(self, keys: Collection[bytes]) -> None:
         self.file.write(("DELETE FROM rows WHERE key = ?", [(key,) for key in keys]), what="repaired")

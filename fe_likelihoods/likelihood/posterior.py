@@ -475,7 +475,7 @@ class Posterior:
             Samples of the posterior.
         block : float, optional
             Length of a block [s], by default from the correlation of the residuals
-            (`fe_likelihoods.likelihood.block_likelihood.choose_blocks`).
+            (`fe_likelihoods.likelihood.predictive_draws.choose_blocks`).
         seed : int
             Seed of the noise.
 

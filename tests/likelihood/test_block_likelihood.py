@@ -20,7 +20,7 @@ from fe_likelihoods import (
     TruncatedNormal,
     Uniform,
 )
-from fe_likelihoods.likelihood.block_likelihood import choose_blocks
+from fe_likelihoods.likelihood.predictive_draws import choose_blocks
 
 DT, N = 0.1, 120
 TIME = DT * np.arange(N)
