@@ -12,7 +12,7 @@ import numpy as np
 from fe_likelihoods import ColumnAnalysis, RCColumn
 from fe_likelihoods.problems import BRIDGE_COLUMN_MEANS, bridge_column_data, bridge_column_prior
 from fe_likelihoods.simulation.executors import LocalPool, as_executor
-from fe_likelihoods.simulation.model import misfit_batch
+from fe_likelihoods.simulation.model import simulate_batch
 from tests.opensees_column import INCH, peer_of, shake
 
 from .rows import Row
@@ -76,7 +76,7 @@ def batch(repeats: int) -> list[Row]:
         for n in counts:
             numba.set_num_threads(n)
             start = time.perf_counter()
-            misfit_batch(model, thetas, np.zeros((2, model.n_steps)))
+            simulate_batch(model, thetas)
             seconds[n].append(time.perf_counter() - start)
     rows = [
         Row("batch of 64, wall time", f"{n} thread" + "s" * (n > 1), median(times), "s", _speedup(seconds, n))
@@ -85,11 +85,11 @@ def batch(repeats: int) -> list[Row]:
     numba.set_num_threads(1)
     for name, pool, close in _pools():
         executor, times = as_executor(pool, model), {1: [], 2: []}
-        misfit_batch(model, thetas, np.zeros((2, model.n_steps)), executor)  # start the workers
+        simulate_batch(model, thetas, executor)  # start the workers
         for _ in range(repeats):
             for n, used in ((1, None), (2, executor)):
                 start = time.perf_counter()
-                misfit_batch(model, thetas, np.zeros((2, model.n_steps)), used)
+                simulate_batch(model, thetas, used)
                 times[n].append(time.perf_counter() - start)
         rows.append(Row("batch of 64, wall time", name, median(times[2]), "s", _speedup(times, 2)))
         close()

@@ -3,7 +3,12 @@
 import numpy as np
 
 from fe_likelihoods import Channel
-from fe_likelihoods.simulation.model import SimulationBatch, SimulationFailed
+from fe_likelihoods.simulation.model import SimulationBatch, SimulationFailed, misfit_of_responses, simulate_batch
+
+
+def misfit_batch(model, thetas, measured, pool=None, statistic=None):
+    """Statistics of many parameter sets."""
+    return misfit_of_responses(model, simulate_batch(model, thetas, pool), measured, statistic)
 
 
 class Line:

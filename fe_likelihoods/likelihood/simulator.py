@@ -37,8 +37,8 @@ from ..simulation.model import (
     SimulationBatch,
     has_batch_method,
     has_jacobian,
-    misfit_batch,
     most_responses,
+    run_each,
     sent_simulation,
     simulate_batch,
 )
@@ -201,9 +201,8 @@ class Simulator(VerifiedModel):
                 if self.pool is None or self._returns_responses(full):
                     values, reasons = simulate_batch(self.model, self._thetas(some), self.pool)
                 else:
-                    values, reasons = misfit_batch(
-                        self.model, self._thetas(some), self.measured, self.pool, self.statistic
-                    )
+                    run = sent_simulation(self.model, self.measured, self.statistic)
+                    values, reasons = run_each(run, self._thetas(some), (self.n_numbers,), self.pool)
             self._record(request, some, values, reasons, time.perf_counter() - start)
             # the size grows by steps: the first simulations may be failures that took no time
             self.chunk_size = min(
@@ -410,7 +409,8 @@ class Simulator(VerifiedModel):
             raise error
 
     def _returns_responses(self, full: bool) -> bool:
-        return full or self._keeps_responses or (self.cache is not None and self.cache.responses)
+        is_kept = full or self._keeps_responses or (self.cache is not None and self.cache.responses)
+        return is_kept or hasattr(self.model, "simulate_together")
 
     @property
     def _keeps_responses(self) -> bool:

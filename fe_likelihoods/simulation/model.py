@@ -42,11 +42,11 @@ __all__ = [
     "has_batch_method",
     "has_jacobian",
     "is_collapse",
-    "misfit_batch",
     "misfit_of_responses",
     "most_responses",
     "not_finite",
     "real_response",
+    "run_each",
     "sent_simulation",
     "simulate_batch",
 ]
@@ -181,7 +181,7 @@ def simulate_batch(model: Model, thetas: np.ndarray, pool: Any = None) -> Simula
         if pool is None and has_batch_method(model):
             with _one_by_one_if_it_fails(model):
                 return SimulationBatch(*_checked_batch(model, model.simulate_batch(thetas), (len(thetas), *shape)))
-        return SimulationBatch(*_run_each(sent_simulation(model), thetas, shape, pool))
+        return SimulationBatch(*run_each(sent_simulation(model), thetas, shape, pool))
 
 
 @interrupts_end_the_run()
@@ -191,7 +191,7 @@ def derivatives_batch(model: Model, thetas: np.ndarray, pool: Any = None) -> np.
     ValueError if ``jacobian`` fails, or returns an array of another shape, or one that is not real or not finite.
     """
     shape = (len(model.parameter_names), len(model.channels), model.n_steps)
-    values, reasons = _run_each(partial(_attempt, _derivatives, model), thetas, shape, pool)
+    values, reasons = run_each(partial(_attempt, _derivatives, model), thetas, shape, pool)
     for theta, reason in zip(thetas, reasons, strict=True):
         if reason:
             named = ", ".join(f"{name} = {x:.6g}" for name, x in zip(model.parameter_names, theta, strict=True))
@@ -217,31 +217,14 @@ def _derivatives(model: Any, theta: np.ndarray) -> np.ndarray:
     return values
 
 
-@interrupts_end_the_run()
-def misfit_batch(
-    model: Model,
-    thetas: np.ndarray,
-    measured: np.ndarray | Comparison,
-    pool: Any = None,
-    statistic: Statistic | None = None,
-) -> MisfitBatch:
-    """Sums of squared residuals, or another residual statistic, for many parameter sets; responses are not kept.
-
-    Measured values are (n_channels, n_steps) [SI]; pools are as for `simulate_batch`.
-    """
-    if pool is None or hasattr(model, "simulate_together"):
-        return misfit_of_responses(model, simulate_batch(model, thetas, pool), measured, statistic)
-    shape = (statistic_width(measured, statistic),)
-    return MisfitBatch(*_run_each(sent_simulation(model, measured, statistic), thetas, shape, pool))
-
-
 def sent_simulation(
     model: Model, measured: np.ndarray | Comparison | None = None, statistic: Statistic | None = None
 ) -> Callable[[np.ndarray], tuple[np.ndarray | None, str]]:
     """A function that runs one simulation, in this process or in a pool's worker.
 
     It takes parameters (n_parameters,) and returns the result with an empty reason, or None and the reason of a
-    failure. The result is that of `misfit_batch` for these arguments, or the response without `measured`.
+    failure. The result is the statistic of the residuals, by default their sums of squares, or the response without
+    `measured` (n_channels, n_steps) [SI].
     """
     run = _response if measured is None else partial(_misfit, measured, statistic or sums_of_squares)
     return partial(_attempt, run, model)
@@ -250,7 +233,7 @@ def sent_simulation(
 def misfit_of_responses(
     model: Model, batch: SimulationBatch, measured: np.ndarray | Comparison, statistic: Statistic | None = None
 ) -> MisfitBatch:
-    """Sums of squared residuals, or another residual statistic, for given responses; arguments as in `misfit_batch`."""
+    """Sums of squared residuals, or another residual statistic, for given responses, as `sent_simulation`."""
     misfit = np.full((len(batch.response), statistic_width(measured, statistic)), np.nan)
     reasons = list(batch.reasons)
     for place, response in enumerate(batch.response):
@@ -335,10 +318,14 @@ def _attempt(
     return (None, reason) if reason else (result, "")
 
 
-def _run_each(
+@interrupts_end_the_run()
+def run_each(
     run: Callable[[np.ndarray], tuple], thetas: np.ndarray, shape: tuple[int, ...], pool: Any
 ) -> tuple[np.ndarray, list[str]]:
-    """Run simulations one by one, in this process or in the pool's workers."""
+    """Results (n, *shape) and reasons of simulations that run one by one, in this process or in the pool's workers.
+
+    `run` is a `sent_simulation`, such as one that returns statistics, so that the responses stay in the workers.
+    """
     if pool is None:
         if is_worker():  # of the pool of a sampler
             run = partial(_in_folder, run, Sender.here()._replace(process=b""))

@@ -210,7 +210,7 @@ class Workers:
 
         `watch` is called with the process, and with None when it is idle again.
         """
-        worker = self._take(function.key)
+        worker = self._take()
         try:
             watch(worker)
             answer = worker.load(function, self._start_limit) or worker.call(item, seconds)
@@ -224,15 +224,12 @@ class Workers:
             worker.kill()
         return answer
 
-    def _take(self, key: bytes) -> Worker:
-        """A process, preferably one that has loaded the function with a key."""
-        for worker in sorted(self._idle, key=lambda worker: key not in worker.keys):
-            try:
-                self._idle.remove(worker)
-            except ValueError:  # another thread has taken it
-                continue
-            if worker.alive:
-                return worker
+    def _take(self) -> Worker:
+        """An idle process, or a new one."""
+        with suppress(IndexError):  # there is none, or another thread has taken it
+            while True:
+                if (worker := self._idle.pop()).alive:
+                    return worker
         return Worker(**self._options)
 
     def close(self) -> None:

@@ -18,8 +18,8 @@ from fe_likelihoods.priors.distributions import HalfNormal, LogNormal, Truncated
 from fe_likelihoods.priors.priors import Prior
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record
-from fe_likelihoods.simulation.model import SimulationBatch, SimulationFailed, misfit_batch, simulate_batch
-from tests.lines import Batched, Line
+from fe_likelihoods.simulation.model import SimulationBatch, SimulationFailed, simulate_batch
+from tests.lines import Batched, Line, misfit_batch
 
 TRUTH = np.array([1.15, 0.8])
 SIGMA = np.array([0.05, 0.001])

@@ -24,8 +24,8 @@ from fe_likelihoods import (
 from fe_likelihoods.models.rc_column import PARAMETERS
 from fe_likelihoods.problems import BRIDGE_COLUMN_MEANS, bridge_column_data
 from fe_likelihoods.signals.read import read_record
-from fe_likelihoods.simulation.model import misfit_batch
 from fe_likelihoods.units import G0
+from tests.lines import misfit_batch
 
 NOMINAL = np.ones(5)
 PAPER = np.array(list(BRIDGE_COLUMN_MEANS.values()))

@@ -17,9 +17,10 @@ from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.signals.records import Record
 from fe_likelihoods.simulation import by_value
 from fe_likelihoods.simulation.executors import LocalPool, as_executor
-from fe_likelihoods.simulation.model import misfit_batch, sent_simulation, simulate_batch
+from fe_likelihoods.simulation.model import sent_simulation, simulate_batch
 from tests.faults import treacherous
 from tests.faults.treacherous import Absent, Gated, Large, Treacherous, Unpicklable, gone, posterior_of
+from tests.lines import misfit_batch
 
 SLOW = ("executor", "multiprocessing")  # kinds of pools
 SPAWN = multiprocessing.get_context("spawn")
