@@ -23,6 +23,7 @@ from .stored_posterior import StoredPosterior, on_scale
 __all__ = ["StiffnessLoss", "stiffness_loss"]
 
 _LEAST_INFORMATION = 1.0  # of the data about a direction, relative to the prior, below which it is left to the prior
+_UNSEEN = 1e-6  # information about such a direction
 _FEWEST_SAMPLES = 5  # effective ones per stiffness, for their covariance
 _NODES = 8, 12  # of the distributions of the spread and of the factor of the errors
 _PRIOR_DRAWS = 20_000  # for the moments of the priors
@@ -148,8 +149,9 @@ def stiffness_loss(
     shift = sum(change * mean for change, (mean, _) in moved)
     common = float(np.linalg.norm([common, *(change * sd for change, (_, sd) in moved)]))
     second = second._replace(peak=second.peak - shift)
-    sets = [np.array([*itertools.combinations(range(d), m)], dtype=int) for m in range(min(most, d) + 1)]
-    sizes = np.repeat(np.arange(len(sets)), [len(each) for each in sets])
+    sets = [each for m in range(min(most, d) + 1) for each in itertools.combinations(range(d), m)]
+    members = np.array([(*each, *[d] * (most - len(each))) for each in sets])  # d stands for no stiffness
+    sizes = (members < d).sum(axis=1)
     share = 1.0 - (1.0 - presence) ** (1.0 / d)  # of each stiffness, independent
     log_prior = sizes * np.log(share / (1.0 - share))
     log_prior += np.log(presence) - np.logaddexp.reduce(log_prior[1:])
@@ -159,15 +161,15 @@ def stiffness_loss(
         for factor in _quantiles(error, _NODES[1], "error")
         for scatter in _quantiles(spread, _NODES[0], "spread")
     ]
-    evidence = np.array([log_prior + np.concatenate([node.log_evidences(each) for each in sets]) for node in nodes])
+    evidence = np.array([log_prior + node.log_evidences(members) for node in nodes])
     rng = np.random.default_rng(seed)
     cumulative = np.cumsum(np.exp(evidence - evidence.max()))
     chosen = np.searchsorted(cumulative / cumulative[-1], (np.arange(n_draws) + rng.random()) / n_draws)
     of_node, of_set = np.unravel_index(np.minimum(chosen, evidence.size - 1), evidence.shape)
-    change, count, starts = np.empty((n_draws, d + 1)), sizes[of_set], np.searchsorted(sizes, np.arange(len(sets)))
-    for k, m in set(zip(of_node.tolist(), count.tolist(), strict=True)):
-        rows = np.flatnonzero((of_node == k) & (count == m))
-        change[rows] = nodes[k].draw(sets[m][of_set[rows] - starts[m]], rng)
+    change, count = np.empty((n_draws, d + 1)), sizes[of_set]
+    for k in sorted(set(of_node.tolist())):
+        rows = np.flatnonzero(of_node == k)
+        change[rows] = nodes[k].draw(members[of_set[rows]], rng)
     findings = [
         each._replace(text=f"In the calibration {when}: {each.text}")
         for when, state in (("before", first), ("after", second))
@@ -179,16 +181,17 @@ def stiffness_loss(
 
 
 class _State(NamedTuple):
-    """Likelihood of one state, exp(-(x - peak)' information (x - peak) / 2), of the logarithms x (d,), and its prior.
+    """Likelihood of one state, normal in the logarithms x (d,) of the stiffnesses, and their prior.
 
-    `seen` is the number of directions about which the data say more than the prior; the likelihood is flat in others.
+    The data say more than the prior about all directions but some `unseen` ones, whose errors are a thousand times the
+    deviations of the prior.
     """
 
     peak: np.ndarray
-    information: np.ndarray
-    seen: int
+    errors: np.ndarray  # covariance (d, d) of the peak
+    unseen: int
     center: np.ndarray
-    covariance: np.ndarray
+    prior: np.ndarray  # covariance (d, d)
     findings: tuple[Finding, ...]
 
 
@@ -211,71 +214,64 @@ def _state(stored: StoredPosterior, names: tuple[str, ...]) -> _State:
     factor = np.linalg.cholesky(prior_covariance)
     whitened = np.linalg.solve(factor, np.linalg.solve(factor, covariance).T)
     variances, directions = np.linalg.eigh(_symmetric(whitened))
-    gained = 1.0 / np.maximum(variances, np.finfo(float).tiny) - 1.0
-    seen = gained > _LEAST_INFORMATION
-    gained, directions = gained[seen], directions[:, seen]
-    offset = directions.T @ np.linalg.solve(factor, mean - center)
-    peak = center + factor @ directions @ (offset * (1.0 + gained) / gained)
-    back = np.linalg.solve(factor.T, directions)
-    scores = np.column_stack([apart, apart @ back])
+    information = 1.0 / np.maximum(variances, np.finfo(float).tiny) - 1.0  # of the data, relative to the prior
+    seen = information > _LEAST_INFORMATION
+    information = np.where(seen, information, _UNSEEN)
+    offset = directions.T @ np.linalg.solve(factor, mean - center) * seen
+    axes = factor @ directions
+    peak, errors = center + axes @ (offset * (1.0 + 1.0 / information)), axes / information @ axes.T
+    scores = np.column_stack([apart, apart @ np.linalg.solve(factor.T, directions[:, seen])])
     scores /= np.sqrt(weights @ np.square(scores))
     findings = (*stored.findings, *check_normal(weights @ scores**3, weights @ scores**4 - 3.0))
-    return _State(peak, back * gained @ back.T, int(seen.sum()), center, prior_covariance, findings)
+    return _State(peak, errors, int((~seen).sum()), center, prior_covariance, findings)
 
 
 class _Node:
-    """The change T of the logarithms, exp(vector' T - T' matrix T / 2), at one factor of the errors and one spread.
+    """The change of the logarithms as it was observed, at one factor of the errors and one spread.
 
-    T is the damage plus `parts` times scatter and common factor, of the given variances and joint precision `whole`;
-    `reduced` and `pull` are matrix and vector with both integrated out. The stiffnesses before are integrated out.
+    Given the stiffnesses before, the `observed` change is the damage, a scatter, the common factor, of given variances,
+    and `errors` of a covariance; `total` is the covariance of all but the damage.
     """
 
     def __init__(
         self, before: _State, after: _State, error: float, scatter: float, common: float, damaged: LogNormal
     ) -> None:
-        self.error, self.damaged, eye = error, damaged, np.eye(len(before.peak))
-        first, second = before.information / error**2, after.information / error**2
-        peak, later = before.peak - before.center, after.peak - before.center
-        precision = np.linalg.inv(before.covariance) + first
-        covariance = np.linalg.inv(precision)
-        mean = covariance @ (first @ peak)
-        # x_before ~ N(mean, covariance), and the likelihood after of x_before + T
-        spread = eye + second @ covariance
-        self.matrix = _symmetric(np.linalg.solve(spread, second))
-        self.vector = self.matrix @ (later - mean)
-        both = eye + self.matrix @ (other := scatter * eye + common)
-        self.reduced, self.pull = _symmetric(np.linalg.solve(both, self.matrix)), np.linalg.solve(both, self.vector)
-        logs = sum(np.linalg.slogdet(each)[1] for each in (precision, spread, both))
-        squares = mean @ precision @ mean - peak @ first @ peak - (later - mean) @ self.vector
-        squares += self.vector @ other @ self.pull
-        # densities of the peaks, whose errors grow with the factor
-        self.evidence = 0.5 * (squares - logs) - (before.seen + after.seen) * np.log(error)
-        self.parts = np.column_stack([eye, np.ones(len(eye))])
-        self.whole = self.parts.T @ self.matrix @ self.parts + np.diag([1.0 / scatter] * len(eye) + [1.0 / common])
-
-    def _damage(self, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Precision (n, m, m), and times it the mean (n, m), of the damage of sets (n, m)."""
-        mean, variance = np.log(self.damaged.median), self.damaged.log_sd**2
-        precision = self.reduced[members[:, :, None], members[:, None, :]] + np.eye(members.shape[1]) / variance
-        return precision, self.pull[members] + mean / variance
+        self.error, self.scatter, self.common, self.damaged = error, scatter, common, damaged
+        apart, of_peak = before.peak - before.center, before.prior + error**2 * before.errors
+        gain = np.linalg.solve(of_peak, before.prior).T
+        self.observed = after.peak - before.center - gain @ apart
+        self.errors = _symmetric(before.prior - gain @ before.prior + error**2 * after.errors)
+        self.total = self.errors + scatter * np.eye(len(apart)) + common
+        self.inverse = np.linalg.inv(self.total)
+        squares = apart @ np.linalg.solve(of_peak, apart) + self.observed @ self.inverse @ self.observed
+        logs = np.linalg.slogdet(of_peak)[1] + np.linalg.slogdet(self.total)[1]
+        # of the two peaks, but not of directions that were not seen
+        self.evidence = (before.unseen + after.unseen) * np.log(error) - 0.5 * (squares + logs)
 
     def log_evidences(self, members: np.ndarray) -> np.ndarray:
         """Of sets (n, m) of damaged stiffnesses."""
-        precision, vector = self._damage(members)
+        mean, variance, most = np.log(self.damaged.median), self.damaged.log_sd**2, members.shape[1]
+        inverse, pull = np.pad(self.inverse, (0, 1)), np.append(self.inverse @ self.observed, 0.0)
+        precision = inverse[members[:, :, None], members[:, None, :]] + np.eye(most) / variance
+        vector = pull[members] + mean / variance
         gain = (vector * np.linalg.solve(precision, vector[:, :, None])[:, :, 0]).sum(axis=1)
-        of_prior = 2.0 * np.log(self.damaged.log_sd) + (np.log(self.damaged.median) / self.damaged.log_sd) ** 2
-        return self.evidence + 0.5 * (gain - np.linalg.slogdet(precision)[1] - members.shape[1] * of_prior)
+        gain -= most * (np.log(variance) + mean**2 / variance) + np.linalg.slogdet(precision)[1]
+        return self.evidence + 0.5 * gain
 
     def draw(self, members: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Changes (n, d + 1) of the stiffnesses without the common one, and the common one, for sets (n, m)."""
-        n, d = len(members), len(self.vector)
-        precision, vector = self._damage(members)
-        noise = np.linalg.cholesky(precision) @ rng.standard_normal((*members.shape, 1))  # its covariance is precision
-        change = np.zeros((n, d + 1))
-        change[np.arange(n)[:, None], members] = np.linalg.solve(precision, vector[:, :, None] + noise)[:, :, 0]
-        left = (self.vector - change[:, :-1] @ self.matrix) @ self.parts
-        noise = np.linalg.cholesky(self.whole) @ rng.standard_normal((d + 1, n))
-        return change + np.linalg.solve(self.whole, left.T + noise).T
+        """Changes (n, d + 1) of the stiffnesses without the common one, and the common one, for sets (n, m).
+
+        Draws of the prior and of the errors are moved by what they differ from the observed change.
+        """
+        n, d = len(members), len(self.observed)
+        hit = (members[:, :, None] == np.arange(d)).any(axis=1)
+        variances = self.scatter + hit * self.damaged.log_sd**2
+        own = hit * np.log(self.damaged.median) + np.sqrt(variances) * rng.standard_normal((n, d))
+        shared = np.sqrt(self.common) * rng.standard_normal((n, 1))
+        errors = rng.standard_normal((n, d)) @ np.linalg.cholesky(self.errors).T
+        total = self.errors + self.common + variances[:, :, None] * np.eye(d)
+        pull = np.linalg.solve(total, (self.observed - own - shared - errors)[:, :, None])[:, :, 0]
+        return np.hstack([own + variances * pull, shared + self.common * pull.sum(axis=1, keepdims=True)])
 
 
 def _symmetric(matrix: np.ndarray) -> np.ndarray:

@@ -256,7 +256,7 @@ class Prediction:
         return self.quantile(next((p for p in self.probabilities if abs(p - probability) < 1e-9), probability))
 
     def __str__(self) -> str:
-        noise = "with measurement noise" if self.noise else "without measurement noise"
+        noise = f"with the spread of the parameters {'and measurement noise' if self.noise else 'only'}"
         if self.ratios is not None:
             noise = f"of measured values, by the ratios of {len(self.ratios.values)} events"
         noise += "" if self.from_state == "virgin" else f", from_state={self.from_state!r}"

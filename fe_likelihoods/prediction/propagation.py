@@ -161,7 +161,7 @@ def propagate(
     ((2, 200), (2, 200))
     >>> stronger = propagate(posterior, samples, quantity=peak("displacement"), record=record.scale(2.0))
     >>> print(stronger)  # doctest: +SAMPLED
-    Prediction: 300 samples, without measurement noise; effective sample size 300
+    Prediction: 300 samples, with the spread of the parameters only; effective sample size 300
     value         unit  mean  MC error     sd   5 %  50 %  95 %
     displacement    cm  16.5      0.01  0.173  16.2  16.5  16.8
     """

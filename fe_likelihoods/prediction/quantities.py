@@ -116,7 +116,7 @@ def peak(channel: str, part: slice = slice(None)) -> ChannelQuantity:
     --------
     >>> peaks = propagate(posterior, samples, quantity=[peak("acceleration"), peak("displacement")])
     >>> print(peaks)  # doctest: +SAMPLED
-    Prediction: 300 samples, without measurement noise; effective sample size 300
+    Prediction: 300 samples, with the spread of the parameters only; effective sample size 300
     value         unit   mean  MC error       sd    5 %   50 %  95 %
     acceleration     g  0.364  0.000203  0.00352  0.359  0.364  0.37
     displacement    cm   8.25     0.005   0.0866   8.11   8.24  8.39
@@ -130,7 +130,7 @@ def rms(channel: str, part: slice = slice(None)) -> ChannelQuantity:
     Examples
     --------
     >>> print(propagate(posterior, samples, quantity=rms("acceleration")))  # doctest: +SAMPLED
-    Prediction: 300 samples, without measurement noise; effective sample size 300
+    Prediction: 300 samples, with the spread of the parameters only; effective sample size 300
     value         unit   mean  MC error       sd    5 %   50 %   95 %
     acceleration     g  0.167  0.000136  0.00235  0.164  0.167  0.171
     """
@@ -158,7 +158,7 @@ def arias_intensity(channel: str, part: slice = slice(None)) -> ChannelQuantity:
     --------
     >>> from fe_likelihoods.prediction.quantities import arias_intensity
     >>> print(propagate(posterior, samples, quantity=arias_intensity("acceleration")))  # doctest: +SAMPLED
-    Prediction: 300 samples, without measurement noise; effective sample size 300
+    Prediction: 300 samples, with the spread of the parameters only; effective sample size 300
     value                            unit  mean  MC error     sd   5 %  50 %  95 %
     Arias intensity of acceleration   m/s  4.32   0.00701  0.121  4.13  4.31  4.52
     """
@@ -196,7 +196,7 @@ def dissipated_energy(force: str, displacement: str | ArrayLike, part: slice = s
     >>> from fe_likelihoods.prediction.quantities import dissipated_energy
     >>> loops = RCColumn.lhpost(record, outputs=("base_shear", "displacement"))
     >>> print(propagate(loops, np.ones((1, 5)), quantity=dissipated_energy("base_shear", "displacement")))
-    Prediction: 1 samples, without measurement noise; effective sample size 1
+    Prediction: 1 samples, with the spread of the parameters only; effective sample size 1
     value                 unit  mean  MC error  sd   5 %  50 %  95 %
     energy of base_shear    kJ  7.81         0   0  7.81  7.81  7.81
     """
@@ -235,7 +235,7 @@ def displacement_before_failure(force: str, displacement: str | ArrayLike) -> Ch
     >>> tested = RCColumn.lhpost(DisplacementHistory("cycles", cycles), parameters=["Ec"], fatigue=LowCycleFatigue())
     >>> failure = displacement_before_failure("force", cycles)
     >>> print(propagate(tested, np.ones((1, 1)), quantity=failure))
-    Prediction: 1 samples, without measurement noise; effective sample size 1
+    Prediction: 1 samples, with the spread of the parameters only; effective sample size 1
     value                                 unit  mean  MC error  sd  5 %  50 %  95 %
     displacement before failure of force    mm   287         0   0  287   287   287
     """
@@ -264,7 +264,7 @@ def final_value(channel: str, samples: int = 1) -> ChannelQuantity:
     --------
     >>> quiet = record.followed_by(Record("rest", record.dt, [0.0, 0.0]), rest=20.0)
     >>> print(propagate(LinearOscillator(quiet), samples[:, :2], quantity=final_value("displacement", samples=20)))
-    Prediction: 300 samples, without measurement noise; effective sample size 300
+    Prediction: 300 samples, with the spread of the parameters only; effective sample size 300
     value         unit ...
     displacement    cm ...
     """

@@ -118,7 +118,7 @@ def test_the_peak_has_the_exact_t_distribution_of_the_ratios_at_the_median(event
     assert "200 samples, of measured values, by the ratios of 4 events;" in str(found)
     for none in (found.mean, found.variance, found.sd, found.standard_error):
         assert none.shape == () and np.isnan(none)  # exp(t) has no mean
-    assert found.noise and "with measurement noise" not in str(found)
+    assert found.noise and "measurement noise" not in str(found)
     options["quantity"] = [peak("top"), rms("top")]
     both = predict_new_event(hierarchy, posteriors, 2.0, seed=1, **options)
     assert both.values.shape == (200, 2) and abs(stats.spearmanr(*both.values.T).statistic) < 0.3
