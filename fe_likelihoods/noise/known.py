@@ -16,6 +16,7 @@ __all__ = ["KnownNoise"]
 _METHODS = {
     "log_likelihood": 2,
     "standard_deviations": 0,
+    "deviations": 0,
     "deviations_per_event": 0,
     "lag_one_correlations": 0,
     "response_deviations": 0,
@@ -23,7 +24,7 @@ _METHODS = {
     "log_densities": 2,
 }
 _AGAIN = "under", "with_measurements"  # methods that return the noise for other data
-_OF_THE_NOISE = "channels", "statistic", "level", "gap_shares", "effective_samples"
+_OF_THE_NOISE = "channels", "statistic", "level", "gap_shares", "effective_samples", "counts", "n_sets", "student"
 
 
 class KnownNoise:

@@ -218,3 +218,13 @@ def test_a_pairing_that_changes_in_the_posterior_is_noted():
     found = [each for each in check_fit(posterior, samples) if each.kind == "The pairing of modes changes"]
     assert len(found) == 2 and "1 (50 %) and 2 (50 %)" in found[0].text and found[0].severity == "note"
     assert "The pairing of modes changes" not in kinds(posterior, samples[:1])
+
+
+def test_errors_that_are_numbers_among_the_priors_are_checked_as_those_of_the_data():
+    data = identified(1)
+    wrong = replace(data, frequencies=data.frequencies * [[1.0, 1.1, 1.0]])
+    known = Posterior(ModalLikelihood(FRAME, replace(wrong, **KNOWN)), PRIOR)
+    numbers = PRIOR | {"frequency_error": KNOWN["frequency_cv"], "shape_error": KNOWN["shape_error"]}
+    posterior = Posterior(ModalLikelihood(FRAME, wrong), numbers)
+    samples = fitted(known)
+    assert kinds(posterior) == kinds(known) and kinds(posterior, samples) == kinds(known, samples) != []
