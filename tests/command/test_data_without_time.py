@@ -76,6 +76,14 @@ def test_from_a_load_test_to_a_report(tmp_path, monkeypatch):
     assert "Predicted values" in (outcome.folder / "report.html").read_text()
 
 
+def test_a_load_test_has_its_own_temperature(tmp_path):
+    problem = make_problem(read_job(changed(tmp_path, "load-test", ("[load_test]", "[load_test]\ntemperatures = -5"))))
+    assert problem.posterior.parameter_names == ["stiffness", "temperature_slope"] == [*problem.posterior.prior.names]
+    simulate = problem.posterior.likelihood.simulate
+    cold, warm = simulate(np.array([[1.0, -1e-3], [1.0, 0.0]])).response
+    np.testing.assert_allclose(cold * 1.025**2, warm, rtol=1e-12)
+
+
 def test_other_models_have_modes(tmp_path):
     write_templates("modal", tmp_path)
     (tmp_path / "my_storeys.py").write_text(MATRICES)
