@@ -9,11 +9,12 @@ from tqdm import tqdm
 
 from ..likelihood.posterior import Posterior
 from ..simulation.model import SimulationBatch, simulate_batch
-from .compared import Fit, compare, data_sets_of, draws_to_compare
+from .compared import SECONDS, Fit, compare, data_sets_of, draws_to_compare
 from .finding import CARE, Finding, grouped, percent
 from .fit import check_responses, check_supports
 from .model import NO_STEP, STEP, check_chance, check_stronger_motion, halved, motions_to_replace, relative_difference
 from .screening import check_data, check_gaps
+from .tables import MOST_DRAWS
 
 __all__ = ["ModelCheck", "check_model"]
 
@@ -77,9 +78,12 @@ def check_model(posterior: Posterior, *, progress: bool = False) -> ModelCheck:
                     raise ValueError(
                         f"the simulation at the mean of the prior has failed: {batch.reasons[0]}; check model, priors"
                     )
-                start, response = perf_counter(), batch.response[0]
-                again = simulate(model, theta[None])
-                took = perf_counter() - start
+                response = batch.response[0]
+                for _ in range(2):  # a first simulation may start a process, which would leave time for few draws
+                    start = perf_counter()
+                    again = simulate(model, theta[None])
+                    if not SECONDS / MOST_DRAWS < (took := perf_counter() - start) < SECONDS:
+                        break
                 fits += compare(likelihood, draws_to_compare(posterior, took)[:, columns], key)[0]
                 # generators of workers have moved on meanwhile
                 chance = check_chance(response, again) or check_chance(

@@ -152,7 +152,7 @@ def _readable(path: Path) -> tuple[Table, list[str], list[str]]:
     texts, said = list[str](), list[str]()
     while True:
         try:
-            return read_table(path, missing=texts), texts, said
+            return read_table(path, missing=texts or None), texts, said
         except ValueError as error:
             found = re.search(r"got '(.+)'; if it stands for a missing sample", str(error))
             if found is None or len(texts) == _MOST_TEXTS:

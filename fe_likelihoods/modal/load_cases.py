@@ -126,7 +126,7 @@ def read_load_test(
 
     given = zip(channels, units_of(channels, units), strict=True)
     wanted = [(column_of(each), each.dimension, unit, each.name) for each, unit in given]
-    values = [to_si(*each) for each in table_values(table, wanted, None, stacklevel=2)]
+    values = [to_si(*each) for each in table_values(table, wanted, stacklevel=2)]
     chosen = cases or next((name for name in names[:1] if name not in [each[0] for each in wanted]), None)
     options = {"errors": errors, "temperatures": temperatures, "description": f"load test of {Path(path).name}"}
     if chosen is None:

@@ -175,7 +175,7 @@ def _table_series(
     table = read_table(path, along_rows=column == "rows", **options)
     rows = column == "rows" and "rows" not in [each.name for each in table.columns]
     wanted = (None if rows else column, "acceleration", units, table.file)
-    ((values, unit, _),) = table_values(table, [wanted], options["missing"], stacklevel=3)
+    ((values, unit, _),) = table_values(table, [wanted], stacklevel=3)
     absent = np.flatnonzero(np.isnan(values))
     if absent.size:
         raise ValueError(
@@ -265,7 +265,7 @@ def read_columns(
             )
         return _recorded(path, channels, columns, description, zero, resample)
     table = read_table(path, skip, time_unit, time, missing=missing)
-    values = np.array([to_si(*each) for each in table_values(table, wanted, missing, stacklevel=2)])
+    values = np.array([to_si(*each) for each in table_values(table, wanted, stacklevel=2)])
     if resample is None:
         step = table_step(table, dt)
     else:
@@ -336,7 +336,7 @@ def read_imposed_test(
     """
     imposed = (displacement, "displacement", displacement_unit, f"{path}, column {displacement!r}")
     wanted = [imposed, *_wanted(path, channels, columns, units)]
-    found = table_values(read_table(path, skip, missing=missing), wanted, missing, stacklevel=2)
+    found = table_values(read_table(path, skip, missing=missing), wanted, stacklevel=2)
     history, *values = (to_si(*each) for each in found)
     measurements = Measurements(tuple(channels), 1.0, values, description)
     return ImposedTest(DisplacementHistory(Path(path).stem, history, Path(path).name), measurements)

@@ -205,7 +205,20 @@ class Record:
     def spectrum(
         self, periods: Sequence[float] | NDArray[np.float64] | None = None, damping_ratio: float = 0.05
     ) -> ResponseSpectrum:
-        """Compute the elastic response spectrum, see `fe_likelihoods.signals.response_spectrum.response_spectrum`.
+        """Compute the elastic response spectrum of this motion.
+
+        Parameters
+        ----------
+        periods : (n_periods,) array_like, optional
+            Undamped periods [s], each at least a tenth of the step. Default: 120 periods, equally spaced on a
+            logarithmic scale, from twice the step (at least 0.02 s) to 10 s.
+        damping_ratio : float
+            Fraction of critical damping, 0 <= damping_ratio < 1.
+
+        Raises
+        ------
+        ValueError
+            If the periods are not one-dimensional, finite and long enough, or the damping ratio is out of range.
 
         Examples
         --------

@@ -19,7 +19,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .sampling import check_samples, check_step
 from .sdof import respond
 
 __all__ = ["ResponseSpectrum", "response_spectrum"]
@@ -53,45 +52,9 @@ class ResponseSpectrum(NamedTuple):
 
 
 def response_spectrum(
-    acceleration: ArrayLike, dt: float, periods: ArrayLike | None = None, damping_ratio: float = 0.05
+    acceleration: NDArray[np.float64], dt: float, periods: ArrayLike | None, damping_ratio: float
 ) -> ResponseSpectrum:
-    """Compute the elastic response spectrum of a ground acceleration.
-
-    Parameters
-    ----------
-    acceleration : (n_steps,) array_like
-        Ground acceleration [m/s²], linear between its samples.
-    dt : float
-        Time step of the samples [s].
-    periods : (n_periods,) array_like, optional
-        Undamped periods [s], each at least a tenth of the step. Default: 120 periods, equally spaced on a logarithmic
-        scale, from twice the step (at least 0.02 s) to 10 s.
-    damping_ratio : float
-        Fraction of critical damping, 0 <= damping_ratio < 1.
-
-    Returns
-    -------
-    ResponseSpectrum
-        Periods and peak responses.
-
-    Raises
-    ------
-    ValueError
-        If the samples are not a one-dimensional finite array, the step is not positive, the periods are not
-        one-dimensional, finite and long enough, or the damping ratio is out of range.
-
-    Examples
-    --------
-    >>> from fe_likelihoods.signals.response_spectrum import response_spectrum
-    >>> response_spectrum(record.acceleration, record.dt, [0.5, 1.0]).displacement.shape
-    (2,)
-    """
-    try:
-        acceleration, dt = check_samples(acceleration, "acceleration", "the motion"), check_step(dt, "the motion")
-    except ValueError as error:
-        raise ValueError(
-            f"{error}; for a Record use record.spectrum(), or pass record.acceleration and record.dt"
-        ) from None
+    """The elastic response spectrum of a ground acceleration (n_steps,) [m/s²]; see `Record.spectrum`."""
     if periods is None:
         periods = np.geomspace(max(0.02, 2.0 * dt), max(10.0, 4.0 * dt), 120)
     periods = np.array(periods, dtype=float)

@@ -582,8 +582,6 @@ def _parse_geonet(text: str, file: str) -> list[Found]:
             raise ValueError(f"{file}: expected at most {_MOST_COMPONENTS} components")
         component, series, place = _geonet_component(block, place)
         found.append(Found(component, series.title, file, lambda series=series: series))
-    if not found:
-        raise ValueError(f"{file}: expected a GeoNet V1A or V2A file, got an empty one")
     return found
 
 

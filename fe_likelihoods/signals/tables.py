@@ -461,6 +461,14 @@ _SKIP = "If the text is about other samples, give skip= to leave it out"
 _Line = tuple[int, list[str]]  # its number and cells
 
 
+class Missing(NamedTuple):
+    """What stands for missing samples, as the caller says."""
+
+    numbers: NDArray[np.float64]
+    texts: list[str]
+    stated: bool  # whether the caller says it; it may be nothing
+
+
 class Column(NamedTuple):
     """One column of a table."""
 
@@ -481,11 +489,12 @@ class Table(NamedTuple):
     lines: tuple[int, ...]  # line numbers of the rows
     title: str  # the first comment
     stated: Statements  # what comments and the text above state
+    missing: Missing
+    found: frozenset[str]  # texts of missing samples that rows have
     clock: ClockTime | None = None  # the first clock time
     time: int | None = None  # column of times
     time_unit: str | None = None  # as given by the caller
     chosen: bool = False  # whether the caller has chosen the column of times
-    marks: frozenset[str] = frozenset()  # texts of missing samples that the caller has named and the rows have
 
 
 def read_table(
@@ -515,8 +524,8 @@ def read_table(
     separator = "\t" if is_book else _separator([line for _, line in lines[-_LAST_LINES:]])
     rows = [(number, _split(line, separator, f"{file}, line {number}")) for number, line in lines]
     rows, stated = _logger_table(rows, file)
-    _, marks = _listed(missing)
-    found_marks = _blank(rows, marks)
+    absent = _listed(missing)
+    there = _blank(rows, absent.texts)
     along_rows = along_rows and not any("rows" in row for _, row in rows[:_LAST_LINES])
     announced = None if along_rows or stated else _announced(rows, file)
     if announced:
@@ -526,11 +535,11 @@ def read_table(
         rows = _along_rows(rows, file) if along_rows else rows
     names, below, rows = _header(rows, file)
     rows, commas = _with_points(rows, separator, file)
-    columns, clock = _columns(names, below, rows, file, marks, labels)
+    columns, clock = _columns(names, below, rows, file, absent.texts, labels)
     above = [line for number, line in lines if number < rows[0][0]]
     found = read_statements([*comments, *stated, *above], commas)
     title, numbers = "".join([*comments, *stated][:1]), tuple(number for number, _ in rows)
-    table = Table(file, bool(names), columns, numbers, title, found, clock, None, time_unit, marks=found_marks)
+    table = Table(file, bool(names), columns, numbers, title, found, absent, there, clock, None, time_unit)
     for words, count in found.counts:
         check_count(len(rows), count, f"{file}: {words!r}", f". {_SKIP}")
     if time is None:
@@ -1002,17 +1011,16 @@ def _value_column(table: Table, column: int | str | None = None) -> int:
     return places[0]
 
 
-def column_values(table: Table, place: int, missing: Sequence[float | str] | None = None) -> NDArray[np.float64]:
-    """The numbers of a column, with NaN for numbers that are in `missing`.
+def column_values(table: Table, place: int) -> NDArray[np.float64]:
+    """The numbers of a column, with NaN for numbers that stand for missing samples.
 
-    ValueError for a number that usually stands for missing samples and is not in `missing`, unless `missing` is empty
-    or the number may have been measured: the column has other numbers within 1 % of it, or, for -999 and the limits of
-    integers, other numbers of half its size, like the samples next to a measured peak.
+    ValueError for another number that usually does, unless the caller says that none does, or the number may have been
+    measured: the column has other numbers within 1 % of it, or, for -999 and the limits of integers, other numbers of
+    half its size, like the samples next to a measured peak.
     """
-    values, (listed, marks) = table.columns[place].values, _listed(missing)
-    if missing is not None:
-        values = np.where(np.isin(values, listed), np.nan, values)
-    for sentinel in (*_SENTINELS, *_PLAUSIBLE_SENTINELS) if missing is None or listed.size or marks else ():
+    listed, marks, stated = table.missing
+    values = np.where(np.isin(table.columns[place].values, listed), np.nan, table.columns[place].values)
+    for sentinel in (*_SENTINELS, *_PLAUSIBLE_SENTINELS) if listed.size or marks or not stated else ():
         found, size = np.flatnonzero(values == sentinel), abs(sentinel)
         close = sentinel in _SENTINELS
         similar = np.abs(values - sentinel) <= 0.01 * size if close else np.abs(values) >= 0.5 * size
@@ -1026,7 +1034,7 @@ def column_values(table: Table, place: int, missing: Sequence[float | str] | Non
     return values
 
 
-def _listed(missing: Sequence[float | str] | None) -> tuple[NDArray[np.float64], list[str]]:
+def _listed(missing: Sequence[float | str] | None) -> Missing:
     """Numbers and texts that stand for missing samples; ValueError for other values, and for numbers in quotes."""
     given = [] if missing is None else [missing] if np.ndim(missing) == 0 else list(missing)
     marks = [each.strip() for each in given if isinstance(each, str)]
@@ -1036,26 +1044,24 @@ def _listed(missing: Sequence[float | str] | None) -> tuple[NDArray[np.float64],
         raise ValueError(
             f"missing must be finite numbers and texts, such as (-9999, 'OL'), or () for none; got {missing!r}"
         )
-    return np.array(numbers, dtype=float), marks
+    return Missing(np.array(numbers, dtype=float), marks, missing is not None)
 
 
 def table_values(
-    table: Table,
-    columns: Sequence[tuple[str | int | None, str, str | None, str]],
-    missing: Sequence[float | str] | None,
-    stacklevel: int,
+    table: Table, columns: Sequence[tuple[str | int | None, str, str | None, str]], stacklevel: int
 ) -> list[tuple[NDArray[np.float64], str, str]]:
     """Samples of columns (n_rows,), units and dimensions, of columns' names, dimensions, units and words for messages.
 
-    Warns if a number in `missing` is in none of the columns, or a text in no row: the file may write it in another way.
+    Warns if a number for missing samples is in none of the columns, or a text in no row: the file may write it in
+    another way.
     """
     found, places = [], [_value_column(table, name) for name, *_ in columns]
     for place, (_, dimension, unit, where) in zip(places, columns, strict=True):
-        values = column_values(table, place, missing)
+        values = column_values(table, place)
         found.append((values, column_unit(table, place, values, unit, dimension, where), dimension))
-    listed, marks = _listed(missing)
+    listed, marks, _ = table.missing
     absent = [f"{each:g}" for each in listed[~np.isin(listed, [table.columns[place].values for place in places])]]
-    absent += [repr(mark) for mark in marks if mark not in table.marks]
+    absent += [repr(mark) for mark in marks if mark not in table.found]
     if absent:
         warnings.warn(
             f"{table.file}: missing={', '.join(absent)} is in none of the columns that "

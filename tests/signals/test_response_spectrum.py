@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from fe_likelihoods.signals.records import Record
-from fe_likelihoods.signals.response_spectrum import response_spectrum
 from fe_likelihoods.signals.sdof import respond
 
 
@@ -22,7 +21,7 @@ def test_undamped_oscillator_under_a_pulse_peaks_in_free_vibration():
     periods = np.array([0.5, 1.0, 2.0])
     omega = 2 * math.pi / periods
     expected = 2 * height / omega**2 * np.sin(omega * n * dt / 2)
-    spectrum = response_spectrum(record.acceleration, record.dt, periods, 0.0)
+    spectrum = record.spectrum(periods, 0.0)
     np.testing.assert_allclose(spectrum.displacement, expected, rtol=0.01)
     during = [np.abs(respond(record.acceleration, dt, w, 0.0).displacement).max() for w in omega]
     assert np.all(spectrum.displacement > 1.5 * np.array(during)), "the peak is in the free vibration"
