@@ -212,8 +212,10 @@ class ParameterRow(NamedTuple):
     mean: float
     mean_error: float  # Monte Carlo standard error
     sd: float
+    sd_error: float
     cv: float  # coefficient of variation [-]; NaN for a mean of zero
     low: float  # 5 % quantile
+    median: float
     high: float  # 95 % quantile
     nominal: float
     truth: float
@@ -236,17 +238,17 @@ def rows_of(
     rows, known = [], [] if prior is None else prior.table()[1]
     for i, parameter in enumerate(parameters):
         family, *of_prior = ("", np.nan, np.nan, -np.inf, np.inf) if prior is None else known[i][1:]
-        mean, mean_error, sd, _, low, _, high = (float(each[i]) for each in moments)
         true = np.nan if truth is None else truth[i]
         prior_mean, prior_sd, lower, upper = (float(each) for each in parameter.shown(of_prior))
-        numbers = parameter.shown([mean, mean_error, sd, low, high, parameter.nominal, true])
-        *of_posterior, lowest, highest, nominal, true = (float(each) for each in numbers)
+        numbers = parameter.shown([*(each[i] for each in moments), parameter.nominal, true])
+        mean, mean_error, sd, sd_error, *quantiles, nominal, true = (float(each) for each in numbers)
         family = family.split("(")[0]
         text = family if family in ("", "Uniform") else f"{family}, mean {prior_mean:.4g}, sd {prior_sd:.3g}"
         bounds = (("above", lower), ("below", upper))
         text += "".join(f", {side} {bound:.4g}" for side, bound in bounds if family and np.isfinite(bound))
         unit, cv = parameter.label.removeprefix(parameter.name).strip(), sd / abs(mean) if mean else np.nan
-        shown = text, prior_mean, prior_sd, *of_posterior, cv, lowest, highest, nominal, true, lower, upper
+        of_posterior = mean, mean_error, sd, sd_error, cv, *quantiles
+        shown = text, prior_mean, prior_sd, *of_posterior, nominal, true, lower, upper
         rows.append(ParameterRow(parameter.name, parameter.label, unit, *shown))
     return rows
 

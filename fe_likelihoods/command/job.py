@@ -98,7 +98,7 @@ class Job:
         if path.is_dir():
             raise ValueError(f"{self.where(section)} {key}: expected a file; {name!r} is a folder")
         if not path.is_file():
-            near = f"there is no folder {path.parent}"
+            near = f"there is no folder {path.parent}: files are relative to the folder of the TOML file"
             if path.parent.is_dir():
                 near = did_you_mean(path.name, sorted(p.name for p in path.parent.iterdir() if p.is_file()))
             raise ValueError(f"{self.where(section)} {key}: there is no file {path}; {near}")

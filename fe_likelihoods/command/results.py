@@ -10,7 +10,7 @@ import numpy as np
 from ..checks.compared import Fit, ModalFit, data_sets_of
 from ..checks.finding import Judgement
 from ..checks.result import JudgedRun
-from ..checks.run import FinishedRun, moments_of
+from ..checks.run import FinishedRun
 from ..prediction.prediction import Prediction
 from ..reporting.other_events import OtherEvent
 
@@ -24,18 +24,14 @@ def write_tables(folder: Path, run: FinishedRun, judged: JudgedRun, agreement: s
 
     `agreement` says how independent runs agree.
     """
-    from samplers import ladder_table, summary
+    from samplers import ladder_table
+    from samplers.reporting.summary import Summary
 
-    factors = np.array([parameter.factor for parameter in run.parameters])
-    mean, errors, sd, of_sd, low, median, high = (values / factors for values in moments_of(run))
-    labels = [parameter.label for parameter in run.parameters]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        cv = sd / np.abs(mean)
-    moments = summary(run.samples, labels)._replace(mean=mean, sd=sd, cv=cv, mean_error=errors, sd_error=of_sd)
-    columns = ("parameter", "mean", "mean_error", "sd", "sd_error", "cv", "q05", "median", "q95", "nominal")
-    nominal = [parameter.shown(parameter.nominal) for parameter in run.parameters]
-    values = zip(labels, mean, errors, sd, of_sd, cv, low, median, high, nominal, strict=True)
-    tables: dict[str, Rows] = {"summary.csv": [dict(zip(columns, row, strict=True)) for row in values]}
+    columns = ("label", "mean", "mean_error", "sd", "sd_error", "cv", "low", "median", "high", "nominal")
+    names = {"label": "parameter", "low": "q05", "high": "q95"}
+    of_each = [{names.get(key, key): getattr(row, key) for key in columns} for row in judged.rows]
+    moments = Summary(*([getattr(row, key) for row in judged.rows] for key in ("label", *Summary._fields[1:])))
+    tables: dict[str, Rows] = {"summary.csv": of_each}
     evidence = f"log-evidence {run.sampler.log_evidence:.2f} +- {run.sampler.log_evidence_error:.2g}"
     lines = [str(judged.judgement), "", str(moments), "", evidence, str(run.verdict), *filter(None, [agreement]), ""]
     for key, _, _ in data_sets_of(run.posterior):
