@@ -13,7 +13,8 @@ from ..signals.channels import Channel, Measurements
 from ..signals.read import units_of
 from ..signals.tables import read_table, table_values
 from ..units import to_si
-from .temperature import StaticAtTemperatures, check_temperatures
+from .modal_data import DEGREES, TEMPERATURES, checked_numbers
+from .temperature import StaticAtTemperatures
 
 __all__ = ["LoadTest", "read_load_test"]
 
@@ -80,7 +81,9 @@ class LoadTest:
         measurements = Measurements(channels, 1.0, self.values, self.description, axis=self.axis, points=cases)
         found = {"channels": channels, "cases": cases, "values": measurements.values, "errors": errors}
         if self.temperatures is not None:
-            found["temperatures"] = check_temperatures("LoadTest", self.temperatures, len(cases), "load cases")
+            expected = f"{DEGREES} {len(cases)} load cases, from -80 to 80"
+            given = "LoadTest: temperatures", self.temperatures, (len(cases),), TEMPERATURES, expected
+            found["temperatures"] = checked_numbers(*given)
         for name, value in (found | {"measurements": measurements}).items():
             object.__setattr__(self, name, value)
 

@@ -10,9 +10,10 @@ from ..models.base import digest
 from ..signals.sampling import array_digest
 from ..text_tables import text_table
 from .pairing import close_groups
-from .temperature import check_temperatures
 
-__all__ = ["ModalData", "real_shapes"]
+__all__ = ["DEGREES", "TEMPERATURES", "ModalData", "checked_numbers", "real_shapes"]
+
+TEMPERATURES, DEGREES = (-80.0, 80.0), "a number [°C] for each of"
 
 _LARGEST_SHARE = 0.5  # above it, an error was given in percent or in hertz
 _ABOVE_ZERO = np.finfo(float).tiny
@@ -82,13 +83,15 @@ class ModalData:
 
     def __post_init__(self) -> None:
         expected = "positive numbers [Hz] of shape (m,) or (n_sets, m), NaN where one of several missed the mode"
-        frequencies = np.atleast_2d(_numbers("frequencies", self.frequencies, None, (_ABOVE_ZERO, np.inf), expected))
+        frequencies = np.atleast_2d(
+            checked_numbers("ModalData: frequencies", self.frequencies, None, (_ABOVE_ZERO, np.inf), expected)
+        )
         known, (n_sets, m) = ~np.isnan(frequencies), frequencies.shape
         if not known.any(axis=0).all():
             raise ValueError("ModalData: a mode has no frequency: leave out modes that were never identified")
         numbers = range(1, m + 1) if self.mode_numbers is None else self.mode_numbers
         expected = f"{m} different whole numbers from 1 on"
-        numbers = _numbers("mode_numbers", list(numbers), (m,), (1.0, 1e9), expected)
+        numbers = checked_numbers("ModalData: mode_numbers", list(numbers), (m,), (1.0, 1e9), expected)
         if len(set(numbers)) < m or (numbers % 1.0).any():
             raise ValueError(f"ModalData: mode_numbers must be {expected}; got {self.mode_numbers!r}")
         sensors = tuple(self.sensors)
@@ -105,13 +108,12 @@ class ModalData:
         for what, shape, limits, expected in (
             ("frequency_cv", (m,), (_ABOVE_ZERO, _LARGEST_SHARE), f"{share} 0.005 for 0.5 %"),
             ("shape_error", (m,), (_ABOVE_ZERO, _LARGEST_SHARE), f"{share} 0.02, for shapes with a norm of 1"),
+            ("temperatures", (n_sets,), TEMPERATURES, f"{DEGREES} {n_sets} identifications, from -80 to 80"),
             ("damping", (n_sets, m), (0.0, 1.0), ratios),
             ("covariance", (m, m), (-np.inf, np.inf), f"a matrix ({m}, {m}) [Hz²], symmetric positive definite"),
         ):
             if (given := getattr(self, what)) is not None:
-                values[what] = _numbers(what, given, shape, limits, expected)
-        if self.temperatures is not None:
-            values["temperatures"] = check_temperatures("ModalData", self.temperatures, n_sets, "identifications")
+                values[what] = checked_numbers(f"ModalData: {what}", given, shape, limits, expected)
         if (covariance := values.get("covariance")) is not None and (
             self.frequency_cv is not None
             or not known.all()
@@ -238,7 +240,7 @@ def _places(what: str, wanted: Sequence[Any], names: Sequence[Any]) -> list[int]
     return [names.index(name) for name in wanted]
 
 
-def _numbers(
+def checked_numbers(
     what: str, given: Any, shape: tuple[int, ...] | None, limits: tuple[float, float], expected: str
 ) -> np.ndarray:
     """Numbers from a limit to below another one, repeated to a shape; NaN where an identification has none."""
@@ -247,9 +249,11 @@ def _numbers(
     except (TypeError, ValueError):  # texts, complex numbers, rows of different lengths
         values = np.array([])
     fits = values.ndim in (1, 2) if shape is None else values.shape in ((), shape, shape[-1:])
-    inside = (values >= limits[0]) & (values < limits[1]) | np.isnan(values) & (what in ("frequencies", "damping"))
+    inside = (values >= limits[0]) & (values < limits[1]) | np.isnan(values) & (
+        what.endswith(("frequencies", "damping"))
+    )
     if not fits or not values.size:
-        raise ValueError(f"ModalData: {what} must be {expected}; got {given!r}")
+        raise ValueError(f"{what} must be {expected}; got {given!r}")
     if not inside.all():
         places = np.argwhere(~inside)[:3]
         got = (
@@ -257,7 +261,7 @@ def _numbers(
             if values.ndim
             else given
         )
-        raise ValueError(f"ModalData: {what} must be {expected}; got {got}: correct or leave out")
+        raise ValueError(f"{what} must be {expected}; got {got}: correct or leave out")
     return values if shape is None else np.broadcast_to(values, shape).copy()
 
 

@@ -15,28 +15,18 @@ from ..signals.sampling import array_digest
 from ..simulation.model import Model, SimulationBatch
 from ..simulation.user_code import is_of_user
 
-__all__ = ["REFERENCE_TEMPERATURE", "SLOPE", "ModesWithSlope", "StaticAtTemperatures", "check_temperatures"]
+__all__ = ["REFERENCE_TEMPERATURE", "SLOPE", "ModesWithSlope", "StaticAtTemperatures"]
 
 SLOPE = "temperature_slope"
 REFERENCE_TEMPERATURE = 20.0  # [°C], of the stiffnesses of a model
 _OF_THE_MODEL = "code_parts", "jacobian", "nominal", "nominal_units", "simulate_together", "time_limit"
 
 
-def check_temperatures(what: str, given: Any, n: int, points: str) -> np.ndarray:
-    """Temperatures (n,) [°C] from one or n numbers; ValueError for others."""
-    found = np.asarray(given)
-    if found.dtype.kind not in "fiu" or found.shape not in ((), (n,)) or not (np.abs(found) <= 80.0).all():
-        raise ValueError(
-            f"{what}: temperatures must be a number [°C] for each of {n} {points}, from -80 to 80; got {given!r}"
-        )
-    return np.broadcast_to(found.astype(float), (n,)).copy()
-
-
 class _WithSlope:
     """A model with the slope as its last parameter, whose response a subclass changes."""
 
     path_dependent = False
-    fingerprint_parts: tuple[str, ...] = ()
+    _warmer = np.zeros(0)  # than the stiffnesses of the model [K]
 
     def __init__(self, model: Model) -> None:
         self.model, self.channels, self.dt, self.n_steps = model, tuple(model.channels), model.dt, model.n_steps
@@ -56,7 +46,7 @@ class _WithSlope:
     @property
     def fingerprint(self) -> str:
         """Digest of the model and the temperatures."""
-        return digest(type(self).__name__, self.model.fingerprint, *self.fingerprint_parts)
+        return digest(type(self).__name__, self.model.fingerprint, array_digest(self._warmer))
 
     def simulate(self, theta: np.ndarray) -> np.ndarray:
         """Response (n_channels, n_steps) at the parameters (n_parameters,)."""
@@ -94,7 +84,6 @@ class StaticAtTemperatures(_WithSlope):
     def __init__(self, model: Model, temperatures: np.ndarray) -> None:
         super().__init__(model)
         self._warmer = temperatures - REFERENCE_TEMPERATURE
-        self.fingerprint_parts = (array_digest(temperatures),)
 
     def _changed(self, response: np.ndarray, slope: float) -> np.ndarray:
         return response / np.square(1.0 + slope * self._warmer)
