@@ -6,6 +6,8 @@ the parameters as long as the pairing stays, so emulators and searches of modes 
 residuals are the relative frequency errors and the vectors of squared length 1 - MAC.
 """
 
+from functools import partial
+
 import numpy as np
 
 from ..models.base import digest
@@ -13,6 +15,7 @@ from ..noise.statistics import Statistic
 from ..signals.channels import Channel, Measurements
 from ..signals.sampling import array_digest
 from ..simulation.model import Model, SimulationFailed, has_jacobian
+from ..simulation.user_code import code_within, is_of_user
 from .modal_data import ModalData
 from .mode_models import ABSENT
 from .pairing import Paired, pair_modes
@@ -70,6 +73,8 @@ class PairedModes:
                 setattr(self, name, getattr(model, name))
         if has_jacobian(model):
             self.jacobian = self._differentiate
+        if hasattr(model, "code_parts") or is_of_user(type(model).__module__):
+            self.code_parts = partial(code_within, model)
 
     @property
     def identity(self) -> str:

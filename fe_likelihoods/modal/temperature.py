@@ -5,6 +5,7 @@ frequencies are f (1 + s (T - 20 °C)). Masses do not depend on it, so stiffness
 displacements, rotations and strains of a linear structure under known loads are divided by this square.
 """
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from ..models.base import digest
 from ..signals.channels import Channel
 from ..signals.sampling import array_digest
 from ..simulation.model import Model, SimulationBatch
-from ..simulation.user_code import is_of_user
+from ..simulation.user_code import code_within, is_of_user
 
 __all__ = ["REFERENCE_TEMPERATURE", "SLOPE", "ModesWithSlope", "StaticAtTemperatures"]
 
@@ -39,7 +40,7 @@ class _WithSlope:
         if model is None or name not in _OF_THE_MODEL:
             raise AttributeError(f"{type(self).__name__} has no {name}")
         if name == "code_parts" and is_of_user(type(model).__module__):
-            return lambda: {"model": model} | (model.code_parts() if hasattr(model, "code_parts") else {})
+            return partial(code_within, model)
         member = getattr(model, name)
         return {"jacobian": self._jacobian, "simulate_together": self._together}.get(name, member)
 

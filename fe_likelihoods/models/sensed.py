@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from ..signals.channels import Channel
 from ..signals.interpolation import interpolate, make_interpolation
 from ..signals.records import Record
 from ..simulation.model import Model, SimulationBatch, first_part, has_batch_method, simulate_batch
-from ..simulation.user_code import is_of_user
+from ..simulation.user_code import code_within, is_of_user
 from .base import digest
 from .validation import check_theta
 
@@ -139,7 +140,7 @@ class SensedModel:
         """Optional members of the model, such as `nominal`, and its excitation."""
         model = vars(self).get("model")
         if model is not None and name == "code_parts" and is_of_user(type(model).__module__):
-            return lambda: {"model": model} | (model.code_parts() if hasattr(model, "code_parts") else {})
+            return partial(code_within, model)
         if model is not None and name in (*_OF_THE_MODEL, "record", "loading", "supports"):
             return getattr(model, name)
         if model is not None and name == "with_record" and hasattr(model, "with_record"):

@@ -14,7 +14,7 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
-__all__ = ["LIBRARY", "SCRIPTS", "is_of_user", "package_version", "sources_digest"]
+__all__ = ["LIBRARY", "SCRIPTS", "code_within", "is_of_user", "package_version", "sources_digest"]
 
 LIBRARY = __name__.split(".")[0]
 SCRIPTS = ("__main__", "__mp_main__")  # names of a script or notebook, and of a script in a worker that imports it
@@ -29,6 +29,12 @@ def is_of_user(module: Any) -> bool:
     if not isinstance(name, str):
         return False
     return _is_of_user(name, _places(module) or _places(sys.modules.get(name.partition(".")[0])))
+
+
+def code_within(model: Any) -> dict[str, Any]:
+    """User code of a model that another one contains, as ``code_parts()`` of that one; empty if there is none."""
+    own = {"model": model} if is_of_user(type(model).__module__) else {}
+    return own | (model.code_parts() if hasattr(model, "code_parts") else {})
 
 
 def _values(module: Any) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from fe_likelihoods import (
 )
 from fe_likelihoods.modal.mode_models import StructureModes
 from fe_likelihoods.models.undamped_modes import undamped_modes
+from fe_likelihoods.simulation.label import ModelLabel
 
 FLOORS = {"floor 1": 1, "floor 2": 2, "floor 3": 3, "roof": 4}
 FRAME = ShearFrame(FLOORS, [1.0, 1.1, 0.9, 1.0], [900.0] * 4)
@@ -234,3 +235,15 @@ def test_several_identifications_are_one_observation(rng):
     points = posterior.sample_prior(3, 1)
     found = posterior.predictive_draws(points)
     np.testing.assert_allclose(found.blocks.values[:, 0], posterior.log_likelihood(points), rtol=1e-12)
+
+
+def test_the_user_s_code_is_known_within_the_paired_modes():
+    """Else a cache of their predictions would return those of other code."""
+    functions = (
+        (lambda theta: (theta * [1.0, 2.0], np.empty((2, 0)))),
+        (lambda theta: (theta * [1.0, 3.0], np.empty((2, 0)))),
+    )
+    for data in (ModalData([2.0, 4.0]), ModalData([2.0, 4.0], temperatures=5.0)):
+        labels = {ModelLabel(ModalLikelihood(FunctionModes(each, ("f",), ()), data).model).code for each in functions}
+        assert len(labels) == 2
+    assert not hasattr(ModalLikelihood(FRAME, ModalData([2.0, 4.0])).model, "code_parts")
