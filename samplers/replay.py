@@ -108,7 +108,10 @@ def differences(stored: dict, ours: dict) -> list[str]:
     """Differences between the headers of two runs, as text; entries that only the stored one has do not count."""
     if stored["sampler"] != ours["sampler"]:  # most settings then differ as well
         return [f"it was written by {stored['sampler']}, and this is a {ours['sampler']}"]
-    return [f"{name} was {stored.get(name)}, is {ours[name]}" for name in ours if stored.get(name) != ours[name]]
+    found = [f"{name} was {stored.get(name)}, is {ours[name]}" for name in ours if stored.get(name) != ours[name]]
+    if found and found[0].startswith("log_prob_fn was"):  # the first entry; a guide has the same fingerprint
+        found[0] += ": its model, data, noise or prior differ, or another line of the module that has the model"
+    return found
 
 
 def changes(record: Record, last: State | None, compute: Callable[[np.ndarray], EvaluatedBatch]) -> list[str]:

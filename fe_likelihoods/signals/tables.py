@@ -1181,6 +1181,8 @@ def _uniform_step(table: Table) -> tuple[float, float]:
     if bad.any() or off_grid.any():
         index = int(np.argmax(bad) if bad.any() else np.argmax(off_grid))
         advice = "insert rows with empty cells where the logger has missed samples, print the times with more digits"
+        if increments[index] < 0.0:
+            advice = "if the clock was set back, correct the later times, or leave the column of times out and give dt="
         with suppress(ValueError):
             even = uniform_times(times, None, table.file)
             advice += f", or give resample={even.step:.6g} to interpolate to a uniform step"
@@ -1331,7 +1333,8 @@ def uniform_times(times: NDArray[np.float64], step: float | None, where: str) ->
         place = int(np.argmax(~(increments > 0.0))) if times.size > 1 else 0
         raise ValueError(
             f"{where}: expected times that increase, got {times[min(place + 1, times.size - 1)]:.15g} s after "
-            f"{times[place]:.15g} s; if the times are those of packets, leave the column of times out and give dt="
+            f"{times[place]:.15g} s; if the times are those of packets, leave the column of times out and give dt=; "
+            "if the clock was set back, correct the later times"
         )
     usual = float(increments[increments <= _GAP * np.median(increments)].mean())
     if step is None:
