@@ -31,7 +31,7 @@ FAULTS = {
     "sign": (
         "A sign may be wrong",
         "{where}: measured and computed values have opposite signs{better}.",
-        "Where the sensor counts the other way, change its sign in the file, or name it in `reversed` of [measurements].",
+        "Where the sensor counts the other way, change its sign in the file, or by `reversed` in [measurements].",
     ),
     "swap": (
         "Channels may be swapped",
