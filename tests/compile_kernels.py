@@ -1,6 +1,6 @@
 """Compile the kernels that most tests use: ``python -m tests.compile_kernels``, before the workers of pytest start.
 
-The first start takes about half a minute. Otherwise every worker that needs a kernel waits while another compiles it.
+The first start takes a quarter of a minute. Otherwise every worker that needs a kernel waits while another compiles it.
 """
 
 import numpy as np

@@ -71,11 +71,6 @@ def _set_curve(first, low, high, state, c, path, i):
 
 
 @kernel
-def _forget_second(path, i):
-    path[SECOND + LOW, i], path[SECOND + HIGH, i] = math.inf, -math.inf
-
-
-@kernel
 def initialise_bars(memory, path, c):
     """Put the bars with this memory, all zeros, on the knee of the virgin backbone; empty bars stay there."""
     n_bars = memory.shape[0]
@@ -108,7 +103,7 @@ def _renew(eps, state, c, path, i):
             near, far, follower = e, c[A_SHIFT], -sign
         low, high = (origin + near, origin + far) if b == 1 else (origin - far, origin - near)
     _set_curve(0, low, high, state, c, path, i)
-    _forget_second(path, i)
+    path[SECOND + LOW, i], path[SECOND + HIGH, i] = math.inf, -math.inf
     path[COMMITTED, i], path[FOLLOWER, i] = eps, follower
 
 
@@ -137,7 +132,7 @@ def _try(eps, memory, trial, c, path, i):
     _catch_up(memory, trial, c, path, i)
     old, committed = int(memory[BRANCH]), trial[XC]
     stress, tangent = update(eps, trial, c)
-    _forget_second(path, i)
+    path[SECOND + LOW, i], path[SECOND + HIGH, i] = math.inf, -math.inf
     new, x = int(trial[BRANCH]), _natural(eps)
     if new != old and old > 0:
         # A farther trial makes the same transitions, and a nearer one too after a single reversal.
@@ -236,7 +231,7 @@ def commit_bars(e0, kappa, y, memory, trial, c, failure, path):
             path[COMMITTED, i] = eps
             path[LOW, i] = x if path[FOLLOWER, i] < 0.0 else path[LOW, i]
             path[HIGH, i] = x if path[FOLLOWER, i] > 0.0 else path[HIGH, i]
-            _forget_second(path, i)
+            path[SECOND + LOW, i], path[SECOND + HIGH, i] = math.inf, -math.inf
             continue
         if path[SECOND + LOW, i] <= x <= path[SECOND + HIGH, i]:
             for k in range(memory.shape[1]):

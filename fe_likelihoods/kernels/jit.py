@@ -19,11 +19,15 @@ import tempfile
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
+from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import IO
 
 import numba
-from numba.core import caching, event
+from numba.core import caching
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler
 from numba.core.compiler_lock import global_compiler_lock
 
 try:
@@ -101,63 +105,37 @@ CACHE_FOLDER: str | None = _find_cache_folder()
 """Folder of the machine code; None if there is none."""
 
 
-def _is_worker() -> bool:
-    """Whether this process was started by a pool of this library, or by `multiprocessing` (like dask workers)."""
-    marked = any(name.startswith("FE_LIKELIHOODS_RUN_") for name in os.environ)
-    return marked or multiprocessing.parent_process() is not None
+def _package(function: Callable) -> str:
+    return (function.__module__ or "").rpartition(".")[0]
 
 
-class _Announcer(event.Listener):
-    """Logs once per process that kernels are compiled, because users wait meanwhile; silent in workers.
+@cache
+def _announce(package: str) -> None:
+    """Log once per process that kernels of this library are compiled, because users wait meanwhile; not in workers.
 
-    numba reports a compilation only if the machine code is not in the cache.
+    Workers are those of a pool of this library, and those that `multiprocessing` started, as dask does.
     """
-
-    def __init__(self) -> None:
-        self._has_announced = False
-
-    def on_start(self, event: event.Event) -> None:
-        """A function begins to be compiled."""
-        self.announce(event.data["dispatcher"].py_func)
-
-    def announce(self, function: Callable) -> None:
-        """Log that `function` is being compiled, here or in another process."""
-        package = (function.__module__ or "").rpartition(".")[0]
-        if self._has_announced or package != __package__ or CACHE_FOLDER is None or _is_worker():
-            return
-        self._has_announced = True
-        logger.warning(
-            "Compiling the kernels, once: this takes up to about half a minute. The machine code is kept in %s",
-            CACHE_FOLDER,
-        )
-
-    def on_end(self, event: event.Event) -> None:
-        """Nothing is logged at the end: the run goes on."""
+    marked = any(name.startswith("FE_LIKELIHOODS_RUN_") for name in os.environ)
+    if package == __package__ and not marked and multiprocessing.parent_process() is None:
+        text = "Compiling the kernels, once: this takes a quarter of a minute or more. The machine code is kept in %s"
+        logger.warning(text, CACHE_FOLDER)
 
 
-_announcer = _Announcer()
-event.register("numba:compile", _announcer)
-
-
-_patience = [60.0]
-"""Seconds that this process still waits while others compile no kernel; the longest takes 7 s on a free core."""
+_patience = [120.0]
+"""Seconds that this process still waits for kernels of others; all of them take 13 s on a free core."""
 
 
 def _lock(file: IO, function: Callable) -> None:
     """Lock a file; OSError where that is impossible, or where a process that has perhaps been stopped keeps it."""
-    seen, since = 0.0, time.monotonic()
     while True:
         try:
             return flock(file, LOCK_EX | LOCK_NB)
         except BlockingIOError:
-            _announcer.announce(function)
-        newest = max(entry.stat().st_mtime for entry in os.scandir(CACHE_FOLDER))
-        if newest > seen:  # a kernel has begun or is on the disk
-            seen, since = newest, time.monotonic()
-        elif time.monotonic() - since > _patience[0]:
-            _patience[0] = 0.0
+            _announce(_package(function))
+        if _patience[0] <= 0.0:
             raise TimeoutError(f"another process compiles {function.__name__}")
         time.sleep(0.05)
+        _patience[0] -= 0.05
 
 
 def _compile_in_one_process(kernel: numba.core.dispatcher.Dispatcher) -> None:
@@ -185,7 +163,7 @@ class _Locator(caching.UserProvidedCacheLocator):
 
     def __init__(self, function: Callable, file: str) -> None:
         self._py_file, self._lineno = file, function.__code__.co_firstlineno
-        self._cache_path = os.path.join(CACHE_FOLDER, (function.__module__ or "").rpartition(".")[0] or "kernels")
+        self._cache_path = os.path.join(CACHE_FOLDER, _package(function) or "kernels")
 
     def get_source_stamp(self) -> str:
         """Hash of the file: kernels outside this folder are not in the name of the cache folder."""
@@ -204,26 +182,56 @@ class _CacheImpl(caching.CompileResultCacheImpl):
 class _Cache(caching.FunctionCache):
     _impl_class = _CacheImpl
 
+    def load_overload(self, signature, context):
+        """The machine code from the disk; None, with an announcement, if it must be compiled."""
+        found = super().load_overload(signature, context)
+        if found is None:
+            _announce(_package(self._py_func))
+        return found
 
-def kernel(
-    function: Callable | None = None, *, inline: bool = False, fastmath: set[str] | bool = False, cache: bool = True
-) -> Callable:
+
+class _InnerCode(JITCodeLibrary):
+    """Code of a kernel for its callers: optimised and translated as a part of each, never alone."""
+
+    codegen = SimpleNamespace(set_env=lambda name, environment: None)
+
+    def _optimize_final_module(self) -> None:
+        pass
+
+    def _finalize_final_module(self) -> None:
+        self._finalized = True
+
+    def get_pointer_to_function(self, name: str) -> int:
+        self._ensure_finalized()
+        return 0  # nothing in it can be called from Python
+
+
+class _InnerCompiler(Compiler):
+    def __init__(self, types, target, library, *rest) -> None:
+        super().__init__(types, target, _InnerCode(target.codegen(), "inner"), *rest)
+
+
+def kernel(function: Callable | None = None, *, inline: bool = False, fastmath: set[str] | bool = False) -> Callable:
     """Compile a kernel: no Python objects, no GIL, IEEE division, no allocation; ``.py_func`` stays plain Python.
 
     Kernels are compiled without numba's reference counting: the caller provides every array, and an allocation is a
-    compile error. Reference counting took 110 of the 180 ns of one evaluation of a section.
+    compile error. Reference counting took 110 of the 180 ns of one evaluation of a section. Other kernels take a second
+    version of it, without what a call from Python needs: the column compiles in 13 instead of 23 CPU s.
 
     `inline` merges the body into every caller: for functions in the inner loop that take arrays, because a call passes
-    about eight scalars per array. Of `fastmath`, LLVM flags, this library uses `SUM_REORDERING` only. With `cache` the
-    machine code is kept on disk, compiled by one process at a time; inlined functions are never cached separately.
+    about eight scalars per array. Of `fastmath`, LLVM flags, this library uses `SUM_REORDERING` only. The machine code
+    is kept on disk, compiled by one process at a time; that of inlined functions is not.
     """
     if function is None:
-        return lambda f: kernel(f, inline=inline, fastmath=fastmath, cache=cache)
-    cache = cache and not inline and CACHE_FOLDER is not None
-    compiled = numba.njit(
-        nogil=True, error_model="numpy", forceinline=inline, fastmath=fastmath, _nrt=False, no_cfunc_wrapper=True
-    )(function)
-    if cache and compiled is not function:  # the same where numba is switched off
+        return lambda f: kernel(f, inline=inline, fastmath=fastmath)
+    options = {"nogil": True, "error_model": "numpy", "forceinline": inline, "fastmath": fastmath, "_nrt": False}
+    options["no_cfunc_wrapper"] = True
+    compiled = numba.njit(**options)(function)
+    if compiled is function:  # numba is switched off
+        return function
+    inner = numba.njit(**options, no_cpython_wrapper=True, pipeline_class=_InnerCompiler)(function)
+    compiled.get_call_template, compiled.get_overload = inner.get_call_template, inner.get_overload
+    if not inline and CACHE_FOLDER is not None:
         compiled._cache = _Cache(function)
         if flock is not None:
             _compile_in_one_process(compiled)

@@ -164,15 +164,11 @@ def _mirror(state):
     state[OP], state[ON] = -state[ON], -state[OP]
     state[XMAX], state[XMIN] = -state[XMIN], -state[XMAX]
     state[XXMAX], state[XXMIN] = -state[XXMIN], -state[XXMAX]
-    state[RE] = -state[RE]
-    state[XC] = -state[XC]
-    state[SC] = -state[SC]
+    state[RE], state[XC], state[SC] = -state[RE], -state[XC], -state[SC]
     for level in range(9):
         k = CURVES + N_CURVE * level
-        state[k + XA] = -state[k + XA]
-        state[k + SA] = -state[k + SA]
-        state[k + XB] = -state[k + XB]
-        state[k + SB] = -state[k + SB]
+        state[k + XA], state[k + SA] = -state[k + XA], -state[k + SA]
+        state[k + XB], state[k + SB] = -state[k + XB], -state[k + SB]
         state[k + SCH] = -state[k + SCH]
 
 
