@@ -5,7 +5,10 @@ or x0, x1, ... matplotlib and corner are imported inside the functions.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from types import SimpleNamespace
+from functools import cache
+from importlib import util
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -53,6 +56,16 @@ class _Drawn(NamedTuple):
         return {"density": True, "linewidth": 1.2, "histtype": "stepfilled", "fc": colour + "40", "ec": colour}
 
 
+@cache
+def _corner() -> ModuleType:
+    """The file of `corner` that draws arrays: the package around it imports arviz, which takes longer than a figure."""
+    spec = util.find_spec("corner")
+    spec = util.spec_from_file_location("corner_of_arrays", Path(spec.origin).with_name("core.py"))
+    module = util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
 def plot_corner(
     samples: np.ndarray | Mapping[str, np.ndarray],
     posterior: Any = None,
@@ -94,10 +107,9 @@ def plot_corner(
     --------
     >>> figure = plot_corner(samples, posterior, names=["stiffness", "damping"])
     """
-    import corner
     import matplotlib.pyplot as plt
 
-    drawn = _choose(samples, posterior, truths, labels, names, MOST_PARAMETERS)
+    drawn, corner = _choose(samples, posterior, truths, labels, names, MOST_PARAMETERS), _corner()
     k, several = len(drawn.labels), len(drawn.samples) > 1
     size = float(np.clip(1.8 * k + 1.0, 4.5, 15.0))  # [in]
     figure = plt.figure(figsize=(size, size))
@@ -107,7 +119,7 @@ def plot_corner(
         few = len(np.unique(x, axis=0)) < FEW_POINTS
         points = points or few
         with plt.rc_context({"axes.formatter.useoffset": False}):
-            corner.corner(
+            corner.corner_impl(
                 x,
                 bins=_bins(x),
                 range=[tuple(each) for each in drawn.limits],
