@@ -158,7 +158,7 @@ def check_names(sampler: str, names: Collection[str], given: Collection[str], ar
         )
 
 
-def check_arguments(pool: Any, backend: Any, seed: Any) -> None:
+def check_arguments(pool: Any, backend: Any, seed: Any, ndim: int, vectorize: bool, names: Any) -> None:
     """Raise ValueError for arguments that emcee or NumPy would refuse later or with an unclear error."""
     if pool is not None and not (hasattr(pool, "map") or hasattr(pool, "submit")):
         raise ValueError(f"pool must be an object with a method map, such as multiprocessing.Pool(4); got {pool!r}")
@@ -166,6 +166,17 @@ def check_arguments(pool: Any, backend: Any, seed: Any) -> None:
         raise ValueError(f"backend must be a backend of emcee, as emcee.backends.HDFBackend('run.h5'); got {backend!r}")
     if seed is not None and not all(isinstance(each, Integral) for each in np.ravel(seed)):
         raise ValueError(f"seed must be a whole number, several of them, or None; got {seed!r}")
+    if names is None:
+        return
+    if vectorize:
+        raise ValueError("parameter_names needs vectorize=False: a function of a batch takes an array (n, ndim)")
+    places = names if isinstance(names, dict) else {name: place for place, name in enumerate(names)}
+    found = {place for each in places.values() for place in np.ravel(each).tolist()}
+    if not isinstance(names, list | dict) or found != set(range(ndim)) or len(names) > ndim:
+        raise ValueError(
+            f"parameter_names must be a list of {ndim} different names, or a dict of names with their indices, 0 to "
+            f"{ndim - 1} in all; got {names!r}"
+        )
 
 
 def refuse_unused(settings: Settings, guided: bool) -> None:

@@ -141,8 +141,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
         **settings: Any,
     ):
         check_names(type(self).__name__, self.setting_names, settings, ARGUMENTS)
-        check_arguments(pool, backend, seed)
         nwalkers, ndim = as_whole_number("nwalkers", nwalkers), as_whole_number("ndim", ndim)
+        check_arguments(pool, backend, seed, ndim, vectorize, parameter_names)
         functions = log_prob_fn, log_likelihood_fn, log_prior_fn
         self._target = target = Target(*functions, ndim, args, kwargs, vectorize, blobs_dtype)
         self.log_prior_fn = target.log_prior_fn

@@ -11,6 +11,7 @@ No run can see a part of the posterior in which it has no points. The reasons st
 """
 
 from functools import cached_property
+from textwrap import shorten
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ import numpy as np
 from ..estimates.genealogy import standard_error_of_mean
 from ..estimates.importance import FIRST_ROUND_SHARE, USABLE_SHARE, fewest_points, usable
 from ..estimates.pareto import LARGEST_SHAPE
+from ..evaluation.values import most_common_reasons
 from ..finding import CARE, NOTE, WRONG, Finding
 from ..reports import AnnealingResult, EarlyStop, GuidedRound, GuidedStart
 from .checks import LOST, OF_SHARES, find_unreached_part
@@ -36,6 +38,7 @@ __all__ = [
     "judge",
 ]
 
+LONGEST_REASON = 200  # characters
 CONVERGED = "converged"
 USABLE = "usable"
 NOT_USABLE = "not usable"
@@ -170,11 +173,14 @@ class Verdict(_Stored):
             others.append(("check", *check[:2], "" if check.reliable else ", uneven weights"))
         if others:
             stated += f" ({'; '.join(f'{name} {x:.2f} +- {error:.2g}{note}' for name, x, error, note in others)})"
-        failed = f"{run.failure_count} of {run.evaluations} evaluations failed"
+        failed, reasons = "no failed evaluations", ""
         if simulations := run._failed_simulations:
-            failed = f"{simulations} simulations failed"
-        elif not run.failure_count:
-            failed = "no failed evaluations"
+            failed, reasons = f"{simulations} simulations failed", run._target.failure_reasons
+        elif run.failure_count:
+            failed = f"{run.failure_count} of {run.evaluations} evaluations failed"
+            reasons = most_common_reasons(reason for _, reason in run._record.failed)
+        if reasons:
+            failed += f" ({shorten(reasons, LONGEST_REASON)})"
         return (
             f"{self.status.capitalize()}: {found}; log-evidence {stated}; effective sample size "
             f"{self.effective_sample_size:.0f}; {failed}."

@@ -121,6 +121,8 @@ def test_a_setting_of_the_other_sampler_is_refused(Sampler):
         (SMCSampler, {"pool": 4}, "pool must be an object with a method map"),
         (SMCSampler, {"backend": "run.h5"}, "backend must be a backend of emcee"),
         (TMCMCSampler, {"seed": 1.5}, "seed must be a whole number"),
+        (SMCSampler, {"parameter_names": ["a", "a", "b"], "vectorize": False}, "a list of 3 different names"),
+        (SMCSampler, {"parameter_names": ["a", "b", "c"]}, "parameter_names needs vectorize=False"),
         (TMCMCSampler, {"burn_in": 2, "chains": "equal"}, 'chains="leaders"'),
         (TMCMCSampler, {"max_moves": 9, "burn_in": 0}, 'chains="equal"'),
         (TMCMCSampler, {"chains": "leaders", "moves": emcee.moves.StretchMove()}, 'several walkers.*chains="equal"'),
@@ -130,7 +132,7 @@ def test_a_setting_of_the_other_sampler_is_refused(Sampler):
 )
 def test_a_setting_that_cannot_act_is_refused(Sampler, settings, match):
     with pytest.raises(ValueError, match=match):
-        Sampler(60, 3, Gaussian(), vectorize=True, **settings)
+        Sampler(60, 3, Gaussian(), **{"vectorize": True} | settings)
 
 
 @pytest.mark.parametrize(
