@@ -10,6 +10,7 @@ from .estimates.genealogy import standard_error_of_mean, student_factor
 from .estimates.importance import EvidenceCheck
 from .evaluation.evaluator import Evaluator
 from .evaluation.user_target import Target
+from .evaluation.values import most_common_reasons
 from .judgement.checks import OF_MEAN
 from .judgement.clusters import error_between_modes
 from .judgement.failures import NearFailures
@@ -57,6 +58,13 @@ class RunResults:
         """Failed simulations of this run that the function counts itself, also in the search of a guide."""
         since = (self._target.failure_count or 0) - self._failed_before
         return max(len(self._record.counted), since)
+
+    @property
+    def _failure_reasons(self) -> str:
+        """The most frequent reasons of failed simulations, or else of failed evaluations; empty without failures."""
+        if self._failed_simulations:
+            return self._target.failure_reasons
+        return most_common_reasons(reason for _, reason in self._record.failed)
 
     @property
     def failures(self) -> list[dict]:

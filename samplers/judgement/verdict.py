@@ -19,7 +19,6 @@ import numpy as np
 from ..estimates.genealogy import standard_error_of_mean
 from ..estimates.importance import FIRST_ROUND_SHARE, USABLE_SHARE, fewest_points, usable
 from ..estimates.pareto import LARGEST_SHAPE
-from ..evaluation.values import most_common_reasons
 from ..finding import CARE, NOTE, WRONG, Finding
 from ..reports import AnnealingResult, EarlyStop, GuidedRound, GuidedStart
 from .checks import LOST, OF_SHARES, find_unreached_part
@@ -173,13 +172,12 @@ class Verdict(_Stored):
             others.append(("check", *check[:2], "" if check.reliable else ", uneven weights"))
         if others:
             stated += f" ({'; '.join(f'{name} {x:.2f} +- {error:.2g}{note}' for name, x, error, note in others)})"
-        failed, reasons = "no failed evaluations", ""
+        failed = f"{run.failure_count} of {run.evaluations} evaluations failed"
         if simulations := run._failed_simulations:
-            failed, reasons = f"{simulations} simulations failed", run._target.failure_reasons
-        elif run.failure_count:
-            failed = f"{run.failure_count} of {run.evaluations} evaluations failed"
-            reasons = most_common_reasons(reason for _, reason in run._record.failed)
-        if reasons:
+            failed = f"{simulations} simulations failed"
+        elif not run.failure_count:
+            failed = "no failed evaluations"
+        if reasons := run._failure_reasons:
             failed += f" ({shorten(reasons, LONGEST_REASON)})"
         return (
             f"{self.status.capitalize()}: {found}; log-evidence {stated}; effective sample size "
