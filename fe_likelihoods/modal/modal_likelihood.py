@@ -11,7 +11,6 @@ from ..cache.simulation_cache import TOLERANCE
 from ..likelihood.likelihood import FELikelihood
 from ..likelihood.simulator import Simulator
 from ..models.linear_structure import LinearStructure
-from ..noise.protocol import Noise
 from ..priors.points import as_points
 from ..signals.channels import Measurements
 from ..simulation.model import Model, SimulationBatch, SimulationFailed
@@ -19,7 +18,7 @@ from ..text_tables import text_table
 from .modal_data import ModalData
 from .modal_noise import modal_noise
 from .mode_models import StructureModes
-from .paired_modes import PairedModes, PairedStatistic, sensor_rows
+from .paired_modes import PairedModes, sensor_rows
 from .temperature import ModesWithSlope
 
 __all__ = ["ModalLikelihood", "PredictedModes"]
@@ -100,7 +99,7 @@ class ModalLikelihood(FELikelihood):
         super().__init__(self._paired, self._paired.measurements, noise, pool, **options)
 
     def _make_simulator(self, model: PairedModes, measurements: Measurements, **options: Any) -> Simulator:
-        return _ModesSimulator(model, self.noise, measurements, **options)
+        return _ModesSimulator(model, **options)
 
     @property
     def model(self) -> PairedModes:
@@ -115,7 +114,7 @@ class ModalLikelihood(FELikelihood):
     @property
     def measured(self) -> np.ndarray:
         """What responses are compared with (m, n_sets (1 + n_sensors))."""
-        return self.simulator.statistic.measured
+        return self._paired.measurements.values
 
     def run(self, thetas: np.ndarray) -> tuple[np.ndarray, SimulationBatch]:
         """Statistics and responses of the paired modes at structural parameters, as `FELikelihood.run`."""
@@ -165,14 +164,14 @@ class _ModesSimulator(Simulator):
 
     stores_responses = True
 
-    def __init__(self, paired: PairedModes, noise: Noise, measurements: Measurements, **options: Any) -> None:
+    def __init__(self, paired: PairedModes, **options: Any) -> None:
         modes = paired.model
         anything = Measurements(modes.channels, modes.dt, np.ones((len(modes.channels), modes.n_steps)))
-        super().__init__(modes, anything, PairedStatistic(paired, noise.statistic), **options)
+        super().__init__(modes, anything, paired, **options)
 
     def _difference(self, earlier: np.ndarray, reason: str, new: Simulated) -> tuple[str, float]:
-        paired, tolerance = self.statistic.paired, TOLERANCE if self.cache is None else self.cache.tolerance
-        names, norm = [each.name for each in paired.channels], np.linalg.norm(self.statistic.measured, axis=1)
+        measured, tolerance = self.statistic.measurements, TOLERANCE if self.cache is None else self.cache.tolerance
+        names, norm = [each.name for each in measured.channels], np.linalg.norm(measured.values, axis=1)
         return difference_in_words(earlier, reason, new._replace(norm=norm), names, tolerance, False)
 
 

@@ -11,17 +11,17 @@ from functools import partial
 import numpy as np
 
 from ..models.base import digest
-from ..noise.statistics import Statistic
 from ..signals.channels import Channel, Measurements
 from ..signals.sampling import array_digest
 from ..simulation.model import Model, SimulationFailed, has_jacobian
 from ..simulation.user_code import code_within, is_of_user
 from .modal_data import ModalData
+from .modal_noise import ModeSums
 from .mode_models import ABSENT
 from .pairing import Paired, pair_modes
 from .temperature import REFERENCE_TEMPERATURE, ModesWithSlope
 
-__all__ = ["PairedModes", "PairedStatistic", "sensor_rows"]
+__all__ = ["PairedModes", "sensor_rows"]
 
 
 def sensor_rows(model: Model, data: ModalData) -> list[int]:
@@ -47,8 +47,9 @@ def sensor_rows(model: Model, data: ModalData) -> list[int]:
 
 
 class PairedModes:
-    """Model of the measured modes: the modes of another model, paired with them."""
+    """Model of the measured modes, the modes of another model paired with them; a call is a statistic of that one."""
 
+    of_response = True  # as a statistic
     dt = 1.0
     path_dependent = False
     axis = "frequency, then components of the shape"
@@ -68,6 +69,11 @@ class PairedModes:
         self.parameter_names = tuple(model.parameter_names)
         self.channels = tuple(Channel(f"mode {number}", "dimensionless", "1") for number in data.mode_numbers)
         self.n_steps = data.n_sets * (1 + data.n_sensors)
+        sets = [f" of set {k + 1}" if data.n_sets > 1 else "" for k in range(data.n_sets)]
+        points = [f"{what}{end}" for end in sets for what in ("frequency", *data.sensors)]
+        text = " of ".join(filter(None, ["natural frequencies and mode shapes", data.description]))
+        values = self._joined(self._there.astype(float), data.known_shapes)
+        self.measurements = Measurements(self.channels, self.dt, values, text, axis=self.axis, points=points)
         for name in ("nominal", "nominal_units", "parameter_units", "time_limit"):
             if hasattr(model, name):
                 setattr(self, name, getattr(model, name))
@@ -76,29 +82,22 @@ class PairedModes:
         if hasattr(model, "code_parts") or is_of_user(type(model).__module__):
             self.code_parts = partial(code_within, model)
 
-    @property
-    def identity(self) -> str:
-        """Digest of the data and the groups of close modes."""
+    def __repr__(self) -> str:
         arrays = map(array_digest, (self._whitening, self._warmer))
-        return digest(type(self).__name__, self.data.fingerprint, repr(self.groups), *arrays)
+        return f"{type(self).__name__}({digest(self.data.fingerprint, repr(self.groups), *arrays)})"
+
+    def __call__(self, residuals: np.ndarray, modes: np.ndarray) -> np.ndarray:
+        """Statistic (n_numbers,) of modes (1 + n_sensors, n_modes): that of the residuals of the paired ones."""
+        return ModeSums(self.data.n_sets)(self.response(modes) - self.measurements.values)
 
     @property
     def fingerprint(self) -> str:
         """Digest of the model, the data and the groups of close modes."""
-        return digest(self.model.fingerprint, self.identity)
+        return digest(self.model.fingerprint, repr(self))
 
     def factors(self, modes: np.ndarray) -> np.ndarray:
         """Factors (..., n_sets) of frequencies by temperature, of modes (..., 1 + n_sensors, n_modes)."""
         return 1.0 + modes[..., -1, :1] * self._warmer
-
-    @property
-    def measurements(self) -> Measurements:
-        """The data as measurements of the channels."""
-        values = self._joined(self._there.astype(float), self.data.known_shapes)
-        sets = [f" of set {k + 1}" if self.data.n_sets > 1 else "" for k in range(self.data.n_sets)]
-        points = [f"{what}{end}" for end in sets for what in ("frequency", *self.data.sensors)]
-        text = " of ".join(filter(None, ["natural frequencies and mode shapes", self.data.description]))
-        return Measurements(self.channels, self.dt, values, text, axis=self.axis, points=points)
 
     def simulate(self, theta: np.ndarray) -> np.ndarray:
         """Response (m, n_sets (1 + n_sensors)) at the parameters (n_parameters,)."""
@@ -148,19 +147,3 @@ class PairedModes:
         ratios = self._ratios(slopes[:, 0, paired.columns]) * self.factors(modes)[:, None]
         ratios += self._ratios(paired.frequencies) * (self.factors(slopes) - 1.0)[..., None]
         return self._joined(ratios, shapes)
-
-
-class PairedStatistic:
-    """Statistic of modes: that of the residuals of the paired ones."""
-
-    of_response = True
-
-    def __init__(self, paired: PairedModes, statistic: Statistic) -> None:
-        self.paired, self.statistic, self.measured = paired, statistic, paired.measurements.values
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}({self.paired.identity}, {self.statistic!r})"
-
-    def __call__(self, residuals: np.ndarray, modes: np.ndarray) -> np.ndarray:
-        """Numbers (n_numbers,) of modes (1 + n_sensors, n_modes)."""
-        return self.statistic(self.paired.response(modes) - self.measured)

@@ -53,7 +53,9 @@ def modes(truth, rng):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("of", "name", "median"), [(frame, "stiffness", 1.0), (deck, "frequency", 3.0), (modes, "stiffness", 1.0)])
+@pytest.mark.parametrize(
+    ("of", "name", "median"), [(frame, "stiffness", 1.0), (deck, "frequency", 3.0), (modes, "stiffness", 1.0)]
+)
 def test_the_spread_of_ten_events_is_found_whatever_the_structure(of, name, median):
     rng, tests = np.random.default_rng(7), {}
     truths = median * np.exp(0.08 * rng.standard_normal(10))
