@@ -166,6 +166,8 @@ def write_templates(kind: str, folder: Path) -> tuple[str, ...]:
     names = TEMPLATES[kind]
     if there := [name for name in names if (folder / name).exists()]:
         raise ValueError(f"{folder} already contains {', '.join(there)}; give another folder")
+    if folder.is_file():
+        raise ValueError(f"{folder} is a file; give the folder to write to")
     folder.mkdir(parents=True, exist_ok=True)
     source = resources.files("fe_likelihoods.data") / "templates"
     for name in names:

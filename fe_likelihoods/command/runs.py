@@ -123,7 +123,13 @@ def report_run(path: Path, runs_code: bool = False) -> Outcome:
             "--run-code if you trust this code"
         )
     problem = make_problem(job, SimulationCache(folder / CACHE) if (folder / CACHE).is_file() else None)
-    samplers, again = _stored_samplers(job, problem, folder), _command(Path(origin["file"]), folder)
+    again, fingerprint = _command(Path(origin["file"]), folder), getattr(problem.posterior, "fingerprint", None)
+    if origin.get("posterior", fingerprint) != fingerprint:
+        raise ValueError(
+            f"{folder} contains a run with other data or another model than its files have now, or of another release: "
+            f"put them back, or make a new run: {again} --overwrite"
+        )
+    samplers = _stored_samplers(job, problem, folder)
     if not all(sampler.iteration for sampler in samplers):
         raise ValueError(f"the run in {folder} has no samples yet; continue it with: {again}")
     logger = logging.getLogger("samplers.tempered")

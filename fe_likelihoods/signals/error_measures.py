@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["relative_errors", "rrmse", "sum_of_squares"]
+__all__ = ["relative_errors", "rrmse"]
 
 
 def rrmse(
@@ -44,7 +44,13 @@ def rrmse(
     predicted, measured = np.asarray(predicted, dtype=float), np.asarray(measured, dtype=float)
     if predicted.shape != measured.shape or not measured.ndim:
         raise ValueError(f"expected histories of one shape, (..., n_steps); got {predicted.shape} and {measured.shape}")
-    sum_of_squares(measured, names)
+    zero = np.flatnonzero(np.nansum(np.square(measured), axis=-1) == 0.0)
+    if zero.size:
+        rows = ", ".join(f"row {row}" if names is None else repr(names[row]) for row in zero)
+        raise ValueError(
+            f"an error relative to a measured history needs a history that is not zero; {rows} is zero at all samples: "
+            "leave it out"
+        )
     unknown = (np.isnan(predicted) & ~np.isnan(measured)).any(axis=-1)
     return np.where(unknown, np.nan, relative_errors(predicted - measured, measured))[()]
 
@@ -55,20 +61,3 @@ def relative_errors(residuals: np.ndarray, measured: np.ndarray) -> NDArray[np.f
     squares, power = (np.square(np.where(there, each, 0.0)).sum(axis=-1) for each in (residuals, measured))
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.sqrt(np.where(power > 0.0, squares / power, np.nan))
-
-
-def sum_of_squares(measured: ArrayLike, names: Sequence[str] | None = None) -> NDArray[np.float64] | np.float64:
-    """Sums of squares of measured histories (..., n_steps), the denominators of relative errors; NaN is left out.
-
-    Raises ValueError with the name of a history without a sample, or with zeros only.
-    """
-    squares = np.square(np.asarray(measured, dtype=float))
-    sums = (np.nan_to_num(squares, nan=0.0) if np.isnan(squares).any() else squares).sum(axis=-1)
-    if not np.all(sums):
-        rows = np.flatnonzero(np.ravel(sums) == 0.0)
-        zero = ", ".join(f"row {row}" if names is None else repr(names[row]) for row in rows)
-        raise ValueError(
-            f"an error relative to a measured history needs a history that is not zero; {zero} is zero at all samples: "
-            "leave it out"
-        )
-    return sums

@@ -102,23 +102,17 @@ def response_slopes(
     held, _ = lfilter(ramp_slope, [1.0], base_acceleration, zi=[-ramp_slope[0] * start])
     carried = np.concatenate([[0.0], state[:-1]]) * (dt * decay)
     by_eigenvalue = lfilter([1.0], [1.0, -decay], held + carried)
-    by_frequency = _slope_along(state, by_eigenvalue, angular_frequency, damping_ratio, 1.0, 0.0)
-    by_damping = _slope_along(state, by_eigenvalue, angular_frequency, damping_ratio, 0.0, 1.0)
-    return by_frequency, by_damping
-
-
-def _slope_along(
-    q: np.ndarray, by_eigenvalue: np.ndarray, omega: float, zeta: float, d_omega: float, d_zeta: float
-) -> OscillatorResponse:
-    """Derivative of the response along a direction of frequency and damping ratio, from q and its derivative."""
-    root = math.sqrt(1.0 - zeta**2)
-    damped, eigenvalue = omega * root, omega * complex(-zeta, root)
-    d_damped = d_omega * root - d_zeta * omega * zeta / root
-    d_eigenvalue = complex(-d_omega * zeta - d_zeta * omega, d_damped)
-    d_q = by_eigenvalue * d_eigenvalue
-    u, v = q.imag / damped, (eigenvalue * q).imag / damped
-    d_u = (d_q.imag - u * d_damped) / damped
-    d_v = ((d_eigenvalue * q + eigenvalue * d_q).imag - v * d_damped) / damped
-    stiffness, d_stiffness = omega**2, 2.0 * omega * d_omega
-    viscous, d_viscous = 2.0 * zeta * omega, 2.0 * (d_zeta * omega + zeta * d_omega)
-    return OscillatorResponse(d_u, d_v, -d_viscous * v - viscous * d_v - d_stiffness * u - stiffness * d_u)
+    damped = angular_frequency * root
+    by_ratio = -angular_frequency * damping_ratio / root  # of the damped frequency
+    u, v = state.imag / damped, (eigenvalue * state).imag / damped
+    found = []
+    for d_eigenvalue, d_damped, d_stiffness, d_viscous in (
+        (complex(-damping_ratio, root), root, 2.0 * angular_frequency, 2.0 * damping_ratio),
+        (complex(-angular_frequency, by_ratio), by_ratio, 0.0, 2.0 * angular_frequency),
+    ):
+        d_state = by_eigenvalue * d_eigenvalue
+        d_u = (d_state.imag - u * d_damped) / damped
+        d_v = ((d_eigenvalue * state + eigenvalue * d_state).imag - v * d_damped) / damped
+        forces = d_viscous * v + 2.0 * damping_ratio * angular_frequency * d_v
+        found.append(OscillatorResponse(d_u, d_v, -forces - d_stiffness * u - angular_frequency**2 * d_u))
+    return found[0], found[1]
