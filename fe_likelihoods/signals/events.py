@@ -191,15 +191,10 @@ class Events(Record):
         rows = {name: row for row, name in enumerate(channels)}
         for name, each in measurements.items():
             end, duration = each.start + (each.n_steps - 1) * dt, self.records[self.names.index(name)].duration
-            if each.start < -1e-9 * duration:  # these samples would be at times of the pause or of another event
+            if each.start < -1e-9 * duration or end > duration * (1 + 1e-9):  # in a pause or another event
                 raise ValueError(
-                    f"the measurements of {name!r} begin at {each.start:g} s, before the first sample of the event, "
-                    "which is their time zero; use Measurements.trim(0.0, stop)"
-                )
-            if end > duration * (1 + 1e-9):
-                raise ValueError(
-                    f"the measurements of {name!r} end at {end:g} s, after the end of the event at {duration:g} s; use "
-                    "Measurements.trim(start, stop)"
+                    f"the measurements of {name!r} are from {each.start:g} to {end:g} s, the event from 0, its first "
+                    f"sample, to {duration:g} s; use Measurements.trim(start, stop)"
                 )
             time = windows[name].start + each.start
             start = round(time / dt)
@@ -253,12 +248,7 @@ def _flatten(
 
 def find_events(model: Any) -> Events | None:
     """The events that are the excitation of a model; None if the excitation is a plain record."""
-    for name in ("record", "loading", "supports"):  # models of this package have it; optional in others
-        excitation = getattr(model, name, None)
-        for each in excitation if isinstance(excitation, tuple | list) else (excitation,):
-            if isinstance(each, Events):
-                return each
-    return None
+    return next((each for each in motions_of(model) if isinstance(each, Events)), None)
 
 
 def motions_of(model: Any) -> tuple[Record, ...]:

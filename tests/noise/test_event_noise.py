@@ -136,9 +136,9 @@ def test_bad_input_is_refused_before_anything_is_simulated(model, events, measur
         "no event 'EQ3'; the events are EQ1, EQ2": {"EQ3": measured["EQ1"]},
         "expected Measurements for one or more of EQ1, EQ2": {},
         "the steps of 'EQ2' differ": measured | {"EQ2": measured["EQ2"].decimate(2)},
-        "end at 1.18 s, after the end of the event at 0.98 s": {"EQ2": measured["EQ1"]},
-        r"begin at -0.02 s, before .*\.trim\(0.0, stop\)": {"EQ1": measured["EQ1"].shift(-0.02)},
-        "'EQ2' begin at -1.2 s, before": {"EQ2": measured["EQ2"].shift(-1.2)},
+        "from 0 to 1.18 s, the event from 0, its first sample, to 0.98 s": {"EQ2": measured["EQ1"]},
+        r"from -0.02 to .*, the event from 0, .*\.trim\(start, stop\)": {"EQ1": measured["EQ1"].shift(-0.02)},
+        "'EQ2' are from -1.2 to": {"EQ2": measured["EQ2"].shift(-1.2)},
         "is no multiple": {"EQ2": Measurements(channel, 0.04 * 1.5, np.ones((1, 3)))},
         "rename one of them": measured | {"EQ2": Measurements(channel, 0.02, np.ones((1, 5)))},
     }
