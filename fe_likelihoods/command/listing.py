@@ -10,7 +10,7 @@ import numpy as np
 from ..checks.finding import NOTE
 from ..checks.screening import Screened, check_data, check_sensors, repair_lines, screen
 from ..checks.sensor_faults import find_sensor_faults
-from ..modal.modal_readers import read_modal_data
+from ..modal.modal_readers import read_matlab, read_modal_data
 from ..signals.datasets import read_dataset
 from ..signals.strong_motion import find_channels, recognise
 from ..signals.tables import (
@@ -30,6 +30,7 @@ from ..signals.tables import (
 )
 from ..text_tables import number, text_table
 from ..units import from_si, to_si
+from .job import HDF5
 
 __all__ = ["describe_data"]
 
@@ -46,12 +47,13 @@ class _Lines(NamedTuple):
 def describe_data(path: Path) -> str:
     """What a file of data holds, and the lines of a TOML file that read it; ValueError if it cannot be read.
 
-    It is a table, a ground motion in a supported format, a zip archive of V2 files, or a data set (.h5).
+    It is a table, a ground motion in a supported format, a zip archive of V2 files, a data set (.h5), or a MATLAB file.
     """
-    if path.suffix.lower() == ".toml":
+    ending = path.suffix.lower()
+    if ending == ".toml":
         raise ValueError(f"{path} names data: `fe-likelihoods check {path}` reads it; give the files that it names")
-    if path.suffix.lower() in (".h5", ".hdf5"):
-        found = _dataset(path)
+    if ending in HDF5 or ending == ".mat":
+        found = _dataset(path) if ending in HDF5 else _matlab(path)
     else:
         form = recognise(path)
         found = _table(path) if form is None else _motions(path, form)
@@ -145,6 +147,16 @@ def _dataset(path: Path) -> _Lines:
     text = ["a data set", str(found.record), found.record.source, text_table(rows), measured.description]
     text += [f"CAUTION: {each}" for each in check_data(measured, found.record) if each.severity != NOTE]
     return _Lines(text, {"record": [], "measurements": repair_lines(screen(measured))})
+
+
+def _matlab(path: Path) -> _Lines:
+    """Variables of a file that may have identified modes."""
+    found = read_matlab(path)
+    rows = [("variable", "size"), *((name, " x ".join(map(str, np.shape(each)))) for name, each in found.items())]
+    given = ['variables = {frequencies = "?", shapes = "?"}    # write them: names of variables; also damping']
+    given += ['columns = {"?" = "1"}    # write all: sensor of the model = row of the shapes']
+    given += ['unit = "Hz"    # or "rad/s"']
+    return _Lines(["a MATLAB file", text_table(rows)], {"modes": given})
 
 
 def _readable(path: Path) -> tuple[Table, list[str], list[str]]:

@@ -156,6 +156,8 @@ def _read_modes(job: Job) -> tuple[ModalData, ModalData | None]:
     if given.n_modes is not None and job.kind in STRUCTURES:
         raise ValueError(f"n_modes: a {job.kind} has a mode for each storey or shape; leave it out")
     columns = given.columns or {}
+    if "shapes" in (given.variables or {}) and not columns:
+        raise ValueError('columns: name the sensors of all rows of the shapes, in order, as columns = {roof = "1"}')
     sensors = tuple(columns if given.variables else columns.values())
     data = read_modal_data(job.path("modes", "file", given.file), sensors, **given.given("unit", "variables"))
     data = replace(data, sensors=tuple(columns)) if columns and not given.variables else data

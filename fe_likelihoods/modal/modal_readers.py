@@ -13,7 +13,7 @@ from ..signals.tables import Column, Table, agree_on_unit, read_table, stated_un
 from ..units import to_si
 from .modal_data import ModalData, real_shapes
 
-__all__ = ["read_modal_data"]
+__all__ = ["read_matlab", "read_modal_data"]
 
 # what a column is, by its name in lower case without a unit; all others of numbers are sensors
 _KINDS = {
@@ -171,16 +171,21 @@ def _in_hertz(table: Table, place: int, given: str | None) -> np.ndarray:
     )
 
 
+def read_matlab(path: str | Path) -> dict[str, Any]:
+    """The variables of a MATLAB file by name; ValueError if it cannot be read."""
+    from scipy.io import loadmat  # slow to import
+
+    try:
+        return {name: each for name, each in loadmat(path).items() if not name.startswith("__")}
+    except Exception as error:  # a damaged file may raise anything
+        raise ValueError(f"{path} is no MATLAB file up to version 7.2 ({error}): save it again with '-v7'") from None
+
+
 def _of_matlab(
     path: Path, sensors: Sequence[str], unit: str | None, variables: Mapping[str, str], options: dict[str, Any]
 ) -> ModalData:
     """Modes of a MATLAB file."""
-    from scipy.io import loadmat  # slow to import
-
-    try:
-        content = {name: each for name, each in loadmat(path).items() if not name.startswith("__")}
-    except Exception as error:  # a damaged file may raise anything
-        raise ValueError(f"{path} is no MATLAB file up to version 7.2 ({error}): save it again with '-v7'") from None
+    content = read_matlab(path)
     wanted = {"frequencies"} <= set(variables) <= {"frequencies", "shapes", "damping"}
     if not wanted or not set(variables.values()) <= set(content):
         raise ValueError(

@@ -5,6 +5,7 @@ import tomllib
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from scipy.io import savemat
 
 from fe_likelihoods import Channel, Measurements, Record, check_data, read_columns, read_record
 from fe_likelihoods.command.job import read_job
@@ -254,3 +255,13 @@ def test_times_that_repeat_or_contradict_the_header_have_a_line(tmp_path):
     measured = read_columns(path, channel, ["acc_g"], resample=lines["measurements"]["resample"])
     assert np.flatnonzero(np.isnan(measured.values[0])).tolist() == [30]
     assert "without 1 row(s) of a repeated time, the first at 0.58 s" in measured.description
+
+
+def test_variables_of_matlab_and_files_that_are_no_data(tmp_path):
+    savemat(tmp_path / "modes.mat", {"f": [1.0, 3.0], "Phi": np.ones((4, 2))})
+    output, lines = listed(tmp_path / "modes.mat")
+    assert "Phi        4 x 2" in output and set(lines["modes"]) == {"file", "variables", "columns", "unit"}
+    (tmp_path / "own.toml").write_text("[model]\n")
+    for name, message in (("own.toml", "check {} reads it"), ("none.h5", "cannot read {}: there is no such file")):
+        output, _ = listed(tmp_path / name, 1)
+        assert message.format(tmp_path / name) in output.replace("`", "")
