@@ -260,7 +260,7 @@ def test_times_that_repeat_or_contradict_the_header_have_a_line(tmp_path):
 def test_variables_of_matlab_and_files_that_are_no_data(tmp_path):
     savemat(tmp_path / "modes.mat", {"f": [1.0, 3.0], "Phi": np.ones((4, 2))})
     output, lines = listed(tmp_path / "modes.mat")
-    assert "Phi        4 x 2" in output and set(lines["modes"]) == {"file", "variables", "columns", "unit"}
+    assert "Phi       4 x 2" in output and set(lines["modes"]) == {"file", "variables", "columns", "unit"}
     (tmp_path / "own.toml").write_text("[model]\n")
     for name, message in (("own.toml", "check {} reads it"), ("none.h5", "cannot read {}: there is no such file")):
         output, _ = listed(tmp_path / name, 1)
