@@ -40,7 +40,7 @@ from fe_likelihoods import (
     read_columns,
     read_record,
 )
-from fe_likelihoods.checks.faults import support_gains, supports_apart
+from fe_likelihoods.checks.faults import slow_motions, supports_apart
 from fe_likelihoods.checks.finding import Judgement, judge
 from fe_likelihoods.emulation.modes import Mode, find_modes
 from fe_likelihoods.emulation.target import ResponseTarget
@@ -197,17 +197,18 @@ def supports(repeats: int = 1, structures: tuple[str, ...] = tuple(STRUCTURES)) 
             wrong = [(k, factor) for k in range(len(motions)) for factor in (2.0, 0.5, -1.0, 1.0 / 9.80665)]
             sizes[name] += 1, len(wrong)
             for row, limits in enumerate(grid):
-                options = () if limits is None else limits[:2]
+                options, limit = ((), ()) if limits is None else (limits[:2], limits[2:])
                 if options not in known:
-                    known[options] = support_gains(motions, step, *options)
-                limit = () if limits is None else limits[2:]
-                scores[name][row, 0] += bool(supports_apart(known[options], *limit))
+                    known[options] = slow_motions(motions, step, *options)
+                scores[name][row, 0] += bool(_apart(known[options], limit))
                 for k, factor in wrong:
                     spoiled = {
-                        pair: gain * (factor if pair[0] == k else 1.0 / factor if pair[1] == k else 1.0)
-                        for pair, gain in known[options].items()
+                        pair: each._replace(
+                            gain=each.gain * (factor if pair[0] == k else 1.0 / factor if pair[1] == k else 1.0)
+                        )
+                        for pair, each in known[options].items()
                     }
-                    scores[name][row, 1] += k in supports_apart(spoiled, *limit)
+                    scores[name][row, 1] += k in _apart(spoiled, limit)
     rows = []
     for name in decks:
         others = sum(scores[each] for each in decks if each.split()[0] != name.split()[0])
@@ -218,6 +219,11 @@ def supports(repeats: int = 1, structures: tuple[str, ...] = tuple(STRUCTURES)) 
         note += f"; as set {scores[name][-1, 1]:.0f} and {scores[name][-1, 0]:.0f}"
         rows.append(Row("supports named", name, named, "", note))
     return rows
+
+
+def _apart(slow: dict, limit: tuple) -> set[int]:
+    """Numbers of supports with another gain or sign."""
+    return {k for k, fault in supports_apart(slow, range(3), *limit) if fault.kind != "lag"}
 
 
 def posterior_of(event: _Event) -> Posterior:

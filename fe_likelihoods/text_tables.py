@@ -30,4 +30,4 @@ def number(value: float, digits: int = 3) -> str:
 
 def listed(texts: Sequence[str]) -> str:
     """Texts as a list in a sentence: "a, b and c"."""
-    return texts[0] if len(texts) == 1 else f"{', '.join(texts[:-1])} and {texts[-1]}"
+    return " and ".join(filter(None, (", ".join(texts[:-1]), *texts[-1:])))

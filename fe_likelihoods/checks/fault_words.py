@@ -1,7 +1,7 @@
 """Faults of data in words: what was found, which units it may be of, and what to do."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Sequence
 from itertools import combinations
 
 from ..signals.channels import Channel
@@ -10,7 +10,7 @@ from ..units import DIMENSIONS, UNITS
 from .faults import Fault
 from .finding import WRONG, Finding, percent
 
-__all__ = ["describe_unit", "finding_of"]
+__all__ = ["OF_SUPPORTS", "describe_unit", "finding_of"]
 
 SAME_UNITS = 1.25  # ratio of a factor to one between units, up to which it is named after them
 NEAR_ENOUGH = 0.03  # difference of logarithms of ratios that are named together
@@ -24,13 +24,13 @@ OF_FREQUENCIES = {  # square roots of factors of stiffness or mass, besides thos
 FAULTS = {
     "factor": (
         "A {what} may be wrong",
-        "{where}: measured values are {value} times the computed ones{units}{better}.",
+        "{where}: {those} are {value} times {others}{units}{better}.",
         "Look up unit and gain of the channel and of the base motion, loads or stiffnesses, and correct the wrong one; "
         "a model of your own must return SI units.",
     ),
     "sign": (
         "A sign may be wrong",
-        "{where}: measured and computed values have opposite signs{better}.",
+        "{where}: {those} have the opposite sign of {others}{better}.",
         "Where the sensor counts the other way, change its sign in the file, or by `reversed` in [measurements].",
     ),
     "swap": (
@@ -40,7 +40,7 @@ FAULTS = {
     ),
     "lag": (
         "Clocks may differ",
-        "{where}: measured values are {value} s {late} than the computed ones{better}.",
+        "{where}: {those} are {value} s {late} than {others}{better}.",
         "Check the clocks of sensors and motions, and when the motion begins (`zero` in [measurements], or "
         "measurements.shift); a lag that stays unknown can be a parameter (`Sensor`).",
     ),
@@ -58,32 +58,53 @@ FAULTS = {
 """Kind, text and action of each fault of data."""
 
 
+VALUES = "measured values", "the computed ones", ""
+OF_SUPPORTS = (
+    "slow motions",
+    "those of the other supports",
+    "Check unit, sign and clock of its file. Slow motions of one site are alike, except of supports that did move so, "
+    "or that waves reach one by one.",
+)
+"""What a fault compares, with what, and what to do instead of the usual."""
+
+
 def finding_of(
-    fault: Fault, title: str, channels: Iterable[Channel] = (), severity: str = WRONG, loads: bool = False
+    fault: Fault,
+    title: str = "",
+    channels: Sequence[Channel] = (),
+    severity: str = WRONG,
+    loads: bool = False,
+    compared: tuple[str, str, str] = VALUES,
 ) -> Finding:
-    """A fault of a data set with a title; its channels, and whether they are all channels of a load test."""
+    """A fault of a data set with a title; its channels, whether they are all of a load test, what was compared."""
     near = [describe_unit(fault.value, c.dimension, c.unit, loads) for c in channels] if fault.kind == "factor" else []
     if fault.names == OF_MODES:
         near = [
             t for r, t in OF_FREQUENCIES.items() if abs(abs(math.log(fault.value)) - math.log(r)) < math.log(SAME_UNITS)
         ]
     units = " or ".join(filter(None, dict.fromkeys(near)))
-    better = f"; corrected, the error (RRMSE) is {percent(fault.after)} instead of {percent(fault.before)}{fault.where}"
-    if not channels:
-        better = f"; corrected, values differ from draws of the prior by {fault.after:.2g} of their spread instead of "
+    better = ""
+    if channels and compared == VALUES:
+        better = f"the error (RRMSE) is {percent(fault.after)} instead of {percent(fault.before)}{fault.where}"
+    elif compared == VALUES:
+        better = f"values differ from draws of the prior by {fault.after:.2g} of their spread instead of "
         better += f"{fault.before:.2g}"
+    value = abs(fault.value) if fault.kind == "lag" else fault.value
     names = " of ".join(fault.names) if fault.kind == "value" else listed(fault.names)
     words = {
         "where": f"{names}{f' ({title})' if title else ''}",
-        "better": better,
-        "value": f"{abs(fault.value):.0f}" if abs(fault.value) >= 1e3 else f"{abs(fault.value):.3g}",
+        "better": better and f"; corrected, {better}",
+        "those": compared[0],
+        "others": compared[1],
+        "value": f"{value:.0f}" if abs(value) >= 1e3 else f"{value:.3g}",
         "late": "later" if fault.value > 0.0 else "earlier",
         "what": "unit" if units or fault.names == OF_MODES else "gain",
         "units": f", {'as with' if fault.names == OF_MODES else 'about the ratio of'} {units}" if units else "",
     }
     kind, text, action = (each.format(**words) for each in FAULTS[fault.kind])
     numbers = {"before": fault.before, "after": fault.after, fault.kind: fault.value}
-    return Finding(kind, severity, text, action, numbers, "data")
+    numbers = {name: number for name, number in numbers.items() if not math.isnan(number)}
+    return Finding(kind, severity, text, compared[2] or action, numbers, "data")
 
 
 def describe_unit(factor: float, dimension: str, unit: str = "", loads: bool = False) -> str:

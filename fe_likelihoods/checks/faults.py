@@ -9,8 +9,8 @@ gain and lag of a measurement y with the spectrum Y follow from those of their m
 
     c(lag) = sum_f Y conj(R) exp(2 pi i f lag),   lag = argmax |c|,   gain^2 = sum_f |Y|^2 / sum_f |R|^2
 
-with the sign of c. The motions of two supports are compared in the same way, in the lowest band in which they are
-coherent. Counts of what is named are in docs/results.rst.
+with the sign of c. The motions of two supports are compared in the same way, in the lowest lines of the spectrum in
+which they are coherent. Counts of what is named are in docs/results.rst.
 """
 
 import math
@@ -25,7 +25,7 @@ from ..signals.error_measures import relative_errors
 from ..units import find_unit
 from .sensor_faults import runs_of
 
-__all__ = ["FACTOR", "FEWEST_DRAWS", "Fault", "find_faults", "slow_motion", "support_gains", "supports_apart"]
+__all__ = ["FACTOR", "FEWEST_DRAWS", "Fault", "find_faults", "slow_motion", "slow_motions", "supports_apart"]
 
 BETTER = 0.6  # error (RRMSE) with a fault taken into account, as a share of the error without: study `fit_gate`
 EXPLAINED = 0.85  # error above which a response explains nothing: a correlation of a half
@@ -42,6 +42,7 @@ FINE = 8  # lags per step
 # have it in a band for 103 of 109 right pairs, with gains of 0.74 to 1.36 in its lowest 14 lines.
 COHERENT = 0.9
 LARGE_LAG = 0.025  # [s]; right fits have at most 0.02
+PASSED = 0.06  # [s] between supports; waves make 0.048 at most in 37 right events, 32 of 37 late by 0.1 s have more
 
 
 class Fault(NamedTuple):
@@ -50,8 +51,8 @@ class Fault(NamedTuple):
     kind: str  # "factor", "sign", "lag" or "swap"; of data without time also "value" or "exchange"
     names: tuple[str, ...]
     value: float  # measurements / responses [-], or time by which they are late [s]; NaN for a sign and a swap
-    before: float  # error of the channels for the best response (RRMSE, geometric mean)
-    after: float  # the same error with the fault
+    before: float = math.nan  # error of the channels for the best response (RRMSE, geometric mean); NaN of supports
+    after: float = math.nan  # the same error with the fault
     where: str = ""  # that it was looked for, in words
 
 
@@ -89,9 +90,8 @@ def _of_whole_records(measurements: Measurements, draws: np.ndarray, known: Sequ
             gain, before, after = errors[best].sum() - total[row], errors[best, group].mean(), with_fault[row].mean()
             step = max(measurements.steps[usable[k]] for k in group)  # one is a convention of files
             large = {"factor": _is_factor(value[row]), "lag": abs(value[row]) > 1.5 * step, "swap": True}[kind]
-            clear = gain > -math.log(BETTER) * len(group) and after < min(
-                math.log(BETTER) + before, math.log(EXPLAINED)
-            )
+            least = -math.log(BETTER) * (1 if kind == "swap" else len(group))  # a swap has no number to fit
+            clear = gain > least and before - after > least / len(group) and after < math.log(EXPLAINED)
             if large and clear and gain > most:
                 most, chosen = gain, (kind, group, float(value[row]), math.exp(before), math.exp(after), corrected)
         if chosen is None:
@@ -106,9 +106,9 @@ def _of_whole_records(measurements: Measurements, draws: np.ndarray, known: Sequ
 def _named(kind: str, names: tuple[str, ...], value: float, *errors: float, where: str = "") -> Iterator[Fault]:
     """A fault, of which a negative factor is a sign, and may be a factor as well."""
     if kind == "factor" and value < 0.0:
-        yield Fault("sign", names, math.nan, *errors, where)
+        yield Fault("sign", names, math.nan, *errors, where=where)
     if kind != "factor" or _is_factor(abs(value)):
-        yield Fault(kind, names, abs(value) if kind == "factor" else value, *errors, where)
+        yield Fault(kind, names, abs(value) if kind == "factor" else value, *errors, where=where)
 
 
 def _is_factor(value: float) -> bool:
@@ -244,11 +244,11 @@ def slow_motion(measured: np.ndarray, draws: np.ndarray, step: float) -> SlowMot
     return slow if slow.coherence > COHERENT else None
 
 
-def support_gains(
+def slow_motions(
     motions: Sequence[np.ndarray], step: float, coherent: float = COHERENT, lines: int = 2 * SMOOTH
-) -> dict[tuple[int, int], float]:
-    """Gains of supports (k, other), in the lowest band in which their motions (n,) are coherent, where there is one."""
-    n, gains = len(motions[0]), {}
+) -> dict[tuple[int, int], SlowMotion]:
+    """Motions (n,) of supports (k, other), in the lowest lines in which they are coherent, where there are any."""
+    n, found = len(motions[0]), {}
     spectra = {k: _spectra(motion, np.ones(n, dtype=bool)) for k, motion in enumerate(motions) if np.any(motion)}
     for k, other in permutations(spectra, 2):
         own, reference = (_smooth(np.abs(spectra[i]) ** 2) for i in (k, other))
@@ -256,15 +256,17 @@ def support_gains(
         band = _lowest_band(cross > coherent * own * reference, int(np.argmax(reference)))
         if band is not None:
             band = slice(band.start, min(band.stop, band.start + lines))
-            gains[k, other] = _in_band(spectra[k], spectra[other], band, n, step).gain
-    return gains
-
-
-def supports_apart(gains: Mapping[tuple[int, int], float], limit: float = FACTOR) -> dict[int, float]:
-    """Gains of supports, by number, whose slow motion has another sign or size than that of all others known."""
-    found = {}
-    for k in sorted({k for k, _ in gains}):
-        own = [gain for (one, _), gain in gains.items() if one == k]
-        if all(gain < 0.0 or abs(np.log(gain)) > np.log(limit) for gain in own):
-            found[k] = float(np.median(own))
+            found[k, other] = _in_band(spectra[k], spectra[other], band, n, step)
     return found
+
+
+def supports_apart(
+    slow: Mapping[tuple[int, int], SlowMotion], names: Sequence[str], factor: float = FACTOR
+) -> Iterator[tuple[int, Fault]]:
+    """Number and fault of supports whose slow motion has another sign, size or clock than that of all others known."""
+    for k in sorted({k for k, _ in slow}):
+        gains, lags = zip(*((each.gain, each.lag) for (one, _), each in slow.items() if one == k), strict=True)
+        if all(gain < 0.0 or abs(math.log(gain)) > math.log(factor) for gain in gains):
+            yield from ((k, each) for each in _named("factor", (names[k],), float(np.median(gains))))
+        if min(lags) > PASSED or max(lags) < -PASSED:
+            yield k, Fault("lag", (names[k],), float(np.median(lags)))

@@ -2,7 +2,6 @@
 
 import warnings
 from collections.abc import Iterable
-from statistics import NormalDist
 from typing import NamedTuple
 
 from samplers.finding import CARE, NOTE, WRONG, Finding, by_severity
@@ -13,7 +12,6 @@ __all__ = [
     "HALF",
     "NOTE",
     "SMALL_PROBABILITY",
-    "SURE",
     "TAIL",
     "WRONG",
     "Finding",
@@ -29,7 +27,6 @@ __all__ = [
 ]
 
 SMALL_PROBABILITY = 0.01  # that chance explains what was found; of 100 independent tests of right results, one fails
-SURE = NormalDist().inv_cdf(1.0 - 0.5 * SMALL_PROBABILITY)  # standard deviations of a normal distribution
 TAIL = 0.05  # share of samples or draws that is as much as a tail of a 90 % interval
 HALF = 0.5  # of a power, or of what is inside a band: the other half is missed
 CORRELATED = "The errors are correlated"
@@ -106,12 +103,15 @@ def warn(findings: Iterable[Finding], stacklevel: int = 2) -> None:
             warnings.warn(each.message, FindingWarning, stacklevel=stacklevel + 1)
 
 
-def labelled(findings: Iterable[Finding]) -> list[str]:
-    """Findings as lines of a text, which begin with CAUTION unless they are notes, and say what to fix first."""
+def labelled(findings: Iterable[Finding], of: str = "") -> list[str]:
+    """Findings as lines of a text, which begin with CAUTION unless they are notes, and say what to fix first.
+
+    `of` is what they are about, such as "event EQ2: ".
+    """
     lines = []
     for title, group in grouped(findings).items():
         how = f", {title[0].lower()}{title[1:]}" if title in (FIRST, LATER) else ""
-        lines += [f"Note: {each}" if each.severity == NOTE else f"CAUTION{how}: {each}" for each in group]
+        lines += [f"{'Note' if each.severity == NOTE else f'CAUTION{how}'}: {of}{each}" for each in group]
     return lines
 
 

@@ -10,13 +10,14 @@ from ..likelihood.posterior import Posterior
 from ..noise.residuals import ResidualChecks
 from ..priors.between_events import spread_of
 from ..priors.points import as_points
+from ..signals.channels import Channel
 from ..signals.error_measures import relative_errors
 from ..simulation.model import simulate_batch
 from ..text_tables import listed
 from .compared import Fit, checks_of, compare, data_sets_of, draws_to_compare
-from .fault_words import describe_unit, finding_of
-from .faults import EXPLAINED, Fault, find_faults, support_gains, supports_apart
-from .finding import CARE, CORRELATED, HALF, NOTE, SMALL_PROBABILITY, SURE, WRONG, Finding, about, percent
+from .fault_words import OF_SUPPORTS, finding_of
+from .faults import EXPLAINED, Fault, find_faults, slow_motions, supports_apart
+from .finding import CARE, CORRELATED, HALF, NOTE, SMALL_PROBABILITY, WRONG, Finding, about, percent
 from .modal import check_modes, check_squares
 from .model import motions_to_replace
 from .run import ParameterRow, moments, rows_of
@@ -38,23 +39,6 @@ __all__ = [
 SAME_AS_PRIOR = 0.9  # ratio of the standard deviations of posterior and prior: a fifth of the variance is gone
 NEAR_BOUND = 0.1  # distance of the 5 % or 95 % quantile from a bound, in 90 % intervals and in prior deviations
 FEWEST = 10  # samples that the tests of correlation and distribution need
-PLACES = (
-    "Check that it is the right column, its unit, sign and clock, and the place of the sensor in the model; if all "
-    "of them are right, the model lacks what moves it."
-)
-MISSED = {
-    "The model does not follow the measurements": (
-        "The update leaves more than half of the power unexplained: the error (RRMSE) is {}; 71 % is half.",
-        PLACES,
-    ),
-    "A channel is hardly reproduced": ("After the update, the error (RRMSE) is still {}.", PLACES),
-    "The prior does not reach the measurements": (
-        "No draw of the prior comes near the measurements; the best one has an error (RRMSE) of {}.",
-        "Check model and priors. A model of your own must return SI units (m, m/s², N, Pa, rad), and zero in "
-        "[measurements] is the time at which the base motion begins.",
-    ),
-}
-"""Text and action for channels that are not reproduced."""
 
 
 def check_fit(posterior: Posterior, samples: Any = None) -> tuple[Finding, ...]:
@@ -78,7 +62,7 @@ def check_fit(posterior: Posterior, samples: Any = None) -> tuple[Finding, ...]:
     >>> wrong_sign = Measurements(measurements.channels, record.dt, -measurements.values)
     >>> for finding in check_fit(Posterior(FELikelihood(model, wrong_sign), prior)):
     ...     print(finding.severity, finding)
-    wrong A sign may be wrong: acceleration and displacement: measured and computed values have opposite signs...
+    wrong A sign may be wrong: acceleration and displacement: measured values have the opposite sign...
     """
     draws, found, fits = draws_to_compare(posterior), list[Finding](), list[Fit]()
     mean = None
@@ -128,20 +112,16 @@ def _changes(fit: Fit) -> tuple[Fault, ...]:
 
 
 def check_supports(model: Any) -> list[Finding]:
-    """Supports of one structure whose slow motion has another sign or size than that of the others."""
+    """Supports of one structure whose slow motion has another sign, size or clock than that of the others."""
     motions = motions_to_replace(model) if getattr(model, "supports", ()) else ()
     if len({(each.n_steps, each.dt) for each in motions}) != 1:
         return []
-    found, unknown = [], getattr(model, "inputs", ())  # whose gains are parameters of a `SensedModel`
-    apart = supports_apart(support_gains([each.acceleration for each in motions], motions[0].dt))
-    for k, gain in ((k, gain) for k, gain in apart.items() if k not in unknown):
-        unit = describe_unit(abs(gain), "acceleration", "g")
-        kind = "A sign may be wrong" if gain < 0.0 else "A unit may be wrong" if unit else "A gain may be wrong"
-        near = f", about the ratio of {unit}" if unit and gain > 0.0 else ""
-        text = f"Where it is slow, the motion {motions[k].name} is {gain:.2g} times that of the other supports{near}."
-        action = "Check sign, unit and gain of its file: slow motions of one site are equal, unless it did move so."
-        found.append(Finding(kind, WRONG, text, action, {motions[k].name: gain}, "input"))
-    return found
+    found, slow = [], slow_motions([each.acceleration for each in motions], motions[0].dt)
+    for k, fault in supports_apart(slow, [f'motion "{each.name}"' for each in motions]):
+        if k not in getattr(model, "inputs", ()):  # whose gains and lags are parameters of a `SensedModel`
+            severity, channels = CARE if fault.kind == "lag" else WRONG, [Channel(*fault.names, "acceleration", "g")]
+            found.append(finding_of(fault, "", channels, severity, compared=OF_SUPPORTS))  # waves make lags too
+    return about("input", found)
 
 
 def _check_offset(fit: Fit) -> list[Finding]:
@@ -167,8 +147,8 @@ def _check_offset(fit: Fit) -> list[Finding]:
 
 
 def check_errors(fits: Sequence[Fit]) -> list[Finding]:
-    """Channels that the fit, or the best draw of the prior, does not reproduce; white and normal noise is no fault."""
-    useless, poor, far = found = {}, {}, {}
+    """Channels that the fit, or the best draw of the prior, does not explain; white and normal noise is no fault."""
+    useless, far = dict[str, float](), dict[str, float]()
     for fit in fits:
         measured, responses = fit.measurements.values, fit.draws if fit.after is None else fit.after[None]
         errors = np.nan_to_num(relative_errors(measured - responses, measured))
@@ -177,16 +157,24 @@ def check_errors(fits: Sequence[Fit]) -> list[Finding]:
             name = fit.where(fit.measurements.channels[row].name)
             if fit.after is None and size > EXPLAINED:
                 far[name] = float(size)
-            elif fit.after is not None and size > HALF:  # a quarter of its power is left
+            elif fit.after is not None and size**2 > HALF:
                 checks = checks_of(fit.residuals[row])
                 if checks is not None and min(checks.white[0], checks.normal[0]) < SMALL_PROBABILITY:
-                    (useless if size**2 > HALF else poor)[name] = float(size)
-    findings = []
-    for errors, (kind, (text, action)) in zip(found, MISSED.items(), strict=True):
-        shown = listed([f"{percent(size)} in {name}" for name, size in errors.items()]) if errors else ""
-        severity = WRONG if errors is useless else CARE
-        findings += [Finding(kind, severity, text.format(shown), action, errors)] if errors else []
-    return findings
+                    useless[name] = float(size)
+    shown = listed([f"{percent(size)} in {name}" for name, size in (useless or far).items()])
+    if useless:
+        text = f"The update leaves more than half of the power unexplained: the error (RRMSE) is {shown}; 71 % is half."
+        action = (
+            "Check that it is the right column, its unit, sign and clock, and the place of the sensor in the model; if "
+            "all of them are right, the model lacks what moves it."
+        )
+        return [Finding("The model does not follow the measurements", WRONG, text, action, useless)]
+    text = f"No draw of the prior comes near the measurements; the best one has an error (RRMSE) of {shown}."
+    action = (
+        "Check model and priors. A model of your own must return SI units (m, m/s², N, Pa, rad), and zero in "
+        "[measurements] is the time at which the base motion begins."
+    )
+    return [Finding("The prior does not reach the measurements", CARE, text, action, far)] if far else []
 
 
 def edges(rows: Sequence[ParameterRow]) -> dict[str, tuple[str, float, float]]:
@@ -216,11 +204,8 @@ def limits_of_model(
 
 
 def check_parameters(rows: Sequence[ParameterRow], limits: Container[str] = ()) -> list[Finding]:
-    """Parameters far from their prior, not informed, or at bounds that are not `limits` of the model as well."""
-    found = []
-    far = {row.label: (row.mean - row.prior_mean) / row.prior_sd for row in rows}
-    far = {name: distance for name, distance in far.items() if abs(distance) > SURE}
-    flat = [row.label for row in rows if row.sd > SAME_AS_PRIOR * row.prior_sd and row.label not in far]
+    """Parameters that are not informed, or at bounds that are not `limits` of the model as well."""
+    found, flat = [], [row.label for row in rows if row.sd > SAME_AS_PRIOR * row.prior_sd]
     at = [f"{label} at {bound:.4g}" for name, (label, bound, _) in edges(rows).items() if name not in limits]
     if at:
         text = f"The posterior reaches the edge of its prior: {listed(at)}. The bound, not the data, ends it there."
@@ -230,12 +215,6 @@ def check_parameters(rows: Sequence[ParameterRow], limits: Container[str] = ()) 
         text = f"The posterior of {listed(flat)} is nearly as wide as its prior: these data say little about it."
         action = "Do not report it as identified. A stronger excitation or another sensor may inform it."
         found.append(Finding("Not informed by the data", NOTE, text, action))
-    if far:
-        text = (
-            f"The mean of {listed(list(far))} is more than {SURE:.2g} prior standard deviations from the prior's mean."
-        )
-        action = "Check nominal value and prior; the parameter may make up for an error of the model."
-        found.append(Finding("Far from the prior", CARE, text, action, far))
     return found
 
 

@@ -243,9 +243,12 @@ def rows_of(
         numbers = parameter.shown([*(each[i] for each in moments), parameter.nominal, true])
         mean, mean_error, sd, sd_error, *quantiles, nominal, true = (float(each) for each in numbers)
         family = family.split("(")[0]
-        text = family if family in ("", "Uniform") else f"{family}, mean {prior_mean:.4g}, sd {prior_sd:.3g}"
-        bounds = (("above", lower), ("below", upper))
-        text += "".join(f", {side} {bound:.4g}" for side, bound in bounds if family and np.isfinite(bound))
+        text = f"{family}, mean {prior_mean:.4g}, sd {prior_sd:.3g}" if family else ""
+        if family == "Uniform":
+            text = f"{family}, {lower:.4g} to {upper:.4g}"
+        elif family:
+            bounds = (("above", lower), ("below", upper))
+            text += "".join(f", {side} {bound:.4g}" for side, bound in bounds if np.isfinite(bound))
         unit, cv = parameter.label.removeprefix(parameter.name).strip(), sd / abs(mean) if mean else np.nan
         of_posterior = mean, mean_error, sd, sd_error, cv, *quantiles
         shown = text, prior_mean, prior_sd, *of_posterior, nominal, true, lower, upper

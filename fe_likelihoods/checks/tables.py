@@ -85,7 +85,8 @@ def find_change(
     found = []  # of these kinds the first ones have fewer numbers to fit
     for (kind, *names), other in others.items():
         least = chi2.isf(SMALL_PROBABILITY / len(others), 1)
-        found.append((2, before - other.distance()[0], least, kind, tuple(names), np.nan))
+        rank, value = (0, -1.0) if kind == "value" else (2, np.nan)  # a number with the other sign
+        found.append((rank, before - other.distance()[0], least, kind, tuple(names), value))
     for names, rows in factors.items():
         other, factor = table.times(rows)
         if not 1.0 / FACTOR < factor < FACTOR:
@@ -140,6 +141,16 @@ def table_of_modes(modes: Any, deviations: np.ndarray) -> Table:
     return Table(values, draws, errors, ["frequency", *data.sensors], names, slice(1, None))
 
 
+def _turned(modes: Any) -> np.ndarray:
+    """Component (m,) of each measured shape whose other sign makes a computed one most alike, by half of the draws."""
+    data, computed = modes.data, modes.computed[:, 1:]  # (n, n_sensors, n_modes)
+    first, lengths = data.has_shape.argmax(axis=0), np.linalg.norm(computed, axis=1, keepdims=True)
+    measured, computed = data.shapes[first, np.arange(len(first))], computed / np.where(lengths > 0.0, lengths, 1.0)
+    parts = np.nan_to_num(measured)[:, :, None] * computed[:, None]
+    alike = np.square(parts.sum(axis=2, keepdims=True) - 2.0 * parts)  # (n, m, n_sensors, n_modes)
+    return np.median(alike.max(axis=3), axis=0).argmax(axis=1)
+
+
 def find_changes_of_modes(modes: Any, deviations: np.ndarray) -> tuple[Fault, ...]:
     """What explains modes, `PredictedModes` at draws of the prior: a unit, a sensor, exchanged numbers or one number.
 
@@ -165,9 +176,12 @@ def find_changes_of_modes(modes: Any, deviations: np.ndarray) -> tuple[Fault, ..
         for i, j in combinations(range(n), 2):  # a wrong sensor changes which mode is which
             other = replace(data, shapes=data.shapes[:, :, swapped(n, i, j)])
             others["swap", data.sensors[i], data.sensors[j]] = table_of_modes(modes.against(other), deviations)
-        for j, name in enumerate(data.sensors):
-            other = replace(data, shapes=data.shapes * np.where(np.arange(n) == j, -1.0, 1.0))
-            others["sign", name] = table_of_modes(modes.against(other), deviations)
+        turned = {("sign", name): np.where(np.arange(n) == j, -1.0, 1.0) for j, name in enumerate(data.sensors)}
+        for mode, j in enumerate(_turned(modes)):
+            turned["value", data.sensors[j], table.columns[mode]] = np.ones((data.n_modes, n))
+            turned["value", data.sensors[j], table.columns[mode]][mode, j] = -1.0
+        for key, signs in turned.items():
+            others[key] = table_of_modes(modes.against(replace(data, shapes=data.shapes * signs)), deviations)
     change = find_change(table, factors, others)
     # a small one may be the error of the model as well, and one of two frequencies be right
     small = change is not None and change.kind == "value" and np.exp(-TAIL) < change.value < np.exp(TAIL)

@@ -1,6 +1,5 @@
 """Predictions of other events: base motions that a TOML file lists as ``[events.NAME]``."""
 
-import logging
 import math
 import warnings
 from typing import Any, NamedTuple
@@ -19,8 +18,6 @@ from .job import Job
 from .models import Problem
 
 __all__ = ["Event", "predict_events", "predict_quietly", "read_events"]
-
-logger = logging.getLogger(__name__)
 
 
 class Event(NamedTuple):
@@ -94,7 +91,6 @@ def predict_events(
                 f"events.{event.name}", _predict_event, job, event, problem, samples, progress
             )
         except SimulationFailed as error:
-            logger.warning("event %s is left out: %s", event.name, error)
             found[event.name] = error
     return found
 

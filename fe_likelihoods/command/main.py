@@ -124,8 +124,8 @@ def _show(outcome: Any) -> None:
         mean, sd = (parameter.shown(value) for value in prior.moments)
         told = f"{type(prior).__name__}, mean {mean:.3g}, standard deviation {sd:.3g}"
         click.echo(f"Assumed, since the file does not give it: prior of {parameter.label}: {told}")
-    for finding in outcome.findings:
-        click.echo(f"CAUTION: {finding}")
+    for line in outcome.findings:
+        click.echo(line)
     click.echo(f"Written to {outcome.folder}/: {', '.join(outcome.files)}")
 
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..cache.simulation_cache import SimulationCache
-from ..checks.finding import NOTE, grouped
+from ..checks.finding import NOTE, labelled
 from ..checks.model import refuse_chance
 from ..checks.result import judge_run
 from ..checks.run import read_run
@@ -39,7 +39,7 @@ class Outcome(NamedTuple):
     sampler: Any
     problem: Problem
     files: tuple[str, ...]  # names of the result files
-    findings: tuple[str, ...]  # what speaks against the result and the predictions
+    findings: tuple[str, ...]  # lines on what speaks against the result and the predictions
     usable: bool  # whether the result can be used, if with care
 
 
@@ -195,12 +195,11 @@ def _write(
     samples, agreement = write_samples(folder, run, samplers, prediction, job.prediction.draws, judgement)
     write_page(folder / PAGE, run, prediction, judged, events=predicted, measured=measured, repeat=again)
     tables = write_tables(folder, run, judged, agreement)  # last: they say how many simulations there are
-    sources = {f"{title.lower()}: " if title else "": found for title, found in grouped(judgement.findings).items()}
-    sources["prediction: "] = () if prediction is None else prediction.findings
-    sources |= {f"event {each.name}: ": each.findings for each in described}
-    said = tuple(f"{title}{each}" for title, found in sources.items() for each in found if each.severity != NOTE)
+    found = {"": judgement.findings, "prediction: ": () if prediction is None else prediction.findings}
+    found |= {f"event {each.name}: ": each.findings for each in described}
+    said = [line for of, group in found.items() for line in labelled((x for x in group if x.severity != NOTE), of)]
     files = (PAGE, *tables, samples, *write_events(folder, described))
-    return Outcome(folder, samplers[0], problem, files, said, judgement.status != "do not use")
+    return Outcome(folder, samplers[0], problem, files, tuple(said), judgement.status != "do not use")
 
 
 def _prepare(job: Job, folder: Path, fingerprint: str | None, overwrite: bool) -> None:

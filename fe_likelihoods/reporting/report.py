@@ -160,6 +160,7 @@ def gather(
         "rows": rows,
         "factor": judgement.width_factor,
         "has_truth": bool(np.isfinite(run.truth).any()),
+        "has_nominal": any(np.isfinite(row.nominal) for row in rows),
         "evidence": evidence(run),
         "fits": fits,
         "told": _told(run),

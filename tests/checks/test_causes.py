@@ -92,4 +92,4 @@ def test_the_fault_is_first_and_what_it_does_to_fit_and_parameters_follows(fault
 
 
 def test_most_faults_have_others_that_follow():
-    assert sum(LATER in grouped(found_in(FAULTS[fault][1])) for fault in ("stuck", "swapped columns", "clipped")) == 3
+    assert sum(LATER in grouped(found_in(FAULTS[fault][1])) for fault in ("stuck", "spikes", "clipped")) == 3

@@ -122,12 +122,15 @@ def test_a_limit_of_the_model_is_no_edge_of_the_prior():
     assert "At the edge of the prior" in kinds(Uniform(0.5, 4.5))
 
 
-def test_a_support_with_another_gain_or_sign_is_named():
+def test_a_support_with_another_gain_sign_or_clock_is_named():
     """Its share in the response makes up for it, so that no fit shows it; the other supports do."""
     first, second, third = motions(np.random.default_rng(7))
 
+    def deck_of(*motions):
+        return LinearStructure(BridgeDeck("deck"), motions)
+
     def found(factor):
-        return check_supports(LinearStructure(BridgeDeck("deck"), [first, second.scale(factor), third]))
+        return check_supports(deck_of(first, second.scale(factor), third))
 
     assert found(1.0) == found(1.3) == found(0.0) == []
     for factor, kind in (
@@ -138,11 +141,17 @@ def test_a_support_with_another_gain_or_sign_is_named():
     ):
         (each,) = found(factor)
         assert (each.kind, each.severity) == (kind, "wrong"), factor
-        assert each.numbers == {second.name: pytest.approx(factor, rel=0.2)}
-    halved = LinearStructure(BridgeDeck("deck"), [first, second.scale(0.5), third])
+        assert each.text.startswith('motion "support 1": ')
+        assert factor < 0.0 or each.numbers == {"factor": pytest.approx(factor, rel=0.2)}
+    (each,) = check_supports(deck_of(first, Record(second.name, STEP, later(second.acceleration, 10)), third))
+    assert (each.kind, each.severity) == (
+        "Clocks may differ",
+        "care",
+    ) and 'support 1": slow motions are 0.1' in each.text
+    halved = deck_of(first, second.scale(0.5), third)
     assert check_supports(SensedModel(halved, inputs={1: Sensor(gain=LogNormal(1.0, 0.5))})) == []
     other = motions(np.random.default_rng(8))[0]  # of another site: nothing is known
-    assert check_supports(LinearStructure(BridgeDeck("deck"), [first, other, other.scale(2.0)])) != []
-    assert check_supports(LinearStructure(BridgeDeck("deck"), [first, other.scale(2.0), third])) == []
+    assert check_supports(deck_of(first, other, other.scale(2.0))) != []
+    assert check_supports(deck_of(first, other.scale(2.0), third)) == []
     assert check_supports(LinearStructure(ShearFrame({"roof": 1}, [1.0], [900.0]), first)) == []
     assert check_supports(LinearOscillator(first)) == []
