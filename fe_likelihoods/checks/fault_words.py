@@ -14,10 +14,10 @@ __all__ = ["OF_SUPPORTS", "describe_unit", "finding_of"]
 
 SAME_UNITS = 1.25  # ratio of a factor to one between units, up to which it is named after them
 NEAR_ENOUGH = 0.03  # difference of logarithms of ratios that are named together
-OF_MODES = ("frequencies",)
-OF_FREQUENCIES = {  # square roots of factors of stiffness or mass, besides those of frequencies
+OF_MODES = {  # ratios of frequencies; of stiffness or mass, the square roots
     2.0 * math.pi: "rad/s instead of Hz",
     60.0: "1/min instead of Hz",
+    1000.0: "kHz instead of Hz",
     1000.0**0.5: "a stiffness in kN instead of N, or a mass in t instead of kg",
     9.81**0.5: "a weight instead of a mass",
 }
@@ -77,11 +77,9 @@ def finding_of(
     compared: tuple[str, str, str] = VALUES,
 ) -> Finding:
     """A fault of a data set with a title; its channels, whether they are all of a load test, what was compared."""
-    near = [describe_unit(fault.value, c.dimension, c.unit, loads) for c in channels] if fault.kind == "factor" else []
-    if fault.names == OF_MODES:
-        near = [
-            t for r, t in OF_FREQUENCIES.items() if abs(abs(math.log(fault.value)) - math.log(r)) < math.log(SAME_UNITS)
-        ]
+    of_modes = fault.names == ("frequencies",)
+    kinds = [("frequency", "", False)] if of_modes else [(each.dimension, each.unit, loads) for each in channels]
+    near = [describe_unit(fault.value, *each) for each in kinds] if fault.kind == "factor" else []
     units = " or ".join(filter(None, dict.fromkeys(near)))
     better = ""
     if channels and compared == VALUES:
@@ -98,8 +96,8 @@ def finding_of(
         "others": compared[1],
         "value": f"{value:.0f}" if abs(value) >= 1e3 else f"{value:.3g}",
         "late": "later" if fault.value > 0.0 else "earlier",
-        "what": "unit" if units or fault.names == OF_MODES else "gain",
-        "units": f", {'as with' if fault.names == OF_MODES else 'about the ratio of'} {units}" if units else "",
+        "what": "unit" if units or of_modes else "gain",
+        "units": f", {'as with' if of_modes else 'about the ratio of'} {units}" if units else "",
     }
     kind, text, action = (each.format(**words) for each in FAULTS[fault.kind])
     numbers = {"before": fault.before, "after": fault.after, fault.kind: fault.value}
@@ -115,7 +113,9 @@ def describe_unit(factor: float, dimension: str, unit: str = "", loads: bool = F
     """
     bases, near = (unit, DIMENSIONS[dimension]), dict[str, float]()
     units = sorted((each for each in UNITS.values() if each.dimension == dimension), key=lambda u: u.name not in bases)
-    ratios = {9.80665: "m/s2 and g of the base motion"} if dimension != "acceleration" else {}
+    ratios = {} if dimension == "acceleration" else {9.80665: "m/s2 and g of the base motion"}
+    if dimension == "frequency":
+        ratios, units = OF_MODES, []
     for one, other in combinations(units, 2):
         if one.name in bases:  # of two names of a unit, the first
             ratios.setdefault(one.factor / other.factor, f"{one.name} and {other.name}")

@@ -136,8 +136,8 @@ def _check_offset(fit: Fit) -> list[Finding]:
     if not large:
         return []
     text = (
-        f"What the fit leaves of {fit.where(*large)} is {percent(max(large.values()))} of its power one slow parabola "
-        "over the whole record, which no vibration makes, and which the noise takes for scatter."
+        f"{percent(max(large.values()))} of the power that the fit leaves of {fit.where(*large)} is one slow parabola "
+        "over the whole record: no vibration makes it, and the noise takes it for scatter."
     )
     action = (
         "Correct the baseline (`baseline` in [measurements]); if the structure did keep a displacement, the model must "
