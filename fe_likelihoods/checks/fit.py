@@ -1,11 +1,10 @@
 """Findings about a fit: does the model follow the measurements at all, and what would explain it if not?"""
 
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
-from ..likelihood.parameters import Parameter
 from ..likelihood.posterior import Posterior
 from ..noise.residuals import ResidualChecks
 from ..priors.between_events import spread_of
@@ -33,7 +32,6 @@ __all__ = [
     "check_stated_errors",
     "check_supports",
     "describe_residuals",
-    "limits_of_model",
 ]
 
 SAME_AS_PRIOR = 0.9  # ratio of the standard deviations of posterior and prior: a fifth of the variance is gone
@@ -69,7 +67,7 @@ def check_fit(posterior: Posterior, samples: Any = None) -> tuple[Finding, ...]:
     if samples is not None:
         samples = as_points(samples, posterior.prior.names)
         mean, rows = samples.mean(axis=0), rows_of(posterior.parameters, posterior.prior, moments(samples))
-        found += check_parameters(rows, limits_of_model(posterior.likelihood, posterior.parameters, rows, mean))
+        found += check_parameters(rows, posterior, mean)
     for key, likelihood, columns in data_sets_of(posterior):
         own, point = (None if each is None else each[..., columns] for each in (samples, mean))
         fits += compare(likelihood, draws[:, columns], key, point, samples=own)[0]
@@ -177,36 +175,16 @@ def check_errors(fits: Sequence[Fit]) -> list[Finding]:
     return [Finding("The prior does not reach the measurements", CARE, text, action, far)] if far else []
 
 
-def edges(rows: Sequence[ParameterRow]) -> dict[str, tuple[str, float, float]]:
-    """Parameters that the data push to a bound of their prior: label, bound, and a value beyond it, by name."""
-    found = {}
-    for row in (row for row in rows if row.sd <= SAME_AS_PRIOR * row.prior_sd):  # else the prior is at its own edge
-        near = NEAR_BOUND * np.nanmin([row.high - row.low, row.prior_sd])
+def check_parameters(rows: Sequence[ParameterRow], of: Any, point: np.ndarray) -> list[Finding]:
+    """Parameters that are not informed, or at the edge of their prior; `of` is the posterior, or a run, at its fit."""
+    found, at = [], list[str]()
+    flat = [row.label for row in rows if row.sd > SAME_AS_PRIOR * row.prior_sd]  # these are at no edge but the prior's
+    for i, row in ((i, row) for i, row in enumerate(rows) if row.sd <= SAME_AS_PRIOR * row.prior_sd):
+        near, moved = NEAR_BOUND * np.nanmin([row.high - row.low, row.prior_sd]), np.array(point)
         for bound, distance, side in ((row.lower, row.low - row.lower, -1.0), (row.upper, row.upper - row.high, 1.0)):
-            if distance < near:
-                found[row.name] = (row.label, bound, bound + side * NEAR_BOUND * row.prior_sd)
-    return found
-
-
-def limits_of_model(
-    likelihood: Any, parameters: Sequence[Parameter], rows: Sequence[ParameterRow], point: np.ndarray
-) -> set[str]:
-    """Names of `edges` beyond which the model, or the noise, is not defined: it fails at `point` (ndim,) with them."""
-    found, names = set(), [row.name for row in rows]
-    for name, (_, _, beyond) in edges(rows).items():
-        i, moved = names.index(name), np.array(point)
-        moved[i] = beyond * parameters[i].factor
-        for part, columns in likelihood.parts():
-            own = columns[: len(part.model.parameter_names)]  # not by the likelihood, which would count a failure
-            fails = i in own and simulate_batch(part.model, moved[None, own]).reasons[0]
-            found |= {name} if fails or not part.possible(moved[None, columns])[0] else set()
-    return found
-
-
-def check_parameters(rows: Sequence[ParameterRow], limits: Container[str] = ()) -> list[Finding]:
-    """Parameters that are not informed, or at bounds that are not `limits` of the model as well."""
-    found, flat = [], [row.label for row in rows if row.sd > SAME_AS_PRIOR * row.prior_sd]
-    at = [f"{label} at {bound:.4g}" for name, (label, bound, _) in edges(rows).items() if name not in limits]
+            moved[i] = (bound + side * NEAR_BOUND * row.prior_sd) * of.parameters[i].factor
+            if distance < near and not _fails(of.likelihood, moved, i):
+                at.append(f"{row.label} at {bound:.4g}")
     if at:
         text = f"The posterior reaches the edge of its prior: {listed(at)}. The bound, not the data, ends it there."
         action = "If no other finding explains it, widen the prior; else the parameter makes up for that fault."
@@ -216,6 +194,17 @@ def check_parameters(rows: Sequence[ParameterRow], limits: Container[str] = ()) 
         action = "Do not report it as identified. A stronger excitation or another sensor may inform it."
         found.append(Finding("Not informed by the data", NOTE, text, action))
     return found
+
+
+def _fails(likelihood: Any, point: np.ndarray, i: int) -> bool:
+    """Whether model or noise are not defined at a point (ndim,), for its parameter i."""
+    for part, columns in () if likelihood is None else likelihood.parts():
+        own = columns[: len(part.model.parameter_names)]  # not by the likelihood, which would count a failure
+        if i in own and simulate_batch(part.model, point[None, own]).reasons[0]:
+            return True
+        if not part.possible(point[None, columns])[0]:
+            return True
+    return False
 
 
 def check_other_events(rows: Sequence[ParameterRow]) -> list[Finding]:

@@ -24,7 +24,7 @@ def check_modes(fit: Any) -> list[Finding]:
     found = about("data", _check_sets(fit.likelihood.model.data))
     if fit.draws is not None:
         changes = find_changes_of_modes(fit.draws, fit.deviations)
-        turned = [each for each in changes if each.kind != "value" or each.value == -1.0]
+        turned = [each for each in changes if each.kind != "value" or each.value < 0.0]
         of_sensor = any(each.names[0] in fit.draws.data.sensors for each in turned)
         strange = [] if of_sensor else _check_shapes(fit.draws)
         # a mode that the model lacks has no frequency that could be expected

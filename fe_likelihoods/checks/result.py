@@ -17,7 +17,6 @@ from .fit import (
     check_responses,
     check_stated_errors,
     check_supports,
-    limits_of_model,
 )
 from .model import STEP, StepTest, check_stronger_motion, halve_steps, has_steps, motions_to_replace
 from .run import Failures, FinishedRun, ParameterRow, failures, moments_of, read_run, rows_of
@@ -92,8 +91,7 @@ def judge_run(run: FinishedRun) -> JudgedRun:
         found += check_supports(likelihood.model) + _check_range(likelihood) + check_gaps(likelihood.noise)
         found += check_data(likelihood.measurements, motions_to_replace(likelihood.model))
     if not run.is_inconclusive:
-        limits = set() if run.likelihood is None else limits_of_model(run.likelihood, run.parameters, rows, run.centre)
-        found += check_parameters(rows, limits)
+        found += check_parameters(rows, run, run.centre)
         if all(each.severity != WRONG for each in found):  # a fault explains the residuals
             found += check_residuals(fits.fits) + check_stated_errors(fits.fits)
             found += check_other_events([row for row in rows if row.name in _of_one_event(run)])

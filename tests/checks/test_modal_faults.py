@@ -228,3 +228,16 @@ def test_errors_that_are_numbers_among_the_priors_are_checked_as_those_of_the_da
     posterior = Posterior(ModalLikelihood(FRAME, wrong), numbers)
     samples = fitted(known)
     assert kinds(posterior) == kinds(known) and kinds(posterior, samples) == kinds(known, samples) != []
+
+
+def test_one_component_with_the_other_sign_is_named():
+    """Also where its mode then resembles no computed one, or another one more."""
+    named = 0
+    for seed in range(6):
+        data, mode = identified(seed, **KNOWN), seed % 3
+        floor, shapes = int(np.abs(data.shapes[0, mode]).argmax()), data.shapes[0].copy()
+        shapes[mode, floor] *= -1.0
+        for found in check_fit(Posterior(ModalLikelihood(FRAME, changed(data, shapes=shapes)), PRIOR)):
+            assert found.kind == "A value may be wrong" and found.numbers["value"] < 0.0
+            named += f"floor {floor + 1} of mode {mode + 1} (" in found.text and " is -" in found.text
+    assert named >= 5
