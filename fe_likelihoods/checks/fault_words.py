@@ -10,7 +10,7 @@ from ..units import DIMENSIONS, UNITS
 from .faults import Fault
 from .finding import WRONG, Finding, percent
 
-__all__ = ["OF_SUPPORTS", "describe_unit", "finding_of"]
+__all__ = ["describe_unit", "finding_of"]
 
 SAME_UNITS = 1.25  # ratio of a factor to one between units, up to which it is named after them
 NEAR_ENOUGH = 0.03  # difference of logarithms of ratios that are named together
@@ -56,44 +56,32 @@ FAULTS = {
     ),
 }
 """Kind, text and action of each fault of data."""
-
-
-VALUES = "measured values", "the computed ones", ""
 OF_SUPPORTS = (
-    "slow motions",
-    "those of the other supports",
     "Check unit, sign and clock of its file. Slow motions of one site are alike, except of supports that did move so, "
-    "or that waves reach one by one.",
+    "or that waves reach one by one."
 )
-"""What a fault compares, with what, and what to do instead of the usual."""
 
 
 def finding_of(
-    fault: Fault,
-    title: str = "",
-    channels: Sequence[Channel] = (),
-    severity: str = WRONG,
-    loads: bool = False,
-    compared: tuple[str, str, str] = VALUES,
+    fault: Fault, title: str, channels: Sequence[Channel] = (), severity: str = WRONG, loads: bool = False
 ) -> Finding:
-    """A fault of a data set with a title; its channels, whether they are all of a load test, what was compared."""
+    """A fault of a data set with a title; its channels, and whether they are all channels of a load test."""
     of_modes = fault.names == ("frequencies",)
     kinds = [("frequency", "", False)] if of_modes else [(each.dimension, each.unit, loads) for each in channels]
     near = [describe_unit(fault.value, *each) for each in kinds] if fault.kind == "factor" else []
     units = " or ".join(filter(None, dict.fromkeys(near)))
-    better = ""
-    if channels and compared == VALUES:
-        better = f"the error (RRMSE) is {percent(fault.after)} instead of {percent(fault.before)}{fault.where}"
-    elif compared == VALUES:
-        better = f"values differ from draws of the prior by {fault.after:.2g} of their spread instead of "
+    better = f"; corrected, the error (RRMSE) is {percent(fault.after)} instead of {percent(fault.before)}{fault.where}"
+    if not channels:
+        better = f"; corrected, values differ from draws of the prior by {fault.after:.2g} of their spread instead of "
         better += f"{fault.before:.2g}"
+    of_supports = math.isnan(fault.before)
     value = abs(fault.value) if fault.kind == "lag" else fault.value
     names = " of ".join(fault.names) if fault.kind == "value" else listed(fault.names)
     words = {
         "where": f"{names}{f' ({title})' if title else ''}",
-        "better": better and f"; corrected, {better}",
-        "those": compared[0],
-        "others": compared[1],
+        "better": "" if of_supports else better,
+        "those": "slow motions" if of_supports else "measured values",
+        "others": "those of the other supports" if of_supports else "the computed ones",
         "value": f"{value:.0f}" if abs(value) >= 1e3 else f"{value:.3g}",
         "late": "later" if fault.value > 0.0 else "earlier",
         "what": "unit" if units or of_modes else "gain",
@@ -102,7 +90,7 @@ def finding_of(
     kind, text, action = (each.format(**words) for each in FAULTS[fault.kind])
     numbers = {"before": fault.before, "after": fault.after, fault.kind: fault.value}
     numbers = {name: number for name, number in numbers.items() if not math.isnan(number)}
-    return Finding(kind, severity, text, compared[2] or action, numbers, "data")
+    return Finding(kind, severity, text, OF_SUPPORTS if of_supports else action, numbers, "data")
 
 
 def describe_unit(factor: float, dimension: str, unit: str = "", loads: bool = False) -> str:

@@ -14,7 +14,7 @@ from ..signals.error_measures import relative_errors
 from ..simulation.model import simulate_batch
 from ..text_tables import listed
 from .compared import Fit, checks_of, compare, data_sets_of, draws_to_compare
-from .fault_words import OF_SUPPORTS, finding_of
+from .fault_words import finding_of
 from .faults import EXPLAINED, Fault, find_faults, slow_motions, supports_apart
 from .finding import CARE, CORRELATED, HALF, NOTE, SMALL_PROBABILITY, WRONG, Finding, about, percent
 from .modal import check_modes, check_squares
@@ -118,7 +118,7 @@ def check_supports(model: Any) -> list[Finding]:
     for k, fault in supports_apart(slow, [f'motion "{each.name}"' for each in motions]):
         if k not in getattr(model, "inputs", ()):  # whose gains and lags are parameters of a `SensedModel`
             severity, channels = CARE if fault.kind == "lag" else WRONG, [Channel(*fault.names, "acceleration", "g")]
-            found.append(finding_of(fault, "", channels, severity, compared=OF_SUPPORTS))  # waves make lags too
+            found.append(finding_of(fault, "", channels, severity))  # waves make lags too
     return about("input", found)
 
 
