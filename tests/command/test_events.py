@@ -123,7 +123,7 @@ def test_an_event_whose_simulations_all_fail_is_named_in_the_report(events, monk
     said = call("run", "oscillator.toml", "--out", "r", "--quiet")
     report = read_page(events / "r" / "report.html")
     failed = "weaker: An event could not be predicted"
-    assert f"CAUTION: event {failed}: All simulations of this event failed: no motion" in said
+    assert f"CAUTION: event {failed}: " in said and "no motion" in said
     assert failed in report.text and "weaker: There is no prediction." in report.text
     numbers = next(table for table in report.tables if table[0][1:3] == ["Quantity", "Median"])[1:]
     assert {row[0] for row in numbers} == {"after"}
