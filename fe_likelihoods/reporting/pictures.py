@@ -129,8 +129,7 @@ def draw_fit(fit: Fit, before: str, after: str) -> list[Picture]:
     return [
         _picture(
             "Measured and simulated response",
-            "After the update, the two lines should lie on one another at the strong peaks. RRMSE "
-            "is the relative root mean square error: 0 for a perfect fit, 100 % for a response of zero.",
+            "After the update, the two lines should lie on one another at the strong peaks.",
             f"Histories of {', '.join(channel.name for channel in fit.measurements.channels)}, "
             f"{' and '.join(responses)}.",
             lambda: plot_fit(fit.measurements, responses),

@@ -126,6 +126,7 @@ def plot_corner(
                 color=colour,
                 labels=drawn.labels,
                 fig=figure,
+                labelpad=0.08,  # beside rotated numbers
                 max_n_ticks=4,
                 hist_kwargs=drawn.histogram(colour),
                 levels=LEVELS,
