@@ -10,6 +10,7 @@ from .finding import CARE, Finding
 __all__ = [
     "check_bandwidth",
     "check_common",
+    "check_event",
     "check_final_values",
     "check_most",
     "check_normal",
@@ -85,6 +86,15 @@ def check_final_values(ends: Mapping[str, Sequence[float]]) -> list[Finding]:
         "mean over whole periods, final_value(channel, samples=...) or damage_measures(settle=...)."
     )
     return [Finding("A final value still moves", CARE, text, action, numbers)] if numbers else []
+
+
+def check_event(reason: str) -> list[Finding]:
+    """An event that cannot be predicted, with the `reason` of the failures."""
+    text, action = (
+        f"It could not be predicted: {reason}.",
+        "Mend the model for this motion; the samples stay as they are.",
+    )
+    return [Finding("An event is not predicted", CARE, text, action)]
 
 
 def check_reweighting(tests: Mapping[str, _Reweighted], error: float, parameters: Sequence[str]) -> list[Finding]:

@@ -5,7 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..checks.finding import CARE, Finding
+from ..checks.finding import Finding
+from ..checks.transfer import check_event
 from ..prediction.prediction import Prediction
 from ..prediction.scores import HistoryScores, QuantityScores, central_interval, share_within
 from ..signals.channels import Measurements
@@ -89,10 +90,8 @@ def describe_event(
 ) -> OtherEvent:
     """Describe and score the predictions of an event, or the error that `propagate` raises if all simulations fail."""
     if isinstance(predictions, SimulationFailed):
-        text = f"All simulations of this event failed: {predictions.reason}."
-        action = "Mend the model for this motion; the samples of the posterior do not depend on it."
-        failed = Finding("An event could not be predicted", CARE, text, action)
-        return OtherEvent(name, {}, measured, (), (), (), "There is no prediction.", (failed,))
+        failed = tuple(check_event(predictions.reason))
+        return OtherEvent(name, {}, measured, (), (), (), "There is no prediction.", failed)
     findings = list(dict.fromkeys(found for each in predictions.values() for found in each.findings))
     first = next(iter(predictions.values()))
     reasons = "; ".join(f"{count}: {reason}" for reason, count in first.failure_reasons.items())

@@ -122,7 +122,7 @@ def test_an_event_whose_simulations_all_fail_is_named_in_the_report(events, monk
     monkeypatch.setattr(LinearOscillator, "simulate", simulate)
     said = call("run", "oscillator.toml", "--out", "r", "--quiet")
     report = read_page(events / "r" / "report.html")
-    failed = "weaker: An event could not be predicted"
+    failed = "weaker: An event is not predicted"
     assert f"CAUTION: event {failed}: " in said and "no motion" in said
     assert failed in report.text and "weaker: There is no prediction." in report.text
     numbers = next(table for table in report.tables if table[0][1:3] == ["Quantity", "Median"])[1:]
