@@ -19,11 +19,7 @@ OF_GUIDES = "simulations of guides"  # key in the record
 
 
 class BudgetExhausted(Exception):
-    """A batch does not fit into the limit; `records` (m,) belong to its first m points, which were evaluated."""
-
-    def __init__(self, records: np.ndarray):
-        super().__init__("the limit of simulations (max_simulations) does not allow this batch")
-        self.records = records
+    """The limit of simulations (max_simulations) does not allow a batch, of which nothing was evaluated."""
 
 
 def as_limit(value: Any) -> float | None:

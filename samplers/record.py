@@ -13,8 +13,8 @@ The file is a sequence of blocks: kind, length, two CRC-32, arrays in NumPy's fo
 ``MEMO``
     Arrays under a key: simulations of a guide, or the order in which points of an asynchronous run arrived.
 
-A kill can leave only the last block incomplete, and an incomplete block is dropped. Without a path, the record is kept
-in memory only.
+A kill can leave only the last block incomplete, and an incomplete block is dropped. Without a path, points are kept in
+memory, and arrays under a key in a temporary file.
 """
 
 import errno
@@ -46,9 +46,6 @@ __all__ = ["EvaluatedBatch", "Incomplete", "Record", "Remember", "RunStart", "fr
 logger = logging.getLogger(__name__)
 
 MAGIC, BLOCK = b"samplers record 1\n", struct.Struct("<4sQII")  # kind, length, checksums of the content and of both
-# a record in memory keeps only the latest points of a long chain, which a repeated step or the verdict needs
-KEPT_IN_MEMORY = 20_000
-_LARGE = 2**20  # bytes of arrays under a key from which they are in a file only
 Remember = Callable[..., list[np.ndarray] | None]  # see `Record.remembering`
 _open_records: "weakref.WeakValueDictionary[Path, Record]" = weakref.WeakValueDictionary()
 
@@ -63,14 +60,18 @@ class EvaluatedBatch(NamedTuple):
     coords: np.ndarray  # (n, ndim)
     log_prob: np.ndarray  # (n,), NaN where the evaluation failed
     blobs: np.ndarray | None  # (n, ...)
-    reasons: dict[int, str]  # of each failure, by row
-    counted: dict[int, str] = {}  # of failures that the function counts itself; log_prob is -inf there
+    reasons: dict[int, str]  # of each failure, by row; log_prob is -inf if the function counts the failure itself
+
+    @property
+    def failed(self) -> np.ndarray:
+        """Which evaluations failed, (n,) bool, apart from failures that the function counts itself."""
+        return np.isnan(self.log_prob)
 
     def rows(self, rows: Sequence[int]) -> "EvaluatedBatch":
         """The batch of some rows."""
-        said = [{new: each[old] for new, old in enumerate(rows) if old in each} for each in self[3:]]
+        reasons = {new: self.reasons[old] for new, old in enumerate(rows) if old in self.reasons}
         blobs = None if self.blobs is None else self.blobs[rows]
-        return EvaluatedBatch(self.coords[rows], self.log_prob[rows], blobs, *said)
+        return EvaluatedBatch(self.coords[rows], self.log_prob[rows], blobs, reasons)
 
 
 def merge_batches(batches: Sequence[EvaluatedBatch]) -> EvaluatedBatch:
@@ -80,12 +81,9 @@ def merge_batches(batches: Sequence[EvaluatedBatch]) -> EvaluatedBatch:
         shape, dtype = blobs.shape[1:], blobs.dtype
         blobs = joined([np.zeros((len(b.coords), *shape), dtype) if b.blobs is None else b.blobs for b in batches])
     first = np.cumsum([0, *(len(batch.coords) for batch in batches)]).tolist()
-    said = [
-        {start + row: text for start, b in zip(first, batches, strict=False) for row, text in b[column].items()}
-        for column in (3, 4)
-    ]
+    reasons = {start + row: text for start, b in zip(first, batches, strict=False) for row, text in b.reasons.items()}
     coords, log_prob = (np.concatenate([batch[column] for batch in batches]) for column in (0, 1))
-    return EvaluatedBatch(coords, log_prob, blobs, *said)
+    return EvaluatedBatch(coords, log_prob, blobs, reasons)
 
 
 class RunStart(NamedTuple):
@@ -119,15 +117,21 @@ class Record:
         self._batches: list[EvaluatedBatch] = []
         self._known: dict[bytes, tuple[EvaluatedBatch, int]] = {}  # batch and row of each point
         self.simulated: set[bytes] = set()  # keys of the points
-        self._arrays: dict[str, list[list[np.ndarray] | tuple[int, int]]] = {}  # or where large ones are in the file
-        self._large: Any = None  # temporary file of the large arrays of a record in memory
+        self._arrays: dict[str, list[tuple[int, int]]] = {}  # first byte and length of their blocks in the file
         self._whole = 0  # bytes of the file that were read
         self._seen = 0  # size of the file when it was read or closed
 
     def __getstate__(self):
-        arrays = {key: [self._stored(each) for each in known] for key, known in self._arrays.items()}
-        seen = self._seen if self._file is None else self._whole
-        return {**self.__dict__, "_file": None, "_seen": seen, "_large": None, "_arrays": arrays}
+        content = None
+        if self.path is None and self._file is not None:
+            self._file.seek(0)
+            content = self._file.read()
+        return {**self.__dict__, "_file": content, "_seen": self._seen if self._file is None else self._whole}
+
+    def __setstate__(self, state: dict):
+        vars(self).update(state, _file=None)
+        if state["_file"] is not None:
+            self._open_temporary().write(state["_file"])
 
     # ------------------------------------------------------------------ evaluations
 
@@ -139,14 +143,15 @@ class Record:
         known = np.array([each is not None for each in found], dtype=bool)
         return known, [part[0][0].rows([row for _, row in part]) for part in parts]
 
+    @deferred_interrupts()
     def evaluated(self, batch: EvaluatedBatch) -> None:
         """Enter evaluated points; they are in the file on return. ValueError for blobs that a file cannot hold."""
-        if batch.blobs is not None:
-            self.check_blobs(batch.blobs.dtype)
         blobs = [] if batch.blobs is None else [batch.blobs]
-        with deferred_interrupts():
-            self._write(b"EVAL", [batch.coords, batch.log_prob, _text(batch.reasons | batch.counted), *blobs])
-            self._enter(batch)
+        for each in blobs:
+            self.check_blobs(each.dtype)
+        if self.path is not None:
+            self._write(b"EVAL", [batch.coords, batch.log_prob, _text(batch.reasons), *blobs])
+        self._enter(batch)
 
     def check_blobs(self, dtype: np.dtype) -> None:
         """Raise ValueError for blobs that the file of the record, if there is one, cannot hold."""
@@ -170,15 +175,15 @@ class Record:
             self._known.setdefault(point.tobytes(), (batch, row))
         self.simulated.update(self.keys(coords))
         self.count += len(coords)
-        self.failed += [(coords[row].copy(), reason) for row, reason in batch.reasons.items()]
-        self.counted += [(coords[row].copy(), reason) for row, reason in batch.counted.items()]
+        for row, reason in batch.reasons.items():
+            (self.failed if np.isnan(batch.log_prob[row]) else self.counted).append((coords[row].copy(), reason))
 
     def keys(self, coords: np.ndarray) -> list[bytes]:
         """The slow parameters of points (n, ndim) as bytes: points with the same key share a simulation."""
         slow = np.ascontiguousarray(coords if self._slow is None else coords[:, self._slow])
         return [row.tobytes() for row in slow]
 
-    def latest(self, most: int = KEPT_IN_MEMORY) -> EvaluatedBatch | None:
+    def latest(self, most: int) -> EvaluatedBatch | None:
         """At least the latest `most` evaluated points, in the order of their evaluation; None without any."""
         first = len(self._batches)
         while first > 0 and most > 0:
@@ -187,15 +192,9 @@ class Record:
         return merge_batches(self._batches[first:]) if self._batches else None
 
     def first(self, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """The first m <= n evaluated points (m, ndim) that are still known, and their log-probabilities (m,)."""
+        """The first m <= n evaluated points (m, ndim), and their log-probabilities (m,)."""
         coords, log_prob = (np.concatenate([batch[column][:n] for batch in self._batches])[:n] for column in (0, 1))
         return coords, log_prob
-
-    def drop_old_points(self) -> None:
-        """Forget old points of a record in memory that no repeated step can need."""
-        while self._file is None and len(self._known) > 2 * KEPT_IN_MEMORY and len(self._batches) > 1:
-            for point in np.ascontiguousarray(self._batches.pop(0).coords):
-                self._known.pop(point.tobytes(), None)
 
     # ------------------------------------------------------------------ arrays under a key
 
@@ -209,66 +208,52 @@ class Record:
 
         def remember(key: str, compute: Callable[[], Sequence[np.ndarray]] | None = None) -> list[np.ndarray] | None:
             known = self._arrays.setdefault(key, [])
-            if used[key] == len(known):
-                if self.is_complete:
-                    raise Incomplete
-                if compute is None:
-                    return None
+            if used[key] < len(known):
+                arrays = self._stored(known[used[key]])
+            elif self.is_complete:
+                raise Incomplete
+            elif compute is None:
+                return None
+            else:
                 arrays = [np.asarray(array) for array in compute()]
                 with deferred_interrupts():
-                    known.append(self._kept(arrays, self._write(b"MEMO", [_text(key), *arrays])))
-                used[key] += 1
-                return arrays
+                    known.append(self._write(b"MEMO", [_text(key), *arrays]))
             used[key] += 1
-            return self._stored(known[used[key] - 1])
+            return arrays
 
         return remember
 
+    @deferred_interrupts()
     def note(self, key: str, array: np.ndarray) -> None:
         """Store an array under a key; only the last one counts (`noted`)."""
-        with deferred_interrupts():
-            self._write(b"MEMO", [_text(key), array])
-            self._arrays[key] = [[array]]
+        self._arrays[key] = [self._write(b"MEMO", [_text(key), array])]
 
     def noted(self, key: str) -> np.ndarray | None:
         """The last array that was noted under a key since the annealing began; None without any."""
         return self._stored(self._arrays[key][-1])[0] if key in self._arrays else None
 
-    def _kept(self, arrays: list[np.ndarray], place: tuple[int, int] | None) -> list[np.ndarray] | tuple[int, int]:
-        """Arrays; or, if they are large, first byte and length of their block in the file, or in a temporary one."""
-        if sum(array.nbytes for array in arrays) < _LARGE:
-            return arrays
-        if place is None:
-            self._large = self._large or tempfile.TemporaryFile()  # noqa: SIM115  as long as the record
-            start = self._large.seek(0, os.SEEK_END)
-            place = start, self._large.write(_content([_text(""), *arrays]))
-        return place
-
-    def _stored(self, kept: list[np.ndarray] | tuple[int, int]) -> list[np.ndarray]:
-        """The arrays that `_kept` was given."""
-        if isinstance(kept, list):
-            return kept
-        with nullcontext(self._large) if self.path is None else open(self.path, "rb") as file:
-            file.seek(kept[0])
-            return _arrays_of(file.read(kept[1]))[1:]
+    def _stored(self, place: tuple[int, int]) -> list[np.ndarray]:
+        """The arrays in a block of the file."""
+        with nullcontext(self._file) if self.path is None else open(self.path, "rb") as file:
+            file.seek(place[0])
+            return _arrays_of(file.read(place[1]))[1:]
 
     # ------------------------------------------------------------------ the file
 
+    @deferred_interrupts()
     def begin(self, start: RunStart) -> None:
         """Enter the start of an annealing, which begins the record of a new run."""
         start = start._replace(header=json.loads(json.dumps(start.header)))
         kind, keys, *rest = start.random_state
-        arrays = [_text([start.header, kind, *rest]), start.coords, keys]
-        with deferred_interrupts():
-            self._write(b"RUN ", arrays)
-            self._begin(start)
-
-    def _begin(self, start: RunStart) -> None:
+        self._write(b"RUN ", [_text([start.header, kind, *rest]), start.coords, keys])
         self.start, self._arrays = start, {}
 
     def open(self) -> None:
         """Open the file for writing, and lock it. ValueError if another process writes to it."""
-        if self.path is None or self._file is not None:
+        if self._file is not None:
+            return
+        if self.path is None:
+            self._open_temporary()
             return
         if (earlier := _open_records.get(self.path)) is not None:  # the last sampler of a process owns it
             earlier.close()
@@ -293,6 +278,11 @@ class Record:
             self._file, _open_records[self.path] = file, self
             weakref.finalize(self, file.close)
 
+    def _open_temporary(self) -> Any:
+        self._file = tempfile.TemporaryFile()  # noqa: SIM115  as long as the record
+        weakref.finalize(self, self._file.close)
+        return self._file
+
     def _lock(self, file: Any) -> None:
         try:
             lock_now(file)
@@ -302,8 +292,8 @@ class Record:
             logger.info("%s cannot be locked (%s): do not start two runs on it", self.path, error.strerror)
 
     def close(self) -> None:
-        """Close the file."""
-        if self._file is not None:
+        """Close the file of a record that has a path."""
+        if self.path is not None and self._file is not None:
             self._file.close()
             self._file, self._seen = None, self._whole
 
@@ -324,12 +314,12 @@ class Record:
         self._clear()
         return aside
 
-    def _write(self, kind: bytes, arrays: Sequence[np.ndarray]) -> tuple[int, int] | None:
-        if self.path is None:
-            return None
+    def _write(self, kind: bytes, arrays: Sequence[np.ndarray]) -> tuple[int, int]:
+        """Append a block; first byte and length of its content."""
         self.open()
         data, start = memoryview(_block(kind, arrays)), self._whole
         try:
+            self._file.seek(start)
             written = 0
             while written < len(data):
                 written += self._file.write(data[written:])
@@ -340,7 +330,7 @@ class Record:
                 error.errno,
                 f"the record of the run cannot be written ({error.strerror}). Everything before is kept: make space, "
                 "and call run_mcmc again",
-                str(self.path),
+                str(self.path or "temporary file"),
             ) from error
         self._whole = start + len(data)
         return start + BLOCK.size, len(data) - BLOCK.size
@@ -377,16 +367,13 @@ class Record:
             first, *arrays = _arrays_of(content)
             if kind == b"EVAL":
                 log_prob, said, *blobs = arrays
-                said = {int(row): text for row, text in json.loads(said.tobytes()).items()}
-                reasons = {row: text for row, text in said.items() if np.isnan(log_prob[row])}
-                counted = {row: text for row, text in said.items() if row not in reasons}
-                self._enter(EvaluatedBatch(first, log_prob, blobs[0] if blobs else None, reasons, counted))
+                reasons = {int(row): text for row, text in json.loads(said.tobytes()).items()}
+                self._enter(EvaluatedBatch(first, log_prob, blobs[0] if blobs else None, reasons))
             elif kind == b"RUN ":
                 header, name, *rest = json.loads(first.tobytes())
-                self._begin(RunStart(header, arrays[0], (name, arrays[1], *rest)))
+                self.start, self._arrays = RunStart(header, arrays[0], (name, arrays[1], *rest)), {}
             else:
-                kept = self._kept(arrays, (start, len(content)))
-                self._arrays.setdefault(json.loads(first.tobytes()), []).append(kept)
+                self._arrays.setdefault(json.loads(first.tobytes()), []).append((start, len(content)))
         except ValueError:
             return False
         return True
@@ -410,15 +397,11 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_close_in_child)
 
 
-def _content(arrays: Sequence[np.ndarray]) -> bytes:
+def _block(kind: bytes, arrays: Sequence[np.ndarray]) -> bytes:
     content = io.BytesIO()
     for array in arrays:
         np.lib.format.write_array(content, np.ascontiguousarray(array), allow_pickle=False)
-    return content.getvalue()
-
-
-def _block(kind: bytes, arrays: Sequence[np.ndarray]) -> bytes:
-    data = _content(arrays)
+    data = content.getvalue()
     return BLOCK.pack(kind, len(data), zlib.crc32(data), _of_both(kind, len(data))) + data
 
 

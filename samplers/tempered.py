@@ -32,7 +32,7 @@ from .evaluation.user_target import Target
 from .evaluation.values import most_common_reasons
 from .interrupts import deferred_interrupts, interrupts_end_the_run
 from .judgement.checks import check_likelihood, check_prior
-from .judgement.failures import judged_failures
+from .judgement.failures import KEPT_POINTS, judged_failures
 from .judgement.verdict import CONVERGED, describe_early_stop, independent_points, judge
 from .moves.fast_parameters import with_fast_sweeps
 from .moves.population_moves import GuideMove, RandomWalkMove, without_unfitted
@@ -341,7 +341,6 @@ class TemperedSampler(RunResults, EnsembleSampler):
                     set_previous_state(self, State(state, copy=True))  # where the next call goes on after an interrupt
                     self._must_repeat = self._must_repeat and self._result.early_stop is not None
                 self.seconds += time.perf_counter() - start
-                self._evaluator.evaluates_parts = False
                 moves, probabilities = get_moves(self)
                 set_moves(self, without_unfitted(moves), probabilities)
                 state.blobs = self._evaluator.typed(state.blobs)
@@ -364,7 +363,6 @@ class TemperedSampler(RunResults, EnsembleSampler):
                             set_previous_state(self, stored)
                             if store:
                                 self._output.step_stored()
-                        self._record.drop_old_points()
                         self.seconds += time.perf_counter() - start
                         yield advanced
                         start = time.perf_counter()
@@ -424,7 +422,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
             failed = f"{self.failure_count} of {self.evaluations} evaluations" if self.failure_count else ""
             if simulations := self._failed_simulations:
                 failed = f"{simulations} of {self.simulations:.0f} simulations"
-            latest = self._record.latest()
+            latest = self._record.latest(KEPT_POINTS)
             self._near = None if latest is None else judged_failures(latest, coords, self._target)
             numbers = self.nwalkers, self.ndim, self.simulations
             searched = self._budget.of_guides
@@ -540,7 +538,6 @@ class TemperedSampler(RunResults, EnsembleSampler):
         `stored` is the last state at beta = 1 if the run is made again.
         """
         self._result, self._verdict, self._must_repeat = AnnealingResult(), None, True
-        self._evaluator.evaluates_parts = True
         self.random_state = start.random_state
         self._budget.restart(start.header["of_earlier_guides"])
         schedule, guidance = MoveSchedule(*copy.deepcopy(self._first_moves)), None

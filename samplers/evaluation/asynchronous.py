@@ -86,14 +86,13 @@ class AsynchronousEvaluator(Evaluator):
 
     def submit(self, coords: np.ndarray) -> PendingPoints:
         """Begin to evaluate points (n, ndim); the limit of simulations may allow only the first points."""
-        log_prior, inside = self._prior_of(coords)
-        asked, known, _ = self._look_up(coords, inside)
-        refused = len(asked) < sum(inside)
-        end = int(np.flatnonzero(inside)[len(asked)]) if refused else len(coords)
+        log_prior, asked, refused = self._allowed(coords)
+        coords = coords[: len(log_prior)]
+        known, _ = self._look_up(coords[asked])
         self.budget.submitted(coords[asked])
         self.evaluations += len(asked)
-        pending = PendingPoints(coords[:end], log_prior[:end], refused)
-        outside = np.flatnonzero(~inside[:end])
+        pending = PendingPoints(coords, log_prior, refused)
+        outside = np.flatnonzero(log_prior == -np.inf)
         if len(outside) > 0:
             pending.arrive(outside, pending.base[outside])
         numbers = range(self._submitted, self._submitted + len(asked))
@@ -145,7 +144,7 @@ class AsynchronousEvaluator(Evaluator):
         _, batches = self.record.find(self._points(numbers))
         pending = self._running[numbers[0]][0]
         rows = np.array([self._running.pop(number)[1] for number in numbers])
-        failed, whole = sum(len(batch.reasons) for batch in batches), len(numbers) == len(pending.coords)
+        failed, whole = sum(np.count_nonzero(batch.failed) for batch in batches), len(numbers) == len(pending.coords)
         counts = self.record.count - len(numbers), len(self.record.failed) - failed
         self.check_failures(merge_batches(batches), *counts, len(self._running), whole)
         log_prior = pending.base["log_prior"][rows]

@@ -27,8 +27,7 @@ class Evaluator:
     """A posterior density that is evaluated and recorded.
 
     Evaluated points are structured arrays with the fields log_prob, log_prior and, if there are any, blobs.
-    `evaluations` counts the points that were asked for. With `evaluates_parts`, the first points of a batch that does
-    not fit into the limit of simulations are evaluated. A function `observer` is called when the number of points that
+    `evaluations` counts the points that were asked for. A function `observer` is called when the number of points that
     are `done` or `running` changes.
     """
 
@@ -40,7 +39,6 @@ class Evaluator:
         self._nwalkers, self._failure_share = nwalkers, failure_share
         self._fields: list[tuple] = [("log_prob", np.float64), ("log_prior", np.float64)]
         self._has_blobs: bool | None = None  # whether the function returns blobs; None while this is not known
-        self.evaluates_parts = True
         self.pool = self.observer = None
         self.evaluations = self.done = self.running = 0
 
@@ -67,20 +65,18 @@ class Evaluator:
         """Whether each of the points (n, ndim) lies in the support of the prior."""
         return self.target.log_prior(coords) > -np.inf
 
-    def more_draws(self, n: int, random: np.random.RandomState) -> np.ndarray:
-        """Draws (m, ndim) of the prior: m is `n`, or 0 if none can be made."""
-        return self.target.more_draws(n, random)
-
     def begin(self) -> Remember:
         """An annealing begins; returns a function that remembers arrays in the record (`Record.remembering`)."""
         return self.record.remembering()
 
     def submit(self, coords: np.ndarray, observe: Callable[[np.ndarray], None] | None = None) -> PendingPoints:
-        """Evaluate points (n, ndim); the limit of simulations may allow only the first points."""
-        try:
-            return PendingPoints.known(coords, self.evaluate(coords, observe))
-        except BudgetExhausted as stop:
-            return PendingPoints.known(coords[: len(stop.records)], stop.records, refused=True)
+        """Evaluate points (n, ndim); the limit of simulations may allow only the first points.
+
+        `observe` is called with points directly before they are evaluated.
+        """
+        log_prior, asked, refused = self._allowed(coords)
+        coords = coords[: len(log_prior)]
+        return PendingPoints.known(coords, self._evaluated(coords, log_prior, asked, observe), refused)
 
     def wait(self, most: int) -> None:
         """Nothing runs after `submit`."""
@@ -89,62 +85,100 @@ class Evaluator:
         """An annealing has ended: nothing runs after `submit`."""
 
     def evaluate(
-        self,
-        coords: np.ndarray,
-        observe: Callable[[np.ndarray], None] | None = None,
-        then: Callable[[np.ndarray, np.ndarray], Any] = lambda coords, records: records,
+        self, coords: np.ndarray, then: Callable[[np.ndarray, np.ndarray], Any] = lambda coords, records: records
     ) -> Any:
         """Records (n,) of points (n, ndim), known or new; or what ``then(coords, records)`` makes of them.
 
-        `observe` is called with points directly before they are evaluated. Raises BudgetExhausted if the points do not
-        fit into the limit of simulations.
+        Raises BudgetExhausted, before any evaluation, if the points do not fit into the limit of simulations.
         """
-        log_prior, inside = self._prior_of(coords)
-        asked, known, batches = self._look_up(coords, inside)
+        log_prior, asked, refused = self._allowed(coords)
+        if refused:
+            raise BudgetExhausted
+        return then(coords, self._evaluated(coords, log_prior, asked))
+
+    def _allowed(self, coords: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
+        """Of the first points (n, ndim) that the limit of simulations allows: log-prior (m,), and rows of those inside.
+
+        Also whether it refuses a further point.
+        """
+        if not np.all(np.isfinite(coords)):
+            raise ValueError("At least one parameter value was infinite or NaN")
+        log_prior = self.target.log_prior(coords)
+        asked = np.flatnonzero(log_prior > -np.inf)
+        fitting = self.budget.fitting(coords[asked])
+        refused = fitting < len(asked)
+        return log_prior[: asked[fitting]] if refused else log_prior, asked[:fitting], refused
+
+    def _evaluated(
+        self,
+        coords: np.ndarray,
+        log_prior: np.ndarray,
+        asked: np.ndarray,
+        observe: Callable[[np.ndarray], None] | None = None,
+    ) -> np.ndarray:
+        """Records (n,) of points (n, ndim) with log-prior (n,), of which those in the rows `asked` lie inside."""
+        known, batches = self._look_up(coords[asked])
         old, new = asked[known], asked[~known]
         if observe is not None:
             for part in (*(batch.coords for batch in batches), coords[new]):
                 if len(part) > 0:
                     observe(part)
         if len(new) > 0:
-            arriving = _Arriving(self, coords[new])
-            self.count(len(new))
-            try:
-                with interrupts_end_the_run():
-                    for answer in self.target.answers(coords[new], self.pool):
-                        arriving.take(answer)
-            except BaseException:  # Ctrl-C, or a pool that cannot go on
-                arriving.store()
-                raise
-            self.count(0, self.running)
-            batches.append(arriving.settle(whole=len(new) == sum(inside)))
+            batches.append(self._evaluate_new(coords[new], len(new) == np.count_nonzero(log_prior > -np.inf)))
         self.evaluations += len(asked)
-        records = self._pack(log_prior, np.concatenate([old, new]), batches)
-        if len(asked) < sum(inside):
-            raise BudgetExhausted(records[: np.flatnonzero(inside)[len(asked)]])
-        return then(coords, records)
+        return self._pack(log_prior, np.concatenate([old, new]), batches)
 
-    def _prior_of(self, coords: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Log-prior (n,) of points (n, ndim), and which of them lie inside its support, (n,) bool."""
-        if not np.all(np.isfinite(coords)):
-            raise ValueError("At least one parameter value was infinite or NaN")
-        log_prior = self.target.log_prior(coords)
-        return log_prior, log_prior > -np.inf
-
-    def _look_up(self, coords: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[EvaluatedBatch]]:
-        """Rows of the points inside that the limit of simulations allows, which are known, and the known values."""
-        asked = np.flatnonzero(inside)
-        fitting = self.budget.fitting(coords[asked])
-        if fitting < len(asked):
-            known, _ = self.record.find(coords[asked])
-            asked = asked[: fitting if self.evaluates_parts else int(np.argmin(known))]
-        known, batches = self.record.find(coords[asked])
+    def _look_up(self, coords: np.ndarray) -> tuple[np.ndarray, list[EvaluatedBatch]]:
+        """Which of points (n, ndim) are known, (n,) bool, and their values."""
+        known, batches = self.record.find(coords)
         if not known.all() and self.record.is_complete:
             raise Incomplete
         for batch in batches:
             self._check_blobs(batch)
         self.count(int(sum(known)), int(sum(known)))
-        return asked, known, batches
+        return known, batches
+
+    def _evaluate_new(self, coords: np.ndarray, whole: bool) -> EvaluatedBatch:
+        """Evaluate new points (n, ndim), which are a `whole` batch or a part of it.
+
+        Successes are entered in the record every 0.05 s, failures when all values have arrived, since they may yet end
+        the run.
+        """
+        results: Any = []
+        failed, stored, noted = [], 0, time.perf_counter()
+
+        def store() -> None:
+            nonlocal stored, noted
+            if (count := len(results)) > stored:
+                part = self.as_batch(coords[stored:count], results[stored:])
+                failed.extend(stored + np.flatnonzero(part.failed))
+                self.enter(_successes(part))
+            stored, noted = count, time.perf_counter()
+
+        self.count(len(coords))
+        try:
+            with interrupts_end_the_run():
+                for answer in self.target.answers(coords, self.pool):
+                    if self.target.vectorize:
+                        results = answer  # of all points
+                        break
+                    results.append(answer)
+                    self.count(0, 1)
+                    if time.perf_counter() - noted > SECONDS_BETWEEN_NOTES:
+                        store()
+        except BaseException:  # Ctrl-C, or a pool that cannot go on
+            store()
+            raise
+        self.count(0, self.running)
+        batch = self.as_batch(coords, results)
+        new = batch.rows([*failed, *range(stored, len(coords))])
+        try:
+            self.check_failures(new, self.record.count, len(self.record.failed), whole=whole and stored == 0)
+        except RuntimeError:
+            self.enter(_successes(new))
+            raise
+        self.enter(new)
+        return batch
 
     def check_failures(
         self, batch: EvaluatedBatch, evaluations: int, failures: int, running: int = 0, whole: bool = True
@@ -154,16 +188,16 @@ class Evaluator:
         Failures may be quicker than successes, so running points count as successes, and only a `whole` batch may not
         fail as a whole.
         """
-        n, count = len(batch.coords), failures + len(batch.reasons)
+        n, failed = len(batch.coords), np.flatnonzero(batch.failed)
+        count = failures + len(failed)
         total = evaluations + n + running
-        all_failed = whole and len(batch.reasons) == n >= self.target.ndim + 2
+        all_failed = whole and len(failed) == n >= self.target.ndim + 2
         if all_failed or (total >= self._nwalkers and count > self._failure_share * total):
             what = f"all {n} evaluations of a batch" if all_failed else f"{count} of {total} evaluations"
-            first = min(batch.reasons)
             raise RuntimeError(
                 f"{what} failed, where max_failure_share={self._failure_share:g} of the run is allowed: "
-                f"{batch.reasons[first]} at {batch.coords[first]}. Earlier evaluations are kept (see failures), and a "
-                "run with a backend in a file goes on from there after the cause is fixed"
+                f"{batch.reasons[failed[0]]} at {batch.coords[failed[0]]}. Earlier evaluations are kept (see "
+                "failures), and a run with a backend in a file goes on from there after the cause is fixed"
             )
 
     def enter(self, batch: EvaluatedBatch) -> None:
@@ -177,7 +211,7 @@ class Evaluator:
 
     def _check_blobs(self, batch: EvaluatedBatch) -> None:
         """Raise ValueError if points that have not failed have blobs and others have none."""
-        if len(batch.reasons) == len(batch.coords):
+        if batch.failed.all():
             return
         has_blobs = batch.blobs is not None
         self._has_blobs = has_blobs if self._has_blobs is None else self._has_blobs
@@ -218,51 +252,6 @@ class Evaluator:
         return self.as_batch(coords, answers[0] if self.target.vectorize else answers)
 
 
-class _Arriving:
-    """Values of new points (n, ndim) as they arrive: successes are entered in the record every 0.05 s.
-
-    Failures are entered when all values have arrived, since they may yet end the run.
-    """
-
-    def __init__(self, evaluator: Evaluator, coords: np.ndarray):
-        self._evaluator, self._coords, self._results = evaluator, coords, []
-        self._failed: list[int] = []
-        self._stored, self._noted = 0, time.perf_counter()
-
-    def take(self, answer: Any) -> None:
-        """Take the value of the next point; or of all points, if the function takes a batch."""
-        evaluator = self._evaluator
-        if evaluator.target.vectorize:
-            self._results = answer
-            return
-        self._results.append(answer)
-        evaluator.count(0, 1)
-        if time.perf_counter() - self._noted > SECONDS_BETWEEN_NOTES:
-            self.store()
-
-    def store(self) -> None:
-        """Enter the successes among the values that have arrived."""
-        first, count = self._stored, len(self._results)
-        if count > first:
-            part = self._evaluator.as_batch(self._coords[first:count], self._results[first:])
-            self._failed.extend(first + row for row in part.reasons)
-            self._evaluator.enter(_successes(part))
-        self._stored, self._noted = count, time.perf_counter()
-
-    def settle(self, whole: bool) -> EvaluatedBatch:
-        """Enter what is left of a `whole` batch, or of a part of it, and return it; RuntimeError for many failures."""
-        evaluator, record = self._evaluator, self._evaluator.record
-        batch = evaluator.as_batch(self._coords, self._results)
-        new = batch.rows([*self._failed, *range(self._stored, len(self._coords))])
-        try:
-            evaluator.check_failures(new, record.count, len(record.failed), whole=whole and self._stored == 0)
-        except RuntimeError:
-            evaluator.enter(_successes(new))
-            raise
-        evaluator.enter(new)
-        return batch
-
-
 def unpack(records: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
     """log_prob and blobs (or None) of records, as emcee takes them."""
     return records["log_prob"].copy(), records["blobs"].copy() if "blobs" in records.dtype.names else None
@@ -270,4 +259,4 @@ def unpack(records: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
 
 def _successes(batch: EvaluatedBatch) -> EvaluatedBatch:
     """The points of a batch that have not failed."""
-    return batch.rows([row for row in range(len(batch.coords)) if row not in batch.reasons])
+    return batch.rows(np.flatnonzero(~batch.failed))

@@ -134,8 +134,9 @@ class Target:
     def recall(self, batch: EvaluatedBatch) -> None:
         """Tell a function that counts failures itself what an earlier process has evaluated, by `recall_failures`."""
         if hasattr(self._owner, "recall_failures"):
-            rows = [row for row in range(len(batch.coords)) if row in batch.counted or batch.log_prob[row] > -np.inf]
-            reasons = [batch.counted.get(row, "") for row in rows]
+            told = np.isin(np.arange(len(batch.coords)), list(batch.reasons))
+            rows = np.flatnonzero((batch.log_prob > -np.inf) | (told & ~batch.failed)).tolist()
+            reasons = [batch.reasons.get(row, "") for row in rows]
             self._owner.recall_failures(self._as_columns(batch.coords[rows]), reasons)
 
     def _as_columns(self, coords: np.ndarray) -> Any:
@@ -172,11 +173,11 @@ class Target:
         log_prob, blobs, reasons = outcomes(results, len(coords), self.blobs_dtype, self.name)
         if self.is_likelihood:
             log_prob = log_prob + self.log_prior(coords)
-        counted, impossible = {}, np.flatnonzero(log_prob == -np.inf)
+        impossible = np.flatnonzero(log_prob == -np.inf)
         if len(impossible) > 0 and hasattr(self._owner, "failures_at"):
             said = self._owner.failures_at(self._as_columns(coords[impossible]))
-            counted = {int(row): text for row, text in zip(impossible, said, strict=True) if text}
-        return EvaluatedBatch(coords, log_prob, blobs, reasons, counted)
+            reasons |= {int(row): text for row, text in zip(impossible, said, strict=True) if text}
+        return EvaluatedBatch(coords, log_prob, blobs, reasons)
 
     def sample_prior(self, n: int, random: np.random.RandomState) -> np.ndarray:
         """Draws (n, ndim) of the prior; ValueError without the method of the function."""

@@ -131,9 +131,8 @@ def judged_failures(evaluated: Any, final_coords: np.ndarray, target: Any) -> Ne
     a simulation depends on. If the `target` counts failures by itself, all values of -inf are failures, except outside
     its support.
     """
-    failed = np.isin(np.arange(len(evaluated.coords)), list(evaluated.reasons))[-KEPT_POINTS:]
     coords, log_prob = evaluated.coords[-KEPT_POINTS:], evaluated.log_prob[-KEPT_POINTS:]
-    impossible = ~failed & ~(log_prob > -np.inf)
+    failed, impossible = np.isnan(log_prob), log_prob == -np.inf
     if not np.any(failed | impossible):
         return NearFailures(0, 0)
     rows = np.flatnonzero(impossible)

@@ -75,7 +75,7 @@ def anneal(
             return
         coords, more = population.coords, first_draws(size) - size
         if more > 0 and (settings.recycle or schedule.mixtures):  # walks, as in papers, do not use what they reveal
-            coords = np.concatenate([coords, density.more_draws(more, random)])
+            coords = np.concatenate([coords, density.target.more_draws(more, random)])
         start, recycled = submit_start(coords, density, whole=not settings.recycle), None
         if settings.recycle:
             steps = recycle(start, size, density, random)
