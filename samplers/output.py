@@ -14,7 +14,6 @@ import numpy as np
 from emcee import State
 from emcee.backends import Backend, HDFBackend
 
-from .emcee_internals import cut_chain, type_of_blobs
 from .estimates.importance import EvidenceCheck
 from .finding import Finding
 from .judgement.verdict import Verdict
@@ -63,17 +62,17 @@ class Output:
         """Remove a step that an error or Ctrl-C has left incomplete."""
         try:
             if self._backend.iteration != self._counts[0] or np.any(self._backend.accepted != self._counts[1]):
-                cut_chain(self._backend, *self._counts)
+                _cut_chain(self._backend, *self._counts)
         except Exception as error:  # the error that has ended the step is raised
             logger.warning("the chain may end with half of a step (%s)", error)
 
     def trim(self) -> None:
         """Remove allocated steps."""
-        cut_chain(self._backend, int(self._backend.iteration), self._backend.accepted)
+        _cut_chain(self._backend, int(self._backend.iteration), self._backend.accepted)
 
     def check_blobs(self, blobs: np.ndarray | None) -> None:
         """Raise ValueError if blobs (n, ...) that are stored next have another type than those of the chain."""
-        stored = type_of_blobs(self._backend)
+        stored = _type_of_blobs(self._backend)
         if blobs is not None and stored not in (None, blobs.dtype):
             raise ValueError(
                 f"the chain has blobs of type {stored}, and blobs_dtype is now {blobs.dtype}: use another backend; or "
@@ -137,7 +136,7 @@ class Output:
     def clear_chain(self, state: State | None) -> None:
         """Remove all steps; the chain continues from `state`."""
         with self.whole():
-            cut_chain(self._backend, 0, np.zeros_like(self._counts[1]))
+            _cut_chain(self._backend, 0, np.zeros_like(self._counts[1]))
             self.provisional = False
             self.write(state)
 
@@ -152,7 +151,7 @@ class Output:
     def drop_provisional_step(self) -> None:
         """Remove the last step if it is provisional."""
         if self.provisional:
-            cut_chain(self._backend, 0, self._counts[1])
+            _cut_chain(self._backend, 0, self._counts[1])
             self.provisional = False
             self.write()
 
@@ -178,3 +177,31 @@ def _parsed(stored: dict[str, Any]) -> tuple[AnnealingResult, Verdict | None]:
         return result, None
     status, reasons, *others, findings = verdict
     return result, Verdict(status, tuple(reasons), *others, tuple(Finding(*each) for each in findings))
+
+
+def _cut_chain(backend: Backend, steps: int, accepted: np.ndarray) -> None:
+    """Set a chain's number of steps and its counts of accepted proposals (nwalkers,).
+
+    What an interrupted step or allocation has left, from which emcee's backends cannot grow, is removed.
+    """
+    if isinstance(backend, HDFBackend):
+        with backend.open("a") as file:
+            group = file[backend.name]
+            group.attrs["iteration"] = steps
+            group["accepted"][...] = accepted
+            group.attrs["has_blobs"] &= steps > 0
+            if not group.attrs["has_blobs"]:  # emcee sets it after it has made the dataset
+                group.pop("blobs", None)
+        return
+    backend.iteration, backend.accepted = steps, np.array(accepted)
+    backend.chain, backend.log_prob = backend.chain[:steps], backend.log_prob[:steps]
+    backend.blobs = None if backend.blobs is None or steps == 0 else backend.blobs[:steps]
+
+
+def _type_of_blobs(backend: Backend) -> np.dtype | None:
+    """The type of the blobs of a chain; None without any."""
+    if not isinstance(backend, HDFBackend):
+        return None if backend.blobs is None else backend.blobs.dtype
+    with backend.open() as file:
+        group = file[backend.name]
+        return group["blobs"].dtype.base if group.attrs["has_blobs"] else None

@@ -7,9 +7,9 @@ posterior only, and everything that emcee does with a chain works unchanged.
 Each walker carries (log_prob, log_prior, blobs) as the blobs of an emcee State, whose log_prob is the tempered density.
 Therefore any emcee move works below beta = 1, and a change of beta needs no evaluation.
 
-Three collaborators do the rest: `samplers.evaluation.evaluator.Evaluator` evaluates the user's function,
-`samplers.record.Record` keeps its values, and `samplers.output.Output` stores the ladder and the verdict with the
-chain.
+Private attributes of emcee that are used, ``_random``, ``_moves``, ``_weights`` and ``_previous_state``, are pinned by
+`tests.contract.test_emcee_contract`. The user's function is evaluated by `samplers.evaluation.evaluator.Evaluator`, its
+values are kept by `samplers.record.Record`, and ladder and verdict are stored by `samplers.output.Output`.
 """
 
 import copy
@@ -25,7 +25,6 @@ import numpy as np
 from emcee import EnsembleSampler, State
 
 from .budget import Budget, BudgetExhausted, as_limit
-from .emcee_internals import get_moves, get_previous_state, get_random, set_moves, set_previous_state
 from .evaluation.asynchronous import AsynchronousEvaluator, check_asynchronous
 from .evaluation.evaluator import Evaluator, unpack
 from .evaluation.user_target import Target
@@ -158,18 +157,18 @@ class TemperedSampler(RunResults, EnsembleSampler):
         # whether the annealing of the record must be repeated, and whether another sampler wrote the record
         self._must_repeat = self._reopened = self._record.start is not None
         self.seconds = 0.0
-        set_previous_state(self, None)
+        self._previous_state = None
         same = pool, copy.deepcopy(moves), args, kwargs, backend, vectorize, blobs_dtype, parameter_names
         super().__init__(nwalkers, ndim, target.function, *same)
         self._output = Output(self.backend)
         self._result, self._verdict = self._output.result, self._output.verdict
         self._is_compared = not self._reopened and self.backend.iteration == 0
-        check_moves(get_moves(self)[0], given.chains)
+        check_moves(self._moves, given.chains)
         self._fast = target.fast_parameters if pool is None or vectorize else ()
-        followed = with_fast_sweeps(get_moves(self)[0], self._fast, ndim, given.fast_sweeps)
+        followed = with_fast_sweeps(self._moves, self._fast, ndim, given.fast_sweeps)
         # each annealing begins with copies of these
-        self._first_moves = copy.deepcopy(followed), get_moves(self)[1]
-        set_moves(self, followed, get_moves(self)[1])
+        self._first_moves = copy.deepcopy(followed), self._weights
+        self._moves = followed
         refuse_unused(given, guide is not None)
         if given.ess_floor >= nwalkers:
             raise ValueError(f"ess_floor={given.ess_floor} must be below nwalkers={nwalkers}")
@@ -193,7 +192,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
                 "%s contains a run with seed=%s: seed=%s has no effect", self.backend.filename, stored, self._seed
             )
         elif self.backend.random_state is None:
-            get_random(self).seed(stream)
+            self._random.seed(stream)
 
     @classmethod
     def _chosen(cls, settings: dict[str, Any], moves: Any, nwalkers: int) -> tuple[dict[str, Any], Any]:
@@ -218,7 +217,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         """
         if hasattr(self, "_output"):
             if not self._must_repeat:
-                state = get_previous_state(self)
+                state = self._previous_state
             else:  # the annealing of a file, whose chain may end with an estimate that is replaced
                 state = None if self._output.provisional else self._output.last_state()
             self._output.clear_chain(state)
@@ -275,7 +274,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         with interrupts_end_the_run():
             for each in self.sample(initial_state, iterations=nsteps, **kwargs):
                 state = each
-        return State(get_previous_state(self), copy=True) if state is None else state
+        return State(self._previous_state, copy=True) if state is None else state
 
     def sample(
         self,
@@ -315,7 +314,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         arguments = {"tune": tune, "thin_by": thin_by, "thin": thin, "store": store, "iterations": iterations}
         bar = {"progress": progress, "progress_kwargs": progress_kwargs}
         start, provisional, evaluations = time.perf_counter(), self._output.provisional, self.evaluations
-        random_state = get_random(self).get_state()
+        random_state = self._random.get_state()
         with self._output.whole():
             try:
                 state = self._first_state(state, skip_initial_state_check)
@@ -338,11 +337,10 @@ class TemperedSampler(RunResults, EnsembleSampler):
                 if store and provisional and not self._output.provisional:
                     arguments["iterations"] = iterations = iterations + 1  # in place of the provisional step
                 with deferred_interrupts():
-                    set_previous_state(self, State(state, copy=True))  # where the next call goes on after an interrupt
+                    self._previous_state = State(state, copy=True)  # where the next call goes on after an interrupt
                     self._must_repeat = self._must_repeat and self._result.early_stop is not None
                 self.seconds += time.perf_counter() - start
-                moves, probabilities = get_moves(self)
-                set_moves(self, without_unfitted(moves), probabilities)
+                self._moves = without_unfitted(self._moves)
                 state.blobs = self._evaluator.typed(state.blobs)
                 if store:
                     self._output.trim()
@@ -360,7 +358,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
                         new += 1
                         with deferred_interrupts():
                             stored = State(advanced, copy=True)
-                            set_previous_state(self, stored)
+                            self._previous_state = stored
                             if store:
                                 self._output.step_stored()
                         self.seconds += time.perf_counter() - start
@@ -400,7 +398,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         """Remove incomplete results: a part of a step, and the draws of a run that has not begun."""
         self._output.undo_half_a_step()
         if self._record.start is None:  # the next call makes the same draws
-            get_random(self).set_state(random_state)
+            self._random.set_state(random_state)
 
     def _end_early(self, advanced: State | None, stored: State, new: int, missing: int, store: bool) -> Iterator[State]:
         """Finish a call that the limit of simulations has ended after `new` steps; `stored` is the last step."""
@@ -446,7 +444,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._open_record()
         if self._record.start is not None:
             self._output.drop_provisional_step()
-        start, previous = self._record.start, get_previous_state(self)
+        start, previous = self._record.start, self._previous_state
         if start is not None and self._must_repeat:
             known = [each.coords for each in (start, previous) if each is not None]
             if given is None or any(np.array_equal(given.coords, coords) for coords in known):
@@ -462,7 +460,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         if given is None and previous is not None:
             given = previous
         elif given is None:
-            draws = self._target.sample_prior(self.nwalkers, get_random(self))
+            draws = self._target.sample_prior(self.nwalkers, self._random)
             return self._new_start(State(draws), skip_check, True)
         elif previous is not None and given.log_prob is None:
             if np.array_equal(given.coords, previous.coords):
@@ -496,7 +494,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
                 self.backend.filename,
             )
         if not found and getattr(self._target.function, "fingerprint", None) is None:
-            found = changes(self._record, get_previous_state(self), self._evaluator.compute)
+            found = changes(self._record, self._previous_state, self._evaluator.compute)
         if found:
             raise ValueError(
                 f"{self._place} contains another run: {'; '.join(found)}. Use another file or backend, or "
@@ -541,11 +539,11 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self.random_state = start.random_state
         self._budget.restart(start.header["of_earlier_guides"])
         schedule, guidance = MoveSchedule(*copy.deepcopy(self._first_moves)), None
-        set_moves(self, *schedule)
+        self._moves, self._weights = schedule
         remember = self._evaluator.begin()
         if self._given_guide is not None:
             self._guide = AdaptedGuide(self._given_guide, self.ndim)
-            guidance = lend(self._guide, get_random(self), remember, self._budget, self.settings.asynchronous)
+            guidance = lend(self._guide, self._random, remember, self._budget, self.settings.asynchronous)
         self._record.is_complete = stored is not None
         population = Population(0.0, start.coords, None, float(self.nwalkers))
         recording = Recording(self._evaluator)
@@ -561,7 +559,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
                     self._result = recording.add(population, report)
                     progress.show(self._result, population, report)
 
-                arguments = population, self._evaluator, get_random(self), schedule, self.settings, guidance
+                arguments = population, self._evaluator, self._random, schedule, self.settings, guidance
                 yield anneal(*arguments), guidance, take
         finally:
             self._record.is_complete = False
@@ -573,7 +571,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
             moves = with_fast_sweeps([GuideMove(self._guide)], self._fast, self.ndim, self.settings.fast_sweeps)
             schedule = MoveSchedule(moves, np.ones(1))
             schedule.calibrate(population.coords, np.full(self.nwalkers, 1.0 / self.nwalkers))
-            set_moves(self, *schedule)
+            self._moves, self._weights = schedule
         self._judge(0, population.coords)
         self._reopened = False
         ended = self._result.early_stop is not None
@@ -611,5 +609,5 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._budget.take_from_record()
         self._reopened = False
         self.random_state = stored.random_state
-        set_moves(self, *copy.deepcopy(self._first_moves))
+        self._moves, self._weights = copy.deepcopy(self._first_moves)
         return stored

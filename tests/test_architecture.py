@@ -44,7 +44,7 @@ ORDER = {
         ("presets", "reports"),
         ("budget", "estimates", "moves"),
         ("proposals", "record", "settings"),
-        ("blobs", "emcee_internals", "finding", "interrupts", "locks", "resampling"),
+        ("blobs", "finding", "interrupts", "locks", "resampling"),
     ),
 }
 

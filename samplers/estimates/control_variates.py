@@ -1,17 +1,8 @@
 """Expectations from few weighted draws and a known density close to the posterior (control variates).
 
-A guide may know a density close to the posterior whose expectations cost nothing, such as the posterior of an emulator.
-An expectation under the posterior is the known one plus the mean, over the draws of a round, of the function times the
-difference between two weights: of the posterior and of the known density, both relative to the proposal.
-The differences are small where the known density is close to the posterior; a poor one costs accuracy, but no bias.
-They have the sum 0, so the estimate is an expectation over a *signed sample*: points of the known density with positive
-weights, and the draws with weights of both signs. The evidence is estimated with the same gain. The equations are in
-``docs/theory/guided``.
-
-References
-----------
-Owen, A. B. & Zhou, Y. (2000), Safe and effective importance sampling, J. Am. Stat. Assoc. 95(449),
-doi:10.1080/01621459.2000.10473909
+The known density, such as the posterior of an emulator, has expectations that cost nothing; a poor one costs accuracy,
+but no bias. The estimate is an expectation over a *signed sample*: points of the known density with positive weights,
+and the draws with weights of both signs. The equations are in ``docs/theory/guided``.
 """
 
 from collections.abc import Callable, Sequence

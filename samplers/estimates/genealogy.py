@@ -1,20 +1,9 @@
-r"""Genealogy of a population: founders of the points, and the standard error of a mean that accounts for them.
+"""Genealogy of a population: founders of the points, and the standard error of a mean that accounts for them.
 
-Resampling copies points, and moves separate the copies only gradually, so points with a common ancestor (founder) are
-not independent. Groups of points with different founders are independent. With :math:`\bar x` the mean over all points
-and :math:`x_i` the contribution of point i,
-
-.. math:: \mathrm{Var}(\bar x) \approx N^{-2} \sum_k \Big( \sum_{i \in k} (x_i - \bar x) \Big)^2
-
-sums over the groups k. Copies that still agree count as one point, and copies that have separated count as several.
-Where the points are the walkers of a chain, :math:`x_i` is the mean along walker i, which also accounts for
-autocorrelation. Older founders account for more of the annealing but leave fewer groups. As in the fixed-lag estimator
-of Olsson & Douc (2019), the oldest generation that still has enough founders is used.
-
-References
-----------
-Lee & Whiteley (2018), Biometrika 105(3), doi:10.1093/biomet/asy028 (variance from the genealogy of one run)
-Olsson & Douc (2019), Bernoulli 25(2), doi:10.3150/18-BEJ1029 (founders a few generations back)
+Resampling copies points, and moves separate the copies only gradually: only groups of points with different ancestors
+(founders) are independent. Copies that still agree count as one point, and copies that have separated count as several
+(Lee & Whiteley 2018, Olsson & Douc 2019; the equation is in ``docs/theory/tempering``). Older founders account for more
+of the annealing but leave fewer groups, so the oldest generation that still has enough founders is used.
 """
 
 from collections.abc import Sequence

@@ -1,11 +1,7 @@
-r"""Importance sampling: the evidence from weighted draws, and whether their weights are reliable.
+"""Importance sampling: the evidence from weighted draws, and whether their weights are reliable.
 
 A proposal is fixed before its draws are made, so the mean of posterior / proposal over the draws estimates the evidence
-without bias. If the proposal changes from round to round, every draw is weighted by the mixture of the proposals of all
-rounds, whose errors differ (Owen & Zhou 2000, doi:10.1080/01621459.2000.10473909; Cornuet, Marin, Mira & Robert 2012,
-doi:10.1111/j.1467-9469.2011.00756.x).
-
-The equations are in ``docs/theory/guided`` and ``docs/theory/evidence``.
+without bias. The equations and their sources are in ``docs/theory/guided`` and ``docs/theory/evidence``.
 """
 
 from collections.abc import Callable, Sequence
@@ -110,11 +106,8 @@ def draw_inside(
 def evidence_from_weights(log_weights: np.ndarray, made: int) -> EvidenceCheck:
     """Evidence from the log-weights (n,) of the draws inside the support, out of `made` draws.
 
-    The sample variance of n weights is too small if n draws rarely contain the largest weights. Rough likelihoods have
-    nearly log-normal weights, whose variance follows from the spread s of their logarithms, exp(s²) - 1 in units of the
-    squared mean. The error follows from the larger variance. The spread is the distance between the quantiles that lie
-    one and two standard deviations above the median in a normal distribution, so small weights in the tails of the
-    proposal do not count.
+    The error is from the sample variance or, if it is larger, from the variance of log-normal weights with the spread
+    of the larger half (``docs/theory/evidence``): n draws rarely contain the largest weights of a rough likelihood.
     """
     full = np.full(made, -np.inf)
     full[: len(log_weights)] = log_weights
@@ -230,15 +223,12 @@ def tail_shape(log_weights: np.ndarray) -> float:
 
 
 def tail_growth(rounds: Sequence[Round], part: float = 0.5) -> tuple[float, float]:
-    r"""Slope of the log-weights over minus the log-posterior, among a `part` of the draws, and the error of the slope.
+    """Slope of the log-weights over minus the log-posterior, among a `part` of the draws, and the error of the slope.
 
-    The part has the lowest posterior. If the posterior :math:`\pi` is proportional to a power :math:`q^c` of the
-    proposal density, the slope is :math:`(1 - c) / c`, which is positive if the proposal has lighter tails than the
-    posterior. Draws from light tails do not reach the places with large weights, so all weights may be small. Errors of
-    a proposal, and jumps of a likelihood, do not make the slope positive on average.
-
-    The fit is by least squares, and (0, inf) for fewer than 8 draws in the part. The error is the standard error times
-    a factor above 1 for few draws: 4 errors are exceeded with the same probability for any number.
+    The part has the lowest posterior. The slope is positive if the proposal has lighter tails than the posterior
+    (``docs/theory/guided``); errors of a proposal, and jumps of a likelihood, do not make it positive on average. It is
+    (0, inf) for fewer than 8 draws in the part. The error is the standard error times a factor above 1 for few draws: 4
+    errors are exceeded with the same probability for any number.
     """
     log_prob = np.concatenate([r.records["log_prob"] for r in rounds])
     log_weights = np.concatenate([r.log_weights for r in rounds])
@@ -265,12 +255,10 @@ def tails_are_light(rounds: Sequence[Round]) -> bool:
 
 
 def tail_variance(log_weights: np.ndarray) -> float:
-    r"""Variance of the log-evidence due to weights larger than all drawn weights, from log-weights (n,).
+    """Variance of the log-evidence due to weights larger than all drawn ones, from log-weights (n,).
 
-    If the largest weights have a Pareto shape :math:`0 < k < 1`, the mean excess over the largest normalised weight
-    :math:`W_{max}` is about :math:`k W_{max} / (1 - k)`, which is taken as a standard error, up to 1, which a single
-    point has. It is infinite for :math:`k \ge 1`. If there are too few weights for an estimate, k is 0.7. With an
-    effective sample size below 5, points that were not drawn may have any weight, and the variance is infinite.
+    The mean excess over the largest normalised weight, by the Pareto shape, is taken as a standard error, up to 1;
+    infinite for a shape of 1 or more, or an effective sample size below 5 (``docs/theory/guided``).
     """
     shape = tail_shape(log_weights)
     shape = SHAPE_OF_FEW if shape == np.inf else shape
@@ -305,20 +293,12 @@ def mixture_at_draws(rounds: Sequence[Round]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def pool_rounds(rounds: Sequence[Round]) -> PooledRounds:
-    r"""Combine one or more rounds, as `add_round` returns them.
+    """Combine one or more rounds, as `add_round` returns them (``docs/theory/guided``).
 
     Each draw is weighted by the mixture of all densities, so that expectations do not suffer from a part that one round
     missed. But a density that was fitted to earlier draws is large there, so the sum of these weights is too small, in
-    the logarithm by .03 to .17 for mixtures fitted to 100 to 300 draws. The evidence is therefore
-    :math:`\hat Z = \sum_r \alpha_r \hat Z_r` with the mean weight :math:`\hat Z_r` of each round under its own density.
-    The share is proportional to the number of draws and to the effective share of the density,
-    :math:`Z^2 / E_{q_r}[(\pi / q_r)^2] = Z / E_\pi[\pi / q_r]`, an expectation over the draws of all rounds: a round
-    that missed a part of the posterior cannot know it, and a share from its own weights would be too large.
-
-    The variance of the log-evidence is the sum of three parts: the largest of the variance of these means, their
-    deviations, :math:`\sum_r \alpha_r^2 (\hat Z_r / \hat Z - 1)^2`, and the square of the logarithm by which the sum of
-    the mixture's weights is larger, as where each round missed a part; `tail_variance`; and the square of the standard
-    error of the known density's log normalising constant.
+    the logarithm by .03 to .17 for mixtures fitted to 100 to 300 draws. The evidence is therefore the mean of the
+    rounds' own estimates, with the effective share of each density from the draws of all rounds.
     """
     coords, records = np.concatenate([r.coords for r in rounds]), np.concatenate([r.records for r in rounds])
     log_prob, mixture = mixture_at_draws(rounds)

@@ -1,12 +1,6 @@
-r"""The Pareto tail of importance weights: its shape says whether they can be used.
+"""The Pareto tail of importance weights: its shape says whether they can be used (``docs/theory/evidence``).
 
-The largest weights follow a generalised Pareto distribution. If its shape k is below 0.5, the weights have a variance;
-above 0.7, points that were not drawn dominate the mean.
-
-References
-----------
-Vehtari, Simpson, Gelman, Yao & Gabry (2024), Pareto smoothed importance sampling, JMLR 25(72)
-Zhang & Stephens (2009), Technometrics 51(3), doi:10.1198/tech.2009.08017 (estimation of the shape)
+If the shape k is below 0.5, the weights have a variance; above 0.7, points that were not drawn dominate the mean.
 """
 
 import numpy as np

@@ -1,19 +1,7 @@
-"""Tempering by weights: pure functions on log-weights.
+"""Tempering by weights: pure functions on log-weights (``docs/theory/tempering``).
 
-Between the prior (beta = 0) and the posterior (beta = 1) lies the family
-
-    log pi_beta(theta) = (1 - beta) log prior(theta) + beta log posterior(theta)
-                       = log prior(theta) + beta log likelihood(theta) + constant.
-
-A population at beta is carried to beta' by the incremental weights w_i = likelihood(theta_i) ^ (beta' - beta), whose
-effective sample size is (sum w)^2 / sum w^2. The product of the mean weights over all stages estimates the evidence.
 Weights are kept as logarithms until their maximum has been subtracted: log-likelihoods of finite-element models have
 magnitudes of thousands, and a constant added to them must not change anything.
-
-References
-----------
-Del Moral, Doucet & Jasra (2006), J. R. Stat. Soc. B 68(3), doi:10.1111/j.1467-9868.2006.00553.x
-Chan & Lai (2013), Ann. Stat. 41(6), doi:10.1214/13-AOS1172 (standard error of the evidence from one run)
 """
 
 import numpy as np
@@ -55,8 +43,7 @@ def normalised_weights(log_weights: np.ndarray) -> np.ndarray:
 def coarse_weights(log_weights: np.ndarray) -> np.ndarray:
     """Normalised weights from log-weights rounded to 1/4096, for fitting proposals.
 
-    Rounded weights, and thus all draws from the fitted proposal, stay the same to the last bit when a constant is added
-    to the log-likelihood. Slightly different weights do no harm to a fit.
+    All draws from the fitted proposal then keep their bits when a constant is added to the log-likelihood.
     """
     top = np.max(log_weights)
     return normalised_weights(np.round((log_weights - top) * WEIGHT_GRID) / WEIGHT_GRID)
@@ -77,13 +64,10 @@ def log_mean_weight(log_weights: np.ndarray) -> float:
 
 
 class EvidenceError:
-    r"""Standard error of the log-evidence, accumulated during one run (Chan & Lai 2013).
+    """Standard error of the log-evidence, accumulated during one run (Chan & Lai 2013; ``docs/theory/tempering``).
 
-    Points are grouped by their founder. With :math:`W_{ij}` the normalised weight of point i at stage j, group k
-    contributes :math:`A_k = \sum_j \sum_{i \in k} (W_{ij} - 1/N)`, and :math:`\mathrm{Var}(\log Z) \approx \sum_k
-    A_k^2`. Points that never move have the error of plain importance sampling. Once fewer founders than
-    `min_founder_share` times `n_points` are left, the sums are closed, as independent of later ones, and every point
-    becomes a founder.
+    Points are grouped by their founder. Once fewer founders than `min_founder_share` times `n_points` are left, the
+    sums are closed, as independent of later ones, and every point becomes a founder.
     """
 
     def __init__(self, n_points: int, min_founder_share: float = 0.1):

@@ -86,12 +86,12 @@ class AsynchronousEvaluator(Evaluator):
 
     def submit(self, coords: np.ndarray) -> PendingPoints:
         """Begin to evaluate points (n, ndim); the limit of simulations may allow only the first points."""
-        log_prior, asked, refused = self._allowed(coords)
-        coords = coords[: len(log_prior)]
-        known, _ = self._look_up(coords[asked])
+        n = len(coords)
+        coords = coords[: self._allowed(coords)]
+        log_prior, asked, known, _ = self._look_up(coords)
         self.budget.submitted(coords[asked])
         self.evaluations += len(asked)
-        pending = PendingPoints(coords, log_prior, refused)
+        pending = PendingPoints(coords, log_prior, refused=len(coords) < n)
         outside = np.flatnonzero(log_prior == -np.inf)
         if len(outside) > 0:
             pending.arrive(outside, pending.base[outside])

@@ -74,9 +74,8 @@ class Evaluator:
 
         `observe` is called with points directly before they are evaluated.
         """
-        log_prior, asked, refused = self._allowed(coords)
-        coords = coords[: len(log_prior)]
-        return PendingPoints.known(coords, self._evaluated(coords, log_prior, asked, observe), refused)
+        allowed = coords[: self._allowed(coords)]
+        return PendingPoints.known(allowed, self.evaluate(allowed, observe=observe), len(allowed) < len(coords))
 
     def wait(self, most: int) -> None:
         """Nothing runs after `submit`."""
@@ -85,97 +84,86 @@ class Evaluator:
         """An annealing has ended: nothing runs after `submit`."""
 
     def evaluate(
-        self, coords: np.ndarray, then: Callable[[np.ndarray, np.ndarray], Any] = lambda coords, records: records
+        self,
+        coords: np.ndarray,
+        then: Callable[[np.ndarray, np.ndarray], Any] = lambda coords, records: records,
+        observe: Callable[[np.ndarray], None] | None = None,
     ) -> Any:
         """Records (n,) of points (n, ndim), known or new; or what ``then(coords, records)`` makes of them.
 
         Raises BudgetExhausted, before any evaluation, if the points do not fit into the limit of simulations.
         """
-        log_prior, asked, refused = self._allowed(coords)
-        if refused:
+        if self._allowed(coords) < len(coords):
             raise BudgetExhausted
-        return then(coords, self._evaluated(coords, log_prior, asked))
-
-    def _allowed(self, coords: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
-        """Of the first points (n, ndim) that the limit of simulations allows: log-prior (m,), and rows of those inside.
-
-        Also whether it refuses a further point.
-        """
-        if not np.all(np.isfinite(coords)):
-            raise ValueError("At least one parameter value was infinite or NaN")
-        log_prior = self.target.log_prior(coords)
-        asked = np.flatnonzero(log_prior > -np.inf)
-        fitting = self.budget.fitting(coords[asked])
-        refused = fitting < len(asked)
-        return log_prior[: asked[fitting]] if refused else log_prior, asked[:fitting], refused
-
-    def _evaluated(
-        self,
-        coords: np.ndarray,
-        log_prior: np.ndarray,
-        asked: np.ndarray,
-        observe: Callable[[np.ndarray], None] | None = None,
-    ) -> np.ndarray:
-        """Records (n,) of points (n, ndim) with log-prior (n,), of which those in the rows `asked` lie inside."""
-        known, batches = self._look_up(coords[asked])
+        log_prior, asked, known, batches = self._look_up(coords)
         old, new = asked[known], asked[~known]
         if observe is not None:
             for part in (*(batch.coords for batch in batches), coords[new]):
                 if len(part) > 0:
                     observe(part)
         if len(new) > 0:
-            batches.append(self._evaluate_new(coords[new], len(new) == np.count_nonzero(log_prior > -np.inf)))
+            points, failed, stored, noted = coords[new], [], 0, time.perf_counter()
+            results: Any = []
+            self.count(len(points))
+            try:
+                with interrupts_end_the_run():
+                    for answer in self.target.answers(points, self.pool):
+                        if self.target.vectorize:
+                            results = answer  # of all points
+                            break
+                        results.append(answer)
+                        self.count(0, 1)
+                        if time.perf_counter() - noted > SECONDS_BETWEEN_NOTES:
+                            failed += self._store_successes(points, results, stored)
+                            stored, noted = len(results), time.perf_counter()
+            except BaseException:  # Ctrl-C, or a pool that cannot go on
+                self._store_successes(points, results, stored)
+                raise
+            self.count(0, self.running)
+            batches.append(self._settle(points, results, failed, stored, whole=len(new) == len(asked)))
         self.evaluations += len(asked)
-        return self._pack(log_prior, np.concatenate([old, new]), batches)
+        return then(coords, self._pack(log_prior, np.concatenate([old, new]), batches))
 
-    def _look_up(self, coords: np.ndarray) -> tuple[np.ndarray, list[EvaluatedBatch]]:
-        """Which of points (n, ndim) are known, (n,) bool, and their values."""
-        known, batches = self.record.find(coords)
+    def _allowed(self, coords: np.ndarray) -> int:
+        """Number of the first points among (n, ndim) that the limit of simulations allows."""
+        if self.budget.limit is None:
+            return len(coords)
+        inside = np.flatnonzero(self.inside(coords))
+        return int([*inside, len(coords)][self.budget.fitting(coords[inside])])
+
+    def _look_up(self, coords: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[EvaluatedBatch]]:
+        """Log-prior (n,) of points (n, ndim), rows (m,) of those inside, which of these are known, and their values."""
+        if not np.all(np.isfinite(coords)):
+            raise ValueError("At least one parameter value was infinite or NaN")
+        log_prior = self.target.log_prior(coords)
+        asked = np.flatnonzero(log_prior > -np.inf)
+        known, batches = self.record.find(coords[asked])
         if not known.all() and self.record.is_complete:
             raise Incomplete
         for batch in batches:
             self._check_blobs(batch)
         self.count(int(sum(known)), int(sum(known)))
-        return known, batches
+        return log_prior, asked, known, batches
 
-    def _evaluate_new(self, coords: np.ndarray, whole: bool) -> EvaluatedBatch:
-        """Evaluate new points (n, ndim), which are a `whole` batch or a part of it.
+    def _store_successes(self, coords: np.ndarray, results: Any, stored: int) -> list[int]:
+        """Enter the successes among results beyond those `stored` in the record; returns the rows of failures.
 
-        Successes are entered in the record every 0.05 s, failures when all values have arrived, since they may yet end
-        the run.
+        Failures are entered when all values have arrived, since they may yet end the run.
         """
-        results: Any = []
-        failed, stored, noted = [], 0, time.perf_counter()
+        if len(results) == stored:
+            return []
+        part = self.as_batch(coords[stored : len(results)], results[stored:])
+        self.enter(part.rows(np.flatnonzero(~part.failed)))
+        return (stored + np.flatnonzero(part.failed)).tolist()
 
-        def store() -> None:
-            nonlocal stored, noted
-            if (count := len(results)) > stored:
-                part = self.as_batch(coords[stored:count], results[stored:])
-                failed.extend(stored + np.flatnonzero(part.failed))
-                self.enter(_successes(part))
-            stored, noted = count, time.perf_counter()
-
-        self.count(len(coords))
-        try:
-            with interrupts_end_the_run():
-                for answer in self.target.answers(coords, self.pool):
-                    if self.target.vectorize:
-                        results = answer  # of all points
-                        break
-                    results.append(answer)
-                    self.count(0, 1)
-                    if time.perf_counter() - noted > SECONDS_BETWEEN_NOTES:
-                        store()
-        except BaseException:  # Ctrl-C, or a pool that cannot go on
-            store()
-            raise
-        self.count(0, self.running)
+    def _settle(self, coords: np.ndarray, results: Any, failed: list[int], stored: int, whole: bool) -> EvaluatedBatch:
+        """Enter what is left of a `whole` batch, or of a part of it, and return it; RuntimeError for many failures."""
         batch = self.as_batch(coords, results)
         new = batch.rows([*failed, *range(stored, len(coords))])
         try:
             self.check_failures(new, self.record.count, len(self.record.failed), whole=whole and stored == 0)
         except RuntimeError:
-            self.enter(_successes(new))
+            self.enter(new.rows(np.flatnonzero(~new.failed)))
             raise
         self.enter(new)
         return batch
@@ -255,8 +243,3 @@ class Evaluator:
 def unpack(records: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
     """log_prob and blobs (or None) of records, as emcee takes them."""
     return records["log_prob"].copy(), records["blobs"].copy() if "blobs" in records.dtype.names else None
-
-
-def _successes(batch: EvaluatedBatch) -> EvaluatedBatch:
-    """The points of a batch that have not failed."""
-    return batch.rows(np.flatnonzero(~batch.failed))

@@ -1,8 +1,7 @@
 """Whether failed evaluations border on the posterior, so that they, not the data, may end it.
 
-A failed simulation counts as impossible. Far from the posterior this changes nothing. Next to the final points it cuts
-off a part of the posterior, which no weight, evidence or move reveals. Failures that are scattered among successful
-points thin the posterior out evenly, which hardly changes its mean and standard deviation.
+A failed simulation counts as impossible. Next to the final points it cuts off a part of the posterior, which no weight,
+evidence or move reveals; scattered among successful points, failures hardly change mean and standard deviation.
 """
 
 from typing import Any, Literal, NamedTuple

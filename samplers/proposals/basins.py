@@ -1,22 +1,18 @@
-"""Components for parts of the target that a fitted mixture does not cover.
+"""Components for parts of the target that a fitted mixture does not cover (``docs/theory/proposals``).
 
-While the target is annealed, a narrow mode holds little mass: for two modes of equal mass with widths s_1 < s_2 in d
-dimensions, (s_1 / s_2)^(d (1 - beta)) times the mass of the wide one. A mixture fitted to weighted points takes the few
-points there for the tail of the wide mode. But near a mode the log-target is nearly quadratic, and points of another
-mode lie above it. So for every component a quadratic log p(z) = a + g z - z A z / 2 is fitted to its points, in the
-coordinates that standardise it, by least trimmed squares, which ignores a minority of the points (Rousseeuw & Van
-Driessen 2006, doi:10.1007/s10618-005-0024-4).
+A narrow mode holds little mass while the target is annealed, and a mixture fitted to weighted points takes its few
+points for the tail of a wide mode. But near a mode the log-target is nearly a quadratic, and points of another mode lie
+above it. So for every component a quadratic log p(z) = a + g z - z A z / 2 is fitted to its points, in the coordinates
+that standardise it, by least trimmed squares (Rousseeuw & Van Driessen 2006).
 
 1. Points clearly above the quadratics of all components belong to another basin. A second quadratic is fitted to the
    highest of these points and all points that agree with them: its mode, at a limited distance, and A^-1 give a new
-   component, long before a draw hits the top. With fewer points than coefficients, A is drawn towards a multiple of the
-   identity by ridge regression. The points that it explains are set aside, and the next basin is sought.
+   component. The points that it explains are set aside, and the next basin is sought.
 2. If most points agree with the first quadratic, but its mode and A^-1 are far from mean and covariance of the
    component, which were estimated from few effective points, a component is made from the quadratic too.
 
 The new components only decide where draws are made; the weights of the draws are exact for any proposal. Without them,
-11 of 15 runs lost a mode (widths 1:8 and 1:5 in three dimensions, 250 walkers; 1:1.25 in ten, 500), with them 2. Where
-the mixture itself decided which points stand out, 14 of 17 lost the last one, with them none.
+11 of 15 runs lost a mode (widths 1:8 and 1:5 in three dimensions, 250 walkers; 1:1.25 in ten, 500), with them 2.
 """
 
 import math

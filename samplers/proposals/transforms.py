@@ -1,19 +1,9 @@
 """Transformations that make a population nearly Gaussian: maps without bounds, and shears without curvature.
 
-A posterior that is concentrated at a bound, such as a damping ratio near zero, is truncated there, and bell-shaped
-components cannot follow it. The map is the logit between two bounds; for a single bound it is the logarithm of the
-distance near the bound and linear far from it. A sampler knows only whether a point lies in the support, without a
-simulation, so each bound is bracketed and bisected along lines through several points. If the lines disagree, the
-support is not a box, and the parameter is treated as unbounded.
-
-If the data determine only a combination of parameters, such as a product, the posterior is a curved ridge. A shear
-
-    x_target <- x_target - a t - b t^2,   t = (x_source - mean) / sd,
-
-removes the curvature. Its Jacobian determinant is 1, so densities carry over without a correction, and a step that is
-symmetric in the transformed points is symmetric in the original points. Equations, sources and choices are in
-``docs/theory/proposals`` (Haario, Saksman & Tamminen 1999, doi:10.1007/s001800050022; Parno & Marzouk 2018,
-doi:10.1137/17M1134640).
+A sampler knows only whether a point lies in the support, without a simulation, so each bound is bracketed and bisected
+along lines through several points. If the lines disagree, the support is not a box, and the parameter is treated as
+unbounded. A shear subtracts a parabola in one parameter from another one: its Jacobian determinant is 1, so densities
+carry over without a correction. Equations, sources and choices are in ``docs/theory/proposals``.
 """
 
 import math

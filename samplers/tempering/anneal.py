@@ -1,19 +1,15 @@
 """Annealing from draws of the prior to beta = 1: which path to take, and what to do if it fails.
 
-There are three paths. All end with an estimate of the evidence from draws that were not used for the annealing.
-
 guided rounds (`samplers.tempering.guided`)
     With a guide, its weighted draws replace the annealing. If they are not usable, the run ends with a verdict that
     says so: annealing from the prior takes ten times the simulations, which is for the user to decide.
 recycling (`samplers.tempering.recycling`)
-    Adaptive importance sampling. Its weighted draws are resampled to as many points as there are walkers, which are
-    moved only if they are not independent draws already. If the result is not reliable, moves start again from the
-    draws of the prior.
+    Its weighted draws are resampled to as many points as there are walkers, which are moved only if they are not
+    independent draws already. If the result is not reliable, moves start again from the draws of the prior.
 moves (`samplers.tempering.smc_moves`)
-    Sequential Monte Carlo: choose beta, weigh, resample, move.
+    Sequential Monte Carlo, and a check of the evidence.
 
-A limit of simulations ends any path that exceeds it. The points known by then are weighted by the posterior and
-resampled (`StoppedEarly`).
+A limit of simulations ends any path that exceeds it: the known points are weighted by the posterior and resampled.
 """
 
 import logging

@@ -1,19 +1,10 @@
-"""Chains of transitional Markov chain Monte Carlo, which grow from the resampled points, the leaders.
+"""Chains of transitional Markov chain Monte Carlo, which grow from the resampled points (``docs/theory/tempering``).
 
-Ching & Chen (2007) draw a leader by the weights for every new point, and move its chain by one step: a leader that is
-drawn n times has a chain of n points. Its first points have made few steps, and the leaders of long chains have large
-weights, so the new points have a bias, which decreases with the steps that every chain makes before its points count
-(burn-in; Betz, Papaioannou & Straub 2016).
-
-If many points are copies, the next fit and the next weights see too few distinct points: with 100 walkers and 12
-parameters, the means were wrong by 1 to 6 standard deviations. So all points are swept together after the burn-in and
-the chains, until they are nearly uncorrelated with the resampled points. Without a burn-in, the algorithm is as
-published.
-
-References
-----------
-Ching & Chen (2007), J. Eng. Mech. 133(7), doi:10.1061/(ASCE)0733-9399(2007)133:7(816)
-Betz, Papaioannou & Straub (2016), J. Eng. Mech. 142(5), doi:10.1061/(ASCE)EM.1943-7889.0001066
+The first points of a chain have made few steps, and the leaders of long chains have large weights, so the new points
+have a bias, which decreases with the steps that every chain makes before its points count (burn-in). If many points are
+copies, the next fit and the next weights see too few distinct points: with 100 walkers and 12 parameters, the means
+were wrong by 1 to 6 standard deviations. So all points are swept together afterwards, until they are nearly
+uncorrelated with the resampled points. Without a burn-in, the algorithm is as published.
 """
 
 from collections.abc import Generator

@@ -1,28 +1,14 @@
-"""Recycling: adaptive multiple importance sampling (AMIS) from the prior to the posterior.
+"""Recycling: adaptive multiple importance sampling (AMIS) from the prior to the posterior (``docs/theory/recycling``).
 
-All points evaluated so far, draws of the prior and of all proposals, are weighted by the tempered target over the
-mixture of all densities that they were drawn from (deterministic mixture weights). Each round
-
-1. chooses the next beta, which keeps the effective sample size of *all* points at a target,
-2. fits a mixture to the weighted points at that beta, and
-3. draws from this mixture, evaluates the draws and adds them to the points.
+All points evaluated so far are weighted by the tempered target over the mixture of all densities that they were drawn
+from. Each round chooses the next beta, fits a mixture to the weighted points, and adds draws from it.
 
 Beta is increased only when the draws made at it have an effective sample size of three quarters of the target: among
 many old points some have large weights by chance, and if the likelihood is rough, annealing that follows these points
-ends in a local mode. Once beta = 1 is reached, points are drawn until the effective sample size suffices.
-
-The last fit is checked with fresh draws, and the result is used only if their weights are well-behaved and their
-evidence agrees (`Recycled.reliable`); if not, they join the other points, and the next fit is checked, a few times.
-Points that a proposal was fitted to weigh too little, and a small mode can vanish, so the resulting population consists
-only of draws made at beta = 1, each weighted by its own proposal. The equations are in ``docs/theory/recycling``.
-Constants without a reference were chosen by trials on posteriors with known answers. The *efficiency* of a round is the
-effective sample size of its fresh draws divided by their number.
-
-References
-----------
-Cornuet, Marin, Mira & Robert (2012), Adaptive multiple importance sampling, Scand. J. Stat. 39(4),
-doi:10.1111/j.1467-9469.2011.00756.x
-Owen & Zhou (2000), JASA 95(449), doi:10.1080/01621459.2000.10473909 (deterministic mixture weights)
+ends in a local mode. Points that a proposal was fitted to weigh too little, and a small mode can vanish, so the result
+consists only of draws made at beta = 1, each weighted by its own proposal. Constants without a reference were chosen by
+trials on posteriors with known answers. The *efficiency* of a round is the effective sample size of its fresh draws
+divided by their number.
 """
 
 from collections.abc import Generator, Sequence

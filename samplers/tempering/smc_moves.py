@@ -1,23 +1,7 @@
-r"""Sequential Monte Carlo, as in Del Moral, Doucet & Jasra (2006), section 3: from draws of the prior to the posterior.
+"""Sequential Monte Carlo, as in Del Moral, Doucet & Jasra (2006), section 3: from draws of the prior to the posterior.
 
-The targets are :math:`\pi_\beta \propto p(\theta) L(\theta)^\beta` with the prior p and the likelihood L. A stage
-carries N points :math:`\theta_i` from :math:`\beta` to a larger :math:`\beta'`:
-
-1. choose the largest :math:`\beta'` at which the weights keep the wanted effective sample size (ESS);
-2. weigh the points, :math:`w_i = L(\theta_i)^{\beta' - \beta}`;
-3. estimate the evidence, :math:`Z_{\beta'} = Z_\beta \frac{1}{N} \sum_i w_i`;
-4. resample the points by :math:`w_i`, which copies some points and drops others;
-5. move every point by a Markov kernel that leaves :math:`\pi_{\beta'}` unchanged, which separates the copies.
-
-Weights depend only on the points before the moves, so steps 1 to 4 need no evaluation. Before step 4, the kernels of
-step 5 are fitted to the weighted points. The equations are derived in ``docs/theory/tempering``.
-
-References
-----------
-Del Moral, Doucet & Jasra (2006), Sequential Monte Carlo samplers, J. R. Stat. Soc. B 68(3),
-doi:10.1111/j.1467-9868.2006.00553.x
-Ching & Chen (2007), Transitional Markov chain Monte Carlo method for Bayesian model updating, model class selection,
-and model averaging, J. Eng. Mech. 133(7), doi:10.1061/(ASCE)0733-9399(2007)133:7(816) (chains from resampled leaders)
+The equations of the five steps of a stage are in ``docs/theory/tempering``. Weights depend only on the points before
+the moves, so steps 1 to 4 need no evaluation.
 """
 
 from collections.abc import Generator

@@ -118,7 +118,7 @@ def test_an_answer_that_cannot_be_used_rules_nothing_out(answer, caplog):
     posterior = CountingRulesOut(5.0, "inf")
     sampler = run(posterior)
     posterior.possible = possible
-    known = sampler._record.latest()
+    known = sampler._record.latest(10_000)
     target, final = Target(posterior, None, None, posterior.ndim), sampler.get_chain(flat=True)
     found = judged_failures(known, final, target)
     posterior.possible = lambda x: np.ones(len(x), dtype=bool)

@@ -7,7 +7,6 @@ from emcee.model import Model
 from scipy import stats
 
 from samplers import RandomWalkMove, SMCSampler, TMCMCSampler
-from samplers.emcee_internals import get_moves
 from samplers.moves.fast_parameters import WithFastSweeps
 from tests.contract.targets import Gaussian
 from tests.statistics.test_posteriors import deviations, evidence_deviation, runs, within
@@ -78,7 +77,7 @@ MODES = {
 def test_conjugate_sample(mode, seed):
     posterior = NormalInverseGamma()
     samplers = runs(posterior, seed, **MODES[mode])
-    assert all(isinstance(move, WithFastSweeps) for s in samplers for move in get_moves(s)[0])
+    assert all(isinstance(move, WithFastSweeps) for s in samplers for move in s._moves)
     assert within(deviations(samplers, posterior.mean, lambda x: x[:, 0]), samplers)
     assert within(deviations(samplers, posterior.variance, lambda x: x[:, 1] ** 2), samplers)
     assert within(deviations(samplers, 0.5, lambda x: x[:, 1] < posterior.median), samplers)
