@@ -1,23 +1,18 @@
 """Results of a tempered run: evaluations, failures, the stages, the evidence and Monte Carlo errors."""
 
-from collections.abc import Callable
-
 import numpy as np
 
-from .budget import Budget, as_limit
+from .budget import as_limit
 from .estimates.control_variates import SignedSample
 from .estimates.genealogy import standard_error_of_mean, student_factor
 from .estimates.importance import EvidenceCheck
-from .evaluation.evaluator import Evaluator
-from .evaluation.user_target import Target
 from .evaluation.values import most_common_reasons
 from .judgement.checks import OF_MEAN
 from .judgement.clusters import error_between_modes
 from .judgement.failures import NearFailures
 from .judgement.verdict import Verdict
-from .record import Record
-from .reports import AnnealingResult, GuidedRound, Stage
-from .tempering.guide import AdaptedGuide, Guide
+from .reports import GuidedRound, Stage
+from .tempering.guide import Guide
 
 __all__ = ["RunResults"]
 
@@ -27,17 +22,6 @@ KEPT_FAILURES = 1000
 class RunResults:
     """Base class of `samplers.tempered.TemperedSampler`: results after a run, and the limit to go on with."""
 
-    nwalkers: int
-    iteration: int
-    get_chain: Callable[..., np.ndarray]
-    _evaluator: Evaluator
-    _budget: Budget
-    _record: Record
-    _guide: AdaptedGuide | None
-    _result: AnnealingResult
-    _verdict: Verdict | None
-    _target: Target
-    _seed: list[int] | None
     _near: NearFailures | None = None
 
     @property

@@ -423,8 +423,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
             latest = self._record.latest(KEPT_POINTS)
             self._near = None if latest is None else judged_failures(latest, coords, self._target)
             numbers = self.nwalkers, self.ndim, self.simulations
-            searched = self._budget.of_guides
-            self._verdict = judge(self._result, *numbers, missing, failed, searched, self._near)
+            others = self._budget.of_guides, self._near, self._target.names
+            self._verdict = judge(self._result, *numbers, missing, failed, *others)
         elif self._record.start is not None:  # an annealing that could not be made again
             self._verdict = self._verdict._replace(simulations=self.simulations)
         self._output.result, self._output.verdict = self._result, self._verdict
@@ -540,7 +540,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._budget.restart(start.header["of_earlier_guides"])
         schedule, guidance = MoveSchedule(*copy.deepcopy(self._first_moves)), None
         self._moves, self._weights = schedule
-        remember = self._evaluator.begin()
+        self._evaluator.remember = remember = self._record.remembering()
         if self._given_guide is not None:
             self._guide = AdaptedGuide(self._given_guide, self.ndim)
             guidance = lend(self._guide, self._random, remember, self._budget, self.settings.asynchronous)

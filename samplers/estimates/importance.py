@@ -137,8 +137,7 @@ FEWEST_EFFECTIVE = 5.0
 SMALLEST_EXCESS = 0.05
 # Growth of the weights above which the tails of a proposal are too light, for each part of the draws with the lowest
 # posterior. Normal proposals with half the variance of a Student t (3 to 5 degrees of freedom) have 0.11 to 0.5, 0.3 to
-# 0.7 and 0.6 to 0.85; with 3 degrees the weights first fall, and grow among the outermost draws only. Harmless
-# proposals have less: with 6 degrees on 4, 0.03, 0.08 and 0.12.
+# 0.7 and 0.6 to 0.85; harmless ones, with 6 degrees on 4, 0.03, 0.08 and 0.12.
 LARGE_GROWTH = {0.5: 0.1, 0.25: 0.3, 0.125: 0.3}
 SIGNIFICANT = 4.0  # in errors
 FEWEST_FOR_GROWTH = 8

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ..interrupts import deferred_interrupts
-from ..record import Remember, merge_batches
+from ..record import merge_batches
 from ..tempering.pending_points import PendingPoints
 from .evaluator import Evaluator
 from .point_queue import pool_queue
@@ -50,12 +50,12 @@ class AsynchronousEvaluator(Evaluator):
     asynchronous = True
 
     def __init__(self, *args: Any, queue: Callable[[], Any] | None = None):
-        self._open_queue, self._remember = queue, None
+        self._open_queue = queue
         super().__init__(*args)
         self._forget_running()
 
     def __getstate__(self) -> dict:
-        return super().__getstate__() | {"_queue": None, "_running": {}, "_tickets": {}, "_remember": None}
+        return super().__getstate__() | {"_queue": None, "_running": {}, "_tickets": {}}
 
     def _forget_running(self) -> None:
         self._queue: Any = None
@@ -78,11 +78,6 @@ class AsynchronousEvaluator(Evaluator):
     def workers(self) -> int:
         """Number of points that are evaluated at once."""
         return self._opened().workers or 1
-
-    def begin(self) -> Remember:
-        """An annealing begins."""
-        self._remember = super().begin()
-        return self._remember
 
     def submit(self, coords: np.ndarray) -> PendingPoints:
         """Begin to evaluate points (n, ndim); the limit of simulations may allow only the first points."""
@@ -112,7 +107,7 @@ class AsynchronousEvaluator(Evaluator):
         points = self._points(self._running)
         key = f"arrived of {hashlib.blake2b(points.tobytes(), digest_size=16).hexdigest()}"
         by_batch: dict[int, list[int]] = {}
-        for number in self._remember(key, lambda: [self._gather(most)])[0].tolist():
+        for number in self.remember(key, lambda: [self._gather(most)])[0].tolist():
             by_batch.setdefault(id(self._running[number][0]), []).append(number)
         for numbers in by_batch.values():
             self._arrive(numbers)

@@ -40,10 +40,11 @@ class Evaluator:
         self._fields: list[tuple] = [("log_prob", np.float64), ("log_prior", np.float64)]
         self._has_blobs: bool | None = None  # whether the function returns blobs; None while this is not known
         self.pool = self.observer = None
+        self.remember: Remember | None = None  # that of the annealing (`Record.remembering`)
         self.evaluations = self.done = self.running = 0
 
     def __getstate__(self):
-        return {**self.__dict__, "pool": None, "observer": None}
+        return {**self.__dict__, "pool": None, "observer": None, "remember": None}
 
     def __deepcopy__(self, memo):
         return self  # moves that are copied go on with the same density
@@ -64,10 +65,6 @@ class Evaluator:
     def inside(self, coords: np.ndarray) -> np.ndarray:
         """Whether each of the points (n, ndim) lies in the support of the prior."""
         return self.target.log_prior(coords) > -np.inf
-
-    def begin(self) -> Remember:
-        """An annealing begins; returns a function that remembers arrays in the record (`Record.remembering`)."""
-        return self.record.remembering()
 
     def submit(self, coords: np.ndarray, observe: Callable[[np.ndarray], None] | None = None) -> PendingPoints:
         """Evaluate points (n, ndim); the limit of simulations may allow only the first points.

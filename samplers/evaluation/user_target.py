@@ -74,7 +74,7 @@ class Target:
         self.ndim, self.vectorize, self.blobs_dtype = ndim, vectorize, blobs_dtype
         self.caught = Caught(function, args, kwargs, vectorize)
         self._owner = function if owner is None else owner  # of optional methods
-        names, stated = getattr(function, "parameter_names", None) or (), getattr(function, "ndim", None)
+        names, stated = self.names, getattr(function, "ndim", None)
         if isinstance(stated, Integral) and stated != ndim:
             listed = f" ({', '.join(map(str, names))})" if names else ""
             raise ValueError(f"ndim is {ndim}, but {name} has {stated} parameters{listed}: pass ndim={stated}")
@@ -85,6 +85,11 @@ class Target:
         return self.name == "log_likelihood_fn"
 
     # ------------------------------------------------------------------ optional attributes of the function
+
+    @property
+    def names(self) -> Sequence[str]:
+        """Names of the parameters, if the function has them; else empty."""
+        return getattr(self.function, "parameter_names", None) or ()
 
     @property
     def fast_parameters(self) -> Sequence[int]:

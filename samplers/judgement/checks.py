@@ -36,17 +36,13 @@ HIGH_CORRELATION = 0.9
 # The limits are soft: with one of the 33 targets left out they wander from 0.8 to 1.5 and from 0.3 to 0.45.
 WRONG_DIFFERENCE, LARGE_DIFFERENCE = 1.0, 0.8
 LARGE_ERROR = 0.4
-# Standard error of the share of a mode: of 1916 runs it spoke in 47 wrong and 48 right ones; .165 in 41 and 43, and a
-# limit of .35 for the error of the stages, where there are several modes, in 40 and 46.
+# Standard error of the share of a mode: of 1916 runs it spoke in 47 wrong and 48 right ones.
 LARGE_SHARE_ERROR = 0.16
-# A check with even weights that is higher by more than this: of 35 such runs 6 were wrong, and 13 had standard
-# deviations that were off by a fifth, mostly too wide by moves that had not ended.
+# A check with even weights that is higher by more than this: 6 of 35 such runs were wrong, 13 had sds off by a fifth.
 HIGHER_CHECK = 1.5
-# Log-likelihoods are equal if they differ by less than this share of their size, the rounding error of a sum of 1e4
-# terms. With 1e-9, right runs with a log-likelihood of 1e11 and a range of 100 were refused.
+# Log-likelihoods are equal if they differ by less than this share of their size, the rounding error of 1e4 terms.
 ROUNDING = 1e-12
-# Error of the logarithm of a volume; from 40 draws in 20 dimensions its standard error is 0.16. It spoke in 440 of 440
-# starts of 11 box priors of 0, in none of 720 right ones; of priors of volume 1 that are no box, a ball in 12 of 40.
+# Error of the logarithm of a volume: it spoke in 440 of 440 starts of 11 box priors of 0, in none of 720 right ones.
 VOLUME_ERROR = 0.5
 # Smallest difference between two shares of a component that is reported if it is also significant.
 LARGE_SHARE_DIFFERENCE = 0.1

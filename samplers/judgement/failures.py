@@ -14,17 +14,15 @@ from ..finding import CARE, WRONG, Finding
 
 __all__ = ["NearFailures", "check_failed_region", "failures_near", "judged_failures"]
 
-# A failure adjoins the samples if it is one of the evaluated points that are nearest to a sample. Other points lie
-# between the samples and failures further away, whatever the form of the posterior. With 20 points and at least 5
-# failures, those 6 standard deviations beside a bent ridge rarely count, and those at an edge of the posterior do.
+# A failure adjoins the samples if it is one of the evaluated points that are nearest to a sample. With 20 points and at
+# least 5 failures, those 6 standard deviations beside a bent ridge rarely count, and those at an edge do.
 NEAREST = 20
 NEAREST_PER_SAMPLE = 1.0  # at least, in units of the evaluated points per sample
 FEWEST_ADJOINING = 5
 LEAST_ADJOINING = 0.08  # of the failures in the ellipsoid, relative to the share of all points there
 LARGE_SHARE_NEAR = 0.02  # of the evaluated points among the samples
 # Probability of so many failures with this share, below which there are more. Cut off 1 to 1.6 standard deviations
-# beside the mode, 24 of 26 runs are then refused, whose means are off by 2 to 5 errors; at 2, 2 of 21, which are right
-# (5 with the share alone).
+# beside the mode, 24 of 26 runs are then refused, whose means are off by 2 to 5 errors; at 2, 2 of 21 right ones.
 CHANCE = 0.05
 NEIGHBOURS = 5  # evaluated points about a failure, which tell scattered failures from those that fill a region
 UNLIKELY = 1e-4  # probability that so many of them fail by chance

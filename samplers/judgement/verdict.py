@@ -10,6 +10,7 @@
 No run can see a part of the posterior in which it has no points. The reasons state the basis of the verdict.
 """
 
+from collections.abc import Sequence
 from functools import cached_property
 from textwrap import shorten
 from typing import Any, NamedTuple
@@ -209,11 +210,12 @@ def judge(
     failures: str = "",
     searched: float = 0.0,
     near: NearFailures | None = None,
+    names: Sequence[str] = (),
 ) -> Verdict:
     """Judge an annealing that has reached beta = 1.
 
     `searched` is the part of the `simulations` made by the guide for its search; `missing_steps` at beta = 1 were not
-    allowed by the limit; `failures` says how many evaluations failed.
+    allowed by the limit; `failures` says how many evaluations failed; `names` are those of the parameters.
     """
     stage = result.ladder[-1]
     found = [*result.findings, *(() if near is None else check_failed_region(near))]
@@ -238,7 +240,7 @@ def judge(
         if result.start.shortfall:
             unsettled = result.start.shortfall == UNSETTLED
             found.append(find_unreached_part(result.start.shortfall, WRONG if unsettled else CARE))
-        found += _of_signed_sample(result)
+        found += _of_signed_sample(result, names)
     if result.start is not None or (stop is not None and stop.from_guide):
         if all(each.kind != UNSEEN for each in found):
             reasons.append(result.basis or "parts of the posterior in which the guide makes no draws are not seen")
@@ -290,7 +292,12 @@ def independent_points(result: AnnealingResult, coords: np.ndarray) -> float:
 
 
 def describe_early_stop(verdict: Verdict, limit: float | None, result: AnnealingResult, made: int, missing: int) -> str:
-    """The warning when a call ends early: `made` steps at beta = 1 were made, `missing` steps were not."""
+    """The warning when a call ends early: `made` steps at beta = 1 were made, `missing` steps were not.
+
+    What the annealing has warned of before is not repeated.
+    """
+    warned = [each.message.rstrip(".") for each in result.findings]
+    verdict = verdict._replace(reasons=tuple(reason for reason in verdict.reasons if reason not in warned))
     if result.start is not None and not result.start.used:
         return str(verdict)
     if result.early_stop is not None:
@@ -324,16 +331,17 @@ def _of_early_stop(stop: EarlyStop, start: GuidedStart | None, error: float, ndi
     return Finding(kind, WRONG, f"{text} ({wanted}).", action)
 
 
-def _of_signed_sample(result: AnnealingResult) -> list[Finding]:
+def _of_signed_sample(result: AnnealingResult, names: Sequence[str]) -> list[Finding]:
     """A finding if the signed sample does not determine the standard deviation of some parameters."""
     if result.signed is None:
         return []
     unknown = np.flatnonzero(np.isnan(result.signed.standard_deviation().value))
     if len(unknown) == 0:
         return []
+    named = ", ".join(names[j] if names else f"parameter {j + 1}" for j in unknown)
     text = (
-        f"The standard deviation of parameter {', '.join(map(str, unknown + 1))} is not determined: its variance by "
-        "the signed sample is below its own standard error, as with a tail of the posterior in which the guide makes "
+        f"The standard deviation of {named} is not determined: its variance by the "
+        "signed sample is below its own standard error, as with a tail of the posterior in which the guide makes "
         "few draws."
     )
     action = "Use more walkers, a prior without this tail, or no guide."

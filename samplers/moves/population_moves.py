@@ -44,10 +44,8 @@ KERNEL_PROBABILITIES = (0.5, 0.25, 0.25)
 TARGET_ACCEPTANCE, HIGH_ACCEPTANCE = 0.25, 0.5
 KERNEL_PROBABILITIES_IF_ACCEPTED = (0.8, 0.1, 0.1)
 # Parts of the fitted points, from this number of dimensions on; the points of a part are moved by a fit to the others.
-# Independent draws replace a point that the fit was made to too easily: with 500 walkers in 40 dimensions, the first
-# sweep increased the variance of normal draws by 6.5 %, in 20 dimensions by 2 to 3 %, with 10 parts by less than the
-# error of 0.4 %. The log-evidence of six runs was off by 1.9 stated errors in 20 dimensions, with 10 parts by 0.4. In
-# 10 dimensions it was off by 0.4 without parts, which take a sixth more evaluations there.
+# The log-evidence of six runs was off by 1.9 stated errors in 20 dimensions, with 10 parts by 0.4; in 10 dimensions by
+# 0.4 without parts, which take a sixth more evaluations there.
 PARTS, FEWEST_DIMENSIONS = 10, 15
 # Attempts to replace independent draws outside the support of the prior; what is left then is rejected.
 REDRAWS = 20

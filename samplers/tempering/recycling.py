@@ -30,6 +30,7 @@ from ..proposals.mixture import Mixture, fit_mixture, log_density
 from ..proposals.transforms import find_support_bounds
 from ..reports import Report, Stage, Sweep
 from .early_stop import StoppedEarly, stop_at
+from .mutation import tempered_log_prob
 from .next_beta import next_beta
 from .pending_points import PendingPoints
 from .population import Density, Population
@@ -39,21 +40,14 @@ __all__ = ["Recycled", "first_draws", "most_running", "recycle", "search_draws",
 # Wanted effective sample size at each beta (the target), as a share of the number of starting points. A small target
 # allows large steps of beta; the fresh draws of a round then restore the effective sample size.
 TARGET_SHARE = 0.2
-# Smallest target per dimension (and one more): fewer effective points do not determine the covariances of the mixture.
-# Also per component, once a fit has had several: with fewer, the shares of modes drift from beta to beta. And the
-# smallest target per number of a mean and a covariance: with a quarter, draws of a normal posterior in 40 dimensions
-# have an efficiency of 2 %.
+# Smallest target per dimension (and one more), also per component once a fit has had several: with fewer, the shares of
+# modes drift. And per number of a mean and a covariance: with .25, draws in 40 dimensions have an efficiency of 2 %.
 POINTS_PER_DIMENSION, POINTS_PER_COMPONENT, POINTS_PER_NUMBER = 5.0, 8.0, 0.5
 # Draws of a round, as a multiple of the target.
 DRAWS_PER_TARGET = 3.0
-# Draws that find narrow modes, which hold few points at small beta: draws of the prior, and further draws, spread over
-# the stages below beta = 1. They are a multiple of the walkers; from 250 on, at least 1000 of each kind: modes are as
-# narrow for few walkers. Widths 1:6 and 1:8 in three dimensions and 1:3 in five, 250 walkers: recycling lost a mode in
-# 21 of 72 runs with 250 and 1500, in 2 of 96 with 1000 and 1000 (7 % more evaluations); of four modes in eight
-# dimensions one in none and in 2 of 32; of two and three in 4 to 10 dimensions, with volumes 1:100 and 1:10, in 4 and
-# none, and in 4 and 3 of 30.
-# TMCMC lost or mis-weighted one in 13 of 48 runs of the first two, 7 without a warning, and in 6 of 64, none without a
-# warning, with 1.3 to 1.4 times the evaluations.
+# Draws that find narrow modes: draws of the prior, and further draws, spread over the stages below beta = 1, as a
+# multiple of the walkers; from 250 on, at least 1000 of each kind. Widths 1:6 and 1:8 in three dimensions and 1:3 in
+# five, 250 walkers: a mode was lost in 21 of 72 runs with 250 and 1500, in 2 of 96 with 1000 and 1000.
 DRAWS_SHARE, LEAST_DRAWS, FEWEST_TO_SEARCH = 4, 1000, 250
 # A beta is left once the draws made at it have an effective sample size of this share of the target.
 FRESH_SHARE = 0.75
@@ -69,8 +63,7 @@ MOST_BASINS, BASIN_SHARE = 3, 0.1
 MOST_BASIN_ROUNDS, DRAWS_PER_BASIN = 4, 30
 # Smallest estimated share of a part that is explored again. Parts of bent posteriors have 1e-4 and less.
 LEAST_MASS = 0.01
-# Draws that contradict a fit also improve it, so a failed check is repeated, and so is a check after which the draws do
-# not suffice for the walkers: it costs as many draws as there are walkers, and moves up to seven times as many.
+# A failed check is repeated, and so is one after which the draws do not suffice: moves cost up to seven times as much.
 MOST_CHECKS = 4
 # Expected share of distinct points among the walkers above which they are as good as independent draws.
 ENOUGH_DISTINCT = 0.9
@@ -287,10 +280,7 @@ class _Drawn(NamedTuple):
     def log_weights(self, beta: float) -> np.ndarray:
         """Log-weights (m,) of the draws that have arrived, relative to the mixture that they were drawn from."""
         coords, records = self.pending.arrived_part()
-        alive = records["log_prob"] > -np.inf
-        log_prob = np.where(alive, records["log_prob"], 0.0)
-        tempered = (1.0 - beta) * records["log_prior"] + beta * log_prob
-        return np.where(alive, tempered - log_density(self.mixture, coords), -np.inf)
+        return tempered_log_prob(records, beta) - log_density(self.mixture, coords)
 
 
 def _result(drawn: Sequence[_Drawn], beta: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
