@@ -109,10 +109,16 @@ def near_bounds(bounds: SupportBounds, coords: np.ndarray, weights: np.ndarray) 
     return SupportBounds(low, high, np.where(one_sided, scale, bounds.span))
 
 
-def _bounded_parameters(bounds: SupportBounds) -> list[tuple[int, bool, bool]]:
-    """List the bounded parameters: index, whether bounded below, whether bounded above."""
-    below, above = np.isfinite(bounds.low), np.isfinite(bounds.high)
-    return [(int(j), bool(below[j]), bool(above[j])) for j in np.flatnonzero(below | above)]
+def _bounded_parameters(bounds: SupportBounds) -> list[tuple[int, float, float, float, float]]:
+    """Bounded parameters: index, sign, lower and upper bound, and scale of the parameter times the sign.
+
+    The sign is -1 for an upper bound alone, and a single bound is always the lower one.
+    """
+    found = []
+    for j in np.flatnonzero(np.isfinite(bounds.low) | np.isfinite(bounds.high)).tolist():
+        low, high, span = (float(each[j]) for each in bounds)
+        found.append((j, 1.0, low, high, span) if np.isfinite(low) else (j, -1.0, -high, np.inf, span))
+    return found
 
 
 def to_unbounded(bounds: SupportBounds, coords: np.ndarray) -> np.ndarray:
@@ -122,55 +128,45 @@ def to_unbounded(bounds: SupportBounds, coords: np.ndarray) -> np.ndarray:
     Points on or beyond a bound are mapped to zero; `log_abs_det_jacobian` is -inf for them.
     """
     coords = coords.copy()
-    for j, below, above in _bounded_parameters(bounds):
-        x = coords[:, j]
-        from_low = np.maximum((x - bounds.low[j]) / bounds.span[j], 0.0) if below else 1.0
-        from_high = np.maximum((bounds.high[j] - x) / bounds.span[j], 0.0) if above else 1.0
-        good = (from_low > 0.0) & (from_high > 0.0)
-        from_low, from_high = np.where(good, from_low, 1.0), np.where(good, from_high, 1.0)
-        if below and above:
+    for j, sign, low, high, span in _bounded_parameters(bounds):
+        from_low, from_high, _ = _distances(sign * coords[:, j], low, high, span)
+        if high < np.inf:
             coords[:, j] = np.log(from_low) - np.log(from_high)
-        elif below:
-            coords[:, j] = _stretch(from_low)
-        else:
-            coords[:, j] = -_stretch(from_high)
+        else:  # near log(t) if t is small, near t if t is large
+            coords[:, j] = sign * (from_low + np.log(-np.expm1(-from_low)))
     return coords
 
 
-def _stretch(distance: np.ndarray) -> np.ndarray:
-    """log(exp(t) - 1) for positive numbers t: near log(t) if t is small, near t if t is large."""
-    return distance + np.log(-np.expm1(-distance))
+def _distances(x: np.ndarray, low: float, high: float, span: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Distances (n,) from both bounds over a scale, 1 where one is not positive, and whether both are positive."""
+    from_low, from_high = np.maximum((x - low) / span, 0.0), np.maximum((high - x) / span, 0.0)
+    good = (from_low > 0.0) & (from_high > 0.0)
+    return np.where(good, from_low, 1.0), np.where(good, from_high, 1.0), good
 
 
 def from_unbounded(bounds: SupportBounds, coords: np.ndarray) -> np.ndarray:
     """Transform points (n, ndim) back: the inverse of `to_unbounded`."""
     coords = coords.copy()
-    for j, below, above in _bounded_parameters(bounds):
+    for j, sign, low, high, span in _bounded_parameters(bounds):
         z = coords[:, j]
-        if below and above:
-            width = bounds.high[j] - bounds.low[j]
+        if high < np.inf:
+            width = high - low
             # measured from the nearer bound, to keep the last digits
-            coords[:, j] = np.where(z < 0.0, bounds.low[j] + width * expit(z), bounds.high[j] - width * expit(-z))
-        elif below:
-            coords[:, j] = bounds.low[j] + bounds.span[j] * np.logaddexp(0.0, z)
+            coords[:, j] = np.where(z < 0.0, low + width * expit(z), high - width * expit(-z))
         else:
-            coords[:, j] = bounds.high[j] - bounds.span[j] * np.logaddexp(0.0, -z)
+            coords[:, j] = sign * (low + span * np.logaddexp(0.0, sign * z))
     return coords
 
 
 def log_abs_det_jacobian(bounds: SupportBounds, coords: np.ndarray) -> np.ndarray:
     """Log-determinant (n,) of the Jacobian of `to_unbounded` at points (n, ndim); -inf on and beyond a bound."""
     total = np.zeros(len(coords))
-    for j, below, above in _bounded_parameters(bounds):
-        from_low = np.maximum(coords[:, j] - bounds.low[j], 0.0) if below else 1.0
-        from_high = np.maximum(bounds.high[j] - coords[:, j], 0.0) if above else 1.0
-        good = (from_low > 0.0) & (from_high > 0.0)
-        from_low, from_high = np.where(good, from_low, 1.0), np.where(good, from_high, 1.0)
-        if below and above:
-            slope = np.log(bounds.high[j] - bounds.low[j]) - np.log(from_low) - np.log(from_high)
+    for j, sign, low, high, span in _bounded_parameters(bounds):
+        from_low, from_high, good = _distances(sign * coords[:, j], low, high, 1.0)
+        if high < np.inf:
+            slope = np.log(high - low) - np.log(from_low) - np.log(from_high)
         else:
-            distance = from_low if below else from_high
-            slope = -np.log(bounds.span[j]) - np.log(-np.expm1(-distance / bounds.span[j]))
+            slope = -np.log(span) - np.log(-np.expm1(-from_low / span))
         total = np.where(good, total + slope, -np.inf)
     return total
 
