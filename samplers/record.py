@@ -245,15 +245,13 @@ class Record:
         """Enter the start of an annealing, which begins the record of a new run."""
         start = start._replace(header=json.loads(json.dumps(start.header)))
         kind, keys, *rest = start.random_state
-        self._write(b"RUN ", [_text([start.header, kind, *rest]), start.coords, keys])
+        if self.path is not None:
+            self._write(b"RUN ", [_text([start.header, kind, *rest]), start.coords, keys])
         self.start, self._arrays = start, {}
 
     def open(self) -> None:
         """Open the file for writing, and lock it. ValueError if another process writes to it."""
-        if self._file is not None:
-            return
-        if self.path is None:
-            self._open_temporary()
+        if self.path is None or self._file is not None:
             return
         if (earlier := _open_records.get(self.path)) is not None:  # the last sampler of a process owns it
             earlier.close()
@@ -317,6 +315,8 @@ class Record:
     def _write(self, kind: bytes, arrays: Sequence[np.ndarray]) -> tuple[int, int]:
         """Append a block; first byte and length of its content."""
         self.open()
+        if self._file is None:
+            self._open_temporary()
         data, start = memoryview(_block(kind, arrays)), self._whole
         try:
             self._file.seek(start)

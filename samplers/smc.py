@@ -1,8 +1,4 @@
-"""Sequential Monte Carlo behind emcee's interface.
-
-Del Moral, Doucet & Jasra (2006), doi:10.1111/j.1467-9868.2006.00553.x, with the usual adaptation: the next exponent by
-the effective sample size, resampling at every stage, proposals fitted to the weighted population, and moves until the
-population is nearly uncorrelated with its resampled start. The settings of papers are in `samplers.presets`.
+"""Sequential Monte Carlo behind emcee's interface (``docs/theory/tempering``, ``docs/theory/recycling``).
 
 Tempering has a limit that no setting removes: among modes with similar masses, a mode that is much narrower than the
 others has little mass at small beta, and is lost unless draws of the prior happen to lie in it (Woodard, Schmidler &

@@ -1,14 +1,9 @@
-"""Transitional Markov chain Monte Carlo behind emcee's interface.
+"""Transitional Markov chain Monte Carlo behind emcee's interface (``docs/theory/tempering``).
 
-Ching & Chen (2007), doi:10.1061/(ASCE)0733-9399(2007)133:7(816): at the next exponent, the coefficient of variation of
-the weights is 1, and a chain grows from each resampled point, its leader, with one step per copy. The published
-algorithm, with steps of a fixed scale, is biased, and can collapse on a sharp posterior; its settings are
-`samplers.presets.CHING_CHEN_2007`. By default every chain has a burn-in and scales are adapted to the acceptance, after
-Betz, Papaioannou & Straub (2016), doi:10.1061/(ASCE)EM.1943-7889.0001066, and points that are still correlated with the
-leaders are moved further together (`samplers.tempering.leaders`). The moves are `MixtureMove`, since a random walk
-alone gives separate modes wrong shares. With ``chains="equal"``, all chains have the same length, so that all
-processors of a pool are busy, as in BASIS (Angelikopoulos, Papadimitriou & Koumoutsakos 2012, doi:10.1063/1.4757266;
-Wu, Angelikopoulos, Papadimitriou & Koumoutsakos 2018, doi:10.1115/1.4037450).
+The published algorithm (Ching & Chen 2007), with steps of a fixed scale, is biased, and can collapse on a sharp
+posterior; its settings are `samplers.presets.CHING_CHEN_2007`. By default every chain has a burn-in and scales are
+adapted to the acceptance (Betz, Papaioannou & Straub 2016), and the moves are `MixtureMove`, since a random walk alone
+gives separate modes wrong shares.
 """
 
 from typing import Any

@@ -1,16 +1,10 @@
-"""Sweeps over fast parameters, made after each move that needs a simulation.
+"""Sweeps over fast parameters, made after each move that needs a simulation (``docs/theory/tempering``).
 
 Some parameters change the density without a new simulation: noise standard deviations, when the sums of squared
-residuals are cached. A posterior declares their indices by an attribute ``fast_parameters``. After each move that needs
-a simulation, the ensemble makes a few random-walk steps in them alone: Metropolis within Gibbs, so the target is
-unchanged. Without these sweeps, 12 runs of 50 walkers by moves with five structural parameters and four noise levels
-had means that were off by 0.60 standard deviations (with them 0.14), and log-evidences by 10.8 (0.4); 100 walkers 0.26
-(0.10), and 3.2 (0.0); 250 walkers, which recycle, show no difference.
-
-References
-----------
-Lewis, A. (2013), Efficient sampling of fast and slow cosmological parameters, Physical Review D 87, 103529,
-doi:10.1103/PhysRevD.87.103529
+residuals are cached. A posterior declares their indices by an attribute ``fast_parameters`` (Lewis 2013,
+doi:10.1103/PhysRevD.87.103529). Without these sweeps, 12 runs of 50 walkers by moves with five structural parameters
+and four noise levels had means that were off by 0.60 standard deviations (with them 0.14), and log-evidences by 10.8
+(0.4); 250 walkers, which recycle, show no difference.
 """
 
 from collections.abc import Sequence

@@ -1,10 +1,4 @@
-"""Model comparison: posterior probabilities of models from their evidences.
-
-With prior probabilities pi_k and evidences Z_k, the posterior probability of model k is pi_k Z_k / sum_j pi_j Z_j
-(Kass & Raftery 1995, Bayes factors, Journal of the American Statistical Association 90(430),
-doi:10.1080/01621459.1995.10476572). Errors of the log-evidences are propagated to first order to the log-odds, from
-which intervals of the probabilities follow. See ``docs/theory/evidence``.
-"""
+"""Model comparison: posterior probabilities of models from their evidences (``docs/theory/evidence``)."""
 
 import math
 from collections.abc import Mapping
