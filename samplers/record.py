@@ -33,15 +33,18 @@ from contextlib import nullcontext
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
+from urllib.parse import quote
 
 import h5py
 import numpy as np
+from emcee.backends import Backend, HDFBackend
 
 from .blobs import joined
 from .interrupts import deferred_interrupts
 from .locks import lock_now
+from .output_file import DAMAGED, run_of_file, whole_file
 
-__all__ = ["EvaluatedBatch", "Incomplete", "Record", "Remember", "RunStart", "free_name", "merge_batches"]
+__all__ = ["EvaluatedBatch", "Incomplete", "Record", "Remember", "RunStart", "merge_batches", "open_record"]
 
 logger = logging.getLogger(__name__)
 
@@ -307,7 +310,7 @@ class Record:
         if self.path is not None and self.path.exists():
             self.open()  # another process that writes to the file owns it
             self.close()
-            aside = free_name(self.path, "before_reset")
+            aside = _free_name(self.path, "before_reset")
             os.replace(self.path, aside)
         self._clear()
         return aside
@@ -346,7 +349,7 @@ class Record:
             if known and len(content) < length:
                 break  # the process was killed while it wrote this block
             if not known or zlib.crc32(content) != checksum or not self._read_block(kind, content, place + BLOCK.size):
-                aside = free_name(self.path, "damaged")
+                aside = _free_name(self.path, "damaged")
                 shutil.copyfile(self.path, aside)
                 logger.warning(
                     "%s is damaged after %d of %d bytes, with %d evaluations before: the rest is not used, and a copy "
@@ -379,7 +382,54 @@ class Record:
         return True
 
 
-def free_name(path: Path, ending: str) -> Path:
+def open_record(backend: Backend | None, nwalkers: int, ndim: int, slow: Sequence[int]) -> Record:
+    """The record of the run in a backend's file; the HDF5 file is made if it is missing or damaged.
+
+    Without a file that can be written, the record is kept in memory. `slow` are indices of the parameters that a
+    simulation depends on.
+    """
+    if not isinstance(backend, HDFBackend) or backend.read_only:
+        return Record(slow=slow)
+    path = Path(backend.filename).resolve()
+    record = Record(path.with_name(f"{path.name}.{quote(backend.name, safe='')}.record"), slow)
+    stored = run_of_file(backend)
+    if record.start is None:
+        if stored == DAMAGED:
+            raise ValueError(f"{backend.filename} is damaged, and has no record {record.path}: move it away")
+        if stored is None:
+            whole_file(backend).make(nwalkers, ndim, "")  # in one step, unlike emcee
+        return record
+    run, shape = record.start.header["run"], record.start.coords.shape
+    if stored in (run, None, DAMAGED) and shape != (nwalkers, ndim):
+        raise ValueError(
+            f"{backend.filename} contains a run of {shape[0]} walkers in {shape[1]} dimensions; got "
+            f"nwalkers={nwalkers}, ndim={ndim}. Use another file, or backend.reset(nwalkers, ndim)"
+        )
+    if stored == run:
+        return record
+    record.open()  # another process that writes to the files owns them, and is between two writes
+    stored = run_of_file(backend)
+    if stored == run:
+        return record
+    if stored in (None, DAMAGED):
+        if stored is not None:
+            aside = _free_name(path, "damaged")
+            shutil.copyfile(path, aside)
+            said = "%s does not end with a step that this run has stored: it is damaged, or another program has added"
+            logger.warning(f"{said} steps. A copy of it is kept as %s", backend.filename, aside)
+        logger.warning("the chain of %s is made again from %s", backend.filename, record.path)
+        whole_file(backend).make(*record.start.coords.shape, run, anew=stored == DAMAGED)
+        return record
+    aside = record.renew()
+    logger.warning(
+        "%s was reset, or replaced by the chain of another run: a new record begins, the earlier one is kept as %s",
+        backend.filename,
+        aside,
+    )
+    return record
+
+
+def _free_name(path: Path, ending: str) -> Path:
     """A name beside `path` with this ending that no file has: simulations are never overwritten."""
     name, number = path.with_name(f"{path.name}.{ending}"), 2
     while name.exists():

@@ -13,12 +13,13 @@ values are kept by `samplers.record.Record`, and ladder and verdict are stored b
 """
 
 import copy
+import json
 import logging
 import time
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
-from dataclasses import fields
+from dataclasses import asdict, fields
 from typing import Any
 
 import numpy as np
@@ -34,16 +35,15 @@ from .judgement.checks import check_likelihood, check_prior
 from .judgement.failures import KEPT_POINTS, judged_failures
 from .judgement.verdict import CONVERGED, describe_early_stop, independent_points, judge
 from .moves.fast_parameters import with_fast_sweeps
-from .moves.population_moves import GuideMove, RandomWalkMove, without_unfitted
+from .moves.population_moves import GuideMove, RandomWalkMove, describe, without_unfitted
 from .output import Output
-from .record import EvaluatedBatch, Incomplete, RunStart
-from .replay import changes, describe_run, differences, open_record
+from .record import EvaluatedBatch, Incomplete, RunStart, open_record
 from .reporting.progress import ANNEALING, Progress, get_progress_bar, show_sweeps
 from .reports import AnnealingResult, Report, warn
 from .results import RunResults
 from .settings import Settings, as_whole_number, check_arguments, check_names, most_moves, refuse_unused
 from .tempering.anneal import anneal
-from .tempering.guide import AdaptedGuide, Guide, check_guide
+from .tempering.guide import AdaptedGuide, Guide, check_guide, guide_fingerprint
 from .tempering.guided import Guidance, lend
 from .tempering.mutation import MoveSchedule, check_moves
 from .tempering.population import Population, check_size
@@ -478,29 +478,50 @@ class TemperedSampler(RunResults, EnsembleSampler):
 
     def _open_record(self) -> None:
         """Lock the record of a file; once, a ValueError if another posterior or other settings made the stored run."""
-        stored, found = self._record.start, []
-        if stored is not None:
+        if self._record.start is not None:
             self._record.open()
-        if self._is_compared:
-            return
-        if stored is not None:
-            found = differences(stored.header, self._header())
-            log_prior = 0.0 if found else float(np.sum(self._target.log_prior(stored.coords)))
-            if not found and not np.isclose(log_prior, stored.header["log_prior"], rtol=1e-9, atol=1e-9):
-                found = ["the log-prior of the draws that it started from differs"]
-        elif self._record.path is not None and self._result.finished:
-            logger.warning(
-                "%s has no record: the chain goes on from its last step, and other settings cannot be noticed",
-                self.backend.filename,
-            )
-        if not found and getattr(self._target.function, "fingerprint", None) is None:
-            found = changes(self._record, self._previous_state, self._evaluator.compute)
-        if found:
+        if not self._is_compared and (found := self._differences()):
             raise ValueError(
                 f"{self._place} contains another run: {'; '.join(found)}. Use another file or backend, or "
                 "backend.reset(nwalkers, ndim)"
             )
         self._is_compared = True
+
+    def _differences(self) -> list[str]:
+        """How the stored run differs from a run of this sampler, as text: in its settings, or in values of a function
+        without a fingerprint at the best known point.
+        """
+        start, last, close = self._record.start, self._previous_state, {"rtol": 1e-9, "atol": 1e-9}
+        if start is not None:
+            stored, ours = start.header, self._header()
+            if stored["sampler"] != ours["sampler"]:  # most settings then differ as well
+                return [f"it was written by {stored['sampler']}, and this is a {ours['sampler']}"]
+            if changed := [key for key in ours if stored.get(key) != ours[key]]:
+                found = [f"{key} was {stored.get(key)}, is {ours[key]}" for key in changed]
+                if changed[0] == "log_prob_fn":  # a guide has the same fingerprint
+                    found[0] += ": its model, data, noise or prior differ, or another line of the module that has the model"
+                return found
+            log_prior = float(np.sum(self._target.log_prior(start.coords)))
+            if not np.isclose(log_prior, stored["log_prior"], **close):
+                return ["the log-prior of the draws that it started from differs"]
+        elif self._record.path is not None and self._result.finished:
+            logger.warning(
+                "%s has no record: the chain goes on from its last step, and other settings cannot be noticed",
+                self.backend.filename,
+            )
+        known = self._record.latest(max(self._record.count, 1))
+        if known is None and last is not None:
+            known = EvaluatedBatch(last.coords, last.log_prob, last.blobs, {})
+        if getattr(self._target.function, "fingerprint", None) is not None or known is None:
+            return []
+        finite = np.where(np.isfinite(known.log_prob), known.log_prob, -np.inf)
+        if np.max(finite) == -np.inf:
+            return []
+        known = known.rows([int(np.argmax(finite))])
+        found, (coords,) = self._evaluator.compute(known.coords), known.coords
+        if np.isclose(known.log_prob, found.log_prob, **close).all():
+            return []
+        return [f"log_prob_fn was {known.log_prob[0]:.10g} at {coords}, is {found.log_prob[0]:.10g}"]
 
     @property
     def _place(self) -> str:
@@ -508,9 +529,22 @@ class TemperedSampler(RunResults, EnsembleSampler):
         return getattr(self.backend, "filename", "the backend in memory")
 
     def _header(self) -> dict:
-        """The start of this run, in the form that JSON returns."""
-        made_of = self._target, self.settings, *self._first_moves, self._given_guide
-        return describe_run(type(self).__name__, *made_of)
+        """The start of this run, in the form that JSON returns.
+
+        The function and the guide are identified by their attributes ``fingerprint``; a guide without one by its class,
+        a function without one not at all.
+        """
+        moves, probabilities = self._first_moves
+        header = {
+            "log_prob_fn": getattr(self._target.function, "fingerprint", None),
+            "sampler": type(self).__name__,
+            "log_likelihood_fn": "used" if self._target.is_likelihood else None,
+            **asdict(self.settings),
+            "moves": [describe(move) for move in moves],
+            "probabilities": [float(probability) for probability in probabilities],
+            "guide": None if self._given_guide is None else guide_fingerprint(self._given_guide),
+        }
+        return json.loads(json.dumps(header))
 
     def _new_start(self, state: State, skip_check: bool, is_drawn: bool = False) -> RunStart:
         """Draws of the prior, checked and entered in the record."""
