@@ -1,7 +1,6 @@
 """Reports of an annealing while it runs, and the result that they add up to.
 
-`samplers.tempering.anneal.anneal` yields reports. `samplers.tempering.recording.Recording` collects them in an
-`AnnealingResult`, and `samplers.judgement` judges this result.
+`samplers.tempering.anneal.anneal` yields reports, which an `AnnealingResult` collects for `samplers.judgement`.
 """
 
 import sys
@@ -170,6 +169,9 @@ class EarlyStop(NamedTuple):
 Report = (
     Stage | Sweep | GuideTick | Restart | EvidenceCheck | GuidedRound | GuidedStart | SignedSample | EarlyStop | Finding
 )
+# fields of a result that take a report of a kind, or collect them
+TAKEN = {EvidenceCheck: "check", GuidedStart: "start", SignedSample: "signed", EarlyStop: "early_stop"}
+COLLECTED = {Stage: "ladder", GuidedRound: "rounds", Finding: "findings"}
 
 
 class AnnealingResult(NamedTuple):
@@ -187,6 +189,21 @@ class AnnealingResult(NamedTuple):
     findings: tuple[Finding, ...] = ()  # of the checks and of the guide
     # effective sample size of the walkers when beta = 1 was reached; None for a result read from a backend
     independent_points: float | None = None
+
+    def add(self, report: Report, founders: Sequence[np.ndarray]) -> "AnnealingResult":
+        """The result with a further report and the present founders by generations; a finding is a warning as well."""
+        result, kind = self, type(report)
+        if kind is Restart:
+            result = AnnealingResult(rounds=self.rounds)
+        elif kind is Finding:
+            warn(report.message)
+        if kind in TAKEN:
+            result = result._replace(**{TAKEN[kind]: report})
+        elif kind in COLLECTED:
+            result = result._replace(**{COLLECTED[kind]: (*getattr(result, COLLECTED[kind]), report)})
+        if result.finished and founders:
+            result = result._replace(founders=founders[0], parents=founders[-1])
+        return result
 
     @property
     def finished(self) -> bool:

@@ -26,12 +26,13 @@ import numpy as np
 from emcee import EnsembleSampler, State
 
 from .budget import Budget, BudgetExhausted, as_limit
+from .estimates.importance import EvidenceCheck
 from .evaluation.asynchronous import AsynchronousEvaluator, check_asynchronous
 from .evaluation.evaluator import Evaluator, unpack
 from .evaluation.user_target import Target
 from .evaluation.values import most_common_reasons
 from .interrupts import deferred_interrupts, interrupts_end_the_run
-from .judgement.checks import check_likelihood, check_prior
+from .judgement.checks import check_end, check_likelihood, check_prior
 from .judgement.failures import KEPT_POINTS, judged_failures
 from .judgement.verdict import CONVERGED, describe_early_stop, independent_points, judge
 from .moves.fast_parameters import with_fast_sweeps
@@ -39,7 +40,7 @@ from .moves.population_moves import GuideMove, RandomWalkMove, describe, without
 from .output import Output
 from .record import EvaluatedBatch, Incomplete, RunStart, open_record
 from .reporting.progress import ANNEALING, Progress, get_progress_bar, show_sweeps
-from .reports import AnnealingResult, Report, warn
+from .reports import AnnealingResult, Report, Stage, warn
 from .results import RunResults
 from .settings import Settings, as_whole_number, check_arguments, check_names, most_moves, refuse_unused
 from .tempering.anneal import anneal
@@ -47,7 +48,6 @@ from .tempering.guide import AdaptedGuide, Guide, check_guide, guide_fingerprint
 from .tempering.guided import Guidance, lend
 from .tempering.mutation import MoveSchedule, check_moves
 from .tempering.population import Population, check_size
-from .tempering.recording import Recording, check_end
 
 __all__ = ["TemperedSampler"]
 
@@ -580,7 +580,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
             guidance = lend(self._guide, self._random, remember, self._budget, self.settings.asynchronous)
         self._record.is_complete = stored is not None
         population = Population(0.0, start.coords, None, float(self.nwalkers))
-        recording = Recording(self._evaluator)
+        since = time.perf_counter(), self._evaluator.evaluations
         labels = {"desc": ANNEALING, "unit": " evaluations", **(bar["progress_kwargs"] or {})}
         try:
             with (
@@ -590,7 +590,14 @@ class TemperedSampler(RunResults, EnsembleSampler):
             ):
 
                 def take(population: Population, report: Report) -> None:
-                    self._result = recording.add(population, report)
+                    nonlocal since
+                    if isinstance(report, Stage):
+                        seconds, made = time.perf_counter() - since[0], self._evaluator.evaluations - since[1]
+                        report = report._replace(seconds=seconds, evaluations=made)
+                        since = time.perf_counter(), self._evaluator.evaluations
+                    elif isinstance(report, EvidenceCheck):
+                        since = since[0], since[1] + report.evaluations  # these belong to no stage
+                    self._result = self._result.add(report, population.founders)
                     progress.show(self._result, population, report)
 
                 arguments = population, self._evaluator, self._random, schedule, self.settings, guidance

@@ -14,13 +14,15 @@ from ..estimates.importance import EvidenceCheck
 from ..estimates.weights import normalised_weights
 from ..finding import CARE, WRONG, Finding
 from ..proposals.mixture import Mixture, log_responsibilities
-from ..reports import Stage
+from ..reports import AnnealingResult, Stage
+from .clusters import find_clusters
 
 __all__ = [
     "LOST",
     "OF_MEAN",
     "OF_SHARES",
     "check_annealing",
+    "check_end",
     "check_evidence",
     "check_likelihood",
     "check_prior",
@@ -185,6 +187,22 @@ def check_evidence(
         )
         found.append(Finding("The shares of the modes are rough", CARE, text, "Use more walkers."))
     return found
+
+
+def check_end(result: AnnealingResult, coords: np.ndarray) -> list[Finding]:
+    """Findings about the estimates of the evidence at the end, with the final points (n, ndim)."""
+    stop = result.early_stop
+    if stop is not None and not stop.complete:
+        return []  # its points are judged by their weights
+    each = np.arange(len(coords))
+    founders = each if result.founders is None else result.founders
+    error = result.ladder[-1].log_evidence_error
+
+    def share_error() -> float:
+        # as if no point had crossed between modes after the last resampling: the limit was counted with such errors
+        return max(mode.share_error for mode in find_clusters(coords[None], founders, each, error))
+
+    return check_evidence(result.log_evidence_ladder, error, result.check, share_error)
 
 
 def _both(log_evidence: float, error: float, check: EvidenceCheck) -> str:
