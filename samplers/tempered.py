@@ -39,7 +39,7 @@ from .moves.fast_parameters import with_fast_sweeps
 from .moves.population_moves import GuideMove, RandomWalkMove, describe, without_unfitted
 from .output import Output
 from .record import EvaluatedBatch, Incomplete, RunStart, open_record
-from .reporting.progress import ANNEALING, Progress, get_progress_bar, show_sweeps
+from .reporting.progress import Progress
 from .reports import AnnealingResult, Report, Stage, warn
 from .results import RunResults
 from .settings import Settings, as_whole_number, check_arguments, check_names, most_moves, refuse_unused
@@ -351,19 +351,20 @@ class TemperedSampler(RunResults, EnsembleSampler):
                 )
                 per_step = 1 if thin else int(thin_by)
                 sweeps = None if iterations is None else iterations * per_step
-                shown = self._evaluator, self._target.function
+                shown = Progress(bar, self._evaluator, self._target.function, "sweeps at beta = 1", "sweeps", sweeps)
                 start = time.perf_counter()
                 try:
-                    for advanced in show_sweeps(steps, bar, sweeps, per_step, *shown):
-                        new += 1
-                        with deferred_interrupts():
-                            stored = State(advanced, copy=True)
-                            self._previous_state = stored
-                            if store:
-                                self._output.step_stored()
-                        self.seconds += time.perf_counter() - start
-                        yield advanced
-                        start = time.perf_counter()
+                    with shown:
+                        for advanced in steps:
+                            shown.step(per_step)
+                            new += 1
+                            with deferred_interrupts():
+                                self._previous_state = stored = State(advanced, copy=True)
+                                if store:
+                                    self._output.step_stored()
+                            self.seconds += time.perf_counter() - start
+                            yield advanced
+                            start = time.perf_counter()
                 except BudgetExhausted:
                     ended = True
                 missing = 0 if iterations is None else iterations - new
@@ -581,12 +582,10 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._record.is_complete = stored is not None
         population = Population(0.0, start.coords, None, float(self.nwalkers))
         since = time.perf_counter(), self._evaluator.evaluations
-        labels = {"desc": ANNEALING, "unit": " evaluations", **(bar["progress_kwargs"] or {})}
         try:
             with (
-                get_progress_bar(bar["progress"], None, **labels) as shown,
                 closing(self._evaluator),
-                Progress(shown, self._evaluator, labels["desc"], self._target.function) as progress,
+                Progress(bar, self._evaluator, self._target.function, "annealing", "evaluations") as progress,
             ):
 
                 def take(population: Population, report: Report) -> None:

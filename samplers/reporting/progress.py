@@ -6,7 +6,7 @@ because a narrow terminal cuts off the rest.
 
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import emcee.pbar
@@ -15,11 +15,10 @@ from ..evaluation.evaluator import Evaluator
 from ..reports import AnnealingResult, GuideTick, Report, Restart, Stage, Sweep
 from ..tempering.population import Population
 
-__all__ = ["ANNEALING", "Progress", "get_progress_bar", "show_sweeps"]
+__all__ = ["Progress"]
 
 SECONDS_BETWEEN_LINES = 60.0
 SECONDS_BETWEEN_FIGURES = 0.1
-ANNEALING = "annealing"
 ORDER = ("beta", "log Z", "failures", "ESS", "acceptance", "simulations", "running")  # the most important figures first
 
 
@@ -42,7 +41,7 @@ class _Lines:
         sys.stderr.flush()
 
 
-def get_progress_bar(display: bool | str, total: int | None, **kwargs: Any) -> Any:
+def _open_bar(display: bool | str, total: int | None, **kwargs: Any) -> Any:
     """Return a bar of tqdm for `display` True, no bar for False, and emcee's bar of this name for a str.
 
     Where stderr is neither a terminal nor a notebook, the bar writes at most one line per minute and the last state.
@@ -67,19 +66,32 @@ def get_progress_bar(display: bool | str, total: int | None, **kwargs: Any) -> A
 class Progress:
     """Shows a run in a bar: a context manager that observes an `Evaluator`.
 
-    The posterior `function` may have ``when_simulated(callback)``, which announces simulations as they end. The bar
-    counts points, or without `counts_points` the steps of `step`.
+    `bar` has the arguments ``progress`` and ``progress_kwargs`` of `emcee.EnsembleSampler.sample`. The posterior
+    `function` may have ``when_simulated(callback)``, which announces simulations as they end. The bar counts
+    "evaluations"; any other `unit` is counted by `step`, up to a `total`.
     """
 
-    def __init__(self, bar: Any, evaluator: Evaluator, label: str, function: Callable, counts_points: bool = True):
-        self._bar, self._evaluator, self._label, self._counts_points = bar, evaluator, label, counts_points
+    def __init__(
+        self,
+        bar: Mapping[str, Any],
+        evaluator: Evaluator,
+        function: Callable,
+        label: str,
+        unit: str,
+        total: int | None = None,
+    ):
+        labels = {"desc": label, "unit": f" {unit}"} | dict(bar["progress_kwargs"] or {})
+        self._bar = _open_bar(bar["progress"] if total != 0 else False, total, **labels)
+        self._evaluator, self._counts_points = evaluator, unit == "evaluations"
+        self._own = "" if labels["desc"] == label else f"{labels['desc']}, "  # a label of the user is kept
         self._announce: Callable = getattr(function, "when_simulated", lambda callback: None)
-        self._silent = not hasattr(bar, "set_postfix")  # emcee's silent bar has only update
+        self._silent = not hasattr(self._bar, "set_postfix")  # emcee's silent bar has only update
         self._figures: dict[str, Any] = {}
         self._part = 0.0  # of a point: simulations of a point that has several
         self._drawn = time.perf_counter()
 
     def __enter__(self) -> "Progress":
+        self._bar.__enter__()
         self._evaluator.running, self._shown = 0, self._evaluator.done
         if not self._silent:
             self._evaluator.observer = self._draw_now_and_then
@@ -92,6 +104,7 @@ class Progress:
             self._evaluator.observer = None
             self._announce(None)
             self._draw()
+        self._bar.__exit__(*error)
 
     def _simulated(self, points: float) -> None:
         """Simulations of points that are evaluated have ended."""
@@ -105,9 +118,8 @@ class Progress:
         if self._silent or not isinstance(report, Sweep | Stage | GuideTick | Restart):
             return
         effective = f"{population.effective_sample_size:.0f}"
-        own = "" if self._label == ANNEALING else f"{self._label}, "  # a label of the user is kept
         if isinstance(report, GuideTick):
-            self._bar.set_description_str(f"{own}{report.phase}", refresh=False)
+            self._bar.set_description_str(f"{self._own}{report.phase}", refresh=False)
             self._figures = {"simulations": round(report.simulations), "ESS": f"{effective}/{report.target}"}
             if result.rounds:
                 self._figures["log Z"] = f"{result.rounds[-1].log_evidence:.2f}"
@@ -116,7 +128,7 @@ class Progress:
             self._figures = {"beta": f"{population.beta:.3g}", "ESS": effective, "acceptance": acceptance}
             if result.ladder:
                 self._figures["log Z"] = f"{sum(stage.log_evidence_increment for stage in result.ladder):.2f}"
-                self._bar.set_description_str(f"{own}stage {len(result.ladder)}", refresh=False)
+                self._bar.set_description_str(f"{self._own}stage {len(result.ladder)}", refresh=False)
         self._draw()
 
     def step(self, steps: int) -> None:
@@ -139,25 +151,3 @@ class Progress:
         figures = self._figures | {name: number for name, number in counts.items() if number}
         self._bar.set_postfix({name: str(figures[name]) for name in ORDER if name in figures}, refresh=False)
         self._bar.update(steps)
-
-
-def show_sweeps(
-    states: Iterator[Any],
-    bar: Mapping[str, Any],
-    sweeps: int | None,
-    per_state: int,
-    evaluator: Evaluator,
-    function: Callable,
-) -> Iterator[Any]:
-    """Pass on the states of a chain, with a bar of `sweeps` sweeps (None: no end), `per_state` sweeps for each state.
-
-    `bar` has the arguments ``progress`` and ``progress_kwargs`` of `emcee.EnsembleSampler.sample`.
-    """
-    labels = {"desc": "sweeps at beta = 1", "unit": " sweeps"} | dict(bar["progress_kwargs"] or {})
-    with (
-        get_progress_bar(bar["progress"] if sweeps != 0 else False, sweeps, **labels) as shown,
-        Progress(shown, evaluator, labels["desc"], function, counts_points=False) as progress,
-    ):
-        for state in states:
-            progress.step(per_state)
-            yield state
