@@ -500,7 +500,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
             if changed := [key for key in ours if stored.get(key) != ours[key]]:
                 found = [f"{key} was {stored.get(key)}, is {ours[key]}" for key in changed]
                 if changed[0] == "log_prob_fn":  # a guide has the same fingerprint
-                    found[0] += ": its model, data, noise or prior differ, or another line of the module that has the model"
+                    found[0] += ": its model, data, noise or prior differ, or another line of the module with the model"
                 return found
             log_prior = float(np.sum(self._target.log_prior(start.coords)))
             if not np.isclose(log_prior, stored["log_prior"], **close):
