@@ -32,21 +32,19 @@ _EXIT = (
 _names: dict[int, bytes] = {}
 
 
-class _RaisesKeyboardInterrupt:
+class _RaisesKeyboardInterrupt(NamedTuple):
     """Handler of SIGINT that calls another one, and raises KeyboardInterrupt in place of what that one raises."""
 
-    def __init__(self, handler: Callable[..., Any]) -> None:
-        self.handler = handler
+    handler: Callable[..., Any]
 
     def __call__(self, *arguments: Any) -> None:
         global _interrupts
         try:
             self.handler(*arguments)
-        except KeyboardInterrupt:
-            _interrupts += 1
-            raise
         except BaseException as error:
             _interrupts += 1
+            if isinstance(error, KeyboardInterrupt):
+                raise
             raise KeyboardInterrupt from error
 
 

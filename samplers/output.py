@@ -71,7 +71,7 @@ class Output:
         _cut_chain(self._backend, int(self._backend.iteration), self._backend.accepted)
 
     def check_blobs(self, blobs: np.ndarray | None) -> None:
-        """Raise ValueError if blobs (n, ...) that are stored next have another type than those of the chain."""
+        """Raise ValueError if blobs (n, ...) that are stored next have another type than the blobs of the chain."""
         stored = _type_of_blobs(self._backend)
         if blobs is not None and stored not in (None, blobs.dtype):
             raise ValueError(

@@ -149,6 +149,8 @@ class Record:
     @deferred_interrupts()
     def evaluated(self, batch: EvaluatedBatch) -> None:
         """Enter evaluated points; they are in the file on return. ValueError for blobs that a file cannot hold."""
+        if len(batch.coords) == 0:
+            return
         blobs = [] if batch.blobs is None else [batch.blobs]
         for each in blobs:
             self.check_blobs(each.dtype)
@@ -262,7 +264,13 @@ class Record:
             self.path.touch()
             file = open(self.path, "r+b", buffering=0)  # noqa: SIM115  open during the run
             try:
-                self._lock(file)
+                try:
+                    lock_now(file)
+                except BlockingIOError:
+                    text = f"another run is writing to {self.path}: wait for its end, or use another file"
+                    raise ValueError(text) from None
+                except OSError as error:
+                    logger.info("%s cannot be locked (%s): do not start two runs on it", self.path, error.strerror)
                 if self.path.stat().st_size != self._whole:  # an incomplete block, or another process has written
                     vars(self).update(vars(Record(self.path, self._slow)))
                 if self._whole == 0:
@@ -283,14 +291,6 @@ class Record:
         self._file = tempfile.TemporaryFile()  # noqa: SIM115  as long as the record
         weakref.finalize(self, self._file.close)
         return self._file
-
-    def _lock(self, file: Any) -> None:
-        try:
-            lock_now(file)
-        except BlockingIOError:
-            raise ValueError(f"another run is writing to {self.path}: wait for its end, or use another file") from None
-        except OSError as error:
-            logger.info("%s cannot be locked (%s): do not start two runs on it", self.path, error.strerror)
 
     def close(self) -> None:
         """Close the file of a record that has a path."""

@@ -4,7 +4,7 @@ The record of the run contains the finished points and, for each decision of the
 which points had arrived before it, so that an interrupted run, when repeated, makes the same decisions. Points that
 were running when the process ended are submitted again.
 
-A queue, that of ``posterior.evaluation_queue()`` or of a pool, is a `samplers.evaluation.point_queue.PointQueue` or has
+A queue (``posterior.evaluation_queue()``, or made for a pool) is a `samplers.evaluation.point_queue.PointQueue` or has
 its methods ``submit(coords)``, ``collect()``, ``close()``, perhaps ``ended()``, and its attribute ``workers``.
 """
 
@@ -129,7 +129,7 @@ class AsynchronousEvaluator(Evaluator):
             return
         batch = self.as_batch(self._points(new), [value for _, value in new.values()])
         with deferred_interrupts():
-            self.enter(batch)
+            self.record.evaluated(batch)
             for ticket, _ in new.values():
                 del self._tickets[ticket]
         self.count(0, len(new))

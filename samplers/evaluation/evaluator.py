@@ -40,7 +40,7 @@ class Evaluator:
         self._fields: list[tuple] = [("log_prob", np.float64), ("log_prior", np.float64)]
         self._has_blobs: bool | None = None  # whether the function returns blobs; None while this is not known
         self.pool = self.observer = None
-        self.remember: Remember | None = None  # that of the annealing (`Record.remembering`)
+        self.remember: Remember | None = None  # of the present annealing (`Record.remembering`)
         self.evaluations = self.done = self.running = 0
 
     def __getstate__(self):
@@ -150,7 +150,7 @@ class Evaluator:
         if len(results) == stored:
             return []
         part = self.as_batch(coords[stored : len(results)], results[stored:])
-        self.enter(part.rows(np.flatnonzero(~part.failed)))
+        self.record.evaluated(part.rows(np.flatnonzero(~part.failed)))
         return (stored + np.flatnonzero(part.failed)).tolist()
 
     def _settle(self, coords: np.ndarray, results: Any, failed: list[int], stored: int, whole: bool) -> EvaluatedBatch:
@@ -160,9 +160,9 @@ class Evaluator:
         try:
             self.check_failures(new, self.record.count, len(self.record.failed), whole=whole and stored == 0)
         except RuntimeError:
-            self.enter(new.rows(np.flatnonzero(~new.failed)))
+            self.record.evaluated(new.rows(np.flatnonzero(~new.failed)))
             raise
-        self.enter(new)
+        self.record.evaluated(new)
         return batch
 
     def check_failures(
@@ -184,10 +184,6 @@ class Evaluator:
                 f"{batch.reasons[failed[0]]} at {batch.coords[failed[0]]}. Earlier evaluations are kept (see "
                 "failures), and a run with a backend in a file goes on from there after the cause is fixed"
             )
-
-    def enter(self, batch: EvaluatedBatch) -> None:
-        if len(batch.coords) > 0:
-            self.record.evaluated(batch)
 
     def as_batch(self, coords: np.ndarray, results: Any) -> EvaluatedBatch:
         batch = self.target.evaluated(coords, results)

@@ -215,7 +215,7 @@ def judge(
     """Judge an annealing that has reached beta = 1.
 
     `searched` is the part of the `simulations` made by the guide for its search; `missing_steps` at beta = 1 were not
-    allowed by the limit; `failures` says how many evaluations failed; `names` are those of the parameters.
+    allowed by the limit; `failures` says how many evaluations failed; `names` name the parameters.
     """
     stage = result.ladder[-1]
     found = [*result.findings, *(() if near is None else check_failed_region(near))]

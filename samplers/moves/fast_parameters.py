@@ -68,7 +68,7 @@ class WithFastSweeps(Move):
         self._walk.calibrate(*arguments)
 
     def propose(self, model: Model, state: State) -> tuple[State, np.ndarray]:
-        """Make the move, then the fast sweeps; the accepted proposals (nwalkers,) are those of the move."""
+        """Make the move, then the fast sweeps; the accepted proposals (nwalkers,) belong to the move."""
         state, accepted = self.move.propose(model, state)
         acceptances = []
         for _ in range(self.sweeps):

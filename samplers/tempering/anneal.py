@@ -18,19 +18,11 @@ from collections.abc import Generator, Iterator, Sequence
 import numpy as np
 
 from ..budget import BudgetExhausted
-from ..estimates.importance import (
-    EvidenceCheck,
-    draw_inside,
-    evidence_from_weights,
-)
+from ..estimates.importance import EvidenceCheck, draw_inside, evidence_from_weights
 from ..estimates.pareto import pareto_shape
 from ..estimates.weights import WHERE_TO_LOOK, coarse_weights, effective_sample_size, normalised_weights
 from ..finding import WRONG, Finding
-from ..judgement.checks import (
-    check_annealing,
-    check_shares,
-    find_unreached_part,
-)
+from ..judgement.checks import check_annealing, check_shares, find_unreached_part
 from ..proposals.basins import find_basins, with_components
 from ..proposals.mixture import fit_mixture, log_density
 from ..proposals.transforms import find_support_bounds

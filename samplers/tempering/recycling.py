@@ -16,13 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..estimates.importance import (
-    EvidenceCheck,
-    draw_inside,
-    evidence_from_weights,
-    round_shares,
-    tail_variance,
-)
+from ..estimates.importance import EvidenceCheck, draw_inside, evidence_from_weights, round_shares, tail_variance
 from ..estimates.weights import coarse_weights, effective_sample_size, log_mean_weight, normalised_weights
 from ..judgement.rounds import doubt_recycling
 from ..proposals.basins import find_basins, with_components
