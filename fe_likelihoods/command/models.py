@@ -37,7 +37,7 @@ from .job import Job
 from .keys import check_known, did_you_mean, parse_prior, read_by_channel
 from .sections import USER_MODELS, part_keys
 
-__all__ = ["Problem", "make_problem", "noise_channels_of", "runs_code_of_user"]
+__all__ = ["Problem", "make_problem", "runs_code_of_user"]
 
 ERRORS_OF_MODES = {"frequency_error": 0.01, "shape_error": 0.03}  # medians of log-normal priors without one (assumed)
 TEMPERATURE_SLOPE = 2e-3  # [1/K], its sd without a prior (assumed): -1e-4 to -5e-4 in concrete, more if frozen
@@ -259,7 +259,9 @@ def _make_priors(
 ) -> tuple[dict[str, Any], dict[str, Distribution]]:
     """The priors of all parameters, numbers for `known` ones, and the assumed ones, which the file does not give."""
     names, parts, where = likelihood.parameter_names, [part for part, _ in likelihood.parts()], job.where("priors")
-    channels = {name: channel for part in parts for name, channel in noise_channels_of(part).items()}
+    channels = {}  # of each parameter that is the noise level of a channel, by name
+    for part in parts:
+        channels |= channels_of_deviations(part.noise, part.model.channels)
     measured = {channel.name: part.measurements for part in parts for channel in part.model.channels}
     given = {}
     check_known(job.priors, names, where, "the model has no such parameter")
@@ -274,11 +276,6 @@ def _make_priors(
     free = [name for name in names if name not in given and name not in known]
     assumed = {name: _default_prior(name, channels.get(name), measured) for name in free}
     return {name: (given | assumed | dict(known))[name] for name in names}, assumed
-
-
-def noise_channels_of(likelihood: FELikelihood) -> dict[str, Channel]:
-    """Channel of each parameter that is the noise level of a channel, by name."""
-    return channels_of_deviations(likelihood.noise, likelihood.model.channels)
 
 
 def _default_prior(name: str, channel: Channel | None, measured: Mapping[str, Measurements]) -> Distribution:

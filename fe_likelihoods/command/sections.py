@@ -204,11 +204,8 @@ SECTIONS: dict[str, type[Section]] = {
 }
 """Sections besides those of `FREE_SECTIONS`."""
 
-FREE_SECTIONS = {
-    "model": "the structure; its keys depend on `kind`",
-    "priors": "parameter = distribution",
-    "events": "other base motions, one table [events.NAME] for each",
-}
+FREE_SECTIONS = "model", "priors", "events"
+"""Sections whose keys depend on the kind of the structure, its parameters, and names of events."""
 
 
 _LIMIT = Key("time_limit", "time", "Longest duration of a run; a longer run is stopped and counts as failed")
