@@ -159,23 +159,28 @@ def _matlab(path: Path) -> _Lines:
     return _Lines(["a MATLAB file", text_table(rows)], {"modes": given})
 
 
-def _readable(path: Path) -> tuple[Table, list[str], list[str]]:
-    """A table, texts in its columns of numbers, which may stand for missing samples, and what is said about them."""
-    texts, said = list[str](), list[str]()
+def _readable(path: Path) -> tuple[Table, list[str], list[float], list[str]]:
+    """A table, texts and numbers in it that may stand for missing samples, and what is said about them."""
+    texts, numbers, said = list[str](), list[float](), list[str]()
     while True:
         try:
-            return read_table(path, missing=texts or None), texts, said
+            table = read_table(path, missing=[*texts, *numbers] or None)
+            for place in value_columns(table):
+                column_values(table, place)
+            return table, texts, sorted(numbers), said
         except ValueError as error:
-            found = re.search(r"got '(.+)'; if it stands for a missing sample", str(error))
-            if found is None or len(texts) == _MOST_TEXTS:
+            text = re.search(r"got '(.+)'; if it stands for a missing sample", str(error))
+            value = re.search(r"got (\S+) in \d+ rows", str(error))
+            if value is None and (text is None or len(texts) == _MOST_TEXTS):
                 raise
-            texts.append(found[1])
+            texts += [] if value else [text[1]]
+            numbers += [float(value[1])] if value else []
             said.append(str(error))
 
 
 def _table(path: Path) -> _Lines:
     """A table of samples, of modes or of load cases."""
-    table, texts, said = _readable(path)
+    table, texts, marks, said = _readable(path)
     try:
         if table.time is None or table.clock is not None:  # days of several identifications are clocks as well
             return _Lines(["a table of modes", str(read_modal_data(path))], {"modes": []})
@@ -188,14 +193,9 @@ def _table(path: Path) -> _Lines:
     options, remarks, step = ([], ["a line for each load case"], None) if cases else _sampling(table)
     remarks += said
     rows: list[tuple[str, ...]] = [("column", "unit", "numbers", "missing", "smallest", "largest")]
-    columns, unstated, marks, screened = dict[str, object](), dict[str, str](), set[float](), list[Screened]()
+    columns, unstated, screened = dict[str, object](), dict[str, str](), list[Screened]()
     for k in value_columns(table):
-        name, values = names[k], table.columns[k].values
-        try:
-            column_values(table, k)
-        except ValueError as error:
-            remarks.append(str(error))
-            marks |= {float(found) for found in re.findall(r"got (\S+) in \d+ rows", str(error))}
+        name, values = names[k], column_values(table, k)
         known = values[~np.isnan(values)]
         ends = (number(known.min(), 4), number(known.max(), 4)) if known.size else ("-", "-")
         unit = stated_unit(table, k) or text_unit(table, k, "acceleration")  # as the readers of accelerations take it
@@ -206,7 +206,6 @@ def _table(path: Path) -> _Lines:
         channel = _name_of_channel(name if table.named else f"column {name}", columns)
         columns[channel] = name
         if step is not None:
-            values = np.where(np.isin(values, list(marks)), np.nan, values)
             if any(each.startswith("resample") for each in options):
                 values = uniform_times(row_times(table), None, table.file).interpolate(values)
             start = table_start(table, step, 0.0 if table.clock is None else clock_text(table.clock))
@@ -214,8 +213,8 @@ def _table(path: Path) -> _Lines:
         if unit is None or dimension_of(unit) is None:
             unstated[channel] = "?"
     text = [f"a table of {len(table.lines)} rows", text_table(rows), *remarks, *_cautions(screened)]
-    missing = [f"missing = {_toml([*texts, *sorted(marks)])}"] if texts or marks else []
-    repairs = repair_lines(screened, {"missing": [*texts, *sorted(marks)]})
+    missing = [f"missing = {_toml([*texts, *marks])}"] if texts or marks else []
+    repairs = repair_lines(screened, {"missing": [*texts, *marks]})
     repairs = ([] if any(each.startswith("missing") for each in repairs) else missing) + repairs
     if not columns:
         return _Lines(text, {})
