@@ -68,7 +68,7 @@ class ResponseGuide:
     posterior : Posterior
         Its noise must use statistics that are quadratic in the residuals.
     starts : int
-        Starts of the search for modes that shall lead to one: the median of the prior, and draws of it.
+        Starts of the search for modes that shall lead to one: see `Posterior.guide`.
 
     Attributes
     ----------
@@ -84,7 +84,7 @@ class ResponseGuide:
     # a response does not depend on how long its simulation takes
     learns_from_parts = True
 
-    def __init__(self, posterior: Any, starts: int = 6) -> None:
+    def __init__(self, posterior: Any, starts: int = 12) -> None:
         starts = check_starts(starts)
         fewest = min(part.simulator.memory_cache.most for part, _ in posterior.likelihood.parts())
         if fewest < _FEWEST_CACHED:
@@ -142,7 +142,7 @@ class ResponseGuide:
         if len(search.modes) > 1:
             found += check_unseen_modes(search.unseen_share, search.ended, len(search.modes))
         else:
-            found += check_ends(search.ended, len(search.ends), search.wanted(self._starts), search.grown)
+            found += check_ends(search.ended, len(search.ends), self._starts, search.grown)
         found += check_tops(self.highest - max((mode.log_density for mode in search.modes), default=np.inf))
         if self._emulated is not None:
             found += check_draws_in_memory(self._emulated.largest_weight)

@@ -377,7 +377,7 @@ class Posterior:
         """
         return self.likelihood.draw_noise(x, rng)
 
-    def guide(self, starts: int = 6) -> "ResponseGuide":
+    def guide(self, starts: int = 12) -> "ResponseGuide":
         """A guide for samplers: finds the modes from the responses and emulates the responses around them.
 
         It reduces the simulations from thousands to hundreds: ``SMCSampler(..., guide=posterior.guide())``. The result
@@ -387,7 +387,8 @@ class Posterior:
         ----------
         starts : int
             Starts of the search for modes that shall lead to a mode: the median of the prior, and a Latin hypercube of
-            its quantiles. At most four times as many begin. A mode to which no start leads can be missed.
+            its quantiles; half as many on a record that grows. At most twice as many begin. A mode to which no start
+            leads can be missed.
 
         Returns
         -------
@@ -416,7 +417,7 @@ class Posterior:
 
         return ResponseGuide(self, starts)
 
-    def mode(self, starts: int = 6, seed: Any = None, max_simulations: float | None = None) -> "PosteriorModes":
+    def mode(self, starts: int = 12, seed: Any = None, max_simulations: float | None = None) -> "PosteriorModes":
         """The modes of the density: most probable parameters, Laplace covariances and evidences.
 
         The search of `guide` finds the modes. Each is then refined by a few simulations, and by differences of the

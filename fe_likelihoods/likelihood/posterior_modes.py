@@ -114,7 +114,7 @@ class _Linear:
 
 
 def posterior_modes(
-    posterior: Any, starts: int = 6, seed: Any = None, max_simulations: float | None = None
+    posterior: Any, starts: int = 12, seed: Any = None, max_simulations: float | None = None
 ) -> PosteriorModes:
     """Modes of a `Posterior`, see `Posterior.mode`; ValueError as `Posterior.guide`."""
     before = posterior.likelihood.simulations

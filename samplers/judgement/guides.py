@@ -47,12 +47,9 @@ def find_missing_part(text: str, severity: str = CARE) -> Finding:
     return Finding(UNSEEN, severity, f"The guide says: {text}.")
 
 
-def check_ends(ended: int, made: int, wanted: int, grown: bool) -> list[Finding]:
-    """Whether enough of the starts that were made led to the only mode; `grown`: on a record that grows.
-
-    More are `wanted` where the limit of simulations ended a search that other tops, of no weight, would have prolonged.
-    """
-    if ended == 0 or ended >= (GROWN_STARTS if grown else wanted):
+def check_ends(ended: int, made: int, starts: int, grown: bool) -> list[Finding]:
+    """Whether half of the `starts` that were asked for led to the only mode; `grown`: on a record that grows."""
+    if ended == 0 or ended >= (GROWN_STARTS if grown else (starts + 1) // 2):
         return []
     text = (
         f"only {ended} of {made} starts led to the one mode that was found, the others were given up far below it: "
