@@ -157,17 +157,16 @@ class Search:
     def run(self, starts: int) -> Steps:
         """Returns a `ModeSearch`; yields functions that simulate, and is sent their results, and None after each batch.
 
-        As many `starts` begin, or half as many on a growing record. Further ones follow until enough have reached a
-        mode (ascents that are given up may have been on their way to another one; on a growing record, some follow
-        once), and while many are alone in one. If all fail on the first part, which may be too short for the model,
+        As many `starts` begin. Further ones follow until as many have reached a mode (ascents that are given up may
+        have been on their way to another one; on a growing record most are, and some follow once where fewer than half
+        have), and while many are alone in one. If all fail on the first part, which may be too short for the model,
         they begin on the whole record.
         """
-        first = starts
-        begin, following, finished = 0, first, True
+        begin, following, finished = 0, starts, True
         while True:
             try:
-                if begin == first:
-                    yield from self._order(first, _MOST_STARTS * starts - first)
+                if begin == starts:
+                    yield from self._order(starts)
                 self._standing_for.extend(range(begin, following))
                 yield from self._ascend(range(begin, following))
             except _OutOfBudget:
@@ -177,8 +176,9 @@ class Search:
                 begin, self._standing_for = 0, []
                 continue
             search = self._found(finished)
-            few = (first + 1) // 2 - search.ended if search.grown and begin == 0 else 0 if search.grown else first - search.ended
-            missing = max(few, (first + 1) // 2 if search.unseen_share > DOUBTED_SHARE else 0)
+            half = (starts + 1) // 2
+            few = starts - search.ended if not search.grown else half - search.ended if begin == 0 else 0
+            missing = max(few, half if search.unseen_share > DOUBTED_SHARE else 0)
             if not finished or missing <= 0 or following == len(self._starts) or not self._allowed():
                 return search
             begin, following = following, min(following + missing, len(self._starts))
@@ -194,15 +194,15 @@ class Search:
             raise _OutOfBudget
         self.spent += simulations
 
-    def _order(self, begun: int, most: int) -> Steps:
-        """The highest further starts by their likelihoods on the first part: they end at modes more often."""
+    def _order(self, begun: int) -> Steps:
+        """Further starts in the order of their likelihoods on the first part: high ones end at modes more often."""
         part, rest = self._parts[0], self._starts[begun:]
         self._pay(part.share * part.target.new_points(rest))
         runs = yield from part.target.run(rest, self._session.remember)
         yield None
         found = zip(runs.failed, runs.statistics, strict=True)
         heights = [-np.inf if failed else part.target.fit_noise(each).log_density for failed, each in found]
-        highest = np.argsort(-np.array(heights), kind="stable")[:most]
+        highest = np.argsort(-np.array(heights), kind="stable")[: (_MOST_STARTS - 1) * begun]
         self._starts = np.concatenate([self._starts[:begun], rest[highest]])
 
     def _ascend(self, numbers: range) -> Steps:
@@ -303,8 +303,8 @@ def find_modes(posterior: Any, starts: int = 12, seed: Any = None, max_simulatio
     posterior : Posterior
         Any noise whose statistics are quadratic in the residuals, as all noises of this package are.
     starts : int
-        Number of starts that shall lead to a mode: the median of the prior, and a Latin hypercube of its quantiles;
-        half as many on a record that grows. At most twice as many begin.
+        Number of starts that shall lead to a mode: the median of the prior, and a Latin hypercube of its quantiles. At
+        most twice as many begin.
     seed : int, optional
         Seed of the draws.
     max_simulations : float, optional

@@ -387,8 +387,7 @@ class Posterior:
         ----------
         starts : int
             Starts of the search for modes that shall lead to a mode: the median of the prior, and a Latin hypercube of
-            its quantiles; half as many on a record that grows. At most twice as many begin. A mode to which no start
-            leads can be missed.
+            its quantiles. At most twice as many begin. A mode to which no start leads can be missed.
 
         Returns
         -------

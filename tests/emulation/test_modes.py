@@ -147,20 +147,11 @@ def _of_squared_difference(time, theta):
 )
 def test_modes_that_few_starts_led_to_are_doubted(ends, grown, severity):
     """With one mode, by the number of starts that led to it; with several, by those that are alone in one."""
-    guide = _equal_modes(1).guide(starts=6)
+    guide = _equal_modes(1).guide()
     modes = (Mode(np.zeros(3), np.zeros(3), np.eye(3), 0.0, 0.0, True),) * len(set(ends))
     guide.search = ModeSearch(modes, ends + (-1,) * 12, 100.0, True, grown)
     found = [each for each in guide.findings if "not found" in each.text]
     assert [each.severity for each in found] == ([] if severity is None else [severity])
-
-
-@pytest.mark.parametrize(("given_up", "low", "doubted"), [(8, 2, True), (17, 2, False), (8, 0, False)])
-def test_a_search_that_the_limit_ended_is_doubted_where_others_would_have_followed(given_up, low, doubted):
-    """Seven starts led to one mode; tops of no weight ask for eleven, and 24 are the most that begin."""
-    guide = _equal_modes(1).guide(starts=6)
-    mode = Mode(np.zeros(3), np.zeros(3), np.eye(3), 0.0, 0.0, True)
-    guide.search = ModeSearch((mode,), (0,) * 7 + (-1,) * given_up, 100.0, True, False, low)
-    assert any("not found" in each.text for each in guide.findings) == doubted
 
 
 @pytest.mark.slow
