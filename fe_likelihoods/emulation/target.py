@@ -286,7 +286,8 @@ class ResponseTarget:
     def slopes(self, statistics: np.ndarray, coords: np.ndarray) -> np.ndarray:
         """Derivatives (n_numbers,) of the log-likelihood by the statistics, at fixed noise parameters."""
         sizes = np.abs(statistics)  # each by itself: channels in different units differ by any factor
-        steps = _STEP * np.where(sizes > 0.0, sizes, 1e-9 * sizes.max())
-        shifted = np.concatenate([statistics + np.diag(steps), statistics - np.diag(steps)])
+        zero = sizes == 0.0  # sums of squares are nowhere below
+        steps = _STEP * np.where(zero, 1e-9 * sizes.max() or 1.0, sizes)
+        shifted = np.concatenate([statistics + np.diag(steps), statistics - np.diag(np.where(zero, 0.0, steps))])
         ahead, behind = np.split(self.log_likelihood(shifted, np.broadcast_to(coords, (len(shifted), len(coords)))), 2)
-        return (ahead - behind) / (2.0 * steps)
+        return (ahead - behind) / np.where(zero, steps, 2.0 * steps)
