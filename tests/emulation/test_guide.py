@@ -192,7 +192,6 @@ def test_a_long_ridge_is_followed_to_the_bounds_of_its_prior(seed):
     of_k = np.where(inside, h**-3.0 / 4.9 / 1.7, 0.0).sum(axis=1) * (h[1] - h[0])
     log_likelihood = posterior.log_likelihood(np.column_stack([k, np.ones_like(k)]))
     truth = np.log(np.sum(np.exp(log_likelihood - log_likelihood.max()) * of_k) * (k[1] - k[0])) + log_likelihood.max()
-    assert sampler.verdict.status == "usable"  # few starts lead to the one mode
     assert abs(sampler.log_evidence - truth) < 4.0 * sampler.log_evidence_error < 0.3
 
 

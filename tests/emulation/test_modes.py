@@ -25,7 +25,19 @@ from fe_likelihoods.emulation.target import ResponseTarget
 from samplers import SamplingWarning
 from samplers.judgement.guides import DOUBTED_SHARE
 
-from .problems import acts_late, free_vibration, guided, late_response, misleading, noisy, symmetric, vibration
+from .problems import (
+    CHANNELS,
+    DT,
+    N_STEPS,
+    acts_late,
+    free_vibration,
+    guided,
+    late_response,
+    misleading,
+    noisy,
+    symmetric,
+    vibration,
+)
 
 
 def _log_density(posterior, coords):
@@ -87,18 +99,18 @@ def _equal_modes(n):
 
 @pytest.mark.parametrize("n", [2, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 6))])
 def test_starts_are_added_until_few_unseen_modes_are_expected(n):
-    """And until so many have reached the modes found that another one is missed in one of 64 cases."""
+    """And until as many as were asked for have reached one."""
     found = [find_modes(_equal_modes(n), seed=seed) for seed in range(1, 6)]
     for search in found:
-        k, most = len(search.modes), len(search.ends) == 24
+        most = len(search.ends) == 24
         assert len(search.ends) <= 24 and (most or search.unseen_share <= DOUBTED_SHARE)
-        assert most or (k / (k + 1.0)) ** search.ended <= 2.0**-6
+        assert most or search.ended >= 12
     # a share of DOUBTED_SHARE is expected to be missed: of 30, 1.5 with a standard deviation of 1.2
     assert sum(len(search.modes) for search in found) >= 5 * n - (4 if n == 6 else 0)
 
 
 @pytest.mark.slow  # 15 seconds
-def test_tops_of_no_weight_let_more_starts_begin():
+def test_both_orders_of_two_storeys_are_found():
     """Two storeys can be exchanged; a quarter of the starts that end leads to one mode. Six of them lost it in 6 of 30
     searches, eleven in 1 of 40."""
     time, squared = 0.02 * np.arange(250), (2.0 * np.pi) ** 2
@@ -173,6 +185,14 @@ def test_a_curved_ridge_is_sampled_whole_or_doubted(seed):
         sampler = guided(posterior, 600, seed=seed, walkers=60)
     whole = np.allclose(sampler.get_chain(flat=True)[:, :2].std(axis=0), np.sqrt(0.5), rtol=0.2)
     assert whole or sampler.verdict.status != "converged"
+
+
+def test_a_mode_that_fits_exactly_is_found_where_the_noise_is_known():
+    model = FunctionModel(free_vibration, ["stiffness", "damping"], CHANNELS, DT, N_STEPS)
+    exact = Measurements(CHANNELS, DT, model.simulate(np.array([1.0, 1.0])), "SYNTHETIC")
+    prior = {"stiffness": TruncatedNormal(1.0, 0.3), "damping": TruncatedNormal(1.0, 0.3)}
+    posterior = Posterior(FELikelihood(model, exact), prior | {"sigma_top": 2e-3, "sigma_base": 5.0})
+    assert find_modes(posterior, seed=1).modes[0].parameters == pytest.approx([1.0, 1.0], abs=1e-3)
 
 
 def test_a_failing_start_leads_nowhere_and_failing_steps_are_shortened():
