@@ -50,12 +50,8 @@ def evaluation_queue(posterior: Any, responses: bool = False) -> PointQueue:
                 evaluate(rows)  # together, which is faster; their simulations are known then
         return list(threads.submit_all(evaluate, [row[None] for row in rows]))
 
-    def give_up(futures: list[Future]) -> None:
-        for future in futures:
-            future.cancel()
-
     threads = Threads(lambda: (size() or _MOST_THREADS) if streams else 0)
-    return PointQueue(start, size, give_up)
+    return PointQueue(start, size)
 
 
 def _evaluate(posterior: Any, responses: bool, rows: np.ndarray) -> Any:

@@ -14,7 +14,7 @@ slope.
 
 from collections.abc import Sequence
 from itertools import zip_longest
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
@@ -24,6 +24,9 @@ from ..emulation.modes import Mode, find_modes
 from ..simulation.model import SimulationFailed, derivatives_batch, has_jacobian
 from ..text_tables import text_table
 from .likelihood import FELikelihood
+
+if TYPE_CHECKING:
+    import pandas
 
 __all__ = ["PosteriorMode", "PosteriorModes", "posterior_modes"]
 
@@ -83,6 +86,18 @@ class PosteriorModes(NamedTuple):
     def log_evidence(self) -> float:
         """Logarithm of the evidence, the sum over the modes."""
         return float(logsumexp([mode.log_evidence for mode in self.modes])) if self.modes else -np.inf
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """The modes as rows of a `pandas.DataFrame`: parameters, their standard deviations, log_prob, log_evidence."""
+        import pandas
+
+        rows = []
+        for mode in self.modes:
+            sd = np.sqrt(np.diag(mode.covariance))
+            row = dict(zip(self.parameter_names, mode.parameters, strict=True))
+            row |= {f"sd_{name}": each for name, each in zip(self.parameter_names, sd, strict=True)}
+            rows.append(row | {name: getattr(mode, name) for name in ("log_prob", "log_evidence", "converged")})
+        return pandas.DataFrame(rows)
 
     def __str__(self) -> str:
         rows = [["parameter", *(f"mode {k + 1}" for k in range(len(self.modes)))]]

@@ -384,26 +384,26 @@ class Simulator(VerifiedModel):
 
         `ChangedModel` if the model has changed; these simulations, and all since the last comparison, are not stored.
         """
-        keys, results, reasons, error = [], [], [], None
+        done: dict[bytes, tuple[np.ndarray | None, str]] = {}
+        error = None
         with self._running.lock:
             for future in ended:
                 key = left.pop(future)
                 self._running.keys.discard(key)
                 try:
-                    (result, reason), opened = unpack(value_of(future.result()), self.pool)
+                    done[key], opened = unpack(value_of(future.result()), self.pool)
                     self.label.add(opened)
-                    keys, results, reasons = [*keys, key], [*results, result], [*reasons, reason]
                 except CancelledError:
                     error = error or RuntimeError("the pool was closed before a simulation had finished")
                 except BaseException as raised:
                     error = error or raised
-            if keys:
+            if done:
                 now = time.perf_counter()
                 seconds, self._running.counted_until = now - self._running.counted_until, now
                 responses = self._returns_responses(request.full)
                 shape = (len(self.model.channels), self.model.n_steps) if responses else (self.n_numbers,)
-                values = np.array([np.full(shape, np.nan) if each is None else each for each in results])
-                self._record(request, keys, values, reasons, seconds)
+                values = np.array([np.full(shape, np.nan) if each is None else each for each, _ in done.values()])
+                self._record(request, list(done), values, [reason for _, reason in done.values()], seconds)
             self._running.lock.notify_all()
         if error is not None:
             raise error
