@@ -73,11 +73,10 @@ class _Request:
         done = self.responses if self.full else self.outcomes
         return [key for key in self.keys if key not in done]
 
-    def enter(self, keys: Sequence[bytes], outcomes: Sequence[bytes | str]) -> None:
+    def enter(self, outcomes: dict[bytes, bytes | str]) -> None:
         """Fill in outcomes."""
-        found = dict(zip(keys, outcomes, strict=True))
-        self.outcomes |= found
-        self.responses |= {key: reason for key, reason in found.items() if isinstance(reason, str)}
+        self.outcomes |= outcomes
+        self.responses |= {key: reason for key, reason in outcomes.items() if isinstance(reason, str)}
 
 
 class _Running:
@@ -244,8 +243,8 @@ class Simulator(VerifiedModel):
         self.failures.count_outcomes(thetas[new], [reasons[row] for row in new])
         if statistics is None:
             rows = [row for row in rows if reasons[row]]
-        outcomes = [reasons[row] or statistics[row].tobytes() for row in rows]
-        self.memory_cache.store([keys[which[row]] for row in rows], outcomes)
+        outcomes = {keys[which[row]]: reasons[row] or statistics[row].tobytes() for row in rows}
+        self.memory_cache.store(outcomes, outcomes.values())
 
     def reason(self, point: np.ndarray) -> str:
         """Reason of a failure that is cached at parameters (n,), the structural ones first; empty for others."""
@@ -258,10 +257,9 @@ class Simulator(VerifiedModel):
         finite = np.isfinite(self._thetas(keys)).all(axis=1)
         with self._running.lock:
             request, known = _Request(keys, full, self.model), zip(keys, self.memory_cache.look_up(keys), strict=True)
-            known = {key: outcome for key, outcome in known if outcome is not None}
-            request.enter(list(known), list(known.values()))
+            request.enter({key: outcome for key, outcome in known if outcome is not None})
             skipped = [key for key, fine in zip(keys, finite, strict=True) if not fine]
-            request.enter(skipped, ["the parameters are not finite"] * len(skipped))
+            request.enter(dict.fromkeys(skipped, "the parameters are not finite"))
             try:
                 on_disk = {*self._take_statistics(request), *self._take_responses(request)}
             except StaleCache:  # results in memory may belong to another model
@@ -278,7 +276,7 @@ class Simulator(VerifiedModel):
             return []
         rows = self._stored(self._key, self._thetas(left), request.fingerprint, self.n_numbers)
         found = {key: row.outcome for key, row in zip(left, rows, strict=True) if row is not None}
-        self._enter_known(request, list(found), list(found.values()))
+        self._enter(request, found)
         return list(found)
 
     def _take_responses(self, request: _Request) -> list[bytes]:
@@ -302,21 +300,17 @@ class Simulator(VerifiedModel):
             if new := [key for key in found if key not in request.outcomes]:
                 batch = self._as_responses([found[key] for key in new]), [_reason(found[key]) for key in new]
                 statistics, reasons = self.statistics_of(*batch)
-                self._enter_known(request, new, _outcomes(statistics, reasons))
+                self._enter(request, _outcomes(new, statistics, reasons))
                 if self.cache is not None and not self._responses_only:
                     self._store(self._thetas(new), statistics, reasons, None, fingerprint)
         return on_disk
 
-    def _enter_known(self, request: _Request, keys: list[bytes], outcomes: list[bytes | str]) -> None:
-        """Enter known statistics, whose failures are counted."""
-        self.failures.count_outcomes(self._thetas(keys), list(map(_reason, outcomes)))
-        self._enter(request, keys, outcomes)
-
-    def _enter(self, request: _Request, keys: Sequence[bytes], outcomes: list[bytes | str]) -> None:
-        """Fill in statistics and reasons of failures, and cache them in memory."""
-        request.enter(keys, outcomes)
-        self.memory_cache.store(keys, outcomes)
-        self.has_results = self.has_results or bool(keys)
+    def _enter(self, request: _Request, outcomes: dict[bytes, bytes | str]) -> None:
+        """Fill in statistics and reasons of failures, count these, and cache both in memory."""
+        self.failures.count_outcomes(self._thetas(list(outcomes)), list(map(_reason, outcomes.values())))
+        request.enter(outcomes)
+        self.memory_cache.store(outcomes, outcomes.values())
+        self.has_results = self.has_results or bool(outcomes)
 
     # simulations --------------------------------------------------------------------------------------------------
 
@@ -432,7 +426,6 @@ class Simulator(VerifiedModel):
         with self._running.lock:
             self.seconds += seconds
             self.simulations += len(thetas)
-            self.failures.count_outcomes(thetas, why)
             if self.when_simulated is not None:
                 self.when_simulated(len(thetas))
             self._check_after(thetas, statistics, why)
@@ -443,7 +436,7 @@ class Simulator(VerifiedModel):
                 self.response_memory.store([(fingerprint, key) for key in keys], outcomes)
             if request.full:
                 request.responses |= zip(keys, values, strict=True)
-            self._enter(request, keys, _outcomes(statistics, why))
+            self._enter(request, _outcomes(keys, statistics, why))
             if self.cache is not None:
                 kept = None if self._responses_only else statistics
                 stored = values if request.full or self.stores_responses or self.cache.responses else None
@@ -455,9 +448,9 @@ class Simulator(VerifiedModel):
             self._check_before()
 
 
-def _outcomes(statistics: np.ndarray, reasons: Sequence[str]) -> list[bytes | str]:
+def _outcomes(keys: Sequence[bytes], statistics: np.ndarray, reasons: Sequence[str]) -> dict[bytes, bytes | str]:
     """Outcomes of simulations with statistics (n, n_numbers), and reasons of failures; empty for others."""
-    return [reason or row.tobytes() for row, reason in zip(statistics, reasons, strict=True)]
+    return {key: reason or row.tobytes() for key, row, reason in zip(keys, statistics, reasons, strict=True)}
 
 
 def _reason(outcome: Any) -> str:
