@@ -16,7 +16,6 @@ import tempfile
 import threading
 import time
 import weakref
-from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -54,12 +53,6 @@ def _before_fork() -> None:
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(before=_before_fork, after_in_parent=_lock.release, after_in_child=_lock.release)
-
-
-class _Damaged(sqlite3.DatabaseError):
-    """Damage that SQLite does not detect."""
-
-    sqlite_errorcode = sqlite3.SQLITE_CORRUPT
 
 
 def _is_damage(error: Exception) -> bool:
@@ -259,12 +252,12 @@ class CacheFile:
         return not identity and not connection.execute("SELECT 1 FROM sqlite_master").fetchall()
 
     def _identify(self, connection: sqlite3.Connection) -> None:
-        """ValueError for a file of another program or a later release; `_Damaged` for unexpected tables."""
+        """ValueError for a file of another program or another release."""
         ((identity,),) = connection.execute("PRAGMA application_id").fetchall()
         ((version,),) = connection.execute("PRAGMA user_version").fetchall()
-        layout = connection.execute("SELECT sql, name FROM sqlite_master WHERE sql IS NOT NULL").fetchall()
         if identity != APPLICATION_ID:
-            names = ", ".join(sorted(name.decode("utf-8", "replace") for _, name in layout if isinstance(name, bytes)))
+            found = connection.execute("SELECT name FROM sqlite_master WHERE sql IS NOT NULL ORDER BY name").fetchall()
+            names = ", ".join(name.decode("utf-8", "replace") for (name,) in found if isinstance(name, bytes))
             raise ValueError(
                 f"{self.path} is another program's SQLite file (application id {identity:#x}, expected "
                 f"{APPLICATION_ID:#x}; tables and indices {names or 'none'}); give another path"
@@ -274,8 +267,6 @@ class CacheFile:
                 f"{self.path} is a cache of another release (layout {version}); this release reads and writes layout "
                 f"{SCHEMA_VERSION}: give another path, or remove the file"
             )
-        if Counter(sql for sql, _ in layout) != Counter(statement.encode() for statement in LAYOUT):
-            raise _Damaged("its tables are not those of a cache")
 
     def _refuse_other_files(self) -> None:
         """ValueError if a damaged file may be a user's file, such as a table, and not a cache.
