@@ -84,9 +84,6 @@ class Observed:
         self.function, self._sender = function, sender
         self.__qualname__ = getattr(function, "__qualname__", type(function).__qualname__)  # for messages
         self._known: Opened | None = None
-        if sender is not None and sender.process != process_name() and running_simulation() is None and _is_main():
-            with contextlib.suppress(OSError):
-                _mirror_for(sender)  # now, so that it does not count as time of the first simulation
 
     def __repr__(self) -> str:
         return repr(self.function)

@@ -87,7 +87,8 @@ class ModelLabel:
         self._statistic = statistic
         self.items = self._present(model)
         self.items |= {name: _first[name][1] for name in self.changing}
-        self.observes = _has_user_code(model) or (statistic is not None and _defined_by_user(statistic))
+        is_users = hasattr(model, "code_parts") or is_of_user(type(model).__module__)
+        self.observes = is_users or (statistic is not None and _defined_by_user(statistic))
         self.opened = mapped() if self.observes else Opened({})
 
     @property
@@ -141,11 +142,6 @@ def _parts_of(model: Any) -> dict[str, Any]:
 
 def _defined_by_user(function: Any) -> bool:
     return is_of_user(getattr(function, "__module__", None) or type(function).__module__)
-
-
-def _has_user_code(model: Any) -> bool:
-    """Whether a model may run user code."""
-    return hasattr(model, "code_parts") or is_of_user(type(model).__module__)
 
 
 def value_digest(value: Any) -> str:
