@@ -170,7 +170,7 @@ def predictive_draws(
     for prefix, each, columns in _named_parts(likelihood):
         noise, rows = _with_noise_parameters(each, samples[:, columns], rng)
         simulated, values = _responses(each, rows), _compared(each)
-        residuals = _residuals(each, simulated)
+        residuals = -np.stack([each.residuals_of(response) for response in simulated])
         parameters = rows[:, len(each.model.parameter_names) :]
         errors = _errors(each, noise, parameters, simulated, rng)
         if errors is None:
@@ -231,11 +231,6 @@ def _responses(likelihood: FELikelihood, rows: np.ndarray) -> np.ndarray:
             f"{failed[0]}. Leave these samples out, or simulate again if the cause was not the model"
         )
     return batch.response
-
-
-def _residuals(likelihood: FELikelihood, responses: np.ndarray) -> np.ndarray:
-    """Simulated minus measured response of each row, (n, n_channels, n_samples) [SI], NaN where a sample is missing."""
-    return -np.stack([likelihood.residuals_of(response) for response in responses])
 
 
 def _errors(

@@ -116,11 +116,8 @@ class Worker:
         self._key = function.key
         if self.keys.use(function.key):
             return None
-        try:
-            slow = "the worker process did not start within {:g} s"
-            answer = self._ask(_LOAD + pickle.dumps(function, protocol=5), seconds, slow)
-        except SimulationFailed as error:
-            raise LoadingFailed(error.reason) from None
+        slow = "the worker process did not start within {:g} s"
+        answer = self._ask(_LOAD + pickle.dumps(function, protocol=5), seconds, slow, LoadingFailed)
         if answer.error is not None:
             return answer
         self.keys.keep(function.key, True, len(function.payload))
@@ -138,8 +135,10 @@ class Worker:
         message = self._key + pickle.dumps(item, protocol=5)
         return self._ask(message, seconds, "stopped at the time limit of {:g} s")
 
-    def _ask(self, message: bytes, seconds: float, slow: str) -> "Answer":
-        """Answer to a message; `SimulationFailed` without one, and the process is killed."""
+    def _ask(
+        self, message: bytes, seconds: float, slow: str, failure: type[SimulationFailed] = SimulationFailed
+    ) -> "Answer":
+        """Answer to a message; raises `failure` without one, and the process is killed."""
         with suppress(OSError):  # `_receive` notices that the process has died
             self._connection.send_bytes(message)
         try:
@@ -149,7 +148,7 @@ class Worker:
         except SimulationFailed as error:
             reason = error.reason
         self.kill()
-        raise SimulationFailed(reason)
+        raise failure(reason)
 
     def _receive(self, stop: float) -> "Answer | None":
         """The answer; None if there is none until the time `stop`."""
