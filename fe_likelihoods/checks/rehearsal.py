@@ -84,10 +84,12 @@ def check_model(posterior: Posterior, *, progress: bool = False) -> ModelCheck:
                     again = simulate(model, theta[None])
                     if not SECONDS / MOST_DRAWS < (took := perf_counter() - start) < SECONDS:
                         break
-                fits += compare(likelihood, draws_to_compare(posterior, took)[:, columns], key)[0]
+                pool = likelihood.simulator.pool
+                at_once = 1 if pool is None else pool.n_workers or 1
+                fits += compare(likelihood, draws_to_compare(posterior, took / at_once)[:, columns], key)[0]
                 # generators of workers have moved on meanwhile
                 chance = check_chance(response, again) or check_chance(
-                    response, simulate(model, np.tile(theta, (2, 1)), likelihood.simulator.pool)
+                    response, simulate(model, np.tile(theta, (2, 1)), pool)
                 )
                 # where responses differ by chance, other differences say nothing
                 found += chance or check_stronger_motion(model, theta, response, simulate)
