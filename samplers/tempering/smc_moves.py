@@ -21,8 +21,7 @@ from ..judgement.checks import check_stages
 from ..reports import Stage, Sweep
 from ..settings import Settings
 from .early_stop import stop_at
-from .leaders import grow_chains
-from .mutation import MoveSchedule, VisitedPoints, move_together
+from .mutation import MoveSchedule, VisitedPoints, grow_chains, move_together
 from .next_beta import next_beta
 from .population import Density, Population
 
