@@ -4,9 +4,8 @@ from .judgement.verdict import Verdict
 from .moves.population_moves import MixtureMove, RandomWalkMove
 from .rare_events import subset_simulation
 from .reporting.arviz_data import to_arviz
-from .reporting.figures import plot_corner, plot_marginals
+from .reporting.figures import plot_corner, plot_marginals, plot_run
 from .reporting.model_comparison import compare_models
-from .reporting.run_figure import plot_run
 from .reporting.summary import ladder_table, summary
 from .reports import SamplingWarning, Stage
 from .smc import SMCSampler

@@ -58,7 +58,7 @@ class Settings:
         With "leaders", steps of a chain before its points count; 0 for the published algorithm, without sweeps.
     fast_sweeps : int
         Sweeps over the fast parameters after every move, if `log_prob_fn` has an attribute ``fast_parameters``
-        (`samplers.moves.fast_parameters`); 0 for none.
+        (`samplers.moves.population_moves`); 0 for none.
     recycle : bool, optional
         Anneal by adaptive importance sampling over all evaluated points (`samplers.tempering.recycling`), and by moves
         only if the result cannot be trusted. None leaves the choice to the sampler.

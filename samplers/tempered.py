@@ -35,8 +35,7 @@ from .interrupts import deferred_interrupts, interrupts_end_the_run
 from .judgement.checks import check_end, check_likelihood, check_prior
 from .judgement.failures import KEPT_POINTS, judged_failures
 from .judgement.verdict import CONVERGED, describe_early_stop, independent_points, judge
-from .moves.fast_parameters import with_fast_sweeps
-from .moves.population_moves import GuideMove, RandomWalkMove, describe, without_unfitted
+from .moves.population_moves import GuideMove, RandomWalkMove, describe, with_fast_sweeps, without_unfitted
 from .output import Output
 from .record import EvaluatedBatch, Incomplete, RunStart, open_record
 from .reporting.progress import Progress

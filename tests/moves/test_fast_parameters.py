@@ -7,7 +7,7 @@ from emcee.model import Model
 from scipy import stats
 
 from samplers import RandomWalkMove, SMCSampler, TMCMCSampler
-from samplers.moves.fast_parameters import WithFastSweeps
+from samplers.moves.population_moves import WithFastSweeps
 from tests.contract.targets import Gaussian
 from tests.statistics.test_posteriors import deviations, evidence_deviation, runs, within
 
