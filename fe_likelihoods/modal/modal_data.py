@@ -143,6 +143,13 @@ class ModalData:
         values = [np.where(np.isnan(each), np.nan, each) for each in (self.frequencies, self.shapes)]  # one NaN
         return digest(repr([self.sensors, self.mode_numbers]), array_digest(*values))
 
+    @property
+    def frequency_errors(self) -> np.ndarray | None:
+        """Known coefficients of variation (m,) of the frequencies, also by their covariance."""
+        if self.covariance is None:
+            return self.frequency_cv
+        return np.sqrt(np.diag(self.covariance)) / self.mean_frequencies
+
     def groups(self, close: float) -> tuple[tuple[int, ...], ...]:
         """Modes whose frequencies are within a ratio of 1 + `close`, as groups.
 

@@ -219,9 +219,7 @@ class PredictedModes(NamedTuple):
     @property
     def errors(self) -> np.ndarray:
         """Known and unknown relative errors (n, m) of an identified frequency, together; scales if Student-t."""
-        known = 0.0 if self.data.frequency_cv is None else self.data.frequency_cv
-        if self.data.covariance is not None:
-            known = np.sqrt(np.diag(self.data.covariance)) / self.data.mean_frequencies
+        known = 0.0 if (stated := self.data.frequency_errors) is None else stated
         return np.hypot(self.unknown[:, None], known) * np.ones(self.data.n_modes)
 
     def interval(self, level: float = 0.9) -> np.ndarray:

@@ -151,7 +151,7 @@ def plot_modes(
         )
     middle, reach = _of_frequencies(modes, measured)
     first.errorbar(places + 0.2, middle, reach, fmt="s", color=BLUE, markersize=3, label=label, capsize=3)
-    errors = modes.paired.frequency_cv
+    errors = data.frequency_errors
     text = "measured" if errors is None else "measured, with its standard deviation"
     for each in data.frequencies / measured:
         first.errorbar(places, each, errors, fmt="o", color=ORANGE, markersize=4, label=text)
@@ -175,7 +175,7 @@ def plot_modes(
         _name(axes, list(data.sensors), width / columns)
         axes.tick_params(labelbottom=place + columns >= len(shaped))  # names below the lowest of each column alone
         axes.grid(alpha=0.25)
-    add_figure_legend(figure, 4)
+    add_figure_legend(figure, 4 if columns == 3 else 2)
     return figure
 
 

@@ -38,7 +38,11 @@ def test_frequencies_and_shapes_of_modes():
     likelihood = ModalLikelihood(frame, data)
     posterior = Posterior(likelihood, {"stiffness_1": LogNormal(1.0, 0.1), "stiffness_2": LogNormal(1.0, 0.1)})
     modes = likelihood.predict_modes(posterior.sample_prior(20, 1))
-    first, *shapes = plot_modes(modes, modes).axes
+    figure = plot_modes(modes, modes)
+    figure.canvas.draw()
+    low, high = figure.legends[0].get_window_extent().intervalx
+    assert figure.bbox.x0 <= low < high <= figure.bbox.x1  # not cut off
+    first, *shapes = figure.axes
     assert [text.get_text() for text in first.get_xticklabels()] == ["mode 1\n0.98 Hz", "mode 2\n2.6 Hz"]
     assert [axes.get_title().split(",")[0] for axes in shapes] == ["shape of mode 1", "shape of mode 2"]
     heights = [bar.get_height() for bar in shapes[0].patches]
