@@ -10,6 +10,7 @@ from scipy import stats
 
 from samplers import SamplingWarning, SMCSampler, TMCMCSampler
 from samplers.estimates.importance import (
+    KnownDensity,
     Round,
     add_round,
     pool_rounds,
@@ -210,6 +211,19 @@ def test_rounds_that_each_miss_a_part_have_a_large_error(rng):
     assert abs(pooled.log_evidence - np.log(parts)) < 2.0 * pooled.log_evidence_error < 1.0
 
 
+def test_rounds_with_different_means_have_the_error_of_their_spread(rng):
+    """Constant weights in each of three rounds: the error is that between rounds and that of the known density."""
+    rounds, levels, known = [], np.array([0.0, 0.1, 0.3]), KnownDensity(None, None, None, 0.2)
+    for level in levels:
+        records = np.full(50, level).astype([("log_prob", float)])
+        own = {"log_density": lambda x: np.zeros(len(x)), "log_densities": np.zeros((50, 1))}
+        rounds = add_round(rounds, Round(rng.uniform(size=(50, 1)), records, np.full(50, level), known, **own))
+    parts = np.exp(levels) / np.exp(levels).sum()
+    pooled = pool_rounds(rounds)
+    assert pooled.log_evidence == pytest.approx(np.log(np.exp(levels).mean()))
+    assert pooled.log_evidence_error == pytest.approx(np.linalg.norm([*(parts - 1.0 / 3.0), 0.2]))
+
+
 @pytest.mark.parametrize("spreads", [(1.3, 1.2, 1.1), (3.0, 1.5, 1.2), (0.2, 2.0, 1.2)])
 def test_the_evidence_of_rounds_is_unbiased_and_its_error_covers(spreads, rng):
     """Also where the first draws are far too narrow, and would have made the evidence too small alone."""
@@ -229,6 +243,9 @@ def test_the_shape_of_the_tail_counts_only_where_the_tail_does():
     assert tail_shape(np.log1p(1e-4 * errors)) == 0.0
     assert tail_variance(np.log1p(1e-4 * errors)) == 0.0
     assert tail_shape(np.log1p(errors)) > 0.7
+    heavy = np.log1p(np.random.default_rng(1).pareto(2.0, 300))
+    shape, excess = tail_shape(heavy), np.exp(heavy).max() / np.exp(heavy).sum()
+    assert 0.2 < shape < 0.8 and tail_variance(heavy) == pytest.approx((shape / (1.0 - shape) * excess) ** 2)
     assert tail_shape(np.zeros(300)) == 0.0
     assert tail_shape(np.zeros(3)) == np.inf
 
