@@ -233,7 +233,7 @@ def test_a_search_that_ends_below_the_modes_is_refused():
     prior = {"amplitude": TruncatedNormal(1.0, 0.3), "frequency": Uniform(0.2, 9.8), "sigma_top": HalfNormal(0.45)}
     posterior = Posterior(FELikelihood(model, measured), prior).marginal()
     for seed in (1, 3):
-        sampler = SMCSampler(50, 2, posterior, vectorize=True, seed=seed, guide=posterior.guide(), max_simulations=400)
+        sampler = SMCSampler(50, 2, posterior, vectorize=True, seed=seed, guide=posterior.guide(), max_simulations=200)
         with pytest.warns(SamplingWarning, match="above the top of every mode"):
             sampler.run_mcmc(None, 0)
         assert sampler.verdict.status == "not usable"

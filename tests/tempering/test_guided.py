@@ -231,6 +231,7 @@ def test_the_evidence_of_rounds_is_unbiased_and_its_error_covers(spreads, rng):
     for _ in range(300):
         pooled = pool_rounds(_rounds(rng, spreads))
         values.append(np.exp(pooled.log_evidence))
+        assert np.exp(pooled.log_weights).sum() == pytest.approx(values[-1])
         covered.append(abs(pooled.log_evidence) < 2.0 * pooled.log_evidence_error)
     error = np.std(values) / np.sqrt(len(values))
     assert abs(np.mean(values) - 1.0) < 4.0 * error + 0.002
