@@ -14,7 +14,7 @@ from emcee.backends import Backend
 
 from .resampling import RESAMPLING
 
-__all__ = ["MOVES", "Settings", "as_whole_number", "check_arguments", "check_names", "most_moves", "refuse_unused"]
+__all__ = ["MOVES", "Settings", "as_whole_number", "check_arguments", "check_names", "most_moves"]
 
 # settings of annealing by moves that every sampler has
 MOVES = ("resampling", "min_moves", "max_moves", "max_correlation", "fast_sweeps", "check_draws", "max_failure_share")
@@ -176,12 +176,4 @@ def check_arguments(pool: Any, backend: Any, seed: Any, ndim: int, vectorize: bo
         raise ValueError(
             f"parameter_names must be a list of {ndim} different names, or a dict of names with their indices, 0 to "
             f"{ndim - 1} in all; got {names!r}"
-        )
-
-
-def refuse_unused(settings: Settings, guided: bool) -> None:
-    """Raise ValueError for `asynchronous` if the annealing, with a guide or without, cannot use it."""
-    if settings.asynchronous and not (guided or settings.recycle):
-        raise ValueError(
-            "asynchronous=True cannot act here: moves wait for all points that they propose: pass recycle=True"
         )

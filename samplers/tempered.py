@@ -41,7 +41,7 @@ from .record import EvaluatedBatch, Incomplete, RunStart, open_record
 from .reporting.progress import Progress
 from .reports import AnnealingResult, Report, Stage, warn
 from .results import RunResults
-from .settings import Settings, as_whole_number, check_arguments, check_names, most_moves, refuse_unused
+from .settings import Settings, as_whole_number, check_arguments, check_names, most_moves
 from .tempering.anneal import anneal
 from .tempering.guide import AdaptedGuide, Guide, check_guide, guide_fingerprint
 from .tempering.guided import Guidance, lend
@@ -168,13 +168,12 @@ class TemperedSampler(RunResults, EnsembleSampler):
         # each annealing begins with copies of these
         self._first_moves = copy.deepcopy(followed), self._weights
         self._moves = followed
-        refuse_unused(given, guide is not None)
         if given.ess_floor >= nwalkers:
             raise ValueError(f"ess_floor={given.ess_floor} must be below nwalkers={nwalkers}")
         target.parameter_names = self.parameter_names if self.params_are_named else None
         common = target, self._record, self._budget, nwalkers, given.max_failure_share
         if given.asynchronous:
-            check_asynchronous(target, pool)
+            check_asynchronous(target, pool, guide is not None or bool(given.recycle))
             queue = getattr(guide, "evaluation_queue", None)
             self._evaluator: Evaluator = AsynchronousEvaluator(*common, queue=queue)
         else:

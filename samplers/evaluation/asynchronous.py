@@ -32,8 +32,12 @@ def _has_queue(target: Target, pool: Any) -> bool:
     return pool is None and callable(getattr(target.function, "evaluation_queue", None))
 
 
-def check_asynchronous(target: Target, pool: Any) -> None:
-    """Raise ValueError if points cannot be submitted one by one."""
+def check_asynchronous(target: Target, pool: Any, draws: bool) -> None:
+    """Raise ValueError if points cannot be submitted one by one, or are not made by `draws` of recycling or a guide."""
+    if not draws:
+        raise ValueError(
+            "asynchronous=True cannot act here: moves wait for all points that they propose: pass recycle=True"
+        )
     can_submit = callable(getattr(pool, "submit", None))
     if not (target.vectorize if _has_queue(target, pool) else can_submit and not target.vectorize):
         raise ValueError(

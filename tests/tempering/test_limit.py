@@ -50,6 +50,8 @@ def halted(sampler, steps):
         warnings.simplefilter("always")
         until(sampler, steps)
     warned = [re.search("max_simulations=.* (ended the run|allowed)", str(each.message)) for each in caught]
+    said = " ".join(str(each.message) for each in caught)
+    assert all(said.count(each.text) <= 1 for each in sampler.verdict.findings)
     assert any(warned) == (sampler.verdict.status != "converged")
 
 
