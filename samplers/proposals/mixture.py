@@ -164,18 +164,14 @@ def draw(mixture: Mixture, n: int, random: np.random.RandomState) -> np.ndarray:
 
 
 def fit_mixture(
-    coords: np.ndarray,
-    weights: np.ndarray,
-    max_components: int = 6,
-    bounds: SupportBounds | None = None,
-    dof: float = DOF,
+    coords: np.ndarray, weights: np.ndarray, max_components: int = 6, bounds: SupportBounds | None = None
 ) -> Mixture:
     """Fit a mixture to points (n, ndim) with weights (n,) of sum 1; the Bayesian information criterion chooses.
 
-    Components are added by splits as long as the criterion improves. Then fewer degrees of freedom than `dof` (above 2)
-    are tried for heavier tails, and so are shears and a transformation that removes `bounds` near the population.
+    Components are added by splits as long as the criterion improves. Then fewer degrees of freedom are tried for
+    heavier tails, and so are shears and a transformation that removes `bounds` near the population.
     """
-    mixture, criterion = _fit_with_shears(coords, weights, max_components, dof)
+    mixture, criterion = _fit_with_shears(coords, weights, max_components)
     near = None if bounds is None else near_bounds(bounds, coords, weights)
     if near is None or not np.any(np.isfinite([near.low, near.high])):
         return mixture
@@ -183,7 +179,7 @@ def fit_mixture(
     # near a bound a population may be exponential, or vary by factors: the map with a large scale is the logarithm
     for scale in (1.0, LOGARITHMIC) if np.any(np.isfinite(near.low) != np.isfinite(near.high)) else (1.0,):
         tried = near._replace(span=scale * near.span)
-        unbounded, other = _fit_with_shears(to_unbounded(tried, coords), weights, max_components, dof)
+        unbounded, other = _fit_with_shears(to_unbounded(tried, coords), weights, max_components)
         # the criterion of a density in the parameters contains the Jacobian determinant of the transformation
         other -= 2.0 / (weights @ weights) * float(weights[kept] @ log_abs_det_jacobian(tried, coords[kept]))
         if other < criterion:
@@ -191,7 +187,7 @@ def fit_mixture(
     return mixture
 
 
-def fit_normals(coords: np.ndarray, effective: float, max_components: int = 6, start: Mixture | None = None) -> Mixture:
+def fit_normals(coords: np.ndarray, effective: float, start: Mixture | None = None) -> Mixture:
     """Fit a mixture of normal distributions to points (n, ndim) of equal weight, accurately enough for a density.
 
     `effective` is the number of independent points. The number of components minimises the Bayesian information
@@ -203,7 +199,7 @@ def fit_normals(coords: np.ndarray, effective: float, max_components: int = 6, s
         mean, root = location_and_root(coords, weights)
         white = (coords - mean) @ invert_roots(root[None])[0].T
         return _unwhitened(_maximise(white, weights, effective, responsibilities, math.inf, AGAIN)[0], mean, root)
-    return _fit_components((), coords, weights, max_components, math.inf, effective, ACCURATE)[0]
+    return _fit_components((), coords, weights, 6, math.inf, effective, ACCURATE)[0]
 
 
 def leave_out(mixture: Mixture, coords: np.ndarray, weights: np.ndarray, parts: np.ndarray) -> list[Mixture]:
@@ -228,15 +224,15 @@ def leave_out(mixture: Mixture, coords: np.ndarray, weights: np.ndarray, parts: 
     return found
 
 
-def _fit_with_shears(coords: np.ndarray, weights: np.ndarray, max_components: int, dof: float) -> tuple[Mixture, float]:
+def _fit_with_shears(coords: np.ndarray, weights: np.ndarray, max_components: int) -> tuple[Mixture, float]:
     """Fit a mixture, with shears if they improve the criterion; return it with its criterion."""
     shears = find_shears(coords, weights)
     if not shears:
-        return _fit_components((), coords, weights, max_components, dof)
-    sheared, criterion = _fit_components(shears, coords, weights, max_components, dof)
+        return _fit_components((), coords, weights, max_components)
+    sheared, criterion = _fit_components(shears, coords, weights, max_components)
     # a fit without shears that needs many more components has a worse criterion, so it is not tried
     most = min(max_components, len(sheared.weights) + 2)
-    plain, other = _fit_components((), coords, weights, most, dof)
+    plain, other = _fit_components((), coords, weights, most)
     return (sheared, criterion) if criterion < other else (plain, other)
 
 
@@ -245,7 +241,7 @@ def _fit_components(
     coords: np.ndarray,
     weights: np.ndarray,
     max_components: int,
-    dof: float,
+    dof: float = DOF,
     effective: float | None = None,
     limits: tuple[int, float] = PROPOSAL,
 ) -> tuple[Mixture, float]:
