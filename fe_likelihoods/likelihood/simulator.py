@@ -194,7 +194,8 @@ class Simulator(VerifiedModel):
         request = self._run_in_pool(keys, which, full) if self.streams else self._look_up(keys, which, full)
         left = request.left
         while left:
-            self._check_model()
+            with self._running.lock:
+                self._check_before()  # so that finished simulations are stored
             some, start = left[: self._chunk(len(left))], time.perf_counter()
             with self._observed():
                 if self.pool is None or self._returns_responses(full):
@@ -361,7 +362,7 @@ class Simulator(VerifiedModel):
         """Submit what is left of a request to the pool; the futures, whose keys are returned, come through a queue."""
         if not (keys := request.left):
             return {}
-        self._check_model()
+        self._check_before()
         running = self._running
         if not running.keys:
             running.counted_until = time.perf_counter()
@@ -441,11 +442,6 @@ class Simulator(VerifiedModel):
                 kept = None if self._responses_only else statistics
                 stored = values if request.full or self.stores_responses or self.cache.responses else None
                 self._store(thetas, kept, why, stored, fingerprint)
-
-    def _check_model(self) -> None:
-        """Look at the model before simulations, so that finished simulations are stored."""
-        with self._running.lock:
-            self._check_before()
 
 
 def _outcomes(keys: Sequence[bytes], statistics: np.ndarray, reasons: Sequence[str]) -> dict[bytes, bytes | str]:
