@@ -196,7 +196,7 @@ class Simulator(VerifiedModel):
         while left:
             with self._running.lock:
                 self._check_before()  # so that finished simulations are stored
-            some, start = left[: self._chunk(len(left))], time.perf_counter()
+            some, start = left[: self._chunk(len(left), full)], time.perf_counter()
             with self._observed():
                 if self.pool is None or self._returns_responses(full):
                     values, reasons = simulate_batch(self.model, self._thetas(some), self.pool)
@@ -326,9 +326,9 @@ class Simulator(VerifiedModel):
             self._in_pool = _Running()
         return self._in_pool
 
-    def _chunk(self, n: int) -> int:
+    def _chunk(self, n: int, full: bool) -> int:
         """Number of simulations, of n, between two writes to the cache on disk, or two reports of progress."""
-        most = most_responses(self.model)
+        most = most_responses(self.model) if self.pool is None or self._returns_responses(full) else n
         if self.cache is None and (self.when_simulated is None or self.pool is not None):
             return min(n, most)
         workers = (os.cpu_count() or 1) if self.pool is None else self.pool.n_workers or n
