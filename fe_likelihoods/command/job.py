@@ -165,7 +165,7 @@ def _read_event(name: str, keys: Any, file: str) -> sections.Event:
         raise ValueError(f"{file}: [events] {name}: expected a section [events.{name}]; got {keys!r}")
     if not re.fullmatch(r"[\w-]+", name):
         raise ValueError(f"{where}: expected a name of letters, digits, - and _, for names of files")
-    event = sections.Event(**read_keys(keys, keys_of(sections.Event), where))
+    event = sections.Event(**read_keys(keys, keys_of(sections.Event, sections.Event.OTHERS), where))
     for key, needed in (("zero", "measured"), ("rest", "from_state")):
         if key in keys and needed not in keys:
             raise ValueError(f"{where} {key}: this key has no effect without {needed}")

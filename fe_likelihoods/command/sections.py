@@ -55,10 +55,7 @@ class Table(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class Motion(Table):
-    """Base motion of the calibration or of an event."""
-
-    supports: ClassVar = None
-    every: ClassVar = 1
+    """``[record]``, the base motion of the calibration, or of an event."""
 
     file: Any = key("text", "Base acceleration: CSV, Excel, a data set (.h5), or a format of `read_record`")
     column: Any = key("text", "Column of a CSV file or workbook, component (GeoNet), or file in an archive (V2)")
@@ -67,12 +64,6 @@ class Motion(Table):
     missing: Any = key("list of number or text", "What stands for missing samples in other columns")
     scale: Any = key("number", "Factor by which the record is multiplied; -1 for a reversed sensor")
     duration: Any = key("time", "Length of the first part that is used")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Calibration(Motion):
-    """``[record]``."""
-
     supports: Any = key(
         "list of text",
         'Instead of file, "file.csv" or "file.csv:column" of column base, first end and second end of a bridge deck',
@@ -83,6 +74,8 @@ class Calibration(Motion):
 @dataclass(frozen=True, kw_only=True)
 class Event(Motion):
     """``[events.NAME]``, which is predicted after the run."""
+
+    OTHERS: ClassVar = "supports every"  # keys of the calibration alone
 
     measured: Any = key("text", "Measured response in this event, to be compared: a file as in [measurements]")
     zero: Any = key(CLOCK, "Time in this file at which the base motion begins; by default as in [measurements]")
@@ -193,7 +186,7 @@ class Predictions(Section):
 
 
 SECTIONS: dict[str, type[Section]] = {
-    "record": Calibration,
+    "record": Motion,
     "measurements": Measured,
     "modes": Modes,
     "load_test": LoadTest,
