@@ -107,9 +107,7 @@ def report_run(path: Path, runs_code: bool = False) -> Outcome:
     ValueError if it is not such a folder, its data are no longer there, the run has no samples yet, or the model is a
     user's code and `runs_code` is false.
     """
-    if not path.exists():
-        raise ValueError(f"there is no folder {path}; give the folder that `fe-likelihoods run` made")
-    folder = path if path.is_dir() else path.parent
+    folder = path.parent if path.is_file() else path
     if not (folder / SETTINGS).is_file() or not (folder / CHAIN).is_file():
         raise ValueError(
             f"{folder} is not the folder of a run: it has no {SETTINGS} or {CHAIN}; give the folder that "
