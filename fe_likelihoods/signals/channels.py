@@ -7,6 +7,7 @@ import hashlib
 import json
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -341,17 +342,11 @@ def _values_array(values: Any, names: Sequence[str]) -> NDArray[np.float64]:
     if isinstance(values, np.ma.MaskedArray):
         values = _without_masked(values)
     elif not isinstance(values, np.ndarray):
-        try:
-            rows = [_without_masked(row) for row in values]
-            values = rows
-            lengths = [row.size for row in rows]
-            ragged = len(set(lengths)) > 1 and all(row.ndim == 1 for row in rows)
-        except TypeError:
-            ragged = False
-        if ragged:
-            values = np.full((len(rows), max(lengths)), np.nan, dtype=np.result_type(float, *rows))
-            for row, samples in zip(values, rows, strict=True):
-                row[: samples.size] = samples
+        with suppress(TypeError):  # without rows, which is refused below
+            values = [_without_masked(row) for row in values]
+            if all(row.ndim == 1 for row in values):
+                longest = max((row.size for row in values), default=0)
+                values = [np.append(row, np.full(longest - row.size, np.nan)) for row in values]
     if np.iscomplexobj(values):
         raise ValueError("values must be real numbers, got complex ones; give the real part if it is the data")
     try:
