@@ -81,6 +81,12 @@ def handler_of_sigint_is_put_back():
     signal.signal(signal.SIGINT, before)
 
 
+@pytest.fixture
+def path(tmp_path):
+    """The file that most tests of readers write."""
+    return tmp_path / "a.csv"
+
+
 def pytest_configure():
     """Let Ctrl-C end runs also where the tests are in the background of a shell, which ignores it there."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

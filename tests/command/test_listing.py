@@ -39,8 +39,7 @@ def read_as_listed(lines):
     return record, read_columns(measured["file"], channels, list(measured["columns"].values()), **options)
 
 
-def test_a_logger_file(tmp_path):
-    path = tmp_path / "a.csv"
+def test_a_logger_file(path):
     path.write_text(READ["day first, decimal comma"].replace("1,9854", ""))
     output, lines = listed(path)
     assert "a table of 8 rows" in output and "acc_g      g        7        1    -2.872    2.686" in output
@@ -52,8 +51,7 @@ def test_a_logger_file(tmp_path):
     assert measured.start == 0.0
 
 
-def test_what_a_file_does_not_state_must_be_written(tmp_path):
-    path = tmp_path / "a.csv"
+def test_what_a_file_does_not_state_must_be_written(path):
     times = ("0.00", "0.01", "0.03", "0.04", "0.05", "0.0601")
     path.write_text(
         "time_s,base,top,top [1]\n" + "".join(f"{t},{k},3,{k - 9999 * (k == 0)}\n" for k, t in enumerate(times))
@@ -96,16 +94,14 @@ def test_texts_for_lost_samples_have_lines(tmp_path):
         make_problem(read_job(job))
 
 
-def test_histories_are_no_modes(tmp_path):
-    path = tmp_path / "a.csv"
+def test_histories_are_no_modes(path):
     for text in ("time_s,f [kN],f1\n0,1,2\n0.1,2,4\n0.2,3,3\n", "f [kN],b [mm]\n1,2\n2,4\n"):
         path.write_text(text)
         assert set(listed(path)[1]) == {"record", "measurements"}
 
 
 @pytest.mark.parametrize("line", ["# units: gal", "Units: gal", "RAW PGA VALUES (gal) : 4.0"])
-def test_a_unit_above_the_table_is_listed_as_it_is_read(tmp_path, line):
-    path = tmp_path / "a.csv"
+def test_a_unit_above_the_table_is_listed_as_it_is_read(path, line):
     path.write_text(f"{line}\ntime_s,base\n0.00,1\n0.01,2\n0.02,-4\n")
     output, lines = listed(path)
     assert "base     gal        3" in output and "units" not in lines["record"] and "units" not in lines["measurements"]
@@ -171,8 +167,7 @@ def test_a_data_set_and_a_file_that_cannot_be_read(tmp_path):
         ("date,f1_Hz,f2_Hz\n2024-05-01,1.1,3.2\n2024-05-02,1.2,3.3\n", "modes", {}),
     ],
 )
-def test_data_without_time_have_sections_of_their_own(tmp_path, text, section, given):
-    path = tmp_path / "a.csv"
+def test_data_without_time_have_sections_of_their_own(path, text, section, given):
     path.write_text(text)
     assert listed(path)[1][section] == {"file": str(path)} | given
 
@@ -240,8 +235,7 @@ def test_the_lines_for_faults_of_sensors_work(tmp_path):
     assert np.isnan(make_problem(read_job(job)).posterior.likelihood.measurements.values[:, 200:301]).all()
 
 
-def test_times_that_repeat_or_contradict_the_header_have_a_line(tmp_path):
-    path = tmp_path / "a.csv"
+def test_times_that_repeat_or_contradict_the_header_have_a_line(path):
     times = np.round(0.02 * np.arange(60), 2)
     path.write_text("dt = 0.01 s\ntime_s,acc_g\n" + "".join(f"{t:.2f},{np.sin(t):.5f}\n" for t in times))
     output, lines = listed(path)

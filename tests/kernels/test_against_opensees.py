@@ -5,6 +5,7 @@ tested column and options of the model, under base acceleration and imposed disp
 """
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -17,21 +18,15 @@ from fe_likelihoods.signals.records import DisplacementHistory
 from tests.opensees_column import CORE, INCH, KIP, STEEL, peer_of, push, require_opensees, shake
 
 NOMINAL, PAPER = np.ones(5), np.array(list(BRIDGE_COLUMN_MEANS.values()))
-
-
-def tight(**given):
-    """Arguments of a column."""
-    return dict(analysis=ColumnAnalysis(tolerance=1e-11, **given))
-
-
+tight = partial(ColumnAnalysis, tolerance=1e-11)
 TOLERANCE = 1e-10  # OpenSees', in inch and radian
 CASES = {
     "nominal": (NOMINAL, 1.0, {}),
     "paper": (PAPER, 1.0, {}),
     "strong": (PAPER, 4.0, {}),
-    "linear geometry": (NOMINAL, 1.0, tight(geometry="linear")),
-    "one element of five points": (NOMINAL, 1.0, tight(n_elements=1, n_points=5)),
-    "four elements of four points": (PAPER, 1.0, tight(n_elements=4, n_points=4)),
+    "linear geometry": (NOMINAL, 1.0, dict(analysis=tight(geometry="linear"))),
+    "one element of five points": (NOMINAL, 1.0, dict(analysis=tight(n_elements=1, n_points=5))),
+    "four elements of four points": (PAPER, 1.0, dict(analysis=tight(n_elements=4, n_points=4))),
     "rotational inertia": (NOMINAL, 1.0, dict(rotational_inertia=1e6)),
 }
 
@@ -50,7 +45,7 @@ def record():
 @pytest.mark.parametrize("case", CASES)
 def test_base_acceleration(record, case):
     theta, scale, changes = CASES[case]
-    model = RCColumn.lhpost(record.scale(scale), **(tight() | changes))
+    model = RCColumn.lhpost(record.scale(scale), **(dict(analysis=tight()) | changes))
     peer = shake(peer_of(model, theta), model.loading.acceleration / INCH, record.dt, TOLERANCE)
     assert peer.response.shape == (3, record.n_steps), "OpenSees did not finish"
     history = model.history(theta)
@@ -110,7 +105,7 @@ def deviations(model, theta, recorded, wanted):
 
 def test_sensors_under_base_acceleration(record):
     """Forces, curvatures, strains of bars and concrete, and rotations are what OpenSees records."""
-    model = RCColumn.lhpost(record, **tight())
+    model = RCColumn.lhpost(record, analysis=tight())
     wanted = sensors(model)
     recorders = [recorder for column, _, _ in wanted.values() for recorder in column]
     peer = shake(peer_of(model, PAPER), record.acceleration / INCH, record.dt, TOLERANCE, recorders)
@@ -120,7 +115,7 @@ def test_sensors_under_base_acceleration(record):
 
 def test_motions_and_stresses_over_the_height(record):
     """Of a column with a mass: its nodes move, and its bars and its concrete are stressed, as in OpenSees."""
-    model = RCColumn.lhpost(record.scale(2.0), column_mass=2.05e4, **tight(n_elements=3))
+    model = RCColumn.lhpost(record.scale(2.0), column_mass=2.05e4, analysis=tight(n_elements=3))
     heights, bar = model.height / 3.0 * np.arange(1, 4), model.bar_circle_radius
     core = model.section.fibers()[0][-3, 0]
     wanted = {}
@@ -140,7 +135,7 @@ def test_motions_and_stresses_over_the_height(record):
 
 def test_a_wrong_material_is_detected(record):
     """Control: one per cent of one modulus changes far more than the two programs differ by."""
-    model = RCColumn.lhpost(record, **tight())
+    model = RCColumn.lhpost(record, analysis=tight())
     peer = shake(peer_of(model, NOMINAL), record.acceleration / INCH, record.dt, TOLERANCE)
     other = model.simulate(NOMINAL + np.array([0.01, 0, 0, 0, 0]))
     assert rrmse(other[1] / INCH, peer.response[0]) > 1e-3
@@ -154,7 +149,7 @@ def test_a_wrong_material_is_detected(record):
 def test_sensors_under_imposed_displacement(changes, limit):
     """Up to a drift of 2 %, with yielding bars; OpenSees stops the fit of their curves after reversals at 1e-4."""
     targets = np.concatenate([np.arange(0.0, 3.0, 0.05), np.arange(3.0, -6.0, -0.05), [-6.0]])
-    arguments = dict(parameters=("Ec", "Es", "ft"), **tight(max_increment=1.0, **changes))
+    arguments = dict(parameters=("Ec", "Es", "ft"), analysis=tight(max_increment=1.0, **changes))
     model = RCColumn.lhpost(DisplacementHistory("cycle", targets * INCH), **arguments)
     wanted = sensors(model)
     recorders = [recorder for column, _, _ in wanted.values() for recorder in column]
@@ -176,7 +171,7 @@ def test_imposed_displacement(theta, geometry):
     model = RCColumn.lhpost(
         DisplacementHistory("cycles", targets * INCH),
         parameters=("Ec", "Es", "ft"),
-        **tight(geometry=geometry, max_increment=1.0),  # one step per target, as in OpenSees
+        analysis=tight(geometry=geometry, max_increment=1.0),  # one step per target, as in OpenSees
     )
     peer = push(peer_of(model, theta[[0, 1, 4]]), targets, TOLERANCE)
     assert peer.response.shape == (5, len(targets)), "OpenSees did not finish"

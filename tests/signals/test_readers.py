@@ -130,8 +130,7 @@ class TestCSV:
             ("Time (s)  a (g)  b (g)\n0 1 9\n0.5 2 9\n1 3 9\n".replace(" (", "("), {"column": "a(g)"}),
         ],
     )
-    def test_ways_to_state_unit_and_step(self, tmp_path, text, given):
-        path = tmp_path / "a.csv"
+    def test_ways_to_state_unit_and_step(self, path, text, given):
         path.write_text(text, encoding="utf-8")
         record = read_record(path, **given)
         np.testing.assert_allclose(record.acceleration, np.array([1, 2, 3]) * G0)
@@ -171,15 +170,13 @@ class TestCSV:
             ("time_s,a_g\n0,1\n1,2\n", {"column": "c"}, "one column of values named 'c'"),
         ],
     )
-    def test_refusals(self, tmp_path, text, given, message):
-        path = tmp_path / "a.csv"
+    def test_refusals(self, path, text, given, message):
         path.write_text(text)
         with pytest.raises(ValueError, match=message):
             read_record(path, **given)
 
     @pytest.mark.parametrize(("content", "given"), LOGGERS.values(), ids=LOGGERS)
-    def test_files_of_loggers_and_spreadsheets(self, tmp_path, content, given):
-        path = tmp_path / "a.csv"
+    def test_files_of_loggers_and_spreadsheets(self, path, content, given):
         path.write_bytes(content)
         record = read_record(path, **given)
         np.testing.assert_allclose(record.acceleration, [0.1, -0.25, 12.5, 0.0])
@@ -188,21 +185,18 @@ class TestCSV:
     @pytest.mark.parametrize(
         ("step", "digits"), [(1 / 120, 5), (1 / 128, 3), (0.0125, 3), (0.01, 2), (0.02, 2), (0.005, 4)]
     )
-    def test_rounding_of_printed_times_is_accepted(self, tmp_path, step, digits):
-        path = tmp_path / "a.csv"
+    def test_rounding_of_printed_times_is_accepted(self, path, step, digits):
         path.write_text("time_s,acc_g\n" + "".join(f"{k * step:.{digits}f},0\n" for k in range(4000)))
         assert read_record(path).dt == step
 
     @pytest.mark.parametrize("form", ["", ".6f"])
-    def test_single_precision_times_are_accepted(self, tmp_path, form):
-        path = tmp_path / "a.csv"
+    def test_single_precision_times_are_accepted(self, path, form):
         times = (np.arange(4000) * np.float32(0.01)).astype(np.float32)
         path.write_text("time_s,acc_g\n" + "".join(f"{float(time):{form}},0\n" for time in times))
         assert read_record(path).dt == 0.01
 
     @pytest.mark.parametrize("first", [0.0, 43200.0, 1.7e9])
-    def test_lost_samples_are_found_where_the_times_are_large(self, tmp_path, first):
-        path = tmp_path / "a.csv"
+    def test_lost_samples_are_found_where_the_times_are_large(self, path, first):
         rows = [f"{first + 0.01 * k:.2f},0" for k in range(3000)]
         path.write_text("\n".join(["time_s,acc_g", *rows]))
         assert read_record(path).dt == 0.01
@@ -211,8 +205,7 @@ class TestCSV:
             read_record(path)
 
     @pytest.mark.parametrize("names", ["Time_A [s],a_g,Time_B [s],b_g", "time1,a_g,time2,b_g"])
-    def test_two_columns_of_times(self, tmp_path, names):
-        path = tmp_path / "a.csv"
+    def test_two_columns_of_times(self, path, names):
         channel = Channel("b", "acceleration", "g")
         path.write_text(names + "\n0.00,1,0.5,1\n0.01,2,0.52,2\n")
         with pytest.raises(ValueError, match="expected one column of times, the columns '[Tt]ime.* have different"):
@@ -229,14 +222,13 @@ class TestCSV:
         path.write_text(path.read_text().replace(".213", ".000").replace(".223", ".010"))
         assert read_columns(path, (channel,), ("b_g",), zero="09:58:10").start == 0.0
 
-    def test_a_temperature_is_no_column_of_times(self, tmp_path):
-        path = tmp_path / "a.csv"
+    def test_a_temperature_is_no_column_of_times(self, path):
         path.write_text("time_s,acc_g,T [°C],T\n0.00,1,20,20\n0.01,2,20,20\n", encoding="utf-8")
         assert read_record(path, column="acc_g").dt == 0.01
 
     @pytest.mark.parametrize("change", ["missing", "doubled", "shifted"])
     @pytest.mark.parametrize(("step", "digits"), [(0.01, 2), (0.02, 2), (0.005, 4)])
-    def test_first_irregular_step_is_named(self, tmp_path, step, digits, change):
+    def test_first_irregular_step_is_named(self, path, step, digits, change):
         times = [f"{k * step:.{digits}f}" for k in range(1000)]
         if change == "missing":
             del times[500]  # row 500 is line 502 of the file
@@ -244,7 +236,6 @@ class TestCSV:
             times.insert(500, times[499])
         else:
             times[500] = f"{500 * step + 2 * 10**-digits:.{digits}f}"
-        path = tmp_path / "a.csv"
         path.write_text("time_s,acc_g\n" + "".join(f"{time},0\n" for time in times))
         with pytest.raises(
             ValueError, match=rf"a.csv, line 502: expected a uniform time step of about {step:g} s, got"
@@ -400,8 +391,7 @@ class TestV2Forms:
 
 
 class TestColumns:
-    def test_units_by_column_or_for_all(self, tmp_path):
-        path = tmp_path / "a.csv"
+    def test_units_by_column_or_for_all(self, path):
         path.write_text("time_s,acc_g,disp [in]\n0,1,2\n0.01,3,4\n")
         expected = [[G0, 3 * G0], [0.0508, 0.1016]]
         for units in (None, ["g", "in"], {DRIFT.name: "in"}):
@@ -422,14 +412,12 @@ class TestColumns:
             ((TOP,), ("acc_g",), "cm/s2", "states the unit 'g' but units = 'cm/s2'"),
         ],
     )
-    def test_refusals(self, tmp_path, channels, columns, units, message):
-        path = tmp_path / "a.csv"
+    def test_refusals(self, path, channels, columns, units, message):
         path.write_text("time_s,acc_g,disp\n0,1,2\n0.01,3,4\n")
         with pytest.raises(ValueError, match=message):
             read_columns(path, channels, columns, units)
 
-    def test_empty_cells_are_missing_samples(self, tmp_path):
-        path = tmp_path / "a.csv"
+    def test_empty_cells_are_missing_samples(self, path):
         path.write_text("Time [s];Acc [g];Top [µm/m]\n0,37;1;\n0,38;;2\n0,39;NaN;3\n0,40;4;#N/A\n", encoding="utf-8")
         strain = Channel("strain", "strain", "microstrain")
         found = read_columns(path, (TOP, strain), ("Acc [g]", "Top [µm/m]"))
@@ -439,15 +427,13 @@ class TestColumns:
         np.testing.assert_allclose(found.time, [0.37, 0.38, 0.39, 0.40])
         assert read_columns(path, (TOP,), ("Acc [g]",), zero=0.37).start == 0.0
 
-    def test_a_printed_start_is_a_whole_number_of_steps_within_its_rounding(self, tmp_path):
-        path = tmp_path / "a.csv"
+    def test_a_printed_start_is_a_whole_number_of_steps_within_its_rounding(self, path):
         path.write_text("time_s,acc_g\n" + "".join(f"{(k + 1) / 120:.5f},{k}\n" for k in range(500)))
         found = read_columns(path, (TOP,), ("acc_g",))
         assert (found.dt, found.start) == (1 / 120, 1 / 120)
 
     @pytest.mark.parametrize("number", ["-9999", "-999.25", "1E+30", "9.97E+36"])
-    def test_numbers_for_missing_samples(self, tmp_path, number):
-        path = tmp_path / "a.csv"
+    def test_numbers_for_missing_samples(self, path, number):
         path.write_text(f"time_s,acc_g\n0.00,1\n0.01,{number}\n0.02,{number}\n0.03,4\n")
         for read in (read_record, lambda path: read_columns(path, (TOP,), ("acc_g",))):
             with pytest.raises(ValueError, match="line 3: expected a measured number, got .* in 2 rows, .*missing="):
@@ -459,8 +445,7 @@ class TestColumns:
         assert read_record(path).n_steps == 4
 
     @pytest.mark.parametrize("number", [-999, 99999, -99999, 32767, -32768])
-    def test_numbers_that_may_be_measured_are_refused_where_nothing_is_as_large(self, tmp_path, number):
-        path = tmp_path / "a.csv"
+    def test_numbers_that_may_be_measured_are_refused_where_nothing_is_as_large(self, path, number):
         path.write_text(f"time_s,acc_gal\n0.00,120\n0.01,{number}\n0.02,{number}\n0.03,{0.49 * number}\n")
         with pytest.raises(ValueError, match=f"line 3: expected a measured number, got {number} in 2 rows, .*missing="):
             read_record(path)
@@ -471,8 +456,7 @@ class TestColumns:
         assert read_record(path).n_steps == 4  # a peak beside which the record is large as well
 
     @pytest.mark.parametrize("word", ["NA", "N/A", "NULL", "null", "-", "--"])
-    def test_words_for_missing_samples(self, tmp_path, word):
-        path = tmp_path / "a.csv"
+    def test_words_for_missing_samples(self, path, word):
         path.write_text(f"acc_g\n{word}\n{word}\n0\n1\n{word}\n2\n")
         found = read_columns(path, (TOP,), ("acc_g",), dt=0.01)
         np.testing.assert_array_equal(found.values / G0, [[np.nan, np.nan, 0, 1, np.nan, 2]])
@@ -488,15 +472,13 @@ class TestColumns:
         ],
         ids=["unquoted decimal commas", "names of rows"],
     )
-    def test_header_with_one_name_too_few(self, tmp_path, text):
-        path = tmp_path / "a.csv"
+    def test_header_with_one_name_too_few(self, path, text):
         path.write_text(text)
         with pytest.raises(ValueError, match="line 1: expected a name for each of the 3 cells .* got 2; write decimal"):
             read_columns(path, (TOP,), ("acc_g",))
 
     @pytest.mark.parametrize("separator", [",", ";", "\t"])
-    def test_separators_of_thousands(self, tmp_path, separator):
-        path = tmp_path / "a.csv"
+    def test_separators_of_thousands(self, path, separator):
         for first in (980, 1000):
             if first == 1000 and separator != ",":
                 continue  # numbers with three decimals
@@ -505,8 +487,7 @@ class TestColumns:
             with pytest.raises(ValueError, match="got '1,0[0-9]+', which may have a separator of thousands"):
                 read_record(path)
 
-    def test_decimal_commas_with_three_digits(self, tmp_path):
-        path = tmp_path / "a.csv"
+    def test_decimal_commas_with_three_digits(self, path):
         path.write_text('time_s,acc_g\n"0,000","1,250"\n"0,010","2,500"\n')
         np.testing.assert_allclose(read_record(path).acceleration / G0, [1.25, 2.5])
         path.write_text("time_ms;acc_g\n0;1,250\n10;2,500\n")
@@ -516,8 +497,7 @@ class TestColumns:
         ("first", "dt", "digits", "zero", "start"),
         [(0.37, 0.02, 2, 0.0, 0.37), (86000.123, 0.002, 3, 86000.123, 0.0), (86000.123, 1 / 120, 5, 86000.123, 0.0)],
     )
-    def test_a_start_between_two_steps_is_kept(self, tmp_path, first, dt, digits, zero, start):
-        path = tmp_path / "a.csv"
+    def test_a_start_between_two_steps_is_kept(self, path, first, dt, digits, zero, start):
         path.write_text("time_s,acc_g\n" + "".join(f"{first + k * dt:.{digits}f},{k}\n" for k in range(500)))
         assert read_columns(path, (TOP,), ("acc_g",), zero=zero).start == start
 
@@ -541,8 +521,7 @@ class TestColumns:
         with pytest.raises(ValueError, match="install it with pip install openpyxl, or save the sheet as CSV"):
             read_record(tmp_path / "a.xlsx")
 
-    def test_imposed_displacement_needs_a_unit(self, tmp_path):
-        path = tmp_path / "a.csv"
+    def test_imposed_displacement_needs_a_unit(self, path):
         path.write_text("top,force_kN\n0,1\n5,3\n")
         force = (Channel("base", "force", "kN"),)
         with pytest.raises(ValueError, match="column 'top' does not state the unit of its displacement"):

@@ -13,11 +13,6 @@ TOP = Channel("top", "acceleration", "g")
 ROWS = "0.00,1\n0.01,2\n0.02,4\n"
 
 
-@pytest.fixture
-def path(tmp_path):
-    return tmp_path / "a.csv"
-
-
 @pytest.mark.parametrize(
     ("name", "unit"),
     [

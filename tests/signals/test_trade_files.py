@@ -235,8 +235,7 @@ def test_a_short_last_row_is_never_taken_for_a_cut_table(tmp_path):
         read(tmp_path, "a.dat", text(*ROWS[:2], ROWS[2][:70], *ROWS[3:]), units="g", dt=0.01, column="rows")
 
 
-def test_the_column_of_times_may_be_named(tmp_path):
-    path = tmp_path / "a.csv"
+def test_the_column_of_times_may_be_named(path):
     path.write_text("Sek.,Scan,Time_2_s,acc_g\n0.00,1,5.0,1\n0.02,2,5.5,2\n0.04,3,6.0,4\n")
     record = read_record(path, column="acc_g", time="Sek.", time_unit="s")
     assert record.dt == 0.02
@@ -433,10 +432,9 @@ def test_the_advice_for_repeated_times_of_smc_works(tmp_path):
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_the_advice_for_uneven_times_of_a_table_works(tmp_path, seed):
+def test_the_advice_for_uneven_times_of_a_table_works(path, seed):
     chance = np.random.default_rng(seed)
     times = np.cumsum(chance.choice([0.004, 0.010, 0.011, 0.031], size=50, p=[0.1, 0.5, 0.3, 0.1]))
-    path = tmp_path / "a.csv"
     path.write_text("time_s,acc_g\n" + "".join(f"{time:.3f},{k}\n" for k, time in enumerate(times)))
     with pytest.raises(ValueError, match="expected a uniform time step") as error:
         read_record(path)

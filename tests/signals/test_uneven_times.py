@@ -56,8 +56,7 @@ def test_lost_samples_are_missing_in_measurements_and_straight_in_a_record(tmp_p
     assert np.diff(record.acceleration[100:103], 2) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_marks_of_missing_samples_are_not_interpolated(tmp_path):
-    path = tmp_path / "a.csv"
+def test_marks_of_missing_samples_are_not_interpolated(path):
     rows = [f"{0.01 * k + 0.001 * (k % 2)},{-9999 if k == 4 else k}" for k in range(10)]
     path.write_text("time_s,acc_g\n" + "\n".join(rows) + "\n")
     measured = read_columns(path, (TOP,), ("acc_g",), missing=(-9999,), resample=STEP)
