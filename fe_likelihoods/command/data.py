@@ -32,7 +32,12 @@ def _file(job: Job, section: str) -> tuple[Path, Dataset | None]:
     if given is None or given.file is None:
         raise ValueError(f'{job.where(section)} file: this key is missing; it names the data, such as file = "top.csv"')
     path = job.path(section, "file", given.file)
-    return path, job.located(section, read_dataset, path) if is_dataset(job, section) else None
+    if not is_dataset(job, section):
+        return path, None
+    stated = ("column", "channel", "columns", "units", *given.READING, *(["zero"] if section == "measurements" else []))
+    if idle := [name for name in given.given() if name in stated]:
+        raise ValueError(f"{job.where(section)} {idle[0]}: a data set states this itself: leave the key out")
+    return path, job.located(section, read_dataset, path)
 
 
 def read_base_motion(job: Job) -> Record | None:

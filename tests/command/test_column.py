@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import Record, problems
-from fe_likelihoods.command.job import read_job
+from fe_likelihoods.command.job import parse_job, read_job
 from fe_likelihoods.command.models import make_problem
 from tests.command.test_command import ROOT
 
@@ -94,6 +94,9 @@ def test_the_template_is_the_ready_made_posterior():
     assert found.posterior.parameter_names == usual.parameter_names
     point = usual.prior.mean()
     assert found.posterior.log_prob(point) == pytest.approx(usual.log_prob(point), rel=1e-12)
+    file = ROOT / "data" / "templates" / "column.toml"
+    with pytest.raises(ValueError, match="zero: a data set states this itself"):
+        make_problem(parse_job(file.read_text().replace("# zero", "zero"), file, file.parent))
 
 
 def test_sensors_below_the_top_and_drifts_of_floors_are_channels(column):
