@@ -27,16 +27,18 @@ def population(share, random):
     return Population(1.0, coords, None, N, (np.arange(N),))
 
 
-def found_in(points_share, true_share, seed=1):
+def found_in(points_share, true_share, seed=1, family=1):
     random = np.random.RandomState(seed)
     drawn = draw(PROPOSAL, N, random)
     log_weights = log_modes(drawn, true_share) - log_density(PROPOSAL, drawn)
-    return check_shares(PROPOSAL, population(points_share, random).coords, np.arange(N), drawn, log_weights)
+    founders = np.arange(N) // family
+    return check_shares(PROPOSAL, population(points_share, random).coords, founders, drawn, log_weights)
 
 
 @pytest.mark.parametrize("share", [0.05, 0.3, 0.5])
 def test_equal_shares_raise_no_doubt(share):
     assert not any(found_in(share, share, seed) for seed in range(20))
+    assert not found_in(0.4, 0.65, family=100) and found_in(0.4, 0.65)  # five founders do not know it better
 
 
 @pytest.mark.parametrize(("points", "truth"), [(0.0, 0.5), (0.5, 0.75), (1.0, 0.7)])

@@ -109,6 +109,7 @@ def test_exact_knowledge_leaves_the_error_of_its_points(rng):
     assert np.allclose(sample.weights[sample.rounds > 0], 0.0, atol=1e-15)
     assert sample.log_evidence == pytest.approx(LOG_EVIDENCE, abs=1e-12)
     assert np.allclose(sample.expectation().error, 1.0 / np.sqrt(POOL), rtol=0.1)
+    assert np.allclose(sample.standard_deviation().error, 1.0 / np.sqrt(2.0 * POOL), rtol=0.1)
 
 
 def test_rounds_without_knowledge_are_left_out(rng):
