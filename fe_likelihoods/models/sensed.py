@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -140,7 +139,7 @@ class SensedModel:
         """Optional members of the model, such as `nominal`, and its excitation."""
         model = vars(self).get("model")
         if model is not None and name == "code_parts" and is_of_user(type(model).__module__):
-            return partial(code_within, model)
+            return lambda: code_within(model)
         if model is not None and name in (*_OF_THE_MODEL, "record", "loading", "supports"):
             return getattr(model, name)
         if model is not None and name == "with_record" and hasattr(model, "with_record"):
