@@ -236,7 +236,7 @@ def damage(
             factor = errors[name].quantile(rng.random(largest.shape), np.maximum(largest, np.finfo(float).tiny))
             found = found * factor.reshape(*factor.shape, *(1,) * (found.ndim - 2))
         if prediction.probabilities:
-            extent[name] = np.quantile(found, prediction.probabilities, axis=0)
+            extent[name] = np.quantile(found, prediction.probabilities, axis=0, method="weibull")
     return Damage(states, presence, location, extent, _contents(states, errors), prediction)
 
 

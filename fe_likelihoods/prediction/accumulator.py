@@ -176,11 +176,16 @@ class Accumulator:
         return self._kept[self.result_of_sample[samples]]
 
     def quantiles(self, samples: np.ndarray, probabilities: Sequence[float]) -> np.ndarray:
-        """Quantiles (n_probabilities, ...) over samples that did not fail."""
+        """Quantiles (n_probabilities, ...) over samples that did not fail.
+
+        The k-th of n ordered samples is the quantile k / (n + 1), so a further sample lies inside a band with the
+        probability of the band; by numpy's default, 20 samples have bands of 90 % that hold 81 %. Hyndman & Fan (1996),
+        The American Statistician 50, 361-365, definition 6.
+        """
         kept = self._kept.reshape(len(self._kept), -1)
         results, out = self.result_of_sample[samples], np.empty((len(probabilities), kept.shape[1]))
         columns = max(1, _CHUNK // len(results))
         for start in range(0, kept.shape[1], columns):
             part = slice(start, start + columns)
-            out[:, part] = np.quantile(kept[results, part].astype(float), probabilities, axis=0)
+            out[:, part] = np.quantile(kept[results, part].astype(float), probabilities, axis=0, method="weibull")
         return out.reshape(len(probabilities), *self.shape)
