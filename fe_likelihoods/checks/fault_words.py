@@ -13,7 +13,6 @@ from .finding import WRONG, Finding, percent
 __all__ = ["describe_unit", "finding_of"]
 
 SAME_UNITS = 1.25  # ratio of a factor to one between units, up to which it is named after them
-NEAR_ENOUGH = 0.03  # difference of logarithms of ratios that are named together
 OF_MODES = {  # ratios of frequencies; of stiffness or mass, the square roots
     2.0 * math.pi: "rad/s instead of Hz",
     60.0: "1/min instead of Hz",
@@ -99,7 +98,7 @@ def describe_unit(factor: float, dimension: str, unit: str = "", loads: bool = F
     One of the two is the SI unit or the `unit` of the channel, or they are m/s2 and g of the base motion; with `loads`,
     all channels of a static test have this factor.
     """
-    bases, near = (unit, DIMENSIONS[dimension]), dict[str, float]()
+    bases, size = (unit, DIMENSIONS[dimension]), abs(math.log(factor))
     units = sorted((each for each in UNITS.values() if each.dimension == dimension), key=lambda u: u.name not in bases)
     ratios = {} if dimension == "acceleration" else {9.80665: "m/s2 and g of the base motion"}
     if dimension == "frequency":
@@ -107,10 +106,7 @@ def describe_unit(factor: float, dimension: str, unit: str = "", loads: bool = F
     for one, other in combinations(units, 2):
         if one.name in bases:  # of two names of a unit, the first
             ratios.setdefault(one.factor / other.factor, f"{one.name} and {other.name}")
-    for ratio, words in ratios.items():
-        apart = abs(abs(math.log(ratio)) - abs(math.log(factor)))
-        near |= {words: apart} if apart < math.log(SAME_UNITS) else {}
+    near = [words for ratio, words in ratios.items() if abs(abs(math.log(ratio)) - size) < math.log(SAME_UNITS)]
     # stiffnesses are not known to a factor of 2: 86 of 88 load tests are named
-    kilo = loads and abs(abs(math.log(factor)) - math.log(1000.0)) < math.log(2.0)
-    near |= {"kN and N of the loads": 0.0} if kilo else {}
-    return " or ".join(words for words, apart in near.items() if apart < min(near.values()) + NEAR_ENOUGH)
+    near += ["kN and N of the loads"] if loads and abs(size - math.log(1000.0)) < math.log(2.0) else []
+    return " or ".join(near)

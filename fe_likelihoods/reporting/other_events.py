@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..checks.finding import Finding
+from ..checks.finding import Finding, percent
 from ..checks.transfer import check_event
 from ..prediction.prediction import Prediction
 from ..prediction.scores import HistoryScores, QuantityScores, central_interval, share_within
@@ -42,7 +42,7 @@ class NumberRow(NamedTuple):
         if abs(self.pit - 0.5) <= 0.25:
             return "within 50 %"
         if abs(self.pit - 0.5) <= 0.5 * LEVEL:
-            return f"within {_percent(LEVEL)}"
+            return f"within {percent(LEVEL)}"
         return "above" if self.pit > 0.5 else "below"
 
 
@@ -145,20 +145,16 @@ def _sentence(
     known = [row for row in numbers if np.isfinite(row.pit)]
     if known:
         share = share_within([row.pit for row in known], LEVEL)
-        text += f" {share.inside} of {share.n} measured numbers are within their {_percent(LEVEL)} intervals"
+        text += f" {share.inside} of {share.n} measured numbers are within their {percent(LEVEL)} intervals"
         outside = [f"{row.name} {row.place}" for row in known if not row.place.startswith("within")]
         text += f" ({', '.join(outside)})" if outside else ""
-        text += "; so few show a share between {} and {} of all such numbers.".format(*map(_percent, share.interval))
+        text += "; so few show a share between {} and {} of all such numbers.".format(*map(percent, share.interval))
     for scores in histories:
         shares = ", ".join(
-            f"{_percent(share)} of {channel.name}"
+            f"{percent(share)} of {channel.name}"
             for channel, share in zip(scores.channels, scores.coverage, strict=True)
         )
-        text += f" The {_percent(LEVEL)} band contains {shares}."
+        text += f" The {percent(LEVEL)} band contains {shares}."
     if not first.noise:
         text += " A band without noise is that of the response, and contains fewer measurements."
     return text
-
-
-def _percent(share: float) -> str:
-    return f"{100.0 * share:.0f} %"
