@@ -83,8 +83,7 @@ class Verdict(_Stored):
         The points that `effective_sample_size` counts: the walkers, or weighted points that the walkers were resampled
         from.
     findings : tuple of `samplers.finding.Finding`
-        What speaks against the result, each with its severity and what to do; empty for a verdict that version 0.2 has
-        stored.
+        What speaks against the result, each with its severity and what to do.
 
     Examples
     --------
