@@ -422,7 +422,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
             latest = self._record.latest(KEPT_POINTS)
             self._near = None if latest is None else judged_failures(latest, coords, self._target)
             numbers = self.nwalkers, self.ndim, self.simulations
-            others = self._budget.of_guides, self._near, self._target.names
+            others = self._budget.of_guides, self._near, tuple(self._target.names)
             self._verdict = judge(self._result, *numbers, missing, failed, *others)
         elif self._record.start is not None:  # an annealing that could not be made again
             self._verdict = self._verdict._replace(simulations=self.simulations)

@@ -337,7 +337,7 @@ def _of_signed_sample(result: AnnealingResult, names: Sequence[str]) -> list[Fin
     unknown = np.flatnonzero(np.isnan(result.signed.standard_deviation().value))
     if len(unknown) == 0:
         return []
-    named = ", ".join(names[j] if names else f"parameter {j + 1}" for j in unknown)
+    named = ", ".join(names[j] if j < len(names) else f"parameter {j + 1}" for j in unknown)
     text = (
         f"The standard deviation of {named} is not determined: its variance by the "
         "signed sample is below its own standard error, as with a tail of the posterior in which the guide makes "
