@@ -122,7 +122,7 @@ def _announce(package: str) -> None:
 
 
 _patience = [120.0]
-"""Seconds that this process still waits for kernels of others; all of them take 13 s on a free core."""
+"""Seconds that this process still waits for kernels of others; all of them take 12 s on a free core."""
 
 
 def _lock(file: IO, function: Callable) -> None:
@@ -216,7 +216,7 @@ def kernel(function: Callable | None = None, *, inline: bool = False, fastmath: 
 
     Kernels are compiled without numba's reference counting: the caller provides every array, and an allocation is a
     compile error. Reference counting took 110 of the 180 ns of one evaluation of a section. Other kernels take a second
-    version of it, without what a call from Python needs: the column compiles in 13 instead of 23 CPU s.
+    version of it, without what a call from Python needs: the column compiles in 12 instead of 22 CPU s.
 
     `inline` merges the body into every caller: for functions in the inner loop that take arrays, because a call passes
     about eight scalars per array. Of `fastmath`, LLVM flags, this library uses `SUM_REORDERING` only. The machine code

@@ -178,9 +178,11 @@ def lower(column, position, load, imposed, iteration):
 def _static_steps(column, total, share, imposed, targets, iteration, history, out):
     """Add `share` of the load `total` (n,) at each target, in halved steps if they do not converge.
 
-    The degree of freedom `imposed` moves to the targets; -1 for none, and nothing is recorded then. The column is in
-    equilibrium before, and the other arguments are those of `impose_displacement`, as is the result.
+    The degree of freedom `imposed` moves to the targets from an equilibrium. With -1, none moves, the column is made
+    virgin first, and nothing is recorded. The other arguments are those of `impose_displacement`, as is the result.
     """
+    if imposed < 0:
+        initialise_column(column)
     load, u, force = column.vectors[3], column.vectors[4], column.vectors[5]
     position = Position(u, force, column.matrices[2])
     none = min(imposed, -1)  # no literal, for which `equilibrate` would be compiled again
@@ -230,7 +232,6 @@ def apply_gravity(column: Column, gravity: np.ndarray, iteration: Iteration) -> 
     Returns the number of retries, or -1 on failure. Displacements, forces and tangent are in ``column.vectors[4]``,
     ``column.vectors[5]`` and ``column.matrices[2]``.
     """
-    initialise_column(column)
     nothing = np.zeros((9, 0)), recorder(column)
     status, retries, _ = _static_steps(column, gravity, 1.0 / GRAVITY_STEPS, -1, _AT_REST, iteration, *nothing)
     return -1 if status else retries
