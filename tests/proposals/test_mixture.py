@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from samplers import MixtureMove
-from samplers.proposals.mixture import draw, fit_mixture, log_density, log_responsibilities
+from samplers.proposals.mixture import Mixture, draw, fit_mixture, invert_roots, log_density, log_responsibilities
 from samplers.proposals.transforms import (
     apply_shears,
     find_shears,
@@ -107,13 +107,20 @@ def corner(rng, n):
     return rng.exponential(size=(n, 3)) * scale, log_target, inside
 
 
+def overlapping(rng, n):
+    """Normal draws, and a proposal with two components that overlap."""
+    roots = np.repeat(np.eye(2)[None], 2, axis=0)
+    mixture = Mixture(np.array([0.7, 0.3]), np.array([[-0.8, 0.0], [0.8, 0.0]]), roots, invert_roots(roots), 6.0)
+    return rng.standard_normal((n, 2)), lambda x: stats.norm.logpdf(x).sum(axis=1), None, mixture
+
+
 @pytest.mark.parametrize("kernel", ["draw_independence", "draw_local_walk", "draw_differences"])
-@pytest.mark.parametrize(("target", "n"), [(curved, 40_000), (corner, 20_000)])
+@pytest.mark.parametrize(("target", "n"), [(curved, 40_000), (corner, 20_000), (overlapping, 40_000)])
 def test_each_kernel_keeps_the_target(kernel, target, n, rng):
     """Exact draws remain exact, even if the proposal was fitted to other points."""
-    start, log_target, inside = target(rng, n)
+    start, log_target, inside, *mixture = target(rng, n)
     x, move, random = start.copy(), MixtureMove(), np.random.RandomState(rng.integers(2**31))
-    move.calibrate(x[:300] * np.array([1.1, 0.9, 1.0])[: x.shape[1]], uniform(300), *([inside] if inside else []))
+    move.calibrate(x[:300] * np.array([1.1, 0.9, 1.0])[: x.shape[1]], uniform(300), inside, *mixture)
     assert (move._mixture.bounds is not None) == (inside is not None)
     for _ in range(5):
         proposed, factors = getattr(move, kernel)(x, random)
