@@ -87,7 +87,9 @@ def test_a_wider_standard_deviation_is_between_that_of_the_data_and_the_prior():
     nan = float("nan")
 
     def row(sd, prior_sd):
-        return ParameterRow("k", "k", "", "", 1.0, prior_sd, 1.0, nan, sd, sd, 0.0, 2.0, nan, nan, 0.0, np.inf)
+        return ParameterRow(
+            "k", "k", "", "", 1.0, prior_sd, 1.0, nan, sd, nan, sd, 0.0, 1.0, 2.0, nan, nan, 0.0, np.inf
+        )
 
     assert row(0.01, 1e6).widened(3.0) == pytest.approx(0.03)
     assert row(0.01, nan).widened(3.0) == pytest.approx(0.03)
@@ -101,7 +103,9 @@ def test_one_event_says_by_which_factor_its_errors_are_too_small_for_another_one
     nan = float("nan")
 
     def row(name, mean, sd):
-        return ParameterRow(name, name, "", "", 1.0, 1.0, mean, nan, sd, sd / mean, 0.0, 2.0, nan, nan, 0.0, np.inf)
+        return ParameterRow(
+            name, name, "", "", 1.0, 1.0, mean, nan, sd, nan, sd / mean, 0.0, 1.0, 2.0, nan, nan, 0.0, np.inf
+        )
 
     (found,) = check_other_events([row("frequency", 4.0, 0.002), row("damping", 0.1, 0.01), row("share", 0.8, 0.01)])
     expected = {
