@@ -79,7 +79,9 @@ class MemoryCache:
         """Keep outcomes, which are not changed later."""
         with self._lock:
             for key, outcome in zip(keys, outcomes, strict=True) if self.most else ():
-                self._size += self._size_of(outcome) - self._size_of(self._outcomes.pop(key, None))
+                if (old := self._outcomes.pop(key, None)) is not None:
+                    self._size -= self._size_of(old)
+                self._size += self._size_of(outcome)
                 self._outcomes[key] = outcome
                 while self._size > self.most:
                     self._size -= self._size_of(self._outcomes.popitem(last=False)[1])
@@ -92,7 +94,7 @@ class MemoryCache:
 
     @staticmethod
     def _size_of(outcome: Any) -> int:
-        return outcome is not None
+        return 1
 
 
 class ResponseMemory(MemoryCache):
@@ -105,6 +107,4 @@ class ResponseMemory(MemoryCache):
 
     @staticmethod
     def _size_of(outcome: Any) -> int:
-        if outcome is None:
-            return 0
         return _ENTRY_BYTES + (len(outcome) if isinstance(outcome, str) else outcome.nbytes)

@@ -258,17 +258,17 @@ class Simulator(VerifiedModel):
         finite = np.isfinite(self._thetas(keys)).all(axis=1)
         with self._running.lock:
             request, known = _Request(keys, full, self.model), zip(keys, self.memory_cache.look_up(keys), strict=True)
-            request.enter({key: outcome for key, outcome in known if outcome is not None})
             skipped = [key for key, fine in zip(keys, finite, strict=True) if not fine]
-            request.enter(dict.fromkeys(skipped, "the parameters are not finite"))
+            outcomes = {key: outcome for key, outcome in known if outcome is not None}
+            request.enter(outcomes | dict.fromkeys(skipped, "the parameters are not finite"))
             try:
                 on_disk = {*self._take_statistics(request), *self._take_responses(request)}
             except StaleCache:  # results in memory may belong to another model
                 self._clear()
                 raise
-            new = {*skipped, *request.left}
-            self.cache_hits += sum(keys[place] not in new for place in which)
-            self.disk_hits += sum(keys[place] in on_disk for place in which)
+            if found := set(keys).difference(skipped, request.left):
+                self.cache_hits += sum(keys[place] in found for place in which)
+                self.disk_hits += sum(keys[place] in on_disk for place in which)
         return request
 
     def _take_statistics(self, request: _Request) -> list[bytes]:
@@ -277,7 +277,8 @@ class Simulator(VerifiedModel):
             return []
         rows = self._stored(self._key, self._thetas(left), request.fingerprint, self.n_numbers)
         found = {key: row.outcome for key, row in zip(left, rows, strict=True) if row is not None}
-        self._enter(request, found)
+        if found:
+            self._enter(request, found)
         return list(found)
 
     def _take_responses(self, request: _Request) -> list[bytes]:
@@ -308,10 +309,13 @@ class Simulator(VerifiedModel):
 
     def _enter(self, request: _Request, outcomes: dict[bytes, bytes | str]) -> None:
         """Fill in statistics and reasons of failures, count these, and cache both in memory."""
-        self.failures.count_outcomes(self._thetas(list(outcomes)), list(map(_reason, outcomes.values())))
+        self.failures.outcomes += len(outcomes)
+        for key, outcome in outcomes.items():
+            if isinstance(outcome, str):
+                self.failures.add(np.frombuffer(key), outcome)
         request.enter(outcomes)
         self.memory_cache.store(outcomes, outcomes.values())
-        self.has_results = self.has_results or bool(outcomes)
+        self.has_results = True
 
     # simulations --------------------------------------------------------------------------------------------------
 
