@@ -30,7 +30,6 @@ _POOL, _NUMBERS = 20_000, 300_000  # points of the pool, and numbers that they h
 _ENOUGH_PER_DIMENSION = 6.0  # effective points per dimension for a covariance
 _CURVED = 0.15  # share of effective points in the pool below which several components per region are fitted
 _COMPONENTS, _FITTED = 12, 4000  # of them, and points of the pool that they are fitted to
-_MOST_BENT = 10  # parameters; in more, the points are too few for several components
 _RIDGE = 1e-9  # added to variances, relative, since rounding may make one negative
 _PLAUSIBLE = 8.0  # log-density below the best, besides 1 per dimension, of runs that the pool must reach
 
@@ -63,7 +62,7 @@ class EmulatedPosterior:
     """Density of the emulated posterior, from regions with emulators, and a weighted sample of it, the pool.
 
     `log_evidence` is the log of the integral over the emulated density, with an error from the importance sampling in
-    memory; `largest_weight` is the largest normalised weight in the pool; `of_runs` are log-densities (n,) of the
+    memory; `effective_share` is the share of effective points in the pool; `of_runs` are log-densities (n,) of the
     simulations by their responses, and by the emulators; `regions` are those given, with their moments.
     """
 
@@ -140,22 +139,26 @@ class EmulatedPosterior:
                 break
         parts = [(mixture(scaled), own), *wide]
         points, self._pool, log_weights = self._propose(parts, size, random)
+        effective = effective_sample_size(log_weights)
         for _ in range(3):
-            if effective_sample_size(log_weights) >= _CURVED * size or target.ndim > _MOST_BENT:
+            if effective >= _CURVED * size:
                 break
             rows = np.argsort(-log_weights)[:_FITTED]
             weights = tempered(log_weights[rows], 1.5 * _ENOUGH_PER_DIMENSION * target.ndim)
             fitted = fit_mixture(points[rows], normalised_weights(weights), _COMPONENTS)
             both = [(fitted, 0.7), *((each, 0.3 * share) for each, share in parts)]
-            points, self._pool, log_weights = self._propose(both, size, random)
+            proposed = self._propose(both, size, random)
+            if effective_sample_size(proposed[2]) <= effective:
+                break
+            points, self._pool, log_weights = proposed
+            effective = effective_sample_size(log_weights)
         if not np.any(log_weights > -np.inf):
             raise np.linalg.LinAlgError("the emulated posterior has no density")
         self._pool[log_weights == -np.inf] = 0.0  # outside the support of the prior, coordinates are infinite
         self.regions = self._moments(self._pool, self._pool, log_weights, 0.0)
         self._weights = normalised_weights(log_weights)
-        self.log_evidence, effective = log_mean_weight(log_weights), effective_sample_size(log_weights)
+        self.log_evidence, self.effective_share = log_mean_weight(log_weights), effective / size
         self.log_evidence_error = float(np.sqrt(max(1.0 / effective - 1.0 / size, 0.0)))
-        self.largest_weight = float(self._weights.max())
 
     def _propose(
         self, parts: Sequence[tuple[Mixture, float]], n: int, random: np.random.RandomState

@@ -145,7 +145,7 @@ class ResponseGuide:
             found += check_ends(search.ended, len(search.ends), self._starts, search.grown)
         found += check_tops(self.highest - max((mode.log_density for mode in search.modes), default=np.inf))
         if self._emulated is not None:
-            found += check_draws_in_memory(self._emulated.largest_weight)
+            found += check_draws_in_memory(self._emulated.effective_share)
             found += check_excluded_runs(*self._emulated.of_runs)
         return tuple(found)
 

