@@ -12,7 +12,7 @@ from ..signals.channels import Measurements
 from ..signals.records import Record
 from ..units import from_si
 from .finding import CARE, NOTE, TAIL, Finding, about, by_severity
-from .sensor_faults import SensorFault, find_sensor_faults
+from .sensor_faults import SensorFault, find_sensor_faults, straight_parts
 
 __all__ = [
     "Screened",
@@ -101,7 +101,7 @@ class Screened(NamedTuple):
 
     def missing(self) -> list[list[str]]:
         """First and last times of the samples that are to be left out."""
-        left_out = [each for each in self.faults if each.kind in ("clipped", "stuck", "spikes")]
+        left_out = [each for each in self.faults if each.kind in ("clipped", "stuck", "spikes", "straight")]
         return [[self.time(sample) for sample in span] for each in left_out for span in sorted(each.spans)]
 
     def baseline(self) -> list[str]:
@@ -131,6 +131,8 @@ def screen_motion(motion: Record) -> list[Screened]:
     for fault in find_sensor_faults(motion.acceleration, "acceleration"):
         padding = fault.kind == "stuck" and all(last == motion.n_steps - 1 for _, last in fault.spans)
         found += [] if padding or fault.kind == "noise" else [fault]
+    if lines := straight_parts(motion.acceleration):
+        found.append(SensorFault("straight", lines, sum(last - first + 1 for first, last in lines) / motion.n_steps))
     return [Screened(motion.name, "m/s²", motion.dt, 0.0, tuple(found), is_motion=True)]
 
 
@@ -157,6 +159,7 @@ def _key(name: str) -> str:
 FAULTS = {
     "clipped": ("A sensor is clipped", "has its largest or smallest value for several samples in a row, {when}."),
     "stuck": ("A sensor was stuck", "stands still {when}, while it moves before and after."),
+    "straight": ("A motion has a gap", "is a straight line {when}, as over missing samples."),
     "spikes": ("A channel has spikes", "has spikes of one to three samples {when}."),
     "offset": ("A channel has an offset", "has the same mean in all its parts, about {level}."),
     "drift": ("A channel drifts", "has a mean that changes steadily, from {level}."),

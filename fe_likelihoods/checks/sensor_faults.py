@@ -11,7 +11,7 @@ import numpy as np
 
 from .finding import HALF
 
-__all__ = ["SensorFault", "find_sensor_faults", "runs_of"]
+__all__ = ["SensorFault", "find_sensor_faults", "runs_of", "straight_parts"]
 
 FEWEST = 50  # samples that are judged
 MATTERS = 0.25  # of the peak, or of the standard deviation: smaller parts hardly change a sum of squares
@@ -24,13 +24,14 @@ LEVEL = 0.02  # smallest mean of a tenth of a channel, or change of such means, 
 SMOOTH = 0.9  # share of the variance of these means in a polynomial; right channels: 0.8
 STEADY = HALF  # rate of a drift in the first and last third, as a share of the whole; after yielding: 0
 WHITE = 0.25  # largest autocorrelation at lags of one to six samples; right channels: 0.37; noise is 3/4 of the power
+STRAIGHT = 15  # equal steps of a motion in a row; right motions: 11
 WIDEST, AROUND, MOST_SPIKES = 3, 10, 200  # samples of a spike, samples around it that are looked at, and their number
 
 
 class SensorFault(NamedTuple):
     """A fault of one channel."""
 
-    kind: str  # "clipped", "stuck", "spikes", "offset", "drift" or "noise"
+    kind: str  # "clipped", "stuck", "spikes", "offset", "drift" or "noise"; of a motion also "straight"
     spans: tuple[tuple[int, int], ...]  # first and last samples, both included
     size: float  # of the peak, as the kind needs it [-]
     level: tuple[float, ...] = ()  # offset, or drift at evenly spaced samples, the first and the last included
@@ -126,6 +127,19 @@ def _stuck(x: np.ndarray) -> tuple[tuple[int, int], ...]:
                     still[first:after] |= bool(np.isfinite(found) and found >= least * level and noisy)
     # a quiet start, as of a shake table, is no fault
     return tuple((first, stop - 1) for first, stop in runs_of(still) if first > 0 or stop == len(x))
+
+
+def straight_parts(x: np.ndarray) -> tuple[tuple[int, int], ...]:
+    """First and last samples of straight lines in a motion (n,) that moves before and after, as readers fill gaps."""
+    steps = np.diff(x)
+    equal = (np.abs(np.diff(steps)) <= 4.0 * _round_off(x)) & (np.abs(steps[1:]) > 4.0 * _round_off(x))
+    found = []
+    for first, last in runs_of(equal):
+        sides = x[max(first + first - last, 0) : first], x[last + 2 : last + last + 2 - first]
+        if last - first >= STRAIGHT and min(side.std() if len(side) else 0.0 for side in sides) >= MATTERS * x.std():
+            found.append((first, last + 1))
+    # a motion with a larger step that was interpolated is straight everywhere
+    return tuple(found) if sum(last - first for first, last in found) < HALF * len(x) else ()
 
 
 def _moving_deviation(x: np.ndarray, length: int) -> np.ndarray:

@@ -5,7 +5,7 @@ import pytest
 
 from fe_likelihoods import Channel, Measurements, Record, check_data
 from fe_likelihoods.checks.screening import repair_lines, screen
-from fe_likelihoods.checks.sensor_faults import find_sensor_faults
+from fe_likelihoods.checks.sensor_faults import find_sensor_faults, straight_parts
 from tests.checks.real_channels import real_channels
 
 STEP, N = 0.01, 3000
@@ -128,10 +128,15 @@ def test_a_finding_says_when_and_has_a_line():
     assert lines[1].startswith('baseline = {"deck@1" = [[0.0, "1 g"]], top = [[0.500, ')
     (found,) = check_data(Measurements([top], STEP, [response(2, "displacement")]), Record("EQ", STEP, values))
     assert found.text.startswith("The motion EQ stands still at 7.000") and "missing" not in found.action
+    line, coarse = response(3, "acceleration"), np.interp(np.arange(20 * N) / 20, np.arange(N), response(3))
+    line[700:731] = np.linspace(line[700], line[730], 31)
+    gaps = [check_data(Measurements([top], STEP, [response(2)]), Record("EQ", STEP, x)) for x in (line, coarse)]
+    assert [[str(each) for each in found if each.kind == "A motion has a gap"] != [] for found in gaps] == [True, False]
 
 
 @pytest.mark.slow
 def test_real_records_and_measurements_are_left_alone(shared):
     named = {each.name for each in real_channels(shared) if find_sensor_faults(each.values, each.dimension)}
+    assert not [each.name for each in real_channels(shared) if straight_parts(each.values) and "acc" in each.dimension]
     # an accelerometer that is not level, and gravity
     assert all(name.startswith("Flexible_3_story") and name.endswith(("_y", "_z")) for name in named)
