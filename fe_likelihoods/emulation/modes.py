@@ -22,7 +22,7 @@ __all__ = ["Mode", "ModeSearch", "Search", "check_starts", "draw_starts", "find_
 _NEGLIGIBLE = 15.0  # a mode whose log-evidence is lower than the largest by more than this is dropped
 _LOOSEST = 5.0  # largest tolerance of a short part of the record
 _FLATTEST = 0.2  # smallest curvature of the Laplace approximation: five times the variance of the prior
-_APART = 0.25, 2.0  # prior standard deviations in one coordinate that part ends on a part of the record; times starts
+_APART = 0.25  # prior standard deviations in one coordinate that part ends on a part of the record
 _FEW = 6  # parameters whose differences cost about as much as two steps
 _MOST_STARTS, _DRAWN = 2, 4  # times the number asked for: that begin, and of which the highest begin
 _HOPELESS = 1.6  # log-density per measured number below the best end of a part: residuals five times as large
@@ -211,8 +211,8 @@ class Search:
         fronts = {k: (self._starts[k], small) for k in numbers}
         for place, part in enumerate(self._parts):
             whole = part.target is self._target
-            # many starts are close together, and none may be lost before the part of the record where they differ
-            apart = np.inf if whole else min(_APART[0], _APART[1] / numbers.stop)
+            # ends may differ on a later part of the record only, so that none may be lost before
+            apart = np.inf if whole else _APART
             shared = whole and self._target.n_structural > _FEW
             # one ascent leads: others often lead to its end, which costs them no derivatives
             order, leading = list(fronts), 1 if place or shared else len(fronts)
