@@ -131,15 +131,20 @@ def _stuck(x: np.ndarray) -> tuple[tuple[int, int], ...]:
 
 def straight_parts(x: np.ndarray) -> tuple[tuple[int, int], ...]:
     """First and last samples of straight lines in a motion (n,) that moves before and after, as readers fill gaps."""
-    steps = np.diff(x)
-    equal = (np.abs(np.diff(steps)) <= 4.0 * _round_off(x)) & (np.abs(steps[1:]) > 4.0 * _round_off(x))
-    found = []
+    steps, still, found = np.diff(x), 4.0 * _round_off(x), []
+    moves = np.abs(steps) > still
+    equal = (np.abs(np.diff(steps)) <= still) & moves[1:]
+    # a slope of rounded samples, which also are a straight line, is a multiple of their resolution
+    other = moves & ~(np.append(False, equal) | np.append(equal, False))
+    digit = np.abs(steps[other]).min(initial=np.inf)
     for first, last in runs_of(equal):
         sides = x[max(first + first - last, 0) : first], x[last + 2 : last + last + 2 - first]
-        if last - first >= STRAIGHT and min(side.std() if len(side) else 0.0 for side in sides) >= MATTERS * x.std():
+        rounded = abs(steps[last] / digit - round(steps[last] / digit)) < 1e-3
+        beside = min(side.std() if len(side) else 0.0 for side in sides)
+        if last - first >= STRAIGHT and not rounded and beside >= MATTERS * x.std():
             found.append((first, last + 1))
-    # a motion with a larger step that was interpolated is straight everywhere
-    return tuple(found) if sum(last - first for first, last in found) < HALF * len(x) else ()
+    # a motion with a larger step that was interpolated is straight wherever it moves
+    return tuple(found) if sum(last - first for first, last in found) < HALF * np.count_nonzero(moves) else ()
 
 
 def _moving_deviation(x: np.ndarray, length: int) -> np.ndarray:

@@ -130,8 +130,11 @@ def test_a_finding_says_when_and_has_a_line():
     assert found.text.startswith("The motion EQ stands still at 7.000") and "missing" not in found.action
     line, coarse = response(3, "acceleration"), np.interp(np.arange(20 * N) / 20, np.arange(N), response(3))
     line[700:731] = np.linspace(line[700], line[730], 31)
-    gaps = [check_data(Measurements([top], STEP, [response(2)]), Record("EQ", STEP, x)) for x in (line, coarse)]
-    assert [[str(each) for each in found if each.kind == "A motion has a gap"] != [] for found in gaps] == [True, False]
+    padded, k = np.append(coarse, np.zeros(40 * N)), np.arange(4000)
+    rounded = np.round(np.sin(np.pi * k / 4000) * np.sin(np.pi * k / 100), 2)  # straight parts, all at two digits
+    for x, gap in ((line, True), (coarse, False), (padded, False), (rounded, False)):
+        found = check_data(Measurements([top], STEP, [response(2)]), Record("EQ", STEP, x))
+        assert ("A motion has a gap" in {each.kind for each in found}) == gap
 
 
 @pytest.mark.slow
