@@ -2,7 +2,8 @@
 
 There is one more parameter, ``temperature_slope`` s [1/K], common to all modes and stiffnesses: at a temperature T,
 frequencies are f (1 + s (T - 20 °C)). Masses do not depend on it, so stiffnesses are k (1 + s (T - 20 °C))², and the
-displacements, rotations and strains of a linear structure under known loads are divided by this square.
+displacements, rotations, curvatures and strains of a linear structure under known loads are divided by this square;
+forces and stresses remain.
 """
 
 from functools import partial
@@ -20,6 +21,7 @@ __all__ = ["REFERENCE_TEMPERATURE", "SLOPE", "ModesWithSlope", "StaticAtTemperat
 
 SLOPE = "temperature_slope"
 REFERENCE_TEMPERATURE = 20.0  # [°C], of the stiffnesses of a model
+_REMAIN = "force", "moment", "stress"
 _OF_THE_MODEL = "code_parts", "jacobian", "nominal", "nominal_units", "simulate_together", "time_limit"
 
 
@@ -84,7 +86,8 @@ class StaticAtTemperatures(_WithSlope):
 
     def __init__(self, model: Model, temperatures: np.ndarray) -> None:
         super().__init__(model)
-        self._warmer = temperatures - REFERENCE_TEMPERATURE
+        moves = [each.dimension not in _REMAIN for each in self.channels]
+        self._warmer = np.outer(moves, temperatures - REFERENCE_TEMPERATURE)
 
     def _changed(self, response: np.ndarray, slope: float) -> np.ndarray:
         return response / np.square(1.0 + slope * self._warmer)

@@ -80,6 +80,8 @@ def test_load_cases_at_other_temperatures_have_the_slope_of_frequencies():
     for found, unit in zip(model.jacobian(theta), np.eye(2), strict=True):
         difference = (model.simulate(theta + 1e-6 * unit) - model.simulate(theta - 1e-6 * unit)) / 2e-6
         np.testing.assert_allclose(found, difference, rtol=1e-6, atol=1e-12)
+    reaction = LoadTest([Channel("reaction", "force", "N")], CASES, VALUES[:1], temperatures=-5.0)
+    np.testing.assert_array_equal(reaction.model(lambda theta: UNIT[:1], ("E",)).simulate(theta), UNIT[:1])
     assert test.at_temperatures(model.model).fingerprint == model.fingerprint != model.model.fingerprint
     with pytest.raises(ValueError, match="for each of 3 load cases, from -80 to 80; got 290"):
         LoadTest(CHANNELS, CASES, VALUES, temperatures=290.0)
