@@ -199,16 +199,15 @@ def supports(repeats: int = 1, structures: tuple[str, ...] = tuple(STRUCTURES)) 
             for row, limits in enumerate(grid):
                 options, limit = ((), ()) if limits is None else (limits[:2], limits[2:])
                 if options not in known:
-                    known[options] = slow_motions(motions, step, *options)
-                scores[name][row, 0] += bool(_apart(known[options], limit))
+                    slow = slow_motions(motions, step, *options)
+                    known[options] = {pair: each._replace(lag=0.0) for pair, each in slow.items()}  # gains alone
+                scores[name][row, 0] += bool(dict(supports_apart(known[options], range(3), *limit)))
                 for k, factor in wrong:
                     spoiled = {
-                        pair: each._replace(
-                            gain=each.gain * (factor if pair[0] == k else 1.0 / factor if pair[1] == k else 1.0)
-                        )
+                        pair: each._replace(gain=each.gain * factor ** ((pair[0] == k) - (pair[1] == k)))
                         for pair, each in known[options].items()
                     }
-                    scores[name][row, 1] += k in _apart(spoiled, limit)
+                    scores[name][row, 1] += k in dict(supports_apart(spoiled, range(3), *limit))
     rows = []
     for name in decks:
         others = sum(scores[each] for each in decks if each.split()[0] != name.split()[0])
@@ -219,11 +218,6 @@ def supports(repeats: int = 1, structures: tuple[str, ...] = tuple(STRUCTURES)) 
         note += f"; as set {scores[name][-1, 1]:.0f} and {scores[name][-1, 0]:.0f}"
         rows.append(Row("supports named", name, named, "", note))
     return rows
-
-
-def _apart(slow: dict, limit: tuple) -> set[int]:
-    """Numbers of supports with another gain or sign."""
-    return {k for k, fault in supports_apart(slow, range(3), *limit) if fault.kind != "lag"}
 
 
 def posterior_of(event: _Event) -> Posterior:
