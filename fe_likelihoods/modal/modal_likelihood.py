@@ -93,7 +93,7 @@ class ModalLikelihood(FELikelihood):
         model = _with_modes(model)
         self._paired = PairedModes(model if data.temperatures is None else ModesWithSlope(model), data, close)
         noise = modal_noise(self._paired, (frequency_error, shape_error), student_t)
-        self.held_out, self._student = held_out, noise.student
+        self.held_out = held_out
         if held_out is not None:
             sensor_rows(model, held_out)  # refuses what cannot be predicted
         super().__init__(self._paired, self._paired.measurements, noise, pool, **options)
@@ -156,7 +156,7 @@ class ModalLikelihood(FELikelihood):
         if not good.any():
             reason = batch.reasons[0] or "a frequency is not positive"
             raise SimulationFailed(f"none of {len(rows)} samples can be simulated; the first reason: {reason}")
-        return PredictedModes.of(paired, batch.response[good], errors[good], self._student)
+        return PredictedModes.of(paired, batch.response[good], errors[good], self.noise.student)
 
 
 class _ModesSimulator(Simulator):
