@@ -35,7 +35,9 @@ def _file(job: Job, section: str) -> tuple[Path, Dataset | None]:
     if not is_dataset(job, section):
         return path, None
     stated = ("column", "channel", "columns", "units", *given.READING, *(["zero"] if section == "measurements" else []))
-    if idle := [name for name in given.given() if name in stated]:
+    others = [each.measured.lower() for each in job.events.values() if each.measured]
+    of_events = section == "measurements" and not all(each.endswith(HDF5) for each in others)  # which these keys read
+    if not of_events and (idle := [name for name in given.given() if name in stated]):
         raise ValueError(f"{job.where(section)} {idle[0]}: a data set states this itself: leave the key out")
     return path, job.located(section, read_dataset, path)
 

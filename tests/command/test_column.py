@@ -95,8 +95,11 @@ def test_the_template_is_the_ready_made_posterior():
     point = usual.prior.mean()
     assert found.posterior.log_prob(point) == pytest.approx(usual.log_prob(point), rel=1e-12)
     file = ROOT / "data" / "templates" / "column.toml"
+    text = file.read_text().replace("# zero", "zero")
     with pytest.raises(ValueError, match="zero: a data set states this itself"):
-        make_problem(parse_job(file.read_text().replace("# zero", "zero"), file, file.parent))
+        make_problem(parse_job(text, file, file.parent))
+    event = '[events.weaker]\nfile = "base.csv"\nmeasured = "top.csv"\n'  # a table, for which the key is
+    make_problem(parse_job(text + event, file, file.parent))
 
 
 def test_sensors_below_the_top_and_drifts_of_floors_are_channels(column):

@@ -118,14 +118,13 @@ def test_student_errors_have_the_density_of_scipy(rng):
     shapes = np.where(np.isnan(frequencies)[:, :, None], np.nan, data.shapes)
     data = ModalData(frequencies, shapes, data.sensors, mode_numbers=[3, 1])
     likelihood = ModalLikelihood(FRAME, data).with_noise(ModalLikelihood(FRAME, data, student_t=4).noise)
-    found = likelihood([*theta, 0.02, 0.04])
     computed = StructureModes(FRAME).simulate(theta)[:, [2, 0]]
     c, sigma, expected = np.hypot(0.02, 1e-4), np.hypot(0.04, 1e-3), 0.0
     for k, j in ((0, 0), (0, 1), (1, 1)):
         expected += t.logpdf(computed[0, j] / frequencies[k, j] - 1.0, 4, scale=c)
         mac = (computed[1:, j] @ shapes[k, j]) ** 2 / (computed[1:, j] @ computed[1:, j])
         expected += multivariate_t.logpdf([np.sqrt(1.0 - mac), 0.0, 0.0], np.zeros(3), sigma**2 * np.eye(3), 4)
-    assert found == pytest.approx(expected, rel=1e-10)
+    assert likelihood([*theta, 0.02, 0.04]) == pytest.approx(expected, rel=1e-10)
     predicted = likelihood.predict_modes([[*theta, 0.02, 0.04]] * 50)
     half = 0.5 * np.diff(predicted.interval(0.9), axis=0)[0] / predicted.frequencies[0]
     np.testing.assert_allclose(half, t.ppf(0.95, 4) * 0.02, rtol=0.05)
