@@ -13,8 +13,8 @@ The file is a sequence of blocks: kind, length, two CRC-32, arrays in NumPy's fo
 ``MEMO``
     Arrays under a key: simulations of a guide, or the order in which points of an asynchronous run arrived.
 
-A kill can leave only the last block incomplete, and an incomplete block is dropped. Without a path, points are kept in
-memory, and arrays under a key in a temporary file.
+A kill can leave only the last block incomplete, and an incomplete block is dropped. Without a path, the latest
+points are kept in memory, and arrays under a key in a temporary file.
 """
 
 import errno
@@ -29,7 +29,6 @@ import weakref
 import zlib
 from collections import Counter
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -134,7 +133,8 @@ class Record:
     def __setstate__(self, state: dict):
         vars(self).update(state, _file=None)
         if state["_file"] is not None:
-            self._open_temporary().write(state["_file"])
+            with open(self._open_temporary().fileno(), "wb", closefd=False) as file:
+                file.write(state["_file"])
 
     # ------------------------------------------------------------------ evaluations
 
@@ -197,9 +197,15 @@ class Record:
         return merge_batches(self._batches[first:]) if self._batches else None
 
     def first(self, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """The first m <= n evaluated points (m, ndim), and their log-probabilities (m,)."""
+        """The first m <= n evaluated points (m, ndim) that are still known, and their log-probabilities (m,)."""
         coords, log_prob = (np.concatenate([batch[column][:n] for batch in self._batches])[:n] for column in (0, 1))
         return coords, log_prob
+
+    def drop_old_points(self, most: int) -> None:
+        """Forget points of a record in memory before the latest `most`: a long chain needs none of them."""
+        while self.path is None and self._batches and len(self._known) - len(self._batches[0].coords) >= most:
+            for point in np.ascontiguousarray(self._batches.pop(0).coords):
+                self._known.pop(point.tobytes(), None)
 
     # ------------------------------------------------------------------ arrays under a key
 
@@ -239,7 +245,7 @@ class Record:
 
     def _stored(self, place: tuple[int, int]) -> list[np.ndarray]:
         """The arrays in a block of the file."""
-        with nullcontext(self._file) if self.path is None else open(self.path, "rb") as file:
+        with open(self._file.fileno() if self.path is None else self.path, "rb", closefd=self.path is not None) as file:
             file.seek(place[0])
             return _arrays_of(file.read(place[1]))[1:]
 
@@ -288,7 +294,8 @@ class Record:
             weakref.finalize(self, file.close)
 
     def _open_temporary(self) -> Any:
-        self._file = tempfile.TemporaryFile()  # noqa: SIM115  as long as the record
+        # as long as the record; without a buffer, which a forked process would write a second time at its end
+        self._file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115
         weakref.finalize(self, self._file.close)
         return self._file
 

@@ -360,6 +360,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
                                 self._previous_state = stored = State(advanced, copy=True)
                                 if store:
                                     self._output.step_stored()
+                            self._record.drop_old_points(KEPT_POINTS)
                             self.seconds += time.perf_counter() - start
                             yield advanced
                             start = time.perf_counter()

@@ -1,5 +1,6 @@
-"""Arrays under a key of a record: large ones are in a file only, and are returned as they were."""
+"""Arrays under a key of a record are in a file only, and are returned as they were."""
 
+import io
 import pickle
 
 import numpy as np
@@ -27,5 +28,4 @@ def test_large_arrays_are_returned_as_they_were(tmp_path, in_file):
     for other in others:
         for arrays, expected in zip(asked_from(other, False), given, strict=True):
             assert len(arrays) == 2 and all(map(np.array_equal, arrays, expected))
-    held = sum(array.nbytes for each in record._arrays["key"] if isinstance(each, list) for array in each)
-    assert held < 2**10
+    assert in_file or isinstance(record._file, io.RawIOBase)  # a forked process would write a buffer again at its end
