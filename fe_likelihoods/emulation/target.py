@@ -156,8 +156,9 @@ class ResponseTarget:
         Parameters that may be zero are not transformed, except that those with a lognormal prior are logarithms.
         """
         other = copy.copy(self)
-        low, high = self._prior.from_normal(np.array([[-2.0], [2.0]]) * np.ones(self.ndim))
-        factors = (low > 0.0) & (high < _LARGEST_FACTOR * low)  # the prior keeps them away from zero
+        least, low, high = self._prior.from_normal(np.array([[-_AT_BOUND], [-2.0], [2.0]]) * np.ones(self.ndim))
+        # the prior keeps them away from zero, and excludes what has no logarithm
+        factors = (least >= 0.0) & (low > 0.0) & (high < _LARGEST_FACTOR * low)
         powers = np.where(self._prior.logarithmic, np.where(factors, min(power, 0), 0), np.where(factors, power, 1))
         other._power = powers[: self.n_structural]
         return other
