@@ -59,16 +59,16 @@ def test_near_a_bound_the_emulator_follows_the_response(prior):
     assert np.abs(emulated - true).max() < 0.3
 
 
+@pytest.mark.parametrize("damping", [LogNormal(0.8, 0.3), TruncatedNormal(1.0, 0.3, -np.inf)])
 @pytest.mark.parametrize("scale", SCALES)
-def test_a_line_is_straight_in_scaled_parameters(scale):
-    """In logarithms, in which lines are drawn; and scaled parameters increase with the coordinates."""
-    target = ResponseTarget(vibration(damping=LogNormal(0.8, 0.3)))
-    first, last = np.random.default_rng(1).standard_normal((2, 2))
-    shares = np.array([0.0, 0.3, 1.0])
+def test_a_line_is_straight_in_scaled_parameters(scale, damping):
+    """In logarithms, in which lines are drawn; and scaled parameters increase with the coordinates, also below zero."""
+    target = ResponseTarget(vibration(damping=damping))
+    (first, last), shares = np.random.default_rng(1).standard_normal((2, 2)), np.array([0.0, 0.3, 1.0])
     scaled = target.scaled(target.line(first, last, shares))
     np.testing.assert_allclose(scaled - scaled[0], shares[:, None] * (scaled[2] - scaled[0]), atol=1e-9)
     np.testing.assert_allclose(target.line(first, last, shares)[[0, 2]], [first, last], atol=1e-6)
-    assert (np.diff(target.in_scale(scale).scaled(np.outer(np.linspace(-3.0, 3.0, 9), [1.0, 1.0])), axis=0) > 0.0).all()
+    assert (np.diff(target.in_scale(scale).scaled(np.outer(np.linspace(-6.0, 3.0, 9), [1.0, 1.0])), axis=0) > 0.0).all()
 
 
 def test_uncertainty_enters_through_the_expected_likelihood():
