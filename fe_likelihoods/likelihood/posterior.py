@@ -27,7 +27,7 @@ from .gradient import likelihood_gradient, slopes_along
 from .joint import JointLikelihood
 from .likelihood import FELikelihood
 from .parameters import Parameter
-from .predictive_draws import MeasuredData, PredictiveDraws, measured_data, predictive_draws
+from .predictive_draws import MeasuredHistory, PredictiveDraws, measured_data, predictive_draws
 
 if TYPE_CHECKING:
     from ..emulation.guide import ResponseGuide
@@ -458,24 +458,19 @@ class Posterior:
 
         return posterior_modes(self, starts, seed, max_simulations)
 
-    def measured_data(self) -> MeasuredData:
-        """The measurements, without missing samples, and the records of the excitation; nothing is simulated."""
+    def measured_data(self) -> tuple[MeasuredHistory, ...]:
+        """The measurements, without missing samples; nothing is simulated."""
         return measured_data(self.likelihood)
 
-    def predictive_draws(self, samples: Any, block: float | None = None, seed: int = 0) -> PredictiveDraws:
-        """Predictions of the measurements by samples of the posterior, and the log-likelihood in blocks of time.
+    def predictive_draws(self, samples: Any, seed: int = 0) -> PredictiveDraws:
+        """Predictions of the measurements by samples of the posterior, without and with a draw of the noise.
 
-        The terms of all blocks (`PredictiveDraws.blocks`), for leave-one-out cross-validation, add up to
-        `log_likelihood`; for a `marginal` posterior they do so for one draw of its noise parameters. The responses are
-        cached, like those for a guide; cached ones are not simulated again.
+        The responses are cached, like those for a guide; cached ones are not simulated again.
 
         Parameters
         ----------
         samples : (n, ndim) float, or mapping
             Samples of the posterior.
-        block : float, optional
-            Length of a block [s], by default from the correlation of the residuals
-            (`fe_likelihoods.likelihood.predictive_draws.choose_blocks`).
         seed : int
             Seed of the noise.
 
@@ -486,12 +481,12 @@ class Posterior:
         Raises
         ------
         ValueError
-            For samples of another shape, or a length of a block that is not positive.
+            For samples of another shape.
         SimulationFailed
             If a sample cannot be simulated.
         """
         self._check_models("a prediction")
-        return predictive_draws(self.likelihood, as_points(samples, self.prior.names), block, seed)
+        return predictive_draws(self.likelihood, as_points(samples, self.prior.names), seed)
 
     def evaluation_queue(self, responses: bool = False) -> PointQueue:
         """A queue of points whose log-probabilities are returned in the order in which their simulations end.

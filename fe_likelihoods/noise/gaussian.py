@@ -537,20 +537,5 @@ class GaussianNoise:
 
         They are white, with a standard deviation of one, if the noise fits. All at the measured samples [SI].
         """
-        return self._whitened(residuals, response, parameters)[0]
-
-    @only_if(lambda noise: noise.level == "response")
-    def log_densities(self, residuals: np.ndarray, response: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        """Terms (n_channels, n_samples) of the log-likelihood, one per sample; zero where a sample is missing.
-
-        Arguments as for `whitened`.
-        """
-        white, logarithms = self._whitened(residuals, response, parameters)
-        return np.nan_to_num(-HALF_LOG_TWO_PI - logarithms - 0.5 * np.square(white), nan=0.0)
-
-    def _whitened(
-        self, residuals: np.ndarray, response: np.ndarray, parameters: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Whitened residuals, and the logarithm of the standard deviations at each sample."""
         sums, deviations = self._of_response(parameters, np.where(np.isnan(residuals), np.nan, response), None)
         return sums.whitened(residuals, deviations)

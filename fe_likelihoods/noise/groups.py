@@ -95,10 +95,9 @@ class PartSums(GroupSums):
         found = np.take_along_axis(deviations.T, _places(self, there.shape[1]), axis=1)
         return np.where(there, found, np.nan)
 
-    def whitened(self, residuals: np.ndarray, deviations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Residuals divided by their standard deviations, and the log standard deviations, at each sample."""
-        levels = self.in_time(deviations, ~np.isnan(residuals))
-        return residuals / levels, np.log(levels)
+    def whitened(self, residuals: np.ndarray, deviations: np.ndarray) -> np.ndarray:
+        """Residuals divided by their standard deviations at each sample."""
+        return residuals / self.in_time(deviations, ~np.isnan(residuals))
 
 
 @lru_cache(maxsize=64)  # the same for every simulation

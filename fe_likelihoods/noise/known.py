@@ -21,7 +21,6 @@ _METHODS = {
     "lag_one_correlations": 0,
     "response_deviations": 0,
     "whitened": 2,
-    "log_densities": 2,
 }
 _AGAIN = "under", "with_measurements"  # methods that return the noise for other data
 _OF_THE_NOISE = "channels", "statistic", "level", "gap_shares", "effective_samples", "counts", "n_sets", "student"

@@ -36,8 +36,7 @@ class Noise(Protocol):
     * ``response_deviations(parameters, response, dt)`` with the parameters (n_noise,) of one sample, which returns the
       standard deviations (n_channels, n_steps) of the errors, given a simulated response; used in predictions instead
       of ``standard_deviations`` where the noise depends on the response.
-    * ``whitened(residuals, response, parameters)`` and ``log_densities(residuals, response, parameters)`` at the
-      measured samples, for checks of residuals and for the log-likelihood in blocks of time.
+    * ``whitened(residuals, response, parameters)`` at the measured samples, for checks of residuals.
     * ``under(model, first)``, which returns the noise under the excitation of a model whose response begins at the step
       ``first``; called by a likelihood with its model, and by a prediction with the model under the predicted record.
     * ``with_measurements(measurements)``, which returns the noise for a part of the measurements; needed if the noise

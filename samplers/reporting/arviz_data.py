@@ -37,7 +37,6 @@ def to_arviz(
     parameter_names: Sequence[str] | None = None,
     discard: int = 0,
     draws: int = 400,
-    block: float | None = None,
     seed: int = 0,
 ) -> Any:
     """Convert one run, or several independent runs, to arviz data.
@@ -47,7 +46,7 @@ def to_arviz(
     sampler : sampler or sequence of samplers
         Samplers that have run, with chains of equal length; `emcee.EnsembleSampler` is accepted too.
     posterior : fe_likelihoods.Posterior, optional
-        Adds the groups that need simulations: ``posterior_predictive`` and ``log_likelihood``, from `draws` samples.
+        Adds the group ``posterior_predictive``, which needs simulations of `draws` samples.
     prediction : fe_likelihoods.prediction.prediction.Prediction, optional
         The result of `fe_likelihoods.propagate`; adds the group ``predictions``.
     parameter_names : sequence of str, optional
@@ -56,10 +55,7 @@ def to_arviz(
     discard : int
         Burn-in of each run, in steps. Chains of SMC and TMCMC have none.
     draws : int
-        Number of samples for the groups that need simulations, evenly spaced in the chains.
-    block : float, optional
-        Length of log-likelihood blocks [s]. Default: five correlation times of the residuals. Models that are compared
-        need the same length.
+        Number of samples that are simulated, evenly spaced in the chains.
     seed : int
         Seed for draws of the prior and the noise.
 
@@ -67,9 +63,8 @@ def to_arviz(
     -------
     arviz.InferenceData
         A DataTree from arviz 1.0 on; ``to_netcdf(path)`` writes it to a file. It has the groups ``posterior``,
-        ``sample_stats`` and, where they are known, ``prior``, ``observed_data``, ``constant_data``,
-        ``posterior_predictive``, ``log_likelihood`` and ``predictions``; ``docs/arviz`` describes them. A slash in the
-        name of a parameter or channel becomes ``_``.
+        ``sample_stats`` and, where they are known, ``prior``, ``observed_data``, ``posterior_predictive`` and
+        ``predictions``; ``docs/arviz`` describes them. A slash in the name of a parameter or channel becomes ``_``.
 
     Examples
     --------
@@ -112,9 +107,9 @@ def to_arviz(
     if (prior := _prior_group(runs, known, names, described, seed)) is not None:
         groups["prior"] = prior
     if hasattr(known, "measured_data"):
-        groups |= _measured_groups(known.measured_data())
+        groups["observed_data"] = _measured_group(known.measured_data())
     if posterior is not None:
-        groups |= _predictive_groups(posterior, chains, groups["observed_data"], draws, block, seed)
+        groups |= _predictive_group(posterior, chains, groups["observed_data"], draws, seed)
     if prediction is not None:
         groups["predictions"] = prediction.to_xarray()
     groups = {group: _without_slashes(dataset) for group, dataset in groups.items()}
@@ -243,56 +238,35 @@ def _time_coordinate(times: Mapping[str, np.ndarray]) -> tuple[dict[str, str], d
     return dimensions, {dimensions[name]: (dimensions[name], row, about) for name, row in times.items()}
 
 
-def _measured_groups(data: Any) -> dict[str, "xarray.Dataset"]:
+def _measured_group(histories: Sequence[Any]) -> "xarray.Dataset":
     import xarray
 
-    groups = {}
-    for group, histories in (("observed_data", data.channels), ("constant_data", data.excitations)):
-        dimensions, coordinates = _time_coordinate({each.name: each.time for each in histories})
-        variables = {
-            each.name: (dimensions[each.name], each.values, _about(each.channel, each.name)) for each in histories
-        }
-        groups[group] = xarray.Dataset(variables, coordinates)
-    groups["constant_data"] = groups["constant_data"].assign(
-        time_step=("channel", list(data.time_steps.values()), {"units": "s"}),
-        display_unit=("channel", [each.channel.unit for each in data.channels]),
-        quantity=("channel", [each.channel.quantity for each in data.channels]),
-        channel=[each.name for each in data.channels],
-    )
-    return groups
+    dimensions, coordinates = _time_coordinate({each.name: each.time for each in histories})
+    variables = {each.name: (dimensions[each.name], each.values, _about(each.channel, each.name)) for each in histories}
+    return xarray.Dataset(variables, coordinates)
 
 
 def _about(channel: Any, name: str) -> dict[str, str]:
     return {"units": channel.si_unit, "long_name": f"{name} [{channel.si_unit}]", "quantity": channel.quantity}
 
 
-def _predictive_groups(
-    posterior: Any, chains: np.ndarray, observed: "xarray.Dataset", draws: int, block: float | None, seed: int
+def _predictive_group(
+    posterior: Any, chains: np.ndarray, observed: "xarray.Dataset", draws: int, seed: int
 ) -> dict[str, "xarray.Dataset"]:
+    """Replicated measurements; none for a noise that cannot be drawn from."""
     import xarray
 
     n_chains, n_draws, ndim = chains.shape
     if not draws >= n_chains:
         raise ValueError(f"draws must be one or more for each of {n_chains} chains; got {draws!r}")
     chosen = np.unique(np.linspace(0, n_draws - 1, min(n_draws, -(-int(draws) // n_chains))).round().astype(int))
-    found = posterior.predictive_draws(chains[:, chosen].reshape(-1, ndim), block, seed)
+    found = posterior.predictive_draws(chains[:, chosen].reshape(-1, ndim), seed)
     shape, coordinates = (n_chains, len(chosen)), _coordinates(n_chains, chosen)
-    groups = {}
-    if found.replicates:
-        variables = {
-            name: (("chain", "draw", *observed[name].dims), values.reshape(*shape, -1), observed[name].attrs)
-            for name, values in found.replicates.items()
-        }
-        note = {"note": "replicated measurements: simulated response plus one draw of the noise per sample"}
-        groups["posterior_predictive"] = xarray.Dataset(variables, {**observed.coords, **coordinates}, note)
-    blocks = found.blocks
-    coordinates |= {
-        "block": np.arange(len(blocks.starts)),
-        "block_start": ("block", blocks.starts, {"units": "s"}),
-        "block_stop": ("block", blocks.stops, {"units": "s"}),
-        "block_part": ("block", list(blocks.parts)),
+    if not found.replicates:
+        return {}
+    variables = {
+        name: (("chain", "draw", *observed[name].dims), values.reshape(*shape, -1), observed[name].attrs)
+        for name, values in found.replicates.items()
     }
-    values = {"measurements": (("chain", "draw", "block"), blocks.values.reshape(*shape, -1))}
-    about = {"note": "\n".join([blocks.note, *found.notes]), "block_seconds": blocks.seconds}
-    groups["log_likelihood"] = xarray.Dataset(values, coordinates, about)
-    return groups
+    note = "\n".join(["simulated response plus one draw of the noise per sample", *found.notes])
+    return {"posterior_predictive": xarray.Dataset(variables, {**observed.coords, **coordinates}, {"note": note})}

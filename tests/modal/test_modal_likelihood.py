@@ -228,15 +228,6 @@ def test_a_model_without_modes_is_refused(rng):
         ModalLikelihood(model, identified(np.ones(4), [1], rng))
 
 
-def test_several_identifications_are_one_observation(rng):
-    """For comparisons of models: modes have no blocks of time, and the term is the log-likelihood."""
-    data = identified(np.ones(4), [1, 3], rng, n_sets=30, frequency_cv=0.01, shape_error=0.03)
-    posterior = Posterior(ModalLikelihood(FRAME, data), PRIOR)
-    points = posterior.sample_prior(3, 1)
-    found = posterior.predictive_draws(points)
-    np.testing.assert_allclose(found.blocks.values[:, 0], posterior.log_likelihood(points), rtol=1e-12)
-
-
 def test_the_user_s_code_is_known_within_the_paired_modes():
     """Else a cache of their predictions would return those of other code."""
     functions = (
