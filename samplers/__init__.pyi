@@ -1,5 +1,4 @@
 from . import presets
-from .cost import estimate_cost
 from .judgement.verdict import Verdict
 from .moves.population_moves import MixtureMove, RandomWalkMove
 from .rare_events import subset_simulation
@@ -24,7 +23,6 @@ __all__ = [
     "TemperedSampler",
     "Verdict",
     "compare_models",
-    "estimate_cost",
     "ladder_table",
     "plot_corner",
     "plot_marginals",

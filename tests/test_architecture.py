@@ -33,7 +33,6 @@ ORDER = {
         ("text_tables", "units"),
     ),
     "samplers": (
-        ("cost",),
         ("rare_events", "smc", "tmcmc"),
         ("tempered",),
         ("results",),

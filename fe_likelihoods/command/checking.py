@@ -1,9 +1,8 @@
-"""What the command ``check`` does: read everything, simulate a few times, estimate the cost, draw the picture."""
+"""What the command ``check`` does: read everything, simulate a few times, draw the picture."""
 
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from ..information.identifiability import identifiability
 from ..signals.error_measures import rrmse
 from ..units import from_si
 from .events import read_events
-from .job import Job, read_job
+from .job import read_job
 from .models import Problem, make_problem
 from .runs import CACHE, default_folder, is_free, make_sampler
 
@@ -39,7 +38,7 @@ def check_job(file: Path, picture: Path, say: Callable[[str], None], progress: b
             folder.mkdir(parents=True, exist_ok=True)
             cache = SimulationCache(folder / CACHE)
     problem = make_problem(job, cache)
-    sampler = make_sampler(job, problem)
+    make_sampler(job, problem)  # checks its settings
     events = read_events(job, problem)
     _say_data(problem, say)
     checked = _say_simulation(problem, say, progress)
@@ -52,11 +51,12 @@ def check_job(file: Path, picture: Path, say: Callable[[str], None], progress: b
     for event in events:
         compared = "without measurements" if event.measured is None else "compared with measurements"
         say(f"Event {event.name}: {event.record}, {compared}")
-    timed = _say_cost(job, sampler, say)
+    if (most := job.budget.max_simulations) is not None:
+        say(f"The run stops at {most} simulations (max_simulations)")
     names = ", ".join(map(str, _draw(problem, checked, picture)))
     say(f"{names}: the measurements should lie within the band of the simulations at draws of the prior")
     stored = "" if cache is None else f", those of the calibrated model are stored in {folder}/ for the run"
-    say(f"This check made {checked.simulations + timed} simulations{stored}")
+    say(f"This check made {checked.simulations} simulations{stored}")
     say(f"Next: fe-likelihoods run {file} (writes to {folder}/)")
 
 
@@ -107,29 +107,6 @@ def _say_simulation(problem: Problem, say: Callable[[str], None], progress: bool
             say(f"{told}")
             return checked._replace(simulations=checked.simulations + round(told.simulations))
     return checked
-
-
-def _say_cost(job: Job, sampler: Any, say: Callable[[str], None]) -> int:
-    """Estimate the cost with simulations that are not cached; returns their number."""
-    from samplers import estimate_cost
-
-    posterior, most = make_problem(job).posterior, job.budget.max_simulations
-    estimate = estimate_cost(posterior, sampler.nwalkers, type(sampler), seed=1)
-    if job.sampler.guide:
-        say(
-            f"The run uses a guide: how many simulations it needs is not predicted; 500 take {estimate.time_of(500)}, "
-            "to which the guide adds its own computations, half a minute for 7 parameters"
-        )
-    else:
-        say(f"Estimated cost until beta = 1:\n{estimate}")
-    if most is not None:
-        say(f"The run stops at {most} simulations (max_simulations)")
-        if not job.sampler.guide and most < estimate.fewest:
-            say(
-                f"CAUTION: it needs about {estimate.fewest:.3g} or more, and will probably end before beta = 1; a "
-                "larger max_simulations continues it"
-            )
-    return posterior.report()["simulations"]
 
 
 def _draw(problem: Problem, checked: ModelCheck, picture: Path) -> list[Path]:
