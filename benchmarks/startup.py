@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[1]
 LIMIT_IMPORT, LIMIT_COMPILATION = 0.5, 60.0
 IMPORTS = (
     "import fe_likelihoods, samplers",
-    "import fe_likelihoods.problems",
+    "from fe_likelihoods import *; from samplers import *",
     "from samplers import SMCSampler",
     "import fe_likelihoods; fe_likelihoods.problems.bridge_column()",
     "import fe_likelihoods; fe_likelihoods.problems.isolated_bridge()",
@@ -49,7 +49,7 @@ print(json.dumps([*first, time.perf_counter() - start, len(compiled.buffer) / 2]
 
 def _run(code: str, cache: str | None = None, root: Path = ROOT) -> list[float]:
     """Seconds that `code` prints in a new interpreter, with the folder `cache` for compiled kernels if given."""
-    environment = dict(os.environ) | ({} if cache is None else {"FE_LIKELIHOODS_CACHE": cache})
+    environment = os.environ | {"PYTHONDONTWRITEBYTECODE": ""} | ({"FE_LIKELIHOODS_CACHE": cache} if cache else {})
     run = subprocess.run([sys.executable, "-c", code], cwd=root, env=environment, capture_output=True, text=True)
     if run.returncode:
         raise RuntimeError(f"the process ended with code {run.returncode}: {run.stderr[-2000:]}")

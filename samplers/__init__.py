@@ -1,8 +1,8 @@
 """Tempered ensemble samplers behind emcee's interface.
 
 All public names can be imported from here, ``from samplers import SMCSampler, compare_models``, and are loaded on first
-use: importing the package takes about 0.01 s, importing emcee with `scipy.stats` takes longer. The names are listed in
-``__init__.pyi``, which editors and type checkers read as well.
+use: importing the package takes about 0.01 s. The names are listed in ``__init__.pyi``, which editors and type
+checkers read as well.
 """
 
 import lazy_loader

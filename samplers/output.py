@@ -11,9 +11,8 @@ from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import numpy as np
-from emcee import State
-from emcee.backends import Backend, HDFBackend
 
+from .emcee_names import Backend, HDFBackend, State
 from .estimates.importance import EvidenceCheck
 from .finding import Finding
 from .judgement.verdict import Verdict

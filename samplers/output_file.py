@@ -18,8 +18,8 @@ from typing import Any
 
 import h5py
 import numpy as np
-from emcee.backends import Backend, HDFBackend
 
+from .emcee_names import Backend, HDFBackend
 from .interrupts import deferred_interrupts
 from .locks import locked_folder
 

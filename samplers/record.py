@@ -36,9 +36,9 @@ from urllib.parse import quote
 
 import h5py
 import numpy as np
-from emcee.backends import Backend, HDFBackend
 
 from .blobs import joined
+from .emcee_names import Backend, HDFBackend
 from .interrupts import deferred_interrupts
 from .locks import lock_now
 from .output_file import DAMAGED, run_of_file, whole_file

@@ -10,8 +10,8 @@ from numbers import Integral
 from typing import Any
 
 import numpy as np
-from emcee.backends import Backend
 
+from .emcee_names import Backend
 from .resampling import RESAMPLING
 
 __all__ = ["MOVES", "Settings", "as_whole_number", "check_arguments", "check_names", "most_moves"]

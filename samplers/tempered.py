@@ -23,9 +23,9 @@ from dataclasses import asdict, fields
 from typing import Any
 
 import numpy as np
-from emcee import EnsembleSampler, State
 
 from .budget import Budget, BudgetExhausted, as_limit
+from .emcee_names import EnsembleSampler, State
 from .estimates.importance import EvidenceCheck
 from .evaluation.asynchronous import AsynchronousEvaluator, check_asynchronous
 from .evaluation.evaluator import Evaluator, unpack

@@ -44,7 +44,7 @@ ORDER = {
         ("budget", "estimates", "moves"),
         ("proposals", "record", "settings"),
         ("output_file",),
-        ("blobs", "finding", "interrupts", "locks", "resampling"),
+        ("blobs", "emcee_names", "finding", "interrupts", "locks", "resampling"),
     ),
 }
 

@@ -4,9 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from scipy.special import ndtri
-from scipy.stats import chi2
-from scipy.stats import t as student
+from scipy.special import chdtrc, ndtri, stdtrit
 
 from ..text_tables import listed
 from .fault_words import finding_of
@@ -96,7 +94,7 @@ def _check_reach(modes: Any) -> list[Finding]:
     """Frequencies further from the nearest draw than all draws are from each other, and than one more would be."""
     logs = np.log(modes.data.mean_frequencies / modes.frequencies)
     n, m = logs.shape
-    reach = student.ppf(1.0 - 0.5 * SMALL_PROBABILITY / m, n - 1) * logs.std(axis=0) * np.sqrt((n + 1) / max(n - 1, 1))
+    reach = stdtrit(n - 1, 1.0 - 0.5 * SMALL_PROBABILITY / m) * logs.std(axis=0) * np.sqrt((n + 1) / max(n - 1, 1))
     beyond = np.maximum(logs.min(axis=0), -logs.max(axis=0)) > np.ptp(logs, axis=0)
     shown = [
         f"{_number(modes, k)}, computed {modes.frequencies[:, k].min():.4g} to {modes.frequencies[:, k].max():.4g} Hz"
@@ -133,7 +131,7 @@ def check_squares(squares: np.ndarray, n: int, names: Sequence[str], what: str, 
     """Whether squares (m,) of residuals by their stated errors, NaN where unknown, are larger than n errors explain."""
     square = float(np.nansum(squares))
     factor = float(np.sqrt(square / n))
-    if not chi2.sf(square, n) < SMALL_PROBABILITY:
+    if not chdtrc(n, square) < SMALL_PROBABILITY:
         return []
     text = (
         f"{what} differ from the model by {factor:.2g} times their stated errors (root mean square): intervals of the "

@@ -10,9 +10,9 @@ from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
-from emcee import EnsembleSampler
 
 from samplers import Verdict
+from samplers.emcee_names import EnsembleSampler
 from samplers.judgement.failures import NearFailures, failures_near
 
 from ..likelihood.failure_log import reason_without_numbers

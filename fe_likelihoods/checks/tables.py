@@ -19,7 +19,7 @@ from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from .faults import FACTOR, Fault
 from .finding import HALF, SMALL_PROBABILITY, TAIL
@@ -84,7 +84,7 @@ def find_change(
     chance = FACTOR * float(np.max(np.square(right @ weights) / np.diag(weights)))
     found = []  # of these kinds the first ones have fewer numbers to fit
     for (kind, *names), other in others.items():
-        least = chi2.isf(SMALL_PROBABILITY / len(others), 1)
+        least = chdtri(1, SMALL_PROBABILITY / len(others))
         rank, value = (0, -1.0) if kind == "value" else (2, np.nan)  # a number with the other sign
         found.append((rank, before - other.distance()[0], least, kind, tuple(names), value))
     for names, rows in factors.items():

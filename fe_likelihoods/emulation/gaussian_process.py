@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, qr, solve_triangular
-from scipy.optimize import minimize
 
 __all__ = ["GaussianProcess", "fit_process", "left_out_errors", "predict", "predict_mean"]
 
@@ -100,6 +99,8 @@ def fit_process(
         log_scales = min((np.full(d, scale) for scale in np.arange(0.2, 3.4, 0.4)), key=lambda scales: loss(scales)[0])
     log_scales = np.asarray(log_scales, dtype=float)
     if iterations > 0:
+        from scipy.optimize import minimize  # slow to import
+
         bounds, options = [_LOG_SCALES] * d, {"maxiter": iterations}
         log_scales = minimize(loss, log_scales, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
     nuggets = _NUGGETS[_restricted(log_scales, *fixed)[0].argmin(axis=0)]

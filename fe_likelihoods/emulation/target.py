@@ -17,7 +17,6 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize
 
 from ..signals.durations import growing_durations
 from .archive import Archive
@@ -268,6 +267,7 @@ class ResponseTarget:
 
         The search begins at coordinates (n_noise,) near the result, or with a grid.
         """
+        from scipy.optimize import minimize  # slow to import
 
         def density(coords: np.ndarray) -> np.ndarray:
             repeated = np.broadcast_to(statistics, (len(coords), len(statistics)))

@@ -17,7 +17,6 @@ from itertools import zip_longest
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize
 from scipy.special import logsumexp
 
 from ..emulation.modes import Mode, find_modes
@@ -220,6 +219,8 @@ def _linear_posterior(posterior: Any, tangents: Sequence[_Linear]) -> Any:
 
 def _top(linear: Any, x: np.ndarray, sd: np.ndarray, bounds: np.ndarray) -> np.ndarray:
     """Most probable parameters (ndim,) of a posterior with linear responses, from a point."""
+    from scipy.optimize import minimize  # slow to import
+
     found = minimize(
         lambda z: (linear.negative_log_prob(z * sd), -linear.grad_log_prob(z * sd) * sd),
         x / sd,

@@ -23,7 +23,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import orth
-from scipy.optimize import linear_sum_assignment
 
 __all__ = ["Paired", "close_groups", "pair_modes"]
 
@@ -56,6 +55,8 @@ def pair_modes(frequencies: np.ndarray, shapes: np.ndarray, measured: Any, group
     Pairs are assigned so that the sum of 1 - MAC, with a weak term in the frequencies, is least. Modes without a shape
     are paired by their number. `groups` are modes that are close to each other (`ModalData.groups`).
     """
+    from scipy.optimize import linear_sum_assignment  # slow to import
+
     clusters, counts = close_groups(frequencies, _COINCIDENT), measured.has_shape.sum(axis=0)
     members = {mode: cluster for cluster in clusters for mode in cluster}
     lengths = np.linalg.norm(shapes, axis=-1, keepdims=True)

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import brentq
 
 from ..kernels import bar_fatigue, concrete04, reinforcing_steel
 from ..kernels.fiber_section import Sections, commit, forces, reset
@@ -160,6 +159,7 @@ def _advance(
 
 def _balance(sections: Sections, start: float, curvature: float, axial_force: float, tolerance: float) -> float | None:
     """Axial strain at a curvature and an axial force, sought from `start`; None if there is no equilibrium."""
+    from scipy.optimize import brentq  # slow to import
 
     def excess(strain: float) -> float:
         return forces(strain, -curvature, 0, sections)[0] - axial_force

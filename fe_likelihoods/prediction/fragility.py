@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import optimize, special
+from scipy import special
 
 from ..events.ratios import EventRatios
 from ..text_tables import number, text_table
@@ -205,6 +205,8 @@ def fit_fragility(intensity: np.ndarray, exceedances: np.ndarray, trials: np.nda
             "the points do not determine the slope: use more intensities between those where none and all exceed"
         )
 
+    from scipy.optimize import minimize  # slow to import
+
     logs = np.log(intensity)
     centre, width = logs.mean(), logs.std()
     x = (logs - centre) / width
@@ -218,7 +220,7 @@ def fit_fragility(intensity: np.ndarray, exceedances: np.ndarray, trials: np.nda
         value = exceedances @ above + (trials - exceedances) @ below
         return -value / total, -np.array([slope.sum(), slope @ x]) / total
 
-    found = optimize.minimize(loss, np.array([0.0, 1.0]), jac=True, method="BFGS", options={"gtol": 1e-8})
+    found = minimize(loss, np.array([0.0, 1.0]), jac=True, method="BFGS", options={"gtol": 1e-8})
     offset, slope = found.x
     if not (np.isfinite(found.x).all() and slope > 0.0):
         raise ValueError(

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import stats
+from scipy.special import betainccinv, betaincinv
 
 from ..events.ratios import EventRatios
 from ..signals.channels import Channel
@@ -334,8 +334,8 @@ def _binomial_interval(share: np.ndarray, effective: ArrayLike, level: float) ->
     share = np.asarray(share, dtype=float)
     hits, misses = share * effective, (1.0 - share) * effective
     # The beta distribution does not exist for a count of zero. The bound is then 0 or 1.
-    lower = np.where(hits > 0.0, stats.beta.ppf(tail, np.maximum(hits, 1e-300), misses + 1.0), 0.0)
-    upper = np.where(misses > 0.0, stats.beta.isf(tail, hits + 1.0, np.maximum(misses, 1e-300)), 1.0)
+    lower = np.where(hits > 0.0, betaincinv(np.maximum(hits, 1e-300), misses + 1.0, tail), 0.0)
+    upper = np.where(misses > 0.0, betainccinv(hits + 1.0, np.maximum(misses, 1e-300), tail), 1.0)
     return lower, upper
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy import stats
+from scipy.special import ndtr, stdtrit
 
 from ..proposals.mixture import Mixture, draw
 from .pareto import LARGEST_SHAPE, pareto_shape, tail_size
@@ -243,7 +243,7 @@ def tail_growth(rounds: Sequence[Round], part: float = 0.5) -> tuple[float, floa
     slope = float(depth @ log_weights) / squares
     left = log_weights - slope * depth
     error = float(np.sqrt(left @ left / (len(depth) - 2) / squares))
-    few = float(stats.t.isf(stats.norm.sf(SIGNIFICANT), len(depth) - 2)) / SIGNIFICANT
+    few = float(-stdtrit(len(depth) - 2, ndtr(-SIGNIFICANT))) / SIGNIFICANT
     return slope, few * error
 
 

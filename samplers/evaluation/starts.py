@@ -9,7 +9,6 @@ zero (Besag & Clifford 1989, Generalized Monte Carlo significance tests, doi:10.
 from collections.abc import Callable
 
 import numpy as np
-from scipy import stats
 
 __all__ = ["not_of_the_prior"]
 
@@ -28,6 +27,8 @@ def not_of_the_prior(coords: np.ndarray, log_prior: Callable[[np.ndarray], np.nd
     (n, ndim), random = coords.shape, np.random.RandomState(SEED)
     if n < FEWEST_POINTS:
         return ""
+    from scipy.stats import wilcoxon  # slow to import
+
     if np.any(np.ptp(coords, axis=0) == 0.0):
         return "a parameter has the same value in all points"
     halves = np.array_split(coords[random.permutation(n)], 2)
@@ -44,7 +45,7 @@ def not_of_the_prior(coords: np.ndarray, log_prior: Callable[[np.ndarray], np.nd
         scale[scale == 0.0] = 1.0
         before, after = (np.sum(((x - centre) / scale) ** 2, axis=1) for x in (start, points))
         change = (after - before)[after != before]
-        if len(change) > 1 and (p := stats.wilcoxon(change).pvalue) < LEVEL / 2:
+        if len(change) > 1 and (p := wilcoxon(change).pvalue) < LEVEL / 2:
             verb = "spreads" if np.median(change) > 0.0 else "contracts"
             return f"the population {verb} in Metropolis steps that keep the prior (p = {p:.1g})"
     return ""

@@ -7,8 +7,8 @@ from numbers import Integral
 from typing import Any
 
 import numpy as np
-from emcee.ensemble import ndarray_to_list_of_dicts, walkers_independent
 
+from ..emcee_names import ndarray_to_list_of_dicts, walkers_independent
 from ..interrupts import Ended, SentFunction, interrupts_end_the_run, raise_if_it_ends_the_run
 from ..record import EvaluatedBatch
 from .starts import not_of_the_prior

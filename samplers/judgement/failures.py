@@ -7,8 +7,6 @@ evidence or move reveals; scattered among successful points, failures hardly cha
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
-from scipy.stats import binom
 
 from ..finding import CARE, WRONG, Finding
 
@@ -70,6 +68,8 @@ class NearFailures(NamedTuple):
             return "away"
         if self.scattered:
             return "scattered" if self.failed > LARGE_SHARE_NEAR * self.evaluated else "away"
+        from scipy.stats import binom  # slow to import
+
         is_large = binom.sf(self.failed - 1, self.evaluated, LARGE_SHARE_NEAR) < CHANCE
         # of failures beside a bent posterior, far fewer adjoin the samples than of the other points in the ellipsoid
         adjoin = self.adjoining * self.evaluated > LEAST_ADJOINING * self.failed * self.nearest
@@ -107,6 +107,9 @@ def failures_near(samples: np.ndarray, failed: np.ndarray, succeeded: np.ndarray
     number, evaluated = int(np.count_nonzero(inside & has_failed)), int(np.count_nonzero(inside))
     if not has_failed.any():
         return NearFailures(number, evaluated)
+    from scipy.spatial import cKDTree  # both are slow to import
+    from scipy.stats import binom
+
     tree = cKDTree(points)
     # long chains evaluate many points per sample, all of them closer than the next sample
     count = max(NEAREST, int(NEAREST_PER_SAMPLE * evaluated / len(distinct)))

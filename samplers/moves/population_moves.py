@@ -13,10 +13,8 @@ from numbers import Integral
 from typing import Any
 
 import numpy as np
-from emcee import State
-from emcee.model import Model
-from emcee.moves import DEMove, MHMove, Move
 
+from ..emcee_names import DEMove, MHMove, Model, Move, State
 from ..proposals.basins import find_basins, with_components
 from ..proposals.mixture import (
     Mixture,

@@ -5,8 +5,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import expit, logsumexp
-from scipy.stats import norm
+from scipy.special import expit, logsumexp, ndtri
 
 from .summary import aligned, log_posterior_of, verdict_summary_of
 
@@ -121,7 +120,7 @@ def compare_models(models: Mapping[str, Any], prior: Mapping[str, float] | None 
         odds[k] = score[k] - rest
         share = np.exp(np.delete(score, k) - rest) if rest > -np.inf else 0.0
         odds_error[k] = math.hypot(error[k], *(share * np.delete(error, k)))
-    reach = norm.ppf(0.975) * odds_error
+    reach = ndtri(0.975) * odds_error
     best = int(np.argmax(log_evidence))
     factor_error = np.where(np.arange(len(names)) == best, 0.0, np.hypot(error, error[best]))
     shares = before, probability, expit(odds - reach), expit(odds + reach)

@@ -9,8 +9,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import emcee.pbar
-
+from ..emcee_names import get_progress_bar
 from ..evaluation.evaluator import Evaluator
 from ..reports import AnnealingResult, GuideTick, Report, Restart, Stage, Sweep
 from ..tempering.population import Population
@@ -47,7 +46,7 @@ def _open_bar(display: bool | str, total: int | None, **kwargs: Any) -> Any:
     Where stderr is neither a terminal nor a notebook, the bar writes at most one line per minute and the last state.
     """
     if display is not True:
-        return emcee.pbar.get_progress_bar(display, total, **kwargs)
+        return get_progress_bar(display, total, **kwargs)
     from tqdm import tqdm as terminal_bar
     from tqdm.auto import tqdm
 

@@ -15,11 +15,9 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from emcee import State
-from emcee.model import Model
-from emcee.moves import DESnookerMove, Move, RedBlueMove
 
 from ..budget import BudgetExhausted
+from ..emcee_names import DESnookerMove, Model, Move, RedBlueMove, State
 from ..estimates.weights import LOWEST
 from ..judgement.checks import ROUNDING
 from ..moves.population_moves import MixtureMove
