@@ -163,6 +163,8 @@ class Climb:
             end = self.known[self.number]
             if steps is None or (start - end.coords) @ end.hessian @ (start - end.coords) >= _SAME_MODE * len(start):
                 yield from self._design(tolerance)
+            elif tolerance < TOLERANCE:
+                yield from self._climb(False, tolerance)
             end = self._quadratic()
             # where the data leave a direction to the prior, the emulator must reach as far as the prior
             free = axes_of(end)[np.linalg.eigvalsh(end.hessian) < _FREE][:_LONGEST]

@@ -14,6 +14,7 @@ from scipy.special import ndtri
 from samplers.judgement.guides import DOUBTED_SHARE
 from samplers.tempering.guide import GuideSession
 
+from ..text_tables import text_table
 from .levenberg_marquardt import FIRST_DIFFERENCE, TOLERANCE, Ascent, Climb, Jacobians, axes_of
 from .target import ResponseTarget, Runs, Steps, at_once, nothing_stored
 
@@ -26,6 +27,7 @@ _APART = 0.25  # prior standard deviations in one coordinate that part ends on a
 _FEW = 6  # parameters whose differences cost about as much as two steps
 _MOST_STARTS, _DRAWN = 2, 4  # times the number asked for: that begin, and of which the highest begin
 _HOPELESS = 1.6  # log-density per measured number below the best end of a part: residuals five times as large
+_STEP = 1e-4  # of the derivatives of parameters by coordinates
 _SHARES = 0.03, 0.1, 0.3, 0.6  # of the Arias intensity, at which the parts of the record end
 
 
@@ -36,8 +38,10 @@ class Mode(NamedTuple):
     ----------
     parameters : (ndim,) float
         All parameters at the mode of the density in standard normal coordinates.
+    parameter_covariance : (ndim, ndim) float
+        Laplace approximation of their covariance.
     coords : (ndim,) float
-        These coordinates.
+        The mode in these coordinates.
     covariance : (ndim, ndim) float
         Covariance of the coordinates in the Laplace approximation.
     log_density : float
@@ -49,6 +53,7 @@ class Mode(NamedTuple):
     """
 
     parameters: np.ndarray
+    parameter_covariance: np.ndarray
     coords: np.ndarray
     covariance: np.ndarray
     log_density: float
@@ -57,12 +62,12 @@ class Mode(NamedTuple):
 
 
 class ModeSearch(NamedTuple):
-    """Result of a search for modes.
+    """Result of a search for modes; printed as a table.
 
     Attributes
     ----------
     modes : tuple of Mode
-        Distinct modes, the highest first.
+        Distinct modes, the one with the largest evidence first.
     ends : tuple of int
         Mode in which each start ended, -1 where it ended in none (a start that failed, or a mode of no weight).
     simulations : float
@@ -71,6 +76,7 @@ class ModeSearch(NamedTuple):
         False if `max_simulations` ended the search.
     grown : bool
         Whether it began with the first part of the record, where most starts are given up, in right runs as well.
+    parameter_names : tuple of str
     """
 
     modes: tuple[Mode, ...]
@@ -78,6 +84,22 @@ class ModeSearch(NamedTuple):
     simulations: float
     finished: bool
     grown: bool = False
+    parameter_names: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        rows = [["parameter", *(f"mode {k + 1}" for k in range(len(self.modes)))]]
+        for k, name in enumerate(self.parameter_names):
+            ends = ((mode.parameters[k], np.sqrt(mode.parameter_covariance[k, k])) for mode in self.modes)
+            rows.append([name, *(f"{value:.4g} +- {sd:.2g}" for value, sd in ends)])
+        rows.append(["log-evidence", *(f"{mode.log_evidence:.2f}" for mode in self.modes)])
+        rows.append(["share", *(f"{np.exp(mode.log_evidence - self.log_evidence):.2g}" for mode in self.modes)])
+        rows.append(["converged", *("yes" if mode.converged else "no" for mode in self.modes)])
+        return text_table(rows)
+
+    @property
+    def log_evidence(self) -> float:
+        """Logarithm of the evidence, the sum over the modes; -inf without a mode."""
+        return float(np.logaddexp.reduce([mode.log_evidence for mode in self.modes], initial=-np.inf))
 
     @property
     def ended(self) -> int:
@@ -126,7 +148,10 @@ def laplace(target: ResponseTarget, end: Ascent) -> Mode:
     values = np.maximum(values, _FLATTEST)
     covariance, top = (vectors / values) @ vectors.T, float(log_density(at[None])[0])
     log_evidence = top + 0.5 * target.ndim * float(np.log(2.0 * np.pi)) - 0.5 * float(np.log(values).sum())
-    return Mode(target.parameters(at[None])[0], at, covariance, top, log_evidence, finite and end.converged)
+    ahead, behind = (target.parameters(at + sign * _STEP * unit) for sign in (1.0, -1.0))
+    tangents = (ahead - behind) / (2.0 * _STEP)
+    spread = tangents.T @ covariance @ tangents
+    return Mode(target.parameters(at[None])[0], spread, at, covariance, top, log_evidence, finite and end.converged)
 
 
 class _OutOfBudget(Exception):
@@ -145,11 +170,13 @@ class _Part(NamedTuple):
 class Search:
     """Search from starts (n, n_structural) [standard normal coordinates], on growing parts of the record if possible.
 
-    `session` is a `GuideSession`, `spent` are the simulations so far.
+    `session` is a `GuideSession`, `spent` are the simulations so far. Ascents leave less than a `tolerance` of
+    log-density to gain.
     """
 
-    def __init__(self, target: ResponseTarget, starts: np.ndarray, session: Any) -> None:
+    def __init__(self, target: ResponseTarget, starts: np.ndarray, session: Any, tolerance: float = TOLERANCE) -> None:
         self._target, self._starts, self._session, self.spent = target, starts, session, 0.0
+        self._tolerance = tolerance
         parts = [*target.shortened(_SHARES), target]
         self._parts = [_Part(part, part.n_steps / target.n_steps, {}, Jacobians()) for part in parts]
         self._standing_for: list[int] = []  # start that has taken the place of each; -1 for none
@@ -223,7 +250,8 @@ class Search:
                     jacobians = part.jacobians if shared else Jacobians()
                     centre = np.zeros(self._target.n_structural) if whole else start
                     climb = Climb(part.target, jacobians, k, centre, part.ends, apart, whole)
-                    ascents[k] = climb.run(start, steps, TOLERANCE if whole else min(TOLERANCE / part.share, _LOOSEST))
+                    least = self._tolerance if whole else min(TOLERANCE / part.share, _LOOSEST)
+                    ascents[k] = climb.run(start, steps, least)
                 yield from self._side_by_side(part, ascents)
             # a model that is not exact may fit a part of the record best where it does not fit the whole one
             heights = {k: end.value for k, end in part.ends.items()}
@@ -271,7 +299,8 @@ class Search:
             for _ in self._standing_for:  # two starts may stand for each other, one of them on an earlier part
                 k = k if k < 0 or k in ends else self._standing_for[k]
             led.append(next((number for number, (_, start) in enumerate(kept) if start == k), -1))
-        return ModeSearch(tuple(mode for mode, _ in kept), tuple(led), self.spent, finished, len(self._parts) > 1)
+        names, grown = tuple(self._target.posterior.parameter_names), len(self._parts) > 1
+        return ModeSearch(tuple(mode for mode, _ in kept), tuple(led), self.spent, finished, grown, names)
 
 
 def draw_starts(target: ResponseTarget, n: int, random: Any) -> np.ndarray:
@@ -295,7 +324,13 @@ def check_starts(starts: Any) -> int:
     return int(starts)
 
 
-def find_modes(posterior: Any, starts: int = 12, seed: Any = None, max_simulations: float | None = None) -> ModeSearch:
+def find_modes(
+    posterior: Any,
+    starts: int = 12,
+    seed: Any = None,
+    max_simulations: float | None = None,
+    tolerance: float = TOLERANCE,
+) -> ModeSearch:
     """Find the modes of a posterior from the responses of its model.
 
     Parameters
@@ -309,6 +344,8 @@ def find_modes(posterior: Any, starts: int = 12, seed: Any = None, max_simulatio
         Seed of the draws.
     max_simulations : float, optional
         Largest number of simulations; parts of a record count as fractions.
+    tolerance : float
+        Log-density that an ascent may leave to gain: the default is enough for draws around the modes.
 
     Returns
     -------
@@ -338,5 +375,5 @@ def find_modes(posterior: Any, starts: int = 12, seed: Any = None, max_simulatio
     session = GuideSession(
         random, nothing_stored, lambda n: search.spent + n <= limit, lambda: limit - search.spent, False
     )
-    search = Search(target, draw_starts(target, starts, random), session)
+    search = Search(target, draw_starts(target, starts, random), session, tolerance)
     return at_once(search.run(starts))

@@ -60,53 +60,32 @@ def likelihood_gradient(
     """
     total, good = np.zeros(rows.shape), np.ones(len(rows), dtype=bool)
     for part, columns in likelihood.parts():
-        left = np.flatnonzero(good)
-        slopes, succeeded = _of_part(part, rows[np.ix_(left, columns)], sd[columns], bounds[columns])
-        total[np.ix_(left, columns)] += slopes
-        good[left[~succeeded]] = False
+        own, left = columns[: part.simulator.n_structural], np.flatnonzero(good)
+        batch, noise = part.simulate(rows[np.ix_(left, own)]), columns[len(own) :]
+        good[left] = [not reason for reason in batch.reasons]
+        derivatives = derivatives_batch(part.model, rows[np.ix_(good, own)], part.simulator.pool)
+        for k, response, along in zip(np.flatnonzero(good), batch.response[good[left]], derivatives, strict=True):
+            total[k, columns] += _slopes(part, response, along, rows[k, noise], sd[noise], bounds[noise])
     total[~good] = 0.0
     return total, good
 
 
-def _of_part(part: Any, rows: np.ndarray, sd: np.ndarray, bounds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Gradient (n, k) of one likelihood, and whether each of its n simulations succeeded."""
-    d, model, slopes = part.simulator.n_structural, part.model, np.zeros(rows.shape)
-    batch = part.simulate(rows[:, :d])
-    good = np.array([not reason for reason in batch.reasons])
-    derivatives = derivatives_batch(model, rows[good, :d], part.simulator.pool)
-    for k, along in zip(np.flatnonzero(good), derivatives, strict=True):
-        noise, response = rows[k, d:], batch.response[k]
-        slopes[k, :d] = _along_responses(part, response, along, noise)
-        if d < rows.shape[1]:
-            here = _statistics(part, response[None])
+def _slopes(
+    part: Any, response: np.ndarray, along: np.ndarray, noise: np.ndarray, sd: np.ndarray, bounds: np.ndarray
+) -> np.ndarray:
+    """Derivatives of a log-likelihood as its response (c, n) moves along derivatives (d, c, n), and by its noise."""
+    d = len(along)
 
-            def of_noise(values: np.ndarray, here: np.ndarray = here) -> np.ndarray:
-                return part.noise.log_likelihood(np.repeat(here, len(values), 0), part.n_samples, values)
+    def density(moved: np.ndarray) -> np.ndarray:
+        batch = SimulationBatch(response + np.tensordot(moved[:, :d], along, 1), [""] * len(moved))
+        statistics = misfit_of_responses(part.model, batch, part.measured, noise_statistic(part.noise)).misfit
+        return part.noise.log_likelihood(statistics, part.n_samples, moved[:, d:])
 
-            slopes[k, d:] = slopes_along(of_noise, noise, sd[d:], bounds[d:])
-    return slopes, good
-
-
-def _statistics(part: Any, responses: np.ndarray) -> np.ndarray:
-    """Statistics (n, n_numbers) of responses (n, n_channels, n_steps) [SI]."""
-    batch = SimulationBatch(responses, [""] * len(responses))
-    return misfit_of_responses(part.model, batch, part.measured, noise_statistic(part.noise)).misfit
-
-
-def _along_responses(part: Any, response: np.ndarray, along: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """Derivatives (d,) of the log-likelihood as a response (c, n) moves along its derivatives (d, c, n)."""
     sizes = np.sqrt(np.nanmean(np.square(part.residuals_of(response)), axis=1))
     moves = np.sqrt(np.square(along).mean(axis=2))
     # the channel that moves most, compared with its residuals, sets the step
     with np.errstate(divide="ignore", invalid="ignore"):
-        steps = _STEP * np.where((moves > 0.0) & (sizes > 0.0), sizes / moves, np.inf).min(axis=1)
-    steps = np.where(np.isfinite(steps), steps, _STEP)
-    offsets, weights = _CENTRAL
-    slopes = np.empty(len(along))
-    for j, (step, direction) in enumerate(zip(steps, along, strict=True)):
-        moved = response + step * offsets[:, None, None] * direction
-        values = part.noise.log_likelihood(
-            _statistics(part, moved), part.n_samples, np.repeat(noise[None], len(offsets), 0)
-        )
-        slopes[j] = weights @ values / step
-    return slopes
+        scales = np.where((moves > 0.0) & (sizes > 0.0), sizes / moves, np.inf).min(axis=1)
+    scales = np.where(np.isfinite(scales), scales, 1.0)
+    free = np.full((d, 2), [-np.inf, np.inf])
+    return slopes_along(density, np.append(np.zeros(d), noise), np.append(scales, sd), np.concatenate([free, bounds]))

@@ -31,10 +31,11 @@ from .predictive_draws import MeasuredHistory, PredictiveDraws, measured_data, p
 
 if TYPE_CHECKING:
     from ..emulation.guide import ResponseGuide
-    from .posterior_modes import PosteriorModes
+    from ..emulation.modes import ModeSearch
 
 __all__ = ["Posterior"]
 
+_TOP = 1e-3  # log-density below the top of a mode: .04 standard deviations
 _ALMOST_INFINITE = 1e100  # below any log-likelihood, and far from overflow when differences of it are squared
 
 
@@ -416,12 +417,11 @@ class Posterior:
 
         return ResponseGuide(self, starts)
 
-    def mode(self, starts: int = 12, seed: Any = None, max_simulations: float | None = None) -> "PosteriorModes":
+    def mode(self, starts: int = 12, seed: Any = None, max_simulations: float | None = None) -> "ModeSearch":
         """The modes of the density: most probable parameters, Laplace covariances and evidences.
 
-        The search of `guide` finds the modes. Each is then refined by a few simulations, and by differences of the
-        responses where the model has no ``jacobian``. Responses are cached, so a sampler with a guide, or another
-        search, repeats none of them.
+        The search of `guide`, with a few more simulations at each top. Responses are cached, so a sampler with a guide,
+        or another search, repeats none of them.
 
         Parameters
         ----------
@@ -434,7 +434,7 @@ class Posterior:
 
         Returns
         -------
-        PosteriorModes
+        ModeSearch
             Print it for a table; ``modes[0].parameters`` are the most probable ones.
 
         Raises
@@ -444,8 +444,8 @@ class Posterior:
 
         Notes
         -----
-        The Laplace approximation takes the response as linear within a mode. On a posterior that is curved or cut by a
-        bound it is rough: sample with a guide.
+        Density and Laplace approximation are those of standard normal coordinates of the prior, in which it has no
+        bounds. On a posterior that is curved or cut by a bound they are rough: sample with a guide.
 
         Examples
         --------
@@ -454,9 +454,9 @@ class Posterior:
         (1, True)
         """
         self._check_models("the search for modes")
-        from .posterior_modes import posterior_modes  # scipy.optimize is slow to import
+        from ..emulation.modes import find_modes  # scipy.special and scipy.optimize are slow to import
 
-        return posterior_modes(self, starts, seed, max_simulations)
+        return find_modes(self, starts, seed, max_simulations, _TOP)
 
     def measured_data(self) -> tuple[MeasuredHistory, ...]:
         """The measurements, without missing samples; nothing is simulated."""

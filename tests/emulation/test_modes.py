@@ -159,7 +159,7 @@ def _of_squared_difference(time, theta):
 def test_modes_that_few_starts_led_to_are_doubted(ends, grown, severity):
     """With one mode, by the number of starts that led to it; with several, by those that are alone in one."""
     guide = _equal_modes(1).guide()
-    modes = (Mode(np.zeros(3), np.zeros(3), np.eye(3), 0.0, 0.0, True),) * len(set(ends))
+    modes = (Mode(np.zeros(3), np.eye(3), np.zeros(3), np.eye(3), 0.0, 0.0, True),) * len(set(ends))
     guide.search = ModeSearch(modes, ends + (-1,) * 12, 100.0, True, grown)
     found = [each for each in guide.findings if "not found" in each.text]
     assert [each.severity for each in found] == ([] if severity is None else [severity])
