@@ -143,7 +143,7 @@ def correlated_errors() -> dict[str, Figure]:
     labels = [parameter.label for parameter in runs["white noise"][0].parameters[:2]]
     samples = {label: x[:, :2] for label, (_, x) in runs.items()}
     posterior, x = runs["white noise"]
-    residuals = posterior.likelihood.residuals(x.mean(axis=0))
+    residuals = posterior.likelihood.residuals_of(model.simulate(x[:, :2].mean(axis=0)))
     return {
         "wrong_noise": plot_corner(samples, labels=labels, truths=truth, title="Correlated errors (synthetic data)"),
         "wrong_noise_residuals": plot_residuals(residuals, model.channels, model.dt),
@@ -159,7 +159,8 @@ def column_update() -> dict:
     print(sampler.verdict)
     measured, means = posterior.likelihood.measurements, sampler.get_chain(flat=True).mean(axis=0)[:5]
     points = {"Before updating (reported values)": np.ones(5), "After updating (posterior mean)": means}
-    responses = {title: measured.values - posterior.likelihood.residuals(theta) for title, theta in points.items()}
+    model = posterior.likelihood.model
+    responses = {title: model.simulate(theta) for title, theta in points.items()}
     corner = plot_corner(sampler.signed_sample.draw(4000, SEED), posterior, truths=truth)
     return {"column_corner": corner, "column_fit": plot_fit(measured, responses, title="synthetic data")}
 

@@ -241,7 +241,7 @@ def test_bad_arguments_of_the_bridge_are_refused(arguments, message):
 
 def test_the_free_vibration_has_its_stated_truth():
     posterior = problems.free_vibration()
-    residuals = posterior.likelihood.residuals([1.1, 0.8])
+    residuals = posterior.likelihood.residuals_of(posterior.likelihood.model.simulate([1.1, 0.8]))
     assert 0.0018 < np.sqrt(np.mean(residuals**2)) < 0.0022  # 2 mm within twice the standard error of 200 samples
     assert posterior([1.1, 0.8, 0.002]) > posterior([[1.0, 1.0, 0.002], [1.1, 0.8, 0.004]]).max()
     assert posterior.likelihood.first(0.5).model.n_steps == 51

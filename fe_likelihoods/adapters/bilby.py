@@ -98,7 +98,8 @@ def _likelihood_class() -> type:
                     "with a DeltaFunction"
                 )
             # other names are ignored: bilby's conversions may have added parameters
-            return self.posterior.finite_log_likelihood(np.array([parameters[name] for name in names], dtype=float))
+            value = self.posterior.log_likelihood(np.array([parameters[name] for name in names], dtype=float))
+            return max(value, -1e100)  # bilby would replace a point of -inf by another draw of the prior
 
     return BlackBoxLikelihood
 

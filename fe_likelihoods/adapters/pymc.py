@@ -52,7 +52,7 @@ def to_pymc(posterior: Posterior) -> pymc.Model:
 
     Pass starting points where the posterior is not zero; the default starting point of PyMC may be elsewhere:
 
-    >>> starts = [dict(zip(posterior.parameter_names, x)) for x in posterior.sample_start(4)]
+    >>> starts = [dict(zip(posterior.parameter_names, x)) for x in posterior.sample_prior(4)]
     >>> with to_pymc(posterior):  # doctest: +SKIP
     ...     trace = pymc.sample(3000, tune=3000, step=pymc.DEMetropolisZ(), initvals=starts, chains=4)
     """

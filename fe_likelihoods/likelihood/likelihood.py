@@ -23,7 +23,7 @@ from ..signals.channels import Measurements
 from ..signals.comparison import Comparison
 from ..signals.events import join_measurements
 from ..signals.sampling import same_step
-from ..simulation.model import Model, SimulationBatch, SimulationFailed, first_part, simulate_batch
+from ..simulation.model import Model, SimulationBatch, first_part
 from .inputs import check_model, check_noise, match_measurements
 from .simulator import Simulator
 from .sum_of_parts import SumOfParts
@@ -200,45 +200,16 @@ class FELikelihood(SumOfParts):
         self.shortened.append(self._with(model, measurements, self.noise))
         return self.shortened[-1]
 
-    def residuals(self, theta: np.ndarray) -> np.ndarray:
-        """Measured minus simulated response at one point: one simulation, which is neither counted nor cached.
+    def residuals_of(self, response: np.ndarray) -> np.ndarray:
+        """Measured minus simulated response (n_channels, n_steps) [SI], in the order of the model's channels.
 
-        Parameters
-        ----------
-        theta : (n_structural,) or (ndim,) float
-            Structural parameters; the noise parameters may follow.
-
-        Returns
-        -------
-        (n_channels, n_steps) float
-            [SI], in the order of the model's channels; NaN where a sample is missing.
-
-        Raises
-        ------
-        ValueError
-            For a wrong number of parameters.
-        SimulationFailed
-            If the simulation fails.
+        NaN where a sample is missing. Nothing is simulated.
 
         Examples
         --------
-        >>> likelihood.residuals([1.1, 0.9]).shape  # measured minus simulated
+        >>> likelihood.residuals_of(model.simulate([1.1, 0.9])).shape
         (2, 200)
         """
-        theta = np.asarray(theta, dtype=float)
-        n_structural = self.simulator.n_structural
-        if theta.shape not in ((n_structural,), (self.ndim,)):
-            raise ValueError(
-                f"expected one point, of shape ({n_structural},), or ({self.ndim},) with the noise parameters; "
-                f"got shape {theta.shape}"
-            )
-        response, (reason,) = simulate_batch(self.model, theta[None, :n_structural])
-        if reason:
-            raise SimulationFailed(reason)
-        return self.residuals_of(response[0])
-
-    def residuals_of(self, response: np.ndarray) -> np.ndarray:
-        """Measured minus simulated response, as `residuals`, for a known response (n_channels, n_steps) [SI]."""
         response = np.asarray(response, dtype=float)
         if isinstance(self.measured, Comparison):
             return -self.measured.residuals(response)

@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 __all__ = ["Posterior"]
 
 _TOP = 1e-3  # log-density below the top of a mode: .04 standard deviations
-_ALMOST_INFINITE = 1e100  # below any log-likelihood, and far from overflow when differences of it are squared
 
 
 class Posterior:
@@ -214,18 +213,6 @@ class Posterior:
             self.prior.from_normal(0.5 * np.eye(self.ndim)) - self.prior.from_normal(-0.5 * np.eye(self.ndim))
         )
 
-    def finite_log_likelihood(self, x: Any) -> np.ndarray | float:
-        """`log_likelihood` with -1e100 instead of -inf, for clients that reject infinite values.
-
-        ultranest stops at an infinite value. bilby and pocomc replace such a point by another draw of the prior, which
-        makes their evidence too large by the share of the prior in which simulations fail.
-        """
-        return np.maximum(self.log_likelihood(x), -_ALMOST_INFINITE)[()]
-
-    def negative_log_prob(self, x: Any) -> np.ndarray | float:
-        """Minus `log_prob`, with 1e100 instead of inf, for minimisers: differences of infinities would be NaN."""
-        return np.minimum(-self.log_prob(x), _ALMOST_INFINITE)[()]
-
     def possible(self, x: Any) -> np.ndarray | bool:
         """Whether the density may be positive, as far as prior and noise parameters tell; nothing is simulated.
 
@@ -266,45 +253,6 @@ class Posterior:
         (1000, 4)
         """
         return self.prior.rvs(n, rng)
-
-    def sample_start(self, n: int, rng: RandomState = None) -> np.ndarray:
-        """Draws of the prior at which the posterior density is not zero: starting points of walkers.
-
-        Several clients reject a start of zero density. A draw of the prior has zero posterior density if its simulation
-        fails.
-
-        Parameters
-        ----------
-        n : int
-        rng : int, numpy.random.Generator, numpy.random.RandomState or None
-            As for `sample_prior`.
-
-        Returns
-        -------
-        (n, ndim) float
-
-        Raises
-        ------
-        ValueError
-            If fewer than n simulations succeed among the largest of 100 n and 1000 draws.
-
-        Examples
-        --------
-        >>> start = posterior.sample_start(32, rng=1)
-        >>> bool(np.all(np.isfinite(posterior(start))))
-        True
-        """
-        rng = np.random.default_rng(rng) if isinstance(rng, int | np.integer) else rng
-        found = np.empty((0, self.ndim))
-        for _ in range(max(100, -(-1000 // n))):
-            points = self.sample_prior(n, rng)
-            found = np.concatenate([found, points[np.isfinite(self.log_prob(points))]])
-            if len(found) >= n:
-                return found[:n]
-        raise ValueError(
-            f"sample_start: the posterior density is zero at nearly all draws of the prior ({len(found)} points found "
-            f"of {n}); report() has the reasons: correct the model or narrow the prior"
-        )
 
     def _check_models(self, what: str) -> None:
         """ValueError if the likelihood is a function without a model."""

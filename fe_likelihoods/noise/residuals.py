@@ -5,7 +5,7 @@ response) are correlated, because model errors change slowly and repeat from cyc
 this, `effective_samples` is for `fe_likelihoods.GaussianNoise`, and `innovations` shows whether
 `fe_likelihoods.AutoregressiveNoise` explains it::
 
-    residuals = posterior.likelihood.residuals(best)
+    residuals = likelihood.residuals_of(model.simulate(best))
     noise = GaussianNoise(model.channels, effective_samples=effective_samples(residuals))
 
 The equations are on the page ``docs/theory/noise.rst``.
@@ -182,7 +182,7 @@ def effective_samples(residuals: np.ndarray) -> np.ndarray:
 
     Examples
     --------
-    >>> residuals = likelihood.residuals([1.1, 0.9])
+    >>> residuals = likelihood.residuals_of(model.simulate([1.1, 0.9]))
     >>> effective_samples(residuals).round()  # doctest: +SAMPLED
     array([178., 180.])
     """
@@ -207,7 +207,7 @@ def innovations(residuals: np.ndarray, lag_one: np.ndarray) -> np.ndarray:
     Examples
     --------
     >>> from fe_likelihoods.noise.residuals import innovations
-    >>> innovations(likelihood.residuals([1.1, 0.9]), np.array([0.2, 0.1])).shape
+    >>> innovations(likelihood.residuals_of(model.simulate([1.1, 0.9])), np.array([0.2, 0.1])).shape
     (2, 199)
     """
     residuals = _checked(residuals)
@@ -261,7 +261,7 @@ def residual_checks(residuals: np.ndarray, channels: Sequence[Channel] = ()) -> 
 
     Examples
     --------
-    >>> print(residual_checks(likelihood.residuals([1.1, 0.9]), model.channels))
+    >>> print(residual_checks(likelihood.residuals_of(model.simulate([1.1, 0.9])), model.channels))
     channel       unit      mean      sd  lag one  samples  independent  p white  p normal
     acceleration     g  -0.00376  0.0471    -0.07      200          178     0.36      0.31
     displacement    cm    -0.181    1.79    -0.21      200          180   0.0027      0.33

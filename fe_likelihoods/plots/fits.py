@@ -40,7 +40,7 @@ def plot_fit(
         The measured histories; ``measurements.select(names)`` has some of them.
     responses : mapping of str to ndarray, or ndarray
         Responses by their titles, with the samples and channels of ``measurements.values`` [SI], such as
-        ``measurements.values - posterior.likelihood.residuals(x)`` for parameters x.
+        ``measurements.values - likelihood.residuals_of(model.simulate(x))`` for parameters x.
     title : str, optional
         Title of the figure. Default: the description of the measurements.
 

@@ -178,7 +178,7 @@ def plot_residuals(residuals: np.ndarray, channels: Sequence[Channel], dt: float
 
     Examples
     --------
-    >>> figure = plot_residuals(likelihood.residuals([1.1, 0.9]), model.channels, model.dt)
+    >>> figure = plot_residuals(likelihood.residuals_of(model.simulate([1.1, 0.9])), model.channels, model.dt)
     """
     from scipy.special import ndtri
 

@@ -51,6 +51,17 @@ class Exact(NamedTuple):
     log_evidence: float
 
 
+def starts_of(posterior, n, rng=None):
+    """Draws (n, ndim) of the prior at which the posterior is not zero."""
+    draws = posterior.sample_prior(10 * n + 50, rng)
+    return draws[np.isfinite(posterior(draws))][:n]
+
+
+def finite(posterior, x):
+    """Log-likelihood with -1e100 instead of -inf, as the page of clients has it."""
+    return np.maximum(posterior.log_likelihood(x), -1e100)
+
+
 @functools.cache
 def _data() -> tuple[np.ndarray, np.ndarray]:
     """Base acceleration (60,) [m/s²] and measured acceleration and displacement (2, 60)."""

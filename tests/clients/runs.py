@@ -8,6 +8,7 @@ import logging
 import random
 import tempfile
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ import numpy as np
 from fe_likelihoods import Posterior
 from fe_likelihoods.adapters import to_bilby, to_pymc
 
+from .problem import finite, starts_of
 from .scoring import Found, chains, replicates, weighted
 
 
@@ -23,7 +25,7 @@ def _emcee(posterior: Posterior, seed: int) -> Found:
 
     np.random.seed(seed)  # noqa: NPY002 - emcee draws from the global stream
     sampler = emcee.EnsembleSampler(48, posterior.ndim, posterior, vectorize=True)
-    sampler.run_mcmc(posterior.sample_start(48), 500)
+    sampler.run_mcmc(starts_of(posterior, 48), 500)
     return chains(sampler.get_chain(discard=100).swapaxes(0, 1))
 
 
@@ -33,7 +35,7 @@ def _zeus(posterior: Posterior, seed: int) -> Found:
     np.random.seed(seed)  # noqa: NPY002 - zeus draws from the global streams of numpy and of Python
     random.seed(seed)
     sampler = zeus.EnsembleSampler(16, posterior.ndim, posterior, vectorize=True, verbose=False)
-    sampler.run_mcmc(posterior.sample_start(16), 250, progress=False)
+    sampler.run_mcmc(starts_of(posterior, 16), 250, progress=False)
     return chains(sampler.get_chain(discard=50).swapaxes(0, 1))
 
 
@@ -76,7 +78,7 @@ def _pints(posterior: Posterior, seed: int) -> Found:
             return posterior(x)
 
     np.random.seed(seed)  # noqa: NPY002 - pints draws from the global stream
-    starts = list(posterior.sample_start(8))
+    starts = list(starts_of(posterior, 8))
     controller = pints.MCMCController(LogPosterior(), 8, starts, method=pints.DifferentialEvolutionMCMC)
     controller.set_max_iterations(1200)
     controller.set_log_to_screen(False)
@@ -118,7 +120,7 @@ def _ultranest(posterior: Posterior, seed: int) -> Found:
 
     np.random.seed(seed)  # noqa: NPY002 - ultranest draws from the global stream
     sampler = ultranest.ReactiveNestedSampler(
-        posterior.parameter_names, posterior.finite_log_likelihood, posterior.prior_transform, vectorized=True
+        posterior.parameter_names, partial(finite, posterior), posterior.prior_transform, vectorized=True
     )
     logging.getLogger("ultranest").setLevel(logging.WARNING)  # its constructor sets the most detailed level
     result = sampler.run(min_num_live_points=250, show_status=False, viz_callback=False)
@@ -134,7 +136,7 @@ def _pocomc(posterior: Posterior, seed: int) -> Found:
         np.random.seed(10 * seed + repetition)  # noqa: NPY002 - the prior is drawn from the global stream
         sampler = pocomc.Sampler(
             posterior.prior,
-            posterior.finite_log_likelihood,
+            partial(finite, posterior),
             vectorize=True,
             random_state=10 * seed + repetition,
             n_active=64,
@@ -167,7 +169,7 @@ def _pymc_chains(posterior: Posterior, seed: int, draws: int, tune: int, step: C
     """Trace of four chains by a step method, or by the one that PyMC chooses."""
     import pymc
 
-    starts = [dict(zip(posterior.parameter_names, x, strict=True)) for x in posterior.sample_start(4, seed)]
+    starts = [dict(zip(posterior.parameter_names, x, strict=True)) for x in starts_of(posterior, 4, seed)]
     with to_pymc(posterior):
         return pymc.sample(
             draws,

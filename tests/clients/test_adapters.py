@@ -9,7 +9,7 @@ import pytest
 from fe_likelihoods import HalfNormal, LogNormal, TruncatedNormal, Uniform
 from fe_likelihoods.adapters import to_bilby, to_pymc
 
-from .problem import PRIOR, make_posterior
+from .problem import PRIOR, make_posterior, starts_of
 
 NAMES = list(PRIOR)
 VARIANTS = {
@@ -58,7 +58,7 @@ def test_bilby_likelihood_takes_names_in_any_order_and_ignores_others(client_nam
     client_named("bilby")
     posterior = make_posterior()
     likelihood, _ = to_bilby(posterior)
-    (x,) = posterior.sample_start(1, 1)
+    (x,) = starts_of(posterior, 1, 1)
     parameters = dict(reversed(list(zip(NAMES, x.tolist(), strict=True)))) | {"derived": 1.0}
     expected = posterior.log_likelihood(x)
     assert likelihood.log_likelihood(parameters) == expected

@@ -5,7 +5,7 @@ import pytest
 
 from fe_likelihoods import TruncatedNormal
 
-from .problem import CRITICAL, PRIOR, exact, make_posterior, reference_log_prob
+from .problem import CRITICAL, PRIOR, exact, make_posterior, reference_log_prob, starts_of
 from .runs import CLIENTS
 from .scoring import Found, check
 
@@ -17,7 +17,7 @@ def test_quadrature_has_converged_and_is_of_this_posterior(answer):
     for ours, coarser in zip(answer, exact(44), strict=True):
         np.testing.assert_allclose(ours, coarser, rtol=1e-4)
     posterior = make_posterior()
-    points = np.concatenate([posterior.sample_start(20, 1), posterior.sample_prior(20, 2)])
+    points = np.concatenate([starts_of(posterior, 20, 1), posterior.sample_prior(20, 2)])
     expected = [reference_log_prob(point) for point in points]
     np.testing.assert_allclose(posterior(points), expected, rtol=1e-10)
     assert np.isinf(expected).any()

@@ -13,7 +13,7 @@ from fe_likelihoods.problems import bridge_column
 from fe_likelihoods.simulation.faults import ChangedModel
 from tests.covering import covering
 
-from .problem import make_posterior
+from .problem import make_posterior, starts_of
 
 CHANNELS = (Channel("u", "displacement", "m"),)
 TIME = np.linspace(0.0, 1.0, 20)
@@ -59,7 +59,7 @@ def test_a_worker_with_other_values_is_refused(monkeypatch):
 def test_ensemble_through_a_pool_is_the_same_chain(name, client_named):
     client = client_named(name)
     posterior = make_posterior()
-    start = posterior.sample_start(10, 1)
+    start = starts_of(posterior, 10, 1)
     ensemble = __import__(client.module).EnsembleSampler
     quiet = {"verbose": False} if name == "zeus" else {}
 

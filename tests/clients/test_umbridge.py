@@ -28,7 +28,7 @@ from fe_likelihoods.adapters import serve
 from fe_likelihoods.simulation.faults import TransientReason, UnusableModel
 from samplers import SMCSampler
 
-from .problem import CRITICAL, make_posterior
+from .problem import CRITICAL, make_posterior, starts_of
 from .served import WRONG, Process, free_port, line
 
 umbridge = pytest.importorskip("umbridge", reason="UMBRIDGE IS NOT INSTALLED: pip install umbridge")
@@ -67,7 +67,7 @@ def test_posterior_is_served_with_all_digits(ours):
     assert umbridge.supported_models(ours.url) == ["line", "posterior"]
     client, posterior = umbridge.HTTPModel(ours.url, "posterior"), make_posterior()
     assert (client.get_input_sizes(), client.get_output_sizes()) == ([4], [1])
-    for point in posterior.sample_start(3, 1):
+    for point in starts_of(posterior, 3, 1):
         for density in ("log_prob", "log_prior", "log_likelihood"):
             expected = getattr(posterior, density)(point)
             assert client([point.tolist()], {"density": density}) == [[expected]], density

@@ -21,6 +21,7 @@ from fe_likelihoods import (
     TruncatedNormal,
     Uniform,
 )
+from tests.clients.problem import starts_of
 
 STEPS, WEIGHTS = np.array([-2.0, -1.0, 1.0, 2.0]), np.array([1.0, -8.0, 8.0, -1.0]) / 12.0
 STRUCTURE = {"stiffness": TruncatedNormal(1.0, 0.2), "damping": LogNormal(1.0, 0.3)}
@@ -142,7 +143,7 @@ CASES = [
 @pytest.mark.parametrize("make", CASES)
 def test_gradients_agree_with_differences_of_simulations(make, rng):
     posterior = make(rng)
-    points = posterior.sample_start(4, rng)
+    points = starts_of(posterior, 4, rng)
     found = posterior.grad_log_prob(points)
     for x, gradient in zip(points, found, strict=True):
         expected = differences(posterior, x)
@@ -165,7 +166,7 @@ def test_a_wrong_derivative_shows(rng):
         jacobian=lambda theta: 1.001 * model.jacobian(theta),
     )
     posterior = Posterior(FELikelihood(wrong, data), gaussian(rng).prior)
-    x = posterior.sample_start(1, rng)[0]
+    x = starts_of(posterior, 1, rng)[0]
     assert abs(posterior.grad_log_prob(x)[:2] / differences(posterior, x)[:2] - 1.0).min() > 1e-4
 
 

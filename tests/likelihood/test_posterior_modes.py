@@ -56,7 +56,7 @@ def test_no_minimiser_finds_more_and_a_repeated_search_simulates_nothing():
     found = posterior.mode(seed=1)
     (mode,) = found.modes
     options = {"xatol": 1e-10, "fatol": 1e-10, "maxiter": 4000}
-    best = optimize.minimize(posterior.negative_log_prob, mode.parameters, method="Nelder-Mead", options=options)
+    best = optimize.minimize(lambda x: -posterior(x), mode.parameters, method="Nelder-Mead", options=options)
     assert posterior.log_prob(mode.parameters) == pytest.approx(-best.fun, abs=0.02)
     sd = np.sqrt(np.diag(mode.parameter_covariance))
     np.testing.assert_allclose(mode.parameters / sd, best.x / sd, atol=0.2)

@@ -131,7 +131,7 @@ def test_likelihood_with_gaps(rng, tmp_path, noise):
     values = likelihood.log_likelihood(x)
     assert values[0] == -np.inf and np.isfinite(values[1:]).all() and likelihood.simulator.failures.count == 1
     for row, value in zip(x[1:], values[1:], strict=True):
-        residuals = likelihood.residuals(row)
+        residuals = likelihood.residuals_of(likelihood.model.simulate(row[:2]))
         np.testing.assert_array_equal(np.isnan(residuals), ~there)
         statistics = statistics_of(likelihood.noise, residuals)
         assert value == likelihood.noise.log_likelihood(statistics, count_samples(residuals), row[None, 2:])[0]
