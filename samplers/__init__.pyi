@@ -5,7 +5,7 @@ from .rare_events import subset_simulation
 from .reporting.arviz_data import to_arviz
 from .reporting.figures import plot_corner, plot_marginals, plot_run
 from .reporting.model_comparison import compare_models
-from .reporting.summary import ladder_table, summary
+from .reporting.summary import summary
 from .reports import SamplingWarning, Stage
 from .smc import SMCSampler
 from .tempered import TemperedSampler
@@ -23,7 +23,6 @@ __all__ = [
     "TemperedSampler",
     "Verdict",
     "compare_models",
-    "ladder_table",
     "plot_corner",
     "plot_marginals",
     "plot_run",

@@ -15,19 +15,20 @@ from .estimates.importance import EvidenceCheck
 from .finding import Finding
 
 __all__ = [
+    "LIMIT",
     "AnnealingResult",
-    "EarlyStop",
     "GuideTick",
     "GuidedRound",
-    "GuidedStart",
     "Report",
     "Restart",
     "SamplingWarning",
     "Stage",
     "Sweep",
+    "Weighted",
     "warn",
 ]
 
+LIMIT = "The limit of simulations ended the run"  # see `Weighted`
 OUR_PACKAGES = ("samplers", "emcee")
 
 
@@ -141,36 +142,20 @@ class GuidedRound(NamedTuple):
     effective_sample_size: float
 
 
-class GuidedStart(NamedTuple):
-    """Result of a guide's rounds."""
+class Weighted(NamedTuple):
+    """The walkers were resampled from weighted points, and not moved since."""
 
-    reason: str  # why the guide's draws are not used as posterior draws; empty if they are
-    # what the rounds did not reach although their draws are used, or that its tails are too light; else empty
-    shortfall: str
-    pareto_shape: float  # of the largest weights of all rounds
-
-    @property
-    def used(self) -> bool:
-        """Whether the population consists of the guide's draws."""
-        return not self.reason
-
-
-class EarlyStop(NamedTuple):
-    """The limit of simulations ended the annealing."""
-
-    beta: float  # of the points from which the population was made; 1 after a complete annealing
-    points: int  # number of these points
+    points: int  # number of these points; 0 if the annealing was complete, and only moves or a check are missing
     effective_sample_size: float  # of the weights at beta = 1
     pareto_shape: float  # of the largest weights at beta = 1
-    complete: bool = False  # whether only moves or a check at beta = 1 are missing
-    from_guide: bool = False  # whether the points are the draws of a guide
+    beta: float = 1.0  # at which the points were made
+    ended: str = ""  # why the run ended before its result was reached; empty if it did not
+    guided: bool = False  # whether the points are the draws of a guide
 
 
-Report = (
-    Stage | Sweep | GuideTick | Restart | EvidenceCheck | GuidedRound | GuidedStart | SignedSample | EarlyStop | Finding
-)
+Report = Stage | Sweep | GuideTick | Restart | EvidenceCheck | GuidedRound | SignedSample | Weighted | Finding
 # fields of a result that take a report of a kind, or collect them
-TAKEN = {EvidenceCheck: "check", GuidedStart: "start", SignedSample: "signed", EarlyStop: "early_stop"}
+TAKEN = {EvidenceCheck: "check", SignedSample: "signed", Weighted: "weighted"}
 COLLECTED = {Stage: "ladder", GuidedRound: "rounds", Finding: "findings"}
 
 
@@ -182,9 +167,8 @@ class AnnealingResult(NamedTuple):
     founders: np.ndarray | None = None  # (nwalkers,) int, see `samplers.estimates.genealogy`; None if unknown
     parents: np.ndarray | None = None  # (nwalkers,) int, founders by the last resampling alone; None if unknown
     rounds: tuple[GuidedRound, ...] = ()
-    start: GuidedStart | None = None  # result of the rounds; None without a guide
     signed: SignedSample | None = None  # known and evaluated points of the rounds; None if the guide knows no density
-    early_stop: EarlyStop | None = None  # how the limit of simulations ended the annealing; None if it did not
+    weighted: Weighted | None = None  # points that the walkers were resampled from, if they were not moved since
     basis: str = ""  # how the guide searched for parts of the posterior; empty if it does not say
     findings: tuple[Finding, ...] = ()  # of the checks and of the guide
     # effective sample size of the walkers when beta = 1 was reached; None for a result read from a backend
@@ -204,6 +188,11 @@ class AnnealingResult(NamedTuple):
         if result.finished and founders:
             result = result._replace(founders=founders[0], parents=founders[-1])
         return result
+
+    @property
+    def ended(self) -> str:
+        """Why the run ended before its result was reached; empty if it did not."""
+        return "" if self.weighted is None else self.weighted.ended
 
     @property
     def finished(self) -> bool:

@@ -70,8 +70,8 @@ class RunResults:
 
         The last stage of `ladder` then has all points known at that time, weighted for beta = 1.
         """
-        stop = self._result.early_stop
-        return None if stop is None or stop.complete or stop.beta >= 1.0 else stop.beta
+        weighted = self._result.weighted
+        return None if weighted is None or weighted.beta >= 1.0 else weighted.beta
 
     @property
     def log_evidence(self) -> float:
@@ -178,7 +178,7 @@ class RunResults:
     @property
     def guide(self) -> Guide | None:
         """A copy of the given guide that learns from this run; None before the run or without a guide."""
-        return None if self._guide is None else self._guide.guide
+        return self._guide
 
     @property
     def rounds(self) -> tuple[GuidedRound, ...]:

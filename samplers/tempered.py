@@ -43,7 +43,7 @@ from .reports import AnnealingResult, Report, Stage, warn
 from .results import RunResults
 from .settings import Settings, as_whole_number, check_arguments, check_names, most_moves
 from .tempering.anneal import anneal
-from .tempering.guide import AdaptedGuide, Guide, check_guide, guide_fingerprint
+from .tempering.guide import Guide, check_guide
 from .tempering.guided import Guidance, lend
 from .tempering.mutation import MoveSchedule, check_moves
 from .tempering.population import Population, check_size
@@ -174,7 +174,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         common = target, self._record, self._budget, nwalkers, given.max_failure_share
         if given.asynchronous:
             check_asynchronous(target, pool, guide is not None or bool(given.recycle))
-            queue = getattr(guide, "evaluation_queue", None)
+            queue = None if guide is None else guide.evaluation_queue
             self._evaluator: Evaluator = AsynchronousEvaluator(*common, queue=queue)
         else:
             self._evaluator = Evaluator(*common)
@@ -336,7 +336,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
                     arguments["iterations"] = iterations = iterations + 1  # in place of the provisional step
                 with deferred_interrupts():
                     self._previous_state = State(state, copy=True)  # where the next call goes on after an interrupt
-                    self._must_repeat = self._must_repeat and self._result.early_stop is not None
+                    self._must_repeat = self._must_repeat and bool(self._result.ended)
                 self.seconds += time.perf_counter() - start
                 self._moves = without_unfitted(self._moves)
                 state.blobs = self._evaluator.typed(state.blobs)
@@ -542,7 +542,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
             **asdict(self.settings),
             "moves": [describe(move) for move in moves],
             "probabilities": [float(probability) for probability in probabilities],
-            "guide": None if self._given_guide is None else guide_fingerprint(self._given_guide),
+            "guide": None if self._given_guide is None else self._given_guide.fingerprint,
         }
         return json.loads(json.dumps(header))
 
@@ -576,7 +576,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._moves, self._weights = schedule
         self._evaluator.remember = remember = self._record.remembering()
         if self._given_guide is not None:
-            self._guide = AdaptedGuide(self._given_guide, self.ndim)
+            self._guide = self._given_guide.fresh()
             guidance = lend(self._guide, self._random, remember, self._budget, self.settings.asynchronous)
         self._record.is_complete = stored is not None
         population = Population(0.0, start.coords, None, float(self.nwalkers))
@@ -606,14 +606,14 @@ class TemperedSampler(RunResults, EnsembleSampler):
     def _annealed(self, population: Population, guidance: Guidance | None, stored: State | None) -> State:
         """The state at beta = 1 that an annealing has led to, or the last `stored` state of a run made again."""
         self._result = self._finished(self._result, population, guidance)
-        if self._result.start is not None and self._result.start.used:
+        ended, weighted = bool(self._result.ended), self._result.weighted
+        if weighted is not None and weighted.guided and not ended:
             moves = with_fast_sweeps([GuideMove(self._guide)], self._fast, self.ndim, self.settings.fast_sweeps)
             schedule = MoveSchedule(moves, np.ones(1))
             schedule.calibrate(population.coords, np.full(self.nwalkers, 1.0 / self.nwalkers))
             self._moves, self._weights = schedule
         self._judge(0, population.coords)
         self._reopened = False
-        ended = self._result.early_stop is not None
         if stored is not None and not ended:
             self.random_state = stored.random_state
             return stored

@@ -163,11 +163,7 @@ def _check_sampling(run: FinishedRun) -> list[Finding]:
     if run.verdict is None:
         text = "The file of this run holds no verdict, so nothing is known about its convergence."
         return [Finding("No verdict", CARE, text, "Run it again with this version.")]
-    found, more = list(run.verdict.findings), run.verdict.more_simulations
-    if found and more:
-        text = f"At least about {more:.0f} more simulations are needed, possibly several times as many."
-        found.append(Finding("More simulations", NOTE, text, "Raise max_simulations and run again."))
-    return found
+    return list(run.verdict.findings)
 
 
 def _check_chain(run: FinishedRun) -> list[Finding]:

@@ -24,7 +24,6 @@ def write_tables(folder: Path, run: FinishedRun, judged: JudgedRun, agreement: s
 
     `agreement` says how independent runs agree.
     """
-    from samplers import ladder_table
     from samplers.reporting.summary import Summary
 
     columns = ("label", "mean", "mean_error", "sd", "sd_error", "cv", "low", "median", "high", "nominal")
@@ -38,11 +37,11 @@ def write_tables(folder: Path, run: FinishedRun, judged: JudgedRun, agreement: s
         own = [fit for fit in judged.fits.fits if not key or fit.title == key or fit.title.startswith(f"{key}, ")]
         tables[f"fit-{key}.csv" if key else "fit.csv"], text = _modes(own[0].modal) if own[0].modal else _responses(own)
         lines += text
+    tables["stages.csv"] = [stage._asdict() for stage in run.sampler.ladder]
     for name, rows in tables.items():
         _write_csv(folder / name, rows)
     (folder / "summary.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    (folder / "stages.txt").write_text(ladder_table(run.sampler) + "\n", encoding="utf-8")
-    return "summary.txt", *tables, "stages.txt"
+    return "summary.txt", *tables
 
 
 def _responses(fits: Sequence[Fit]) -> tuple[Rows, list[str]]:

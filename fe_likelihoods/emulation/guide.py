@@ -32,6 +32,7 @@ from samplers.judgement.guides import (
     find_missing_part,
 )
 from samplers.proposals.mixture import Mixture, draw, fit_mixture, log_density
+from samplers.tempering.guide import Guide
 
 from .density import EmulatedPosterior, Region, student_mixture, tempered
 from .emulator import ResponseEmulator
@@ -58,7 +59,7 @@ _LARGE = 10.0  # error of an emulated log-likelihood, beyond which its size does
 _CLEARLY = 0.75  # ratio of such errors at which the emulators take a function of the parameters
 
 
-class ResponseGuide:
+class ResponseGuide(Guide):
     """Draws near the posterior of a likelihood whose responses are known.
 
     Made by `Posterior.guide`.
@@ -80,9 +81,6 @@ class ResponseGuide:
     >>> guide = posterior.guide(starts=6)
     >>> guided = SMCSampler(40, posterior.ndim, posterior, vectorize=True, guide=guide, seed=1)
     """
-
-    # a response does not depend on how long its simulation takes
-    learns_from_parts = True
 
     def __init__(self, posterior: Any, starts: int = 12) -> None:
         starts = check_starts(starts)

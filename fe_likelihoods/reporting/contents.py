@@ -161,9 +161,7 @@ def evidence(run: FinishedRun) -> list[str]:
         )
         return [*lines, text if check.reliable else f"{text} Its weights are too uneven to confirm anything."]
     if sampler.rounds:
-        shape = None if run.verdict is None else run.verdict.pareto_shape
-        text = f"It is the mean weight of {sum(each.draws for each in sampler.rounds)} draws that a guide proposed"
-        return [*lines, f"{text}." if shape is None else f"{text}; the Pareto shape of their weights is {shape:.2f}."]
+        return [*lines, f"It is the mean weight of {sum(each.draws for each in sampler.rounds)} draws of a guide."]
     why = " (check_draws=0)" if sampler.settings.check_draws == 0 else ""
     if sampler.ended_at is not None:
         why = f", because the limit of simulations ended the run at beta = {sampler.ended_at:.3g}"

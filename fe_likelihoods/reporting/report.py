@@ -174,7 +174,6 @@ def gather(
         "score_pictures": draw_scores_of_events(events),
         "residuals": [] if run.is_inconclusive else residual_sentences(fits),
         "verdict": verdict_sentences(run, rows),
-        "unknown": [] if run.verdict is None else list(run.verdict.unknown),
         "inconclusive": run.is_inconclusive,
         "failures": failed,
         "cost": cost(run, fits),

@@ -160,12 +160,14 @@ def _log_mean_squares(rounds: Sequence[Round], known_at: dict[int, np.ndarray], 
     return np.array(found)
 
 
-def unreached_share(log_density: Callable[[np.ndarray], np.ndarray], latest: KnownDensity) -> float:
-    """Probability under a known density of the points that draws of an earlier density hardly reach.
+def unreached_share(log_density: Callable[[np.ndarray], np.ndarray], latest: KnownDensity | None) -> float:
+    """Probability under a known density, if there is one, of the points that draws of an earlier one hardly reach.
 
     A guide may learn late that the posterior is larger. Few draws of its earlier density then have all but equal
     weights, and say nothing of the part that is missing.
     """
+    if latest is None:
+        return 0.0
     every = max(1, len(latest.weights) // COMPARED)
     coords, weights = latest.coords[::every], latest.weights[::every]
     hardly = log_density(coords) < latest.log_density(coords) - np.log(HARDLY)

@@ -124,12 +124,6 @@ def evidence_from_weights(log_weights: np.ndarray, made: int) -> EvidenceCheck:
 
 # ---------------------------------------------------------------- rounds
 
-# Draws in the first round of a guide, as a share of the number of walkers: few, since the guide may still be poor.
-FIRST_ROUND_SHARE = 0.3
-# After the last round of a guide, the draws are used even if no round was reliable, provided that the last round has at
-# least this effective share, all rounds together have an effective sample size equal to the number of walkers, and the
-# Pareto shape of their weights is below 0.7 (Vehtari et al. 2024).
-USABLE_SHARE = 0.1
 # Pareto shape that is assumed for fewer weights than an estimate needs
 SHAPE_OF_FEW = 0.7
 FEWEST_EFFECTIVE = 5.0

@@ -1,7 +1,7 @@
 """What is found about runs that ended without an error but whose result may be wrong.
 
-Collapsed populations, moves that are rejected or too few, and evidences or shares that disagree. Each check is a
-function of stages and arrays that returns a list of findings. How often each speaks in wrong runs and in right ones is
+Collapsed populations, and evidences or shares that disagree. Each check is a function of stages and arrays that returns
+a list of findings. How often each speaks in wrong runs and in right ones is
 in ``docs/which_sampler``.
 """
 
@@ -28,10 +28,8 @@ __all__ = [
     "check_prior",
     "check_shares",
     "check_stages",
-    "find_unreached_part",
 ]
 
-LOW_ACCEPTANCE = 0.01
 # runs with right answers ended with correlations of up to 0.8, TMCMC as published with 0.98 and more
 HIGH_CORRELATION = 0.9
 # Differences of the two log-evidences, and standard errors, from 1619 right and 297 wrong runs (docs/which_sampler).
@@ -51,7 +49,6 @@ LARGE_SHARE_DIFFERENCE = 0.1
 # A finding whose numbers are errors of shares and means. Where it speaks in 72 runs of TMCMC, the shares of 18 modes
 # are off by 0.75 stated errors (root mean square), and by 3.7 without these numbers.
 LOST, OF_SHARES, OF_MEAN = "A mode may be lost", "difference of shares", "difference of mean"
-DIFFERENT = "The two estimates of the evidence differ"
 
 
 def check_likelihood(log_prob: np.ndarray, log_prior: np.ndarray) -> list[Finding]:
@@ -100,41 +97,30 @@ def check_prior(coords: np.ndarray, log_prior: np.ndarray) -> list[Finding]:
 
 
 def check_stages(stages: Sequence[Stage], nwalkers: int, ndim: int) -> list[Finding]:
-    """Findings if the last stage is collapsed or stuck, and no earlier stage was.
+    """A finding if the last stage is collapsed, and no earlier stage was.
 
     Collapsed: the distinct points that survived the resampling are fewer than 2 % of the walkers, or too few to span
-    the parameters. Stuck: less than 1 % of the proposals were accepted.
+    the parameters.
     """
-    (*earlier, stage), number, found = stages, len(stages), []
+    *earlier, stage = stages
     fewest = max(ndim + 2, nwalkers // 50)
-    if stage.distinct_ancestors < fewest and all(each.distinct_ancestors >= fewest for each in earlier):
-        text = (
-            f"Collapse at stage {number} (beta = {stage.beta:.3g}): only {stage.distinct_ancestors} distinct points of "
-            f"{nwalkers} survived the resampling."
-        )
-        action = "Use more walkers, more moves or a larger ess_ratio."
-        found.append(Finding("The walkers have collapsed", WRONG, text, action))
-    if stage.acceptance < LOW_ACCEPTANCE and all(each.acceptance >= LOW_ACCEPTANCE for each in earlier):
-        text = (
-            f"Stuck at stage {number} (beta = {stage.beta:.3g}): {100 * stage.acceptance:.2g} % of the proposals were "
-            "accepted, so the points did not move."
-        )
-        found.append(Finding("The walkers are stuck", WRONG, text, "Use other moves or more of them."))
-    return found
-
-
-def check_annealing(stages: Sequence[Stage], correlation: float) -> list[Finding]:
-    """A finding if annealing by moves ended with points that had not moved enough.
-
-    The largest correlation of the final population with its resampled start, `correlation`, is then above 0.9. Not
-    reported if `check_stages` found the moves stuck.
-    """
-    if correlation <= HIGH_CORRELATION or any(s.acceptance < LOW_ACCEPTANCE for s in stages):
+    if stage.distinct_ancestors >= fewest or any(each.distinct_ancestors < fewest for each in earlier):
         return []
     text = (
-        f"The moves at beta = {stages[-1].beta:.3g} were too short: particles are still correlated "
-        f"({correlation:.2f}) with their resampled start, so copies have not separated, and modes keep the weights "
-        "that the resampling gave them."
+        f"Collapse at stage {len(stages)} (beta = {stage.beta:.3g}): only {stage.distinct_ancestors} distinct points "
+        f"of {nwalkers} survived the resampling."
+    )
+    action = "Use more walkers, more moves or a larger ess_ratio."
+    return [Finding("The walkers have collapsed", WRONG, text, action)]
+
+
+def check_annealing(beta: float, correlation: float) -> list[Finding]:
+    """A finding if the largest correlation of the final population with its resampled start is above 0.9."""
+    if correlation <= HIGH_CORRELATION:
+        return []
+    text = (
+        f"The moves at beta = {beta:.3g} were too short: particles are still correlated ({correlation:.2f}) with their "
+        "resampled start, so copies have not separated, and modes keep the weights that the resampling gave them."
     )
     return [Finding("The moves were too short", CARE, text, "Use more moves (max_moves, burn_in) or longer ones.")]
 
@@ -149,33 +135,25 @@ def check_evidence(
     """
     found, believed = [], check is not None and check.reliable
     difference = 0.0 if check is None else abs(log_evidence - check.log_evidence)
-    is_higher = believed and check.log_evidence > log_evidence
-    if difference > WRONG_DIFFERENCE and not believed:
+    higher = believed and check.log_evidence > log_evidence
+    if difference > (HIGHER_CHECK if higher else LARGE_DIFFERENCE):
         text = (
-            f"{_both(log_evidence, error, check)}, and the weights of the second estimate are uneven (effective sample "
-            f"size {check.effective_sample_size:.2g} of {check.evaluations}, Pareto shape {check.pareto_shape:.2f}). "
-            "Evidence, means and standard deviations may be wrong by more than their errors, as with many parameters "
-            "and few walkers, heavy tails, or modes that the final points do not show."
+            f"The stages give the log-evidence {log_evidence:.2f} +- {error:.2f}, importance sampling from the final "
+            f"points gives {check.log_evidence:.2f} +- {check.error:.2f} (effective sample size "
+            f"{check.effective_sample_size:.2g} of {check.evaluations}, Pareto shape {check.pareto_shape:.2f})."
+        )
+        wrong = difference > WRONG_DIFFERENCE and not believed
+        text += (
+            " Means and standard deviations may be wrong by more than their errors too, as with many parameters and "
+            "few walkers, heavy tails, or modes that the final points do not show."
+            if wrong
+            else " The posterior may still be right."
         )
         action = (
             "Use more walkers or more moves (min_moves, max_moves), and compare two runs. Where log_prior is a "
             "function of your own, check that it is normalised."
         )
-        found.append(Finding(DIFFERENT, WRONG, text, action))
-    elif is_higher and difference > HIGHER_CHECK:
-        text = (
-            f"{_both(log_evidence, error, check)}: the evidence is right by the second one, but the stages have lost a "
-            "part of it, and the walkers may be too far spread, or in modes with wrong shares."
-        )
-        action = "Use more walkers or more moves (min_moves, max_moves), or recycling, and compare standard deviations."
-        found.append(Finding(DIFFERENT, CARE, text, action))
-    elif difference > LARGE_DIFFERENCE and not is_higher:
-        text = f"{_both(log_evidence, error, check)}. The posterior may still be right."
-        action = (
-            "Use more walkers or more moves for the evidence. Where log_prior is a function of your own, check that it "
-            "is normalised: only the second estimate depends on this."
-        )
-        found.append(Finding(DIFFERENT, CARE, text, action))
+        found.append(Finding("The two estimates of the evidence differ", WRONG if wrong else CARE, text, action))
     stated = min(error, check.error) if believed else error
     if stated > LARGE_ERROR:
         text = f"The standard error of the log-evidence is {stated:.2g}."
@@ -191,8 +169,8 @@ def check_evidence(
 
 def check_end(result: AnnealingResult, coords: np.ndarray) -> list[Finding]:
     """Findings about the estimates of the evidence at the end, with the final points (n, ndim)."""
-    stop = result.early_stop
-    if stop is not None and not stop.complete:
+    weighted = result.weighted
+    if weighted is not None and weighted.points and weighted.ended:
         return []  # its points are judged by their weights
     each = np.arange(len(coords))
     founders = each if result.founders is None else result.founders
@@ -203,13 +181,6 @@ def check_end(result: AnnealingResult, coords: np.ndarray) -> list[Finding]:
         return max(mode.share_error for mode in find_clusters(coords[None], founders, each, error))
 
     return check_evidence(result.log_evidence_ladder, error, result.check, share_error)
-
-
-def _both(log_evidence: float, error: float, check: EvidenceCheck) -> str:
-    return (
-        f"The stages give the log-evidence {log_evidence:.2f} +- {error:.2f}, importance sampling from the final "
-        f"points gives {check.log_evidence:.2f} +- {check.error:.2f}"
-    )
 
 
 def check_shares(
@@ -243,8 +214,3 @@ def check_shares(
     numbers = {OF_SHARES: float(difference[worst])}
     numbers |= {f"{OF_MEAN} {j}": float(x) for j, x in enumerate(np.abs(points.mean(axis=0) - weights @ coords))}
     return [Finding(LOST, CARE, text, "Use more walkers or more moves, and compare two runs.", numbers)]
-
-
-def find_unreached_part(text: str, severity: str) -> Finding:
-    """A finding about draws of a guide that hardly reached a part of the posterior."""
-    return Finding("The guide missed a part of the posterior", severity, f"{text[0].upper()}{text[1:]}.")

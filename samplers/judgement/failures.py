@@ -37,8 +37,6 @@ class NearFailures(NamedTuple):
         Number of failures in the ellipsoid about the mean of the samples that holds 99 % of the samples.
     evaluated : int
         Number of all distinct points there.
-    known : bool
-        Whether these points are known to be failures; otherwise a log-probability of -inf may have another cause.
     adjoining : int
         Number of failures, in the ellipsoid or not, among the 20 (more after a long chain) evaluated points that are
         nearest to a sample.
@@ -50,35 +48,28 @@ class NearFailures(NamedTuple):
 
     failed: int
     evaluated: int
-    known: bool = True
     adjoining: int = 0
     scattered: bool = False
     nearest: int = 0
 
     @property
-    def place(self) -> Literal["away", "scattered", "edge", "border"]:
+    def place(self) -> Literal["away", "beside", "border"]:
         """Where the failures are.
 
         "away" from the samples: fewer than 5 failures adjoin the samples, or failures are scattered among successful
-        points and at most 2 % of the points in the ellipsoid. "scattered": the same with more than 2 %. "border": more
-        than 2 % failed, and not by chance, and enough failures adjoin the samples to end the posterior. "edge": other
-        adjoining failures.
+        points and at most 2 % of the points in the ellipsoid. "border": more than 2 % failed, not scattered and not by
+        chance, and enough failures adjoin the samples to end the posterior. "beside": other adjoining failures.
         """
         if self.adjoining < FEWEST_ADJOINING:
             return "away"
         if self.scattered:
-            return "scattered" if self.failed > LARGE_SHARE_NEAR * self.evaluated else "away"
+            return "beside" if self.failed > LARGE_SHARE_NEAR * self.evaluated else "away"
         from scipy.stats import binom  # slow to import
 
         is_large = binom.sf(self.failed - 1, self.evaluated, LARGE_SHARE_NEAR) < CHANCE
         # of failures beside a bent posterior, far fewer adjoin the samples than of the other points in the ellipsoid
         adjoin = self.adjoining * self.evaluated > LEAST_ADJOINING * self.failed * self.nearest
-        return "border" if is_large and adjoin else "edge"
-
-    @property
-    def borders(self) -> bool:
-        """Whether failures border on the samples, so that they may end the posterior."""
-        return self.place == "border"
+        return "border" if is_large and adjoin else "beside"
 
 
 def failures_near(samples: np.ndarray, failed: np.ndarray, succeeded: np.ndarray) -> NearFailures:
@@ -119,9 +110,7 @@ def failures_near(samples: np.ndarray, failed: np.ndarray, succeeded: np.ndarray
         return NearFailures(number, evaluated)
     about = tree.query(points[adjoining], k=min(NEIGHBOURS + 1, len(points)))[1][:, 1:]
     by_chance = binom.isf(UNLIKELY, about.size, number / evaluated)
-    return NearFailures(
-        number, evaluated, True, len(adjoining), bool(has_failed[about].sum() <= by_chance), len(nearest)
-    )
+    return NearFailures(number, evaluated, len(adjoining), bool(has_failed[about].sum() <= by_chance), len(nearest))
 
 
 def judged_failures(evaluated: Any, final_coords: np.ndarray, target: Any) -> NearFailures:
@@ -138,41 +127,29 @@ def judged_failures(evaluated: Any, final_coords: np.ndarray, target: Any) -> Ne
     rows = np.flatnonzero(impossible)
     ruled_out = rows[~target.may_be_positive(coords[rows])]
     coords, failed, impossible = (np.delete(each, ruled_out, axis=0) for each in (coords, failed, impossible))
-    slow, either, counts = target.slow_parameters, failed | impossible, target.failure_count is not None
-    coords, samples = coords[:, slow], final_coords[:, slow]
-    found = failures_near(samples, coords[either if counts else failed], coords[~either])
-    if found.borders or counts:
-        return found
-    unknown = failures_near(samples, coords[either], coords[~either])
-    return unknown._replace(known=False) if unknown.borders else found
+    slow, either = target.slow_parameters, failed | impossible
+    coords, counted = coords[:, slow], failed if target.failure_count is None else either
+    return failures_near(final_coords[:, slow], coords[counted], coords[~either])
 
 
 def check_failed_region(near: NearFailures) -> list[Finding]:
-    """A finding if known failures adjoin the final points: severe if they are many and not scattered."""
-    if near.place == "away" or not near.known:
+    """A finding if failures adjoin the final points: severe if they end the posterior there."""
+    if near.place == "away":
         return []
-    where = f"in the region of the final points, {near.failed} of {near.evaluated} evaluated points failed"
-    text = f"{where[0].upper()}{where[1:]}"
-    if near.place == "scattered":
-        text += (
-            ", scattered among successful ones. Means and standard deviations are right if these failures do not "
-            "depend on the parameters."
-        )
-        return [
-            Finding(
-                "Failures among the samples", CARE, text, "Look at their reasons, and mend the model or its solver."
-            )
-        ]
-    if near.place == "edge":
-        text = (
-            f"{near.adjoining} failed points adjoin the final points at an edge ({where}). If the posterior goes on "
-            "there, standard deviations are too small."
-        )
-        action = (
-            "Look at the parameters of the failures, and whether the final points end there abruptly: if so, mend the "
-            "model there, or exclude the region by the prior if it is impossible."
-        )
-        return [Finding("Failures at an edge of the samples", CARE, text, action)]
-    text += ": the failures, not the data, end the posterior there, so means and standard deviations may be wrong."
-    action = "Mend the model there, or exclude the region by the prior if it is impossible."
-    return [Finding("Failures border on the samples", WRONG, text, action)]
+    text = (
+        f"{near.failed} of {near.evaluated} evaluated points in the region of the final points failed, and "
+        f"{near.adjoining} failed points adjoin the final points"
+    )
+    if near.place == "border":
+        text += ": the failures, not the data, end the posterior there, so means and standard deviations may be wrong."
+        action = "Mend the model there, or exclude the region by the prior if it is impossible."
+        return [Finding("Failures border on the samples", WRONG, text, action)]
+    text += (
+        ". Means and standard deviations are right if these failures are scattered, and too small if the posterior "
+        "goes on where they are."
+    )
+    action = (
+        "Look at their reasons and parameters, and mend the model there, or exclude the region by the prior if it is "
+        "impossible."
+    )
+    return [Finding("Failures beside the samples", CARE, text, action)]

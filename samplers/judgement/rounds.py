@@ -3,23 +3,22 @@
 Their limits are stated here, and the reasons that a user reads when one is exceeded.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
-from ..estimates.control_variates import unreached_share
 from ..estimates.importance import EvidenceCheck, KnownDensity, PooledRounds, Round
 from ..estimates.pareto import LARGEST_SHAPE
+from ..finding import Finding
 
 __all__ = [
     "LIGHT_TAILS",
-    "UNREACHED",
     "UNSETTLED",
     "all_impossible",
     "describe_rounds",
     "doubt_recycling",
+    "find_unreached_part",
     "grown",
-    "hardly_reached",
     "hopeless",
     "is_even",
     "is_reliable",
@@ -41,6 +40,10 @@ LARGEST_DIFFERENCE = 0.25
 # and wrong by 3.5 errors.
 RELIABLE_SHARE, LARGEST_RELIABLE_SHAPE = 0.25, 0.5
 SHORT_TAIL_SHARE, FEW_DRAWS = 0.75, 100
+# After the last round of a guide, the draws are used even if no round was reliable, provided that the last round has at
+# least this effective share, all rounds together have an effective sample size equal to the number of walkers, and the
+# Pareto shape of their weights is below 0.7.
+USABLE_SHARE = 0.1
 # Rounds go on while more than this share of the guide's latest known density is hardly reached by the draws of all of
 # them, or was not in the known density before; the result is not usable if that is so at the end. A smaller share that
 # is hardly reached is an error of the log-evidence. Without the first, 1 of 10 ridges E h^3 is wrong (log Z off by .09
@@ -48,20 +51,21 @@ SHORT_TAIL_SHARE, FEW_DRAWS = 0.75, 100
 LARGEST_UNREACHED = 0.03
 # The guide is given up when the mean effective share of the last 4 rounds is below this: 1.5 of 30 draws.
 HOPELESS_ROUNDS, HOPELESS_SHARE = 4, 0.05
-UNREACHED = (
-    "the guide learned at the end that the posterior is larger, and its draws hardly reached a part of it: evidence "
-    "and standard deviations may be too small. Use a larger limit of simulations"
-)
 UNSETTLED = (
-    "the density that the guide emulates has changed from round to round, in a part of it by more than a factor of "
-    "10: the posterior is larger than its draws, as along a ridge of parameters that the data do not tell apart, or "
-    "the response is rough. Evidence and standard deviations may be wrong by far more than their errors. Fix one of "
-    "such parameters, or make their product the parameter"
+    "the posterior is larger than its draws: the density that the guide emulates has grown to the end, as along a "
+    "ridge of parameters that the data do not tell apart, or the response is rough. Evidence and standard deviations "
+    "may be wrong by far more than their errors. Fix one of such parameters, or make their product the parameter; a "
+    "larger limit of simulations may suffice"
 )
 LIGHT_TAILS = (
     "the weights of the draws grow towards the tails: the tails of the guide are lighter than the posterior's, so "
     "standard deviations may be too small. Give the draws of the guide heavier tails, or use no guide"
 )
+
+
+def find_unreached_part(text: str, severity: str) -> Finding:
+    """A finding about draws of a guide that hardly reached a part of the posterior."""
+    return Finding("The guide missed a part of the posterior", severity, f"{text[0].upper()}{text[1:]}.")
 
 
 def doubt_recycling(check: EvidenceCheck | None, log_evidence: float, beta: float, efficiencies: list[float]) -> str:
@@ -100,11 +104,6 @@ def is_even(pooled: PooledRounds) -> bool:
     n, share = len(pooled.log_weights), pooled.effective_sample_size / len(pooled.log_weights)
     even = pooled.pareto_shape < LARGEST_SHAPE or (n < FEW_DRAWS and share >= SHORT_TAIL_SHARE)
     return even and bool(np.isfinite(pooled.log_evidence_error))
-
-
-def hardly_reached(log_density: Callable[[np.ndarray], np.ndarray], latest: KnownDensity | None) -> float:
-    """Share of the guide's latest known density that draws of a density hardly reach; 0 if it knows none."""
-    return 0.0 if latest is None else unreached_share(log_density, latest)
 
 
 def grown(pooled: PooledRounds, before: KnownDensity | None, latest: KnownDensity | None) -> float:

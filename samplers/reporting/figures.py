@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from .summary import finished_ladder
+from .summary import is_tempered
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -211,52 +211,42 @@ def _choose(
 ) -> _Drawn:
     """Check the arguments of a figure, and convert what it shows to the units of its labels."""
     given = samples if isinstance(samples, Mapping) else {"": samples}
-    if not given:
-        raise ValueError("no samples to draw: pass an array (n, ndim), or a mapping of labels to such arrays")
     arrays = {str(label): _checked(x, label) for label, x in given.items()}
     widths = {label: x.shape[1] for label, x in arrays.items()}
-    if len(set(widths.values())) > 1:
-        raise ValueError(f"all samples must have the same parameters; the numbers of columns are {widths}")
+    if len(set(widths.values())) != 1:
+        raise ValueError(
+            "samples must be an array (n, ndim), or a mapping of labels to such arrays of the same parameters; the "
+            f"numbers of columns are {widths}"
+        )
     ndim = next(iter(widths.values()))
-    parameters = _parameters_of(posterior, ndim)
-    if labels is not None and len(labels) != ndim:
-        raise ValueError(f"expected one label for each of {ndim} parameters; got {len(labels)}: {list(labels)}")
-    known = list(labels) if labels is not None and posterior is None else [each.name for each in parameters]
+    parameters = _parameters_of(posterior, labels, ndim)
+    known = [each.name for each in parameters]
     wanted, note = known[:most] if names is None else names, ""
     if names is None and len(wanted) < ndim:
         note = f"the first {most} of {ndim} parameters; names= chooses others"
-    unknown = [name for name in wanted if name not in known]
-    if unknown or not len(wanted):
-        what = f"unknown: {', '.join(map(str, unknown))}" if unknown else "got none"
+    if not len(wanted) or (unknown := [str(name) for name in wanted if name not in known]):
+        what = f"unknown: {', '.join(unknown)}" if len(wanted) else "got none"
         raise ValueError(f"names must be some of the parameters {', '.join(known)}; {what}")
     columns = [known.index(name) for name in wanted]
     factors = np.array([parameters[i].factor for i in columns])
     arrays = {label: x[:, columns] / factors for label, x in arrays.items()}
     nominal = np.array([parameters[i].nominal for i in columns], dtype=float) / factors
     truths = _true_values(truths, known)[columns] / factors
-    densities, prior_draws = _priors(posterior, wanted, columns, factors)
-    return _Drawn(
-        [parameters[i].label if labels is None else labels[i] for i in columns],
-        arrays,
-        truths,
-        nominal,
-        densities,
-        prior_draws,
-        _limits(arrays, np.stack([truths, nominal])),
-        note,
-    )
+    shown = [parameters[i].label if labels is None else labels[i] for i in columns]
+    limits = _limits(arrays, np.stack([truths, nominal]))
+    return _Drawn(shown, arrays, truths, nominal, *_priors(posterior, wanted, columns, factors), limits, note)
 
 
-def _parameters_of(posterior: Any, ndim: int) -> Sequence[Any]:
+def _parameters_of(posterior: Any, labels: Sequence[str] | None, ndim: int) -> Sequence[Any]:
     """Name, label, unit (``factor``) and nominal value for each of `ndim` parameters; ValueError for another number."""
     described = getattr(posterior, "parameters", None)
     if described is None:
-        names = getattr(posterior, "parameter_names", None) or [f"x{i}" for i in range(ndim)]
+        names = getattr(posterior, "parameter_names", None) or labels or [f"x{i}" for i in range(ndim)]
         described = [SimpleNamespace(name=str(name), label=str(name), factor=1.0, nominal=np.nan) for name in names]
-    if len(described) != ndim:
+    if len(described) != ndim or len(labels or described) != ndim:
         raise ValueError(
-            f"the posterior has {len(described)} parameters ({', '.join(each.name for each in described)}), but the "
-            f"samples have {ndim} columns"
+            f"expected one parameter and one label for each of {ndim} columns of the samples; got {len(described)} "
+            f"parameters ({', '.join(each.name for each in described)}) and the labels {labels}"
         )
     return described
 
@@ -359,10 +349,9 @@ def _legend_handles(drawn: _Drawn) -> list:
 
 
 def plot_run(sampler: Any) -> "Figure":
-    """Plot what a sampler did: where its evaluations went, and what was known after each step.
+    """Plot what a sampler did: what was known after each step, against the evaluations.
 
-    From above: the evaluations of each phase (rounds of a guide, tempering stages, check of the evidence, sweeps at
-    beta = 1); the exponent beta and the acceptance of each stage, if there are several; the effective sample size and
+    From above: the exponent beta and the acceptance of each stage, if there are several; the effective sample size and
     the number of distinct points; the log-evidence with two standard errors, after each round of a guide and each
     stage; and the log-probability of the walkers at beta = 1, as median and 90 % range. The log-probability of a
     converged run has no trend. The idea is from the run plot of dynesty (Speagle 2020, Monthly Notices of the Royal
@@ -376,12 +365,21 @@ def plot_run(sampler: Any) -> "Figure":
     """
     import matplotlib.pyplot as plt
 
-    stages, rounds = finished_ladder(sampler), sampler.rounds
+    if not (is_tempered(sampler) and sampler.ladder):
+        raise ValueError(
+            "plot_run draws the stages of an SMCSampler or TMCMCSampler that has run: call run_mcmc first; got "
+            f"{type(sampler).__name__}"
+        )
+    stages, rounds = sampler.ladder, sampler.rounds
     several = len(stages) > 1  # a guide that is enough has a single stage, the result of its rounds
-    size = {"figsize": (7.5, 8.8 + 2.0 * several), "layout": "constrained"}
-    heights = (0.45, 1, 1, 1, 1)[: 4 + several]
-    figure, (top, *ladder, points, evidence, chain) = plt.subplots(4 + several, 1, height_ratios=heights, **size)
-    _draw_phases(top, sampler)
+    size = {"figsize": (7.5, 7.6 + 2.0 * several), "layout": "constrained"}
+    figure, (*ladder, points, evidence, chain) = plt.subplots(3 + several, 1, **size)
+    title = f"{sampler.evaluations} evaluations"
+    if stages[-1].beta == 1.0:
+        title += rf", $\log Z$ = {sampler.log_evidence:.2f} $\pm$ {sampler.log_evidence_error:.2g}"
+    if sampler.ended_at is not None:
+        title += f", ended by the limit of simulations at beta = {sampler.ended_at:.3g}"
+    figure.suptitle(title, fontsize="medium")
     table = np.array([(s.evaluations, *s[:3], s.distinct_ancestors, *s[5:7]) for s in stages]).T
     made, beta, ess, share, distinct, increments, errors = table
     ends = np.cumsum(made)
@@ -390,7 +388,7 @@ def plot_run(sampler: Any) -> "Figure":
         axes.set_ylabel(r"exponent $\beta$ [-]", color=BLUE)
         acceptance = axes.twinx()
         acceptance.plot(ends, share, "s--", color=ORANGE, markersize=4)
-        acceptance.set_ylim(0, 1)
+        acceptance.set(ylim=(0, 1))
         acceptance.set_ylabel("acceptance [-]", color=ORANGE)
     lines = [(ends, ess, np.cumsum(increments), errors, BLUE, "stages")] if several or not rounds else []
     if rounds:
@@ -406,51 +404,18 @@ def plot_run(sampler: Any) -> "Figure":
     points.set(ylim=(0.0, 1.3 * points.get_ylim()[1]), ylabel="number of points")
     evidence.set(xlabel="evaluations of the log-probability", ylabel="log-evidence so far")
     evidence.ticklabel_format(axis="y", useOffset=False)
-    for axes in (points, evidence):
-        axes.legend(frameon=False, fontsize="small", ncols=3)
     chain.set(xlabel="step at beta = 1", ylabel="log-probability")
     if sampler.iteration > 0:
         levels = np.quantile(np.asarray(sampler.get_log_prob(), dtype=float), [0.05, 0.5, 0.95], axis=1)
         steps = np.arange(1, sampler.iteration + 1)
         chain.fill_between(steps, levels[0], levels[2], color=BLUE, alpha=0.3, linewidth=0.0)
-        chain.plot(steps, levels[1], "o-" if len(steps) < 40 else "-", color=BLUE, markersize=3)
-        chain.set_title("median and 90 % of the walkers", fontsize="small")
+        chain.plot(steps, levels[1], "o-", color=BLUE, markersize=3, label="median and 90 % of the walkers")
         chain.xaxis.get_major_locator().set_params(integer=True)
     for axes in (*ladder, points, evidence, chain):
         axes.grid(alpha=0.25)
+        if axes.get_legend_handles_labels()[0]:
+            axes.legend(frameon=False, fontsize="small", ncols=3)
     for axes in (*ladder, points):
         axes.sharex(evidence)
         axes.tick_params(labelbottom=False)
     return figure
-
-
-def _draw_phases(axes: "Axes", sampler: Any) -> None:
-    """One bar with one part per phase, whose length is the number of evaluations; the title has cost and evidence."""
-    stages = sampler.ladder
-    title = f"{len(stages)} stage{'s' if len(stages) > 1 else ''}, {sampler.evaluations} evaluations, "
-    if sampler.ended_at is not None:
-        title += f"ended by the limit of simulations at beta = {sampler.ended_at:.3g}"
-    elif stages[-1].beta < 1.0:
-        title += f"not finished: beta = {stages[-1].beta:.3g}"
-    else:
-        title += rf"$\log Z$ = {sampler.log_evidence:.2f} $\pm$ {sampler.log_evidence_error:.2g}"
-    axes.set_title(title, fontsize="medium")
-    annealing = sum(stage.evaluations for stage in stages)
-    of_guide = min(sum(each.draws for each in sampler.rounds), annealing)
-    check = sampler.log_evidence_check if stages[-1].beta == 1.0 else None
-    of_check = 0 if check is None else check.evaluations
-    phases = (
-        ("draws of the guide", of_guide, ORANGE),
-        ("tempering", annealing - of_guide, BLUE),
-        ("check of the evidence", of_check, "#b7c9da"),
-        ("sweeps at beta = 1", sampler.evaluations - annealing - of_check, GREY),
-    )
-    start = 0
-    for name, number, colour in phases:
-        if number > 0:
-            axes.barh(0, number, left=start, color=colour, edgecolor="white", label=f"{name}: {number}")
-            start += number
-    axes.set(xlim=(0, max(start, 1)), yticks=[], ylim=(-0.5, 1.4))
-    axes.legend(frameon=False, fontsize="small", ncols=4, loc="upper center", borderaxespad=0.0, handlelength=1.0)
-    axes.spines[["left", "right", "top"]].set_visible(False)
-    axes.set_xlabel("evaluations of the log-probability, by phase")

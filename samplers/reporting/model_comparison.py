@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,8 +26,6 @@ class ModelComparison(NamedTuple):
         Prior and posterior probabilities of the models.
     lower, upper : ndarray, shape (n,)
         95 % intervals of the posterior probabilities, from the log-odds.
-    log_bayes_factor, log_bayes_factor_error : ndarray, shape (n,)
-        Log-evidence minus the largest log-evidence, and its standard error, which is zero for the best model.
     summaries : tuple of str
         ``sampler.verdict.summary`` of each model; empty for a pair of numbers.
     """
@@ -38,8 +37,6 @@ class ModelComparison(NamedTuple):
     probability: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
-    log_bayes_factor: np.ndarray
-    log_bayes_factor_error: np.ndarray
     summaries: tuple[str, ...]
 
     @property
@@ -54,18 +51,18 @@ class ModelComparison(NamedTuple):
 
     def table(self) -> str:
         """Table with one line per model, the most probable first, and the verdict of each run."""
-        table = [("model", "log evidence", "log Bayes factor", "prior", "probability", "95 % interval")]
+        table = [("model", "log evidence", "difference", "prior", "probability", "95 % interval")]
         for k in np.argsort(-self.probability, kind="stable"):
-            evidence, factor = (
-                f"{value[k]:.3f} +- {error[k]:.3f}"
-                for value, error in (self[1:3], (self.log_bayes_factor, self.log_bayes_factor_error))
+            table.append(
+                (
+                    self.names[k],
+                    f"{self.log_evidence[k]:.3f} +- {self.log_evidence_error[k]:.3f}",
+                    f"{self.log_evidence[k] - self.log_evidence.max():.3f}",
+                    f"{self.prior[k]:.3g}",
+                    f"{self.probability[k]:.4g}",
+                    f"{self.lower[k]:.4g} ... {self.upper[k]:.4g}",
+                )
             )
-            shares = (
-                f"{self.prior[k]:.3g}",
-                f"{self.probability[k]:.4g}",
-                f"{self.lower[k]:.4g} ... {self.upper[k]:.4g}",
-            )
-            table.append((self.names[k], evidence, factor, *shares))
         said = [f"{name}: {text}" for name, text in zip(self.names, self.summaries, strict=True) if text]
         return "\n".join([*aligned(table), *said])
 
@@ -93,9 +90,9 @@ def compare_models(models: Mapping[str, Any], prior: Mapping[str, float] | None 
     >>> comparison.best
     'inelastic'
     >>> print(comparison)
-    model           log evidence  log Bayes factor  prior  probability      95 % interval
-    inelastic  -118.900 +- 0.100    0.000 +- 0.000    0.5       0.8022  0.7545 ... 0.8425
-    elastic    -120.300 +- 0.100   -1.400 +- 0.141    0.5       0.1978  0.1575 ... 0.2455
+    model           log evidence  difference  prior  probability      95 % interval
+    inelastic  -118.900 +- 0.100       0.000    0.5       0.8022  0.7545 ... 0.8425
+    elastic    -120.300 +- 0.100      -1.400    0.5       0.1978  0.1575 ... 0.2455
     """
     if not isinstance(models, Mapping) or len(models) < 2:
         raise ValueError(f"compare_models needs a mapping with two models or more, by name; got {models!r}")
@@ -121,27 +118,20 @@ def compare_models(models: Mapping[str, Any], prior: Mapping[str, float] | None 
         share = np.exp(np.delete(score, k) - rest) if rest > -np.inf else 0.0
         odds_error[k] = math.hypot(error[k], *(share * np.delete(error, k)))
     reach = ndtri(0.975) * odds_error
-    best = int(np.argmax(log_evidence))
-    factor_error = np.where(np.arange(len(names)) == best, 0.0, np.hypot(error, error[best]))
     shares = before, probability, expit(odds - reach), expit(odds + reach)
-    factors = log_evidence - log_evidence[best], factor_error
-    return ModelComparison(
-        names, log_evidence, error, *shares, *factors, tuple(map(verdict_summary_of, models.values()))
-    )
+    return ModelComparison(names, log_evidence, error, *shares, tuple(map(verdict_summary_of, models.values())))
 
 
 def _evidence(name: str, model: Any) -> tuple[float, float]:
     pair = (model.log_evidence, model.log_evidence_error) if hasattr(model, "log_evidence_error") else model
-    try:
+    with suppress(TypeError, ValueError):
         value, error = map(float, pair)
-    except (TypeError, ValueError) as reason:
-        text = "expected a sampler with log_evidence and log_evidence_error, or a pair of numbers"
-        raise ValueError(f"model {name!r}: {text}; got {model!r}") from reason
-    if not (math.isfinite(value) and math.isfinite(error) and error >= 0.0):
-        raise ValueError(
-            f"model {name!r}: the log-evidence and its error must be finite, and the error not negative; got {pair}"
-        )
-    return value, error
+        if math.isfinite(value) and 0.0 <= error < math.inf:
+            return value, error
+    raise ValueError(
+        f"model {name!r}: expected a sampler with log_evidence and log_evidence_error, or a pair of numbers, which are "
+        f"finite, and the error not negative; got {pair!r}"
+    )
 
 
 def _prior(names: tuple[str, ...], prior: Mapping[str, float] | None) -> np.ndarray:

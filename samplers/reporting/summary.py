@@ -1,21 +1,14 @@
-"""Results of finished runs as tables: moments and tempering stages."""
+"""Results of finished runs as tables: moments of the posterior."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-
-from ..reports import Stage
-
-if TYPE_CHECKING:
-    import pandas
 
 __all__ = [
     "Summary",
     "aligned",
-    "finished_ladder",
     "is_tempered",
-    "ladder_table",
     "log_posterior_of",
     "names_of_parameters",
     "summary",
@@ -81,19 +74,6 @@ class Summary(NamedTuple):
 
     __repr__ = __str__
 
-    def to_dataframe(self) -> "pandas.DataFrame":
-        """The numbers of the table as a `pandas.DataFrame`, whose index is the parameters.
-
-        Examples
-        --------
-        >>> summary(sampler.get_chain(flat=True), posterior.parameter_names).to_dataframe().columns.tolist()
-        ['mean', 'mean_error', 'sd', 'sd_error', 'cv']
-        """
-        import pandas
-
-        columns = {name: getattr(self, name) for name in ("mean", "mean_error", "sd", "sd_error", "cv")}
-        return pandas.DataFrame(columns, index=pandas.Index(self.names, name="parameter"))
-
 
 def names_of_parameters(names: Sequence[str] | None, ndim: int) -> tuple[str, ...]:
     """The given names, or theta_0, theta_1, ...; ValueError if there is not one per parameter."""
@@ -148,54 +128,3 @@ def summary(
     mean, sd = samples.mean(axis=0), samples.std(axis=0)
     cv = np.divide(sd, np.abs(mean), out=np.where(sd > 0.0, np.inf, 0.0), where=mean != 0.0)
     return Summary(names_of_parameters(names, samples.shape[1]), mean, sd, cv, *errors)
-
-
-def finished_ladder(sampler: Any) -> tuple[Stage, ...]:
-    """Return the stages of a tempered sampler, or raise ValueError if there are none."""
-    if not is_tempered(sampler):
-        raise ValueError(f"expected a tempered sampler (SMCSampler or TMCMCSampler); got {type(sampler).__name__}")
-    if not sampler.ladder:
-        raise ValueError("the sampler has no tempering stages yet: call run_mcmc first")
-    return sampler.ladder
-
-
-def ladder_table(sampler: Any) -> str:
-    """Table of the tempering stages (`samplers.Stage`), estimates of the evidence, and summary of the verdict.
-
-    ValueError if the sampler has no stages.
-
-    Examples
-    --------
-    >>> print(ladder_table(sampler))  # doctest: +ELLIPSIS
-    stage       beta   ESS  acceptance  sweeps  distinct  d log Z  evaluations  time [s]
-    ...
-    log evidence 376...
-    Converged: one mode; ...
-    """
-    stages, ended = finished_ladder(sampler), sampler.ended_at
-    table = [("stage", "beta ", "ESS", "acceptance", "sweeps", "distinct", "d log Z", "evaluations", "time [s]")]
-    for number, (beta, ess, share, moves, distinct, increment, _, made, seconds) in enumerate(stages, start=1):
-        reached = f"{beta:.3e} " if ended is None or number < len(stages) else f"{ended:.3e}*"
-        cells = f"{ess:.0f}", f"{share:.3f}", f"{moves}", f"{distinct}", f"{increment:.3f}", f"{made}", f"{seconds:.3g}"
-        table.append((f"{number}", reached, *cells))
-    rows = aligned(table)
-    if ended is not None:
-        rows.append("* the limit of simulations ended the run here: all points known then, weighted for beta = 1")
-    rows.append(
-        f"log evidence {sampler.log_evidence:.3f} +- {sampler.log_evidence_error:.3f}; "
-        f"{sum(s.evaluations for s in stages)} evaluations in {sum(s.seconds for s in stages):.3g} s"
-    )
-    if (check := sampler.log_evidence_check) is not None:
-        rows.append(
-            f"check by {check.evaluations} independent draws: effective sample size {check.effective_sample_size:.0f}, "
-            f"Pareto shape {check.pareto_shape:.2f}"
-        )
-    if (sample := sampler.signed_sample) is not None:
-        error = np.nanmax(sample.expectation().error / sample.standard_deviation().value, initial=0.0)
-        rows.append(
-            f"largest error of a mean by sampler.signed_sample: {error:.2g} posterior standard deviations, from "
-            f"{np.count_nonzero(sample.rounds)} weighted draws and {sampler.simulations:.0f} simulations"
-        )
-    if text := verdict_summary_of(sampler):
-        rows.append(text)
-    return "\n".join(rows)

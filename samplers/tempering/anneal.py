@@ -21,17 +21,17 @@ from ..budget import BudgetExhausted
 from ..estimates.importance import EvidenceCheck, draw_inside, evidence_from_weights
 from ..estimates.pareto import pareto_shape
 from ..estimates.weights import WHERE_TO_LOOK, coarse_weights, effective_sample_size, normalised_weights
-from ..finding import WRONG, Finding
-from ..judgement.checks import check_annealing, check_shares, find_unreached_part
+from ..finding import Finding
+from ..judgement.checks import check_shares
 from ..proposals.basins import find_basins, with_components
 from ..proposals.mixture import fit_mixture, log_density
 from ..proposals.transforms import find_support_bounds
-from ..reports import EarlyStop, GuidedStart, Report, Restart, Stage
+from ..reports import LIMIT, Report, Restart, Stage, Weighted
 from ..resampling import systematic
 from ..settings import Settings
 from .early_stop import StoppedEarly
-from .guided import Guidance, draw_rounds, stopped_rounds
-from .mutation import MoveSchedule, Mutated, VisitedPoints, move_together
+from .guided import Guidance, draw_rounds
+from .mutation import Kernel, MoveSchedule, Mutated, VisitedPoints, move_together
 from .population import Density, Population
 from .recycling import Recycled, first_draws, recycle, submit_start
 from .smc_moves import anneal_by_moves
@@ -65,39 +65,30 @@ def anneal(
         if more > 0 and (settings.recycle or schedule.mixtures):  # walks, as in papers, do not use what they reveal
             coords = np.concatenate([coords, density.target.more_draws(more, random)])
         start, recycled = submit_start(coords, density, whole=not settings.recycle), None
+        kernel = Kernel(density, random, schedule, settings, VisitedPoints())
         if settings.recycle:
-            steps = recycle(start, size, density, random)
-            recycled = yield from _by_recycling(steps, population, size, density, random, schedule, settings)
-        if recycled is None or not recycled.reliable:
+            recycled = yield from _by_recycling(recycle(start, size, density, random), population, size, kernel)
+        if recycled is None or recycled.reason:
+            for coords, records in (start.arrived_part(), *([] if recycled is None else [recycled[1:3]])):
+                kernel.visited.add(coords, records)
             coords, records = start.arrived_part()
-            population, visited = population._replace(coords=coords, records=records), VisitedPoints()
-            visited.add(coords, records)
-            if recycled is not None:
-                visited.add(recycled.coords, recycled.records)
-            moved = yield from anneal_by_moves(population, size, density, random, schedule, settings, visited)
-            yield from _check_moves(*moved, density, random, settings, visited)
+            population = population._replace(coords=coords, records=records)
+            yield from _check_moves(*(yield from anneal_by_moves(population, size, kernel)), kernel)
     except StoppedEarly as stop:
         yield from _finish_early(stop, size, random, 0.0 if guidance is None else guidance.budget.of_guides)
 
 
-def _check_moves(
-    population: Population,
-    stages: Sequence[Stage],
-    correlation: float,
-    density: Density,
-    random: np.random.RandomState,
-    settings: Settings,
-    visited: VisitedPoints,
-) -> Steps:
+def _check_moves(population: Population, stages: Sequence[Stage], kernel: Kernel) -> Steps:
     """The evidence check after annealing by moves, and findings."""
-    yield from ((population, each) for each in check_annealing(stages, correlation))
-    if settings.check_draws == 0:
+    draws = kernel.settings.check_draws
+    if draws == 0:
         return
     log_evidence = sum(stage.log_evidence_increment for stage in stages)
     try:
-        check, found = check_population(population, density, visited, log_evidence, random, settings.check_draws)
+        check, found = check_population(population, *kernel[:2], kernel.visited, log_evidence, draws)
     except BudgetExhausted:
-        raise StoppedEarly(population, 0.0, 0.0, 1.0, complete=True) from None
+        yield population, Weighted(0, population.effective_sample_size, float("-inf"), ended=LIMIT)
+        return
     yield population, check
     yield from ((population, each) for each in found)
 
@@ -105,9 +96,9 @@ def _check_moves(
 def check_population(
     population: Population,
     density: Density,
+    random: np.random.RandomState,
     visited: VisitedPoints,
     log_evidence: float,
-    random: np.random.RandomState,
     draws: int | None = None,
 ) -> tuple[EvidenceCheck, list[Finding]]:
     """Evidence, and findings about the shares of the posterior's parts, by fresh draws of a mixture fitted to the final
@@ -127,37 +118,31 @@ def check_population(
 
 
 def _by_recycling(
-    steps: Generator[tuple[Population, Report], None, Recycled],
-    population: Population,
-    size: int,
-    density: Density,
-    random: np.random.RandomState,
-    schedule: MoveSchedule,
-    settings: Settings,
+    steps: Generator[tuple[Population, Report], None, Recycled], population: Population, size: int, kernel: Kernel
 ) -> Generator[tuple[Population, Report], None, Recycled]:
     """Make the `steps` of `recycle`, then resample the weighted draws to `size` points and move them."""
     found = yield from steps
-    if not found.reliable:
+    if found.reason:
         logger.info("the result of recycling is not reliable, because %s", found.reason)
         yield population, Restart(found.reason)
         return found
     # the last proposal, since it was not fitted to the draws of the check, which are most of the moved points
-    proposal = found.proposals[-1][1]
-    schedule.calibrate(found.coords, coarse_weights(found.log_weights), density.inside, proposal)
-    population, distinct = _resampled(found.coords, found.records, found.log_weights, size, random)
+    proposal, schedule = found.proposal, kernel.schedule
+    schedule.calibrate(found.coords, coarse_weights(found.log_weights), kernel.density.inside, proposal)
+    population, distinct = _resampled(found.coords, found.records, found.log_weights, size, kernel.random)
     effective = population.effective_sample_size
-    if settings.check_draws != 0:
+    if kernel.settings.check_draws != 0:
         yield population, found.check
     if found.independent:  # sweeps would cost evaluations and improve nothing
         for move in schedule.mixtures:
             move.expect_independence()
         moved = Mutated(population, effective / len(found.coords), 0, 0.0)
     else:
-        moved = yield from move_together(population, density, random, schedule, settings)
+        moved = yield from move_together(population, kernel)
     increment, error = found.log_evidence - found.log_evidence_below_one, found.log_evidence_error
     yield moved.population, Stage(1.0, effective, moved.acceptance, moved.moves, distinct, increment, error)
     if moved.stopped:
-        raise StoppedEarly(moved.population, 0.0, 0.0, 1.0, complete=True)
+        yield moved.population, Weighted(0, effective, float("-inf"), ended=LIMIT)
     return found
 
 
@@ -182,33 +167,28 @@ def _from_guide(
     found = yield from draw_rounds(population, density, random, guidance)
     if found.signed is not None:
         yield population, found.signed
-    if found.stopped:
-        if found.shortfall:
-            yield population, find_unreached_part(found.shortfall, WRONG)
-        raise stopped_rounds(found)
+    yield from ((population, each) for each in found.findings)
     pooled = found.pooled
-    if pooled.log_evidence == -np.inf:
+    if found.reason and pooled.log_evidence == -np.inf:
         raise ValueError(
             f"none of {len(pooled.coords)} draws of the guide has a finite log-probability: {WHERE_TO_LOOK}, use a "
             "better guide, or run without a guide"
         )
-    start = GuidedStart(found.reason, "" if found.reason else found.shortfall, pooled.pareto_shape)
-    if not start.used:
-        yield population, start
-        raise stopped_rounds(found)
+    if found.stopped or found.reason:
+        why = f"The rounds of the guide ended, because {found.reason}," if found.reason else LIMIT
+        points = (pooled.coords, pooled.records, pooled.effective_sample_size, (), pooled.log_weights) if pooled else ()
+        points = Population(1.0, *(points or (np.empty((0, 0)), np.empty(0), 0.0, (), np.empty(0))))
+        raise StoppedEarly(points, *(found.evidence if pooled else (-np.inf, np.inf)), 1.0, guided=True, why=why)
     resampled, distinct = _resampled(pooled.coords, pooled.records, pooled.log_weights, size, random)
     schedule.calibrate(pooled.coords, coarse_weights(pooled.log_weights), density.inside)
-    yield resampled, start
     ess, share = pooled.effective_sample_size, found.rounds[-1].effective_share
+    yield resampled, Weighted(len(pooled.coords), ess, pooled.pareto_shape, guided=True)
     yield resampled, Stage(1.0, ess, share, 0, distinct, *found.evidence)
 
 
 def _finish_early(stop: StoppedEarly, size: int, random: np.random.RandomState, searched: float) -> Steps:
     """Resample the known points to `size` points at beta = 1; `searched`: simulations made by guides."""
     population = stop.population
-    if stop.complete:
-        yield population, EarlyStop(1.0, len(population.coords), population.effective_sample_size, float("-inf"), True)
-        return
     log_weights = population.log_weights
     if len(log_weights) == 0 or np.max(log_weights) == -np.inf:
         search = f", besides {searched:.0f} simulations of the search by the guide" if searched > 0.0 else ""
@@ -221,6 +201,6 @@ def _finish_early(stop: StoppedEarly, size: int, random: np.random.RandomState, 
     effective, known = stop.effective_sample_size, len(log_weights)
     population, distinct = _resampled(population.coords, population.records, log_weights, size, random)
     population = population._replace(effective_sample_size=effective)
-    yield population, EarlyStop(stop.beta, known, effective, pareto_shape(log_weights), from_guide=stop.from_guide)
-    increment = stop.log_evidence - stop.log_evidence_of_stages
+    yield population, Weighted(known, effective, pareto_shape(log_weights), stop.beta, stop.why, stop.guided)
+    increment = stop.log_evidence - stop.of_stages
     yield population, Stage(1.0, effective, effective / known, 0, distinct, increment, stop.error)

@@ -4,6 +4,7 @@ import numpy as np
 
 from ..estimates.importance import tail_variance
 from ..estimates.weights import effective_sample_size, log_mean_weight
+from ..reports import LIMIT
 from .population import Population
 
 __all__ = ["StoppedEarly", "stop_at"]
@@ -12,8 +13,8 @@ __all__ = ["StoppedEarly", "stop_at"]
 class StoppedEarly(Exception):
     """The limit of simulations has ended an annealing at `beta`; the known points have log-weights at beta = 1.
 
-    `log_evidence_of_stages` is the part that was already reported. If `complete`, beta = 1 was reached and the
-    population is equally weighted. `from_guide`: the points are draws of a guide.
+    `of_stages` is the part of the log-evidence that was already reported. `guided`: the points are draws of a guide;
+    `why` the run ended.
     """
 
     def __init__(
@@ -22,21 +23,18 @@ class StoppedEarly(Exception):
         log_evidence: float,
         error: float,
         beta: float,
-        log_evidence_of_stages: float = 0.0,
-        complete: bool = False,
-        from_guide: bool = False,
+        of_stages: float = 0.0,
+        guided: bool = False,
+        why: str = LIMIT,
     ):
-        super().__init__("the limit of simulations (max_simulations) ended the annealing")
+        super().__init__(why)
         self.population, self.log_evidence, self.error, self.beta = population, log_evidence, error, beta
-        self.log_evidence_of_stages, self.complete, self.from_guide = log_evidence_of_stages, complete, from_guide
+        self.of_stages, self.guided, self.why = of_stages, guided, why
 
     @property
     def effective_sample_size(self) -> float:
         """Effective sample size at beta = 1, where copies of a point count as one point."""
-        log_weights = self.population.log_weights
-        if log_weights is None or len(log_weights) == 0:
-            return self.population.effective_sample_size
-        return effective_sample_size(_of_distinct_points(self.population.coords, log_weights))
+        return effective_sample_size(_of_distinct_points(self.population.coords, self.population.log_weights))
 
 
 def _of_distinct_points(coords: np.ndarray, log_weights: np.ndarray) -> np.ndarray:
@@ -47,12 +45,10 @@ def _of_distinct_points(coords: np.ndarray, log_weights: np.ndarray) -> np.ndarr
     return total
 
 
-def stop_at(
-    population: Population, log_evidence: float, error: float, log_evidence_of_stages: float = 0.0
-) -> StoppedEarly:
+def stop_at(population: Population, log_evidence: float, error: float, of_stages: float = 0.0) -> StoppedEarly:
     """The error to be raised: equally weighted points at `population.beta`, weighted by the posterior.
 
-    `log_evidence` and `error` belong to the beta of the points; `log_evidence_of_stages` was already reported.
+    `log_evidence` and `error` belong to the beta of the points; `of_stages` was already reported.
     """
     records = population.records
     alive = records["log_prob"] > -np.inf
@@ -60,9 +56,8 @@ def stop_at(
     log_weights = np.where(alive, (1.0 - population.beta) * ratio, -np.inf)
     population = population._replace(log_weights=log_weights)
     if not alive.any():
-        return StoppedEarly(population, float("-inf"), float("inf"), population.beta, log_evidence_of_stages)
-    increment = log_mean_weight(log_weights)
+        return StoppedEarly(population, float("-inf"), float("inf"), population.beta, of_stages)
     distinct = _of_distinct_points(population.coords, log_weights)
     variance = error**2 + 1.0 / effective_sample_size(distinct) - 1.0 / len(distinct) + tail_variance(distinct)
-    total = log_evidence + increment
-    return StoppedEarly(population, total, float(np.sqrt(variance)), population.beta, log_evidence_of_stages)
+    total = log_evidence + log_mean_weight(log_weights)
+    return StoppedEarly(population, total, float(np.sqrt(variance)), population.beta, of_stages)

@@ -26,6 +26,7 @@ from ..settings import Settings
 from .population import Density, Population
 
 __all__ = [
+    "Kernel",
     "MoveSchedule",
     "Mutated",
     "StartCorrelation",
@@ -122,43 +123,45 @@ class VisitedPoints:
     """
 
     def __init__(self) -> None:
-        self._coords: list[np.ndarray] = []
-        self._records: list[np.ndarray] = []
+        self._parts: list[tuple[np.ndarray, ...]] = []
 
     def add(self, coords: np.ndarray, records: np.ndarray) -> None:
         """Add points (n, ndim) with log_prior and log_prob from their records (n,)."""
         possible = records["log_prob"] > -np.inf
-        kept = np.empty(np.count_nonzero(possible), [("log_prior", float), ("log_prob", float)])
-        for name in kept.dtype.names:
-            kept[name] = records[name][possible]
-        self._coords.append(coords[possible])
-        self._records.append(kept)
+        self._parts.append((coords[possible], records["log_prior"][possible], records["log_prob"][possible]))
 
     def at(self, beta: float) -> tuple[np.ndarray, np.ndarray]:
         """The points (n, ndim) and the logarithm (n,) of the tempered target there, not normalised.
 
         If there are more than 10 000 points, those with the lowest target are dropped.
         """
-        coords, records = np.concatenate(self._coords), np.concatenate(self._records)
-        log_target = tempered_log_prob(records, beta)
+        coords, log_prior, log_prob = (np.concatenate(each) for each in zip(*self._parts, strict=True))
+        log_target, highest = (1.0 - beta) * log_prior + beta * log_prob, slice(None)
         if len(coords) > MOST_POINTS:
             highest = np.sort(np.argpartition(-log_target, MOST_POINTS)[:MOST_POINTS])
-            coords, records, log_target = coords[highest], records[highest], log_target[highest]
-        self._coords, self._records = [coords], [records]
-        return coords, log_target
+        self._parts = [(coords[highest], log_prior[highest], log_prob[highest])]
+        return coords[highest], log_target[highest]
 
 
-def _tempered_model(
-    density: Density, beta: float, random: np.random.RandomState, visited: VisitedPoints | None
-) -> Model:
+class Kernel(NamedTuple):
+    """What moves need: density, random numbers, the moves and their settings, and where they keep visited points."""
+
+    density: Density
+    random: np.random.RandomState
+    schedule: MoveSchedule
+    settings: Settings
+    visited: VisitedPoints
+
+
+def _tempered_model(kernel: Kernel, beta: float) -> Model:
     """The tempered density as emcee's moves evaluate it; the records of the points are its blobs."""
 
     def tempered(coords: np.ndarray, records: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        if visited is not None:
-            visited.add(coords, records)
+        kernel.visited.add(coords, records)
         return tempered_log_prob(records, beta), records
 
-    return Model(density.evaluate, partial(density.evaluate, then=tempered), density.map, random)
+    density = kernel.density
+    return Model(density.evaluate, partial(density.evaluate, then=tempered), density.map, kernel.random)
 
 
 class StartCorrelation:
@@ -200,27 +203,20 @@ class StartCorrelation:
 
 
 def move_together(
-    population: Population,
-    density: Density,
-    random: np.random.RandomState,
-    schedule: MoveSchedule,
-    settings: Settings,
-    visited: VisitedPoints | None = None,
-    made: int = 0,
-    correlation: StartCorrelation | None = None,
+    population: Population, kernel: Kernel, made: int = 0, correlation: StartCorrelation | None = None
 ) -> Generator[tuple[Population, Sweep], None, Mutated]:
     """Move equally weighted points equally often, until they are nearly uncorrelated with their start; yields each
     sweep.
 
-    Points that are evaluated are added to `visited`. Chains may have `made` moves before, with a `correlation`.
+    Chains may have `made` moves before, with a `correlation`.
     """
     beta, records = population.beta, population.records
-    model = _tempered_model(density, beta, random, visited)
+    model = _tempered_model(kernel, beta)
     correlation = StartCorrelation(population.coords, records) if correlation is None else correlation
     state = State(population.coords, log_prob=tempered_log_prob(records, beta), blobs=records)
     acceptance = []
-    while not correlation.is_low_enough(settings):
-        move = schedule.choose(random)
+    while not correlation.is_low_enough(kernel.settings):
+        move = kernel.schedule.choose(kernel.random)
         try:
             state, accepted = move.propose(model, state)
         except BudgetExhausted:
@@ -235,13 +231,7 @@ def move_together(
 
 
 def grow_chains(
-    population: Population,
-    ancestors: np.ndarray,
-    density: Density,
-    random: np.random.RandomState,
-    schedule: MoveSchedule,
-    settings: Settings,
-    visited: VisitedPoints | None = None,
+    population: Population, ancestors: np.ndarray, kernel: Kernel
 ) -> Generator[tuple[Population, Sweep], None, Mutated]:
     """Grow a chain from each distinct point (leader), one step per copy of it, after ``settings.burn_in`` steps of all.
 
@@ -249,7 +239,7 @@ def grow_chains(
     points follow if these are still correlated with the resampled points. `ancestors` (n,) are equal for copies.
     """
     beta, coords, records = population.beta, population.coords, population.records
-    model = _tempered_model(density, beta, random, visited)
+    model, schedule, settings = _tempered_model(kernel, beta), kernel.schedule, kernel.settings
     _, first, owner, counts = np.unique(ancestors, return_index=True, return_inverse=True, return_counts=True)
     place = np.argsort(owner, kind="stable")
     start = np.concatenate([[0], np.cumsum(counts)[:-1]])
@@ -261,7 +251,7 @@ def grow_chains(
     for length in range(-settings.burn_in, int(counts.max())):
         growing = np.flatnonzero(counts > length)
         schedule.follow(ancestors[first[growing]])
-        move = schedule.choose(random)
+        move = schedule.choose(kernel.random)
         state = State(chains.coords[growing], log_prob=chains.log_prob[growing], blobs=chains.blobs[growing])
         try:
             state, accepted = move.propose(model, state)
@@ -280,5 +270,4 @@ def grow_chains(
     if settings.burn_in == 0 or grown.correlation < settings.max_correlation:
         return grown
     schedule.follow(ancestors)
-    arguments = density, random, schedule, settings, visited
-    return (yield from move_together(population, *arguments, grown.moves, correlation))
+    return (yield from move_together(population, kernel, grown.moves, correlation))

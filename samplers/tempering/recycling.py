@@ -71,8 +71,9 @@ class Recycled(NamedTuple):
     """Result of recycling: the draws made at beta = 1 with those of the check, their records and log-weights (n,).
 
     `reason` says why the result is not reliable; empty if it is. Each draw is weighted by the mixture of its round,
-    which was not fitted to it. `log_evidence` and its error use all points except the draws of the check. `independent`
-    says whether as many points as walkers, resampled from the draws, are as good as independent draws of the posterior.
+    which was not fitted to it. `log_evidence` and its error use all points except the draws of the check. `proposal` is
+    the mixture of the check. `independent` says whether as many points as walkers, resampled from the draws, are as
+    good as independent draws of the posterior.
     """
 
     reason: str
@@ -82,19 +83,9 @@ class Recycled(NamedTuple):
     log_evidence: float
     log_evidence_error: float
     check: EvidenceCheck | None
-    points: "WeightedPoints | None" = None
+    proposal: Mixture | None = None
     log_evidence_below_one: float = 0.0
     independent: bool = False
-
-    @property
-    def proposals(self) -> Sequence[tuple[int, Mixture]]:
-        """The proposals in order, and how many draws were made from each."""
-        return () if self.points is None else self.points.proposals
-
-    @property
-    def reliable(self) -> bool:
-        """Whether the result is reliable."""
-        return not self.reason
 
 
 def recycle(
@@ -107,7 +98,7 @@ def recycle(
     at the limit of simulations.
     """
     first, ndim = pending.coords.shape
-    search, basin_rounds = _Search(search_draws(n)), 0
+    left, enlarged, basin_rounds = float(search_draws(n)), 1.0, 0  # draws that search for narrow modes
     target = least = smallest_target(n, ndim)
     points, bounds = WeightedPoints(pending), find_support_bounds(density.inside, pending.coords)
     beta, efficiencies, increments, checks, most = 0.0, [], [], 0, 1
@@ -131,7 +122,7 @@ def recycle(
                 density.wait(points.running() - 1)
                 continue
             # more draws shall not make larger steps: it is their number per step that finds narrow modes
-            kept = max(target, min(search.increase * target, LARGEST_SHARE_KEPT * effective))
+            kept = max(target, min(enlarged * target, LARGEST_SHARE_KEPT * effective))
             following = next_beta(points.log_ratio, beta, kept, log_weights)
             if following == 1.0 and points.running() > 0:  # the draws at beta = 1 are the result
                 density.wait(0)
@@ -168,7 +159,9 @@ def recycle(
             mixture = with_components(mixture, basins)
             wanted = n if finished else DRAWS_PER_TARGET * target
         if last_beta < beta < 1.0:
-            wanted = search.enlarge(wanted, beta)
+            # those left are spread evenly over the stages still expected
+            extra = left / max(-np.log(beta) / np.log(EXPECTED_GROWTH), 1.0)
+            left, enlarged, wanted = left - extra, 1.0 + extra / wanted, wanted + extra
 
         # draw
         new, made = draw_inside(mixture, int(round(wanted)), random, density.inside)
@@ -202,9 +195,8 @@ def recycle(
                 density.wait(0)
                 points.update()
                 log_evidence, error = _evidence(points.log_weights(beta), inherited)
-            points.add(mixture, made, pending)
             result = _result(drawn if beta == 1.0 else [draws], beta)
-            return Recycled(reason, *result, log_evidence, error, check, points, sum(increments), independent)
+            return Recycled(reason, *result, log_evidence, error, check, mixture, sum(increments), independent)
         points.add(mixture, made, pending)
 
 
@@ -212,12 +204,12 @@ class WeightedPoints:
     """All arrived points (n, ndim), their records, and the log-mixture over all densities they were drawn from.
 
     The mixture counts every submitted draw. While some are running, the sum of the weights is therefore smaller than
-    the evidence. `proposals` are the mixtures in order, with the number of draws made from each.
+    the evidence.
     """
 
     def __init__(self, pending: PendingPoints):
         self._batches = [pending]
-        self.proposals: list[tuple[int, Mixture]] = []
+        self._proposals: list[tuple[float, Mixture]] = []
         self._log_mixture_of_all = np.log(len(pending.coords)) + pending.base["log_prior"]
         self.update()
 
@@ -225,9 +217,9 @@ class WeightedPoints:
         """Add the draws inside the support, of `made` draws from a mixture."""
         coords = pending.coords
         log_mixture = np.log(len(self._batches[0].coords)) + pending.base["log_prior"]
-        for count, earlier in self.proposals:
+        for count, earlier in self._proposals:
             log_mixture = np.logaddexp(log_mixture, np.log(count) + log_density(earlier, coords))
-        self.proposals.append((made, mixture))
+        self._proposals.append((made, mixture))
         self._batches.append(pending)
         coords_of_all = np.concatenate([pending.coords for pending in self._batches])
         self._log_mixture_of_all = np.logaddexp(
@@ -336,23 +328,6 @@ def most_running(density: Density, submitted: int) -> int:
     Half the points that were submitted last must have arrived: fewer would improve a proposal too little.
     """
     return min(density.workers, submitted // 2)
-
-
-class _Search:
-    """Additional draws that search for narrow modes, spread over the stages of an annealing.
-
-    `left` : float, their number. `increase` : float, all draws of the latest stage over the necessary draws.
-    """
-
-    def __init__(self, left: float) -> None:
-        self._left, self.increase = left, 1.0
-
-    def enlarge(self, draws: float, beta: float) -> float:
-        """The draws of a stage, plus additional draws: those left are spread evenly over the stages still expected."""
-        share = self._left / max(-np.log(beta) / np.log(EXPECTED_GROWTH), 1.0)
-        self._left -= share
-        self.increase = 1.0 + share / draws
-        return draws + share
 
 
 def _stopped_at(points: WeightedPoints, beta: float, of_stages: float, inherited: float) -> StoppedEarly:

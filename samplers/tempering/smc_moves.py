@@ -17,33 +17,26 @@ from ..estimates.weights import (
     normalised_weights,
 )
 from ..finding import Finding
-from ..judgement.checks import check_stages
+from ..judgement.checks import check_annealing, check_stages
 from ..reports import Stage, Sweep
-from ..settings import Settings
 from .early_stop import stop_at
-from .mutation import MoveSchedule, VisitedPoints, grow_chains, move_together
+from .mutation import Kernel, grow_chains, move_together
 from .next_beta import next_beta
-from .population import Density, Population
+from .population import Population
 
 __all__ = ["anneal_by_moves"]
 
 
 def anneal_by_moves(
-    population: Population,
-    n: int,
-    density: Density,
-    random: np.random.RandomState,
-    schedule: MoveSchedule,
-    settings: Settings,
-    visited: VisitedPoints,
-) -> Generator[tuple[Population, Stage | Sweep | Finding], None, tuple[Population, list[Stage], float]]:
-    """Carry evaluated draws of the prior to beta = 1; points that are evaluated here are added to `visited`.
+    population: Population, n: int, kernel: Kernel
+) -> Generator[tuple[Population, Stage | Sweep | Finding], None, tuple[Population, list[Stage]]]:
+    """Carry evaluated draws of the prior to beta = 1; points that are evaluated here are added to the visited ones.
 
     There may be more draws than the `n` points of later stages, to which they are resampled. Yields the points as they
-    are now with a report. Returns the points at beta = 1, all stages, and the correlation of the points with their
-    start after the last moves. Raises StoppedEarly at the limit of simulations.
+    are now with a report. Returns the points at beta = 1 and all stages. Raises StoppedEarly at the limit of
+    simulations.
     """
-    m, ndim = population.coords.shape
+    (m, ndim), (density, random, schedule, settings, visited) = population.coords.shape, kernel
     target, stages, error = float(n), [], EvidenceError(m)
     while population.beta < 1.0:
         log_likelihood = population.records["log_prob"] - population.records["log_prior"]
@@ -74,18 +67,18 @@ def anneal_by_moves(
 
         # 5. move
         schedule.follow(ancestors)
-        arguments = density, random, schedule, settings, visited
         if settings.chains == "leaders":
-            moved = yield from grow_chains(population, ancestors, *arguments)
+            moved = yield from grow_chains(population, ancestors, kernel)
         else:
-            moved = yield from move_together(population, *arguments)
+            moved = yield from move_together(population, kernel)
         population = moved.population
         if moved.stopped:
             raise stop_at(population, log_evidence, standard_error, log_evidence - increment)
         stages.append(Stage(beta, ess, moved.acceptance, moved.moves, distinct, increment, standard_error))
         yield population, stages[-1]
         yield from ((population, finding) for finding in check_stages(stages, n, ndim))
-    return population, stages, moved.correlation
+    yield from ((population, finding) for finding in check_annealing(population.beta, moved.correlation))
+    return population, stages
 
 
 def resample(population: Population, ancestors: np.ndarray, beta: float, ess: float) -> Population:

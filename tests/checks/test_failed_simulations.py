@@ -65,7 +65,7 @@ def test_a_run_that_is_piled_up_against_failures_is_not_called_good():
     # one place decides: the sampler
     assert sampler.verdict.status == "not usable" and contents["failures"].near == sampler.verdict.near_failures
     assert (
-        f"{sampler.verdict.near_failures.failed} of {sampler.verdict.near_failures.evaluated} evaluated points failed"
+        f"{sampler.verdict.near_failures.failed} of {sampler.verdict.near_failures.evaluated} evaluated points in"
         in note.text
     )
     assert (

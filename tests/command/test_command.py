@@ -254,7 +254,7 @@ def test_run_writes_its_files(run_once):
         "summary.txt",
         "summary.csv",
         "fit.csv",
-        "stages.txt",
+        "stages.csv",
         "posterior.nc",
         "run.h5",
         "settings.toml",

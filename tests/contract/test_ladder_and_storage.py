@@ -245,9 +245,9 @@ def test_collapse_is_reported():
         SMCSampler(N, 3, posterior, vectorize=True, seed=1, moves=emcee.moves.GaussianMove(1e6)).run_mcmc(None, 1)
     messages = [str(w.message) for w in caught]
     assert len(messages) == 4  # each reason once, for any number of stages
-    assert "were accepted, so the points did not move" in messages[0]
-    assert "survived the resampling" in messages[1]
-    assert "the weights of the second estimate are uneven" in messages[2]
+    assert "survived the resampling" in messages[0]
+    assert "were too short" in messages[1]
+    assert "importance sampling from the final points gives" in messages[2]
     assert "standard error of the log-evidence" in messages[3]
     with pytest.warns(SamplingWarning, match="distinct points of 40 survived"):
         posterior = Gaussian(sd=1e-3)
@@ -297,7 +297,6 @@ def test_summary_with_errors_of_mean_and_standard_deviation():
     result = summary(sampler.get_chain(flat=True), None, sampler.mean_error(), sampler.sd_error())
     assert np.array_equal(result.mean_error, sampler.mean_error())
     assert np.array_equal(result.sd_error, sampler.sd_error())
-    assert np.array_equal(result.to_dataframe()["sd_error"], result.sd_error)
     rows = str(result).splitlines()
     assert rows[0].count("MC error") == 2
     assert [rows[3].split()[column] for column in (2, 4)] == [

@@ -106,12 +106,12 @@ def test_several_samplers_have_common_axes_and_a_legend(updated, rng):
         (
             lambda x: x[:, :2],
             {"posterior": Posterior()},
-            r"3 parameters \(k, c, sigma\), but the samples have 2 columns",
+            r"each of 2 columns of the samples; got 3 parameters \(k, c, sigma\)",
         ),
         (lambda x: x, {"truths": [1.0]}, "truths must have one value for each of 3"),
         (lambda x: x, {"posterior": Posterior(), "truths": {"mass": 1.0}}, "unknown parameters mass; known are k, c"),
-        (lambda x: x, {"labels": ["a"]}, "one label for each of 3"),
-        (lambda x: {}, {}, "no samples to draw"),
+        (lambda x: x, {"labels": ["a"]}, "one label for each of 3 columns"),
+        (lambda x: {}, {}, "a mapping of labels to such arrays"),
         (lambda x: x[:2], {}, "n >= ndim"),
     ],
 )

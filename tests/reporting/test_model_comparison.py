@@ -62,9 +62,7 @@ def test_errors_against_monte_carlo(values, rng):
     assert np.allclose(found.probability, softmax(np.log(prior) + np.array(values)))
     low, high = np.quantile(probabilities, [0.025, 0.975], axis=0)
     assert np.allclose(found.upper - found.lower, high - low, rtol=0.07)
-    factors = draws - draws[:, :1]
-    assert np.allclose(found.log_bayes_factor_error, factors.std(axis=0), rtol=0.05)
-    assert found.log_bayes_factor[0] == 0.0 and found.best == "m0"
+    assert found.best == "m0"
 
 
 def test_the_interval_is_right_for_large_errors(rng):

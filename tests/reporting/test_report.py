@@ -29,7 +29,7 @@ from fe_likelihoods.checks.finding import Finding, judge
 from fe_likelihoods.checks.result import check_failures, check_result
 from fe_likelihoods.checks.run import Failures, moments_of, read_run
 from fe_likelihoods.reporting.contents import evidence, residual_sentences
-from samplers import SamplingWarning, SMCSampler, TMCMCSampler, ladder_table, plot_run
+from samplers import SamplingWarning, SMCSampler, TMCMCSampler, plot_run
 from samplers.estimates.control_variates import SignedSample
 from tests.contract.targets import Gaussian
 from tests.reporting.report_page import Page, read_page
@@ -120,12 +120,10 @@ def test_a_run_that_the_limit_ended_shows_the_exponent_that_it_reached():
     with pytest.warns(SamplingWarning, match="ended the run"):
         sampler = run(posterior, max_simulations=200)
     assert sampler.ended_at is not None and sampler.ended_at < 1.0 == sampler.ladder[-1].beta
-    last = ladder_table(sampler).splitlines()[len(sampler.ladder)]
-    assert f"{sampler.ended_at:.3e}*" in last and "1.000e+00" not in last
     text = " ".join(evidence(read_run(sampler, posterior)))
     assert "check_draws" not in text and "limit of simulations ended the run at beta" in text
     figure = plot_run(sampler)
-    assert "ended by the limit" in figure.axes[0].get_title()
+    assert "ended by the limit" in figure.get_suptitle()
     plt.close(figure)
     assert run(vibration(), walkers=20, steps=1).ended_at is None
 

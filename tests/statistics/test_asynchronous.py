@@ -80,8 +80,5 @@ def deviations_with_a_guide(seeds=30):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
-@pytest.mark.parametrize("parts", [False, True], ids=["complete rounds", "parts of rounds"])
-def test_rounds_of_a_guide_do_not_prefer_short_runs(monkeypatch, parts):
-    """Also where the guide learns from the first arrivals, none of which is from the long half."""
-    monkeypatch.setattr(LearningGuide, "learns_from_parts", parts, raising=False)
+def test_rounds_of_a_guide_do_not_prefer_short_runs():
     assert np.all(np.abs(deviations_with_a_guide()) < 3.0)

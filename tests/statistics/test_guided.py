@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from samplers import SMCSampler
+from samplers import Guide, SMCSampler
 from tests.contract.targets import Gaussian, Modes
 from tests.tempering.guides import DrawsOf, FixedGuide, LearningGuide
 
@@ -85,10 +85,9 @@ def test_control_a_guide_that_misses_a_mode_is_wrong():
 
 def test_a_guide_that_does_not_say_how_it_searched_is_at_best_usable():
     class Silent(FixedGuide):
-        findings = property()  # reading it raises AttributeError
+        findings = Guide.findings
 
     posterior, guide = two_modes(1, Silent)
-    assert not hasattr(guide, "findings")
     _, statuses = outcomes(posterior, guide, 500, runs=3)
     assert np.all(statuses == "usable")
 

@@ -6,12 +6,13 @@ from functools import partial
 import numpy as np
 from scipy import stats
 
+from samplers import Guide
 from samplers.estimates.weights import coarse_weights, effective_sample_size
 from samplers.judgement.guides import find_missing_part
 from samplers.proposals.mixture import draw, fit_mixture, log_density
 
 
-class FixedGuide:
+class FixedGuide(Guide):
     """Multivariate t distributions of given weights, and a share of the prior; draws outside the support are repeated.
 
     The density is normalised over the support by the share of the draws that lie inside it, from many draws.
@@ -58,9 +59,6 @@ class FixedGuide:
             return total
         prior = np.log(self.prior_share) + self.posterior.log_prior(coords)
         return np.logaddexp(np.log1p(-self.prior_share) + total, prior)
-
-    def refine(self, coords, log_prob, session):
-        pass
 
 
 class LearningGuide(FixedGuide):
@@ -153,16 +151,16 @@ def digest(what, coords):
     return what + hashlib.sha256(np.ascontiguousarray(coords)).hexdigest()
 
 
-class DrawsOf:
+class DrawsOf(Guide):
     """A guide that does not learn; `rvs` is a function of the number of draws and the random state."""
 
     findings = ()
 
     def __init__(self, rvs, logpdf):
-        self.draw, self.logpdf = rvs, logpdf
+        self.rvs, self.logpdf = rvs, logpdf
+
+    def draw(self, n, random):
+        return self.rvs(n, random)
 
     def log_density(self, x):
         return np.atleast_1d(self.logpdf(x))
-
-    def refine(self, coords, log_prob, session):
-        pass
