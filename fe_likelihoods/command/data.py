@@ -13,9 +13,9 @@ from ..signals.read import read_columns, read_record
 from ..signals.records import Record
 from .job import HDF5, Job
 from .keys import check_known, read_quantity
-from .sections import Measured
+from .sections import USER_MODELS, Measured
 
-__all__ = ["is_dataset", "read_base_motion", "read_measured", "read_supports", "reduce_data"]
+__all__ = ["first_part", "is_dataset", "read_base_motion", "read_measured", "read_supports"]
 
 FEWEST_SAMPLES = 10  # of a channel, where others lie outside the record
 
@@ -34,30 +34,23 @@ def _file(job: Job, section: str) -> tuple[Path, Dataset | None]:
     path = job.path(section, "file", given.file)
     if not is_dataset(job, section):
         return path, None
-    stated = ("column", "channel", "columns", "units", *given.READING, *(["zero"] if section == "measurements" else []))
-    others = [each.measured.lower() for each in job.events.values() if each.measured]
-    of_events = section == "measurements" and not all(each.endswith(HDF5) for each in others)  # which these keys read
-    if not of_events and (idle := [name for name in given.given() if name in stated]):
+    stated = {"column", "channel", "columns", "units", *given.READING, *({"zero"} if section == "measurements" else ())}
+    if idle := [name for name in given.given() if name in stated]:
         raise ValueError(f"{job.where(section)} {idle[0]}: a data set states this itself: leave the key out")
     return path, job.located(section, read_dataset, path)
 
 
 def read_base_motion(job: Job) -> Record | None:
-    """The excitation, scaled but neither shortened nor resampled, or None without a section ``[record]``.
-
-    ValueError, which names the key, if the file does not exist or cannot be read.
-    """
+    """The excitation, scaled but not shortened, or None without a section ``[record]``."""
     given = job.record
     if (job.kind == "bridge deck") != (given is not None and given.supports is not None):
         raise ValueError(
             f'{job.where("record")} supports: a bridge deck needs three, supports = ["base.csv", "first.csv", '
             '"second.csv"], and other structures have one motion, file'
         )
-    if given is None:
-        if job.kind in ("column", "bridge", "oscillator", "frame"):
-            raise ValueError(f"{job.where('record')} file: this key is missing; the {job.kind} needs a base motion")
+    if given is None and job.kind in USER_MODELS:
         return None
-    if given.supports is not None:
+    if given is not None and given.supports is not None:
         return read_supports(job)[0]
     path, dataset = _file(job, "record")
     options = given.given("channel", "column", "units", "missing", *given.READING)
@@ -68,36 +61,20 @@ def read_base_motion(job: Job) -> Record | None:
 def read_supports(job: Job) -> list[Record]:
     """The motions of several supports, as `read_base_motion`."""
     if more := job.record.given("file", "column"):
-        raise ValueError(
-            f"{job.where('record')} {[*more][0]}: leave it out with supports, which name files and columns"
-        )
+        raise ValueError(f"{job.where('record')} {[*more][0]}: leave it out with supports, which name files")
     places = [text.partition(":") for text in job.record.supports]
     alone = [replace(job.record, supports=None, file=file, column=column or None) for file, _, column in places]
     return [read_base_motion(replace(job, kind="", record=one)) for one in alone]
 
 
-def reduce_data(
-    job: Job, record: Record | None, measured: Measurements | None
-) -> tuple[Record | None, Measurements | None]:
-    """The first part of the data, reduced to every n-th sample."""
-    given = job.record
-
-    def reduce() -> tuple[Record, Measurements | None]:
-        shorter, fewer = record, measured
-        if given.duration is not None:
-            shorter, fewer = shorter.trim(0.0, given.duration), fewer and fewer.trim(0.0, given.duration)
-        if given.every != 1:
-            shorter, fewer = shorter.resample(shorter.dt * given.every), fewer and fewer.decimate(given.every)
-        return shorter, fewer
-
-    return (record, measured) if record is None else job.located("record", reduce)
+def first_part(job: Job, data: Any) -> Any:
+    """The part of a record or of measurements within the duration that is used."""
+    wanted = job.record and job.record.duration
+    return data if wanted is None or data is None else job.located("record", data.trim, 0.0, wanted)
 
 
 def read_measured(job: Job, channels: Sequence[Channel], record: Record | None) -> Measurements:
-    """The measurements of a model's channels, without samples before and after the record.
-
-    ValueError, which names the key, if the file does not exist, cannot be read or lacks a column.
-    """
+    """The measurements of a model's channels, without samples before and after the record."""
     path, dataset = _file(job, "measurements")
     given = job.measurements
     measured = dataset.measurements if dataset else job.located("measurements", _read_columns, path, given, channels)
@@ -176,36 +153,27 @@ def _straightened(measured: Measurements, points: Mapping[str, Any]) -> Measurem
 
 
 def _within(measured: Measurements, record: Record) -> Measurements:
-    """The samples between the first and the last one of a record, with NaN where the measurements are shorter.
+    """The samples within a record, with NaN where the measurements are shorter; the description says what is left out.
 
-    The description says how many samples were left out, with a caution where these are more than half of them, and how
-    much is missing at the end. ValueError if a channel has no sample within the record, or fewer than `FEWEST_SAMPLES`
-    while others were left out.
+    ValueError if a channel has no sample within the record, or fewer than `FEWEST_SAMPLES` while others were left out.
     """
     end, rows, starts, notes = record.time[-1], [], [], []
-    check = "check time_unit and zero in [measurements], and the record"
     for channel, values, step in zip(measured.channels, measured.values, measured.steps, strict=True):
         times, name = measured.times(channel.name), channel.name
         inside = np.flatnonzero((times >= -1e-6 * step) & (times <= end + 1e-6 * step))
         found, used = np.isfinite(values).sum(), np.isfinite(values[inside]).sum()
-        outside = found - used
-        if not used:
-            raise ValueError(
-                f"channel {name!r} was measured from {times[0]:g} to {times[-1]:g} s and has no sample within the "
-                f"record, 0 to {end:g} s; set zero in [measurements] to the time in the file at which the base motion "
-                'begins (a clock time such as "10:32:07" where the file has clock times)'
-            )
         share = f"{used} of {found} samples of {name} lie within the record"
-        if outside and used < FEWEST_SAMPLES:
+        if not used or used < min(found, FEWEST_SAMPLES):
             raise ValueError(
                 f"{share}, 0 to {end:g} s; expected {FEWEST_SAMPLES} or more. They were measured from {times[0]:g} to "
-                f"{times[-1]:g} s: {check}"
+                f"{times[-1]:g} s: check time_unit, and set zero to the time in the file at which the base motion "
+                'begins (a clock time such as "10:32:07" where the file has clock times)'
             )
         missing = int((end - times[inside[-1]]) / step + 1e-6)
         rows.append(np.append(values[inside], np.full(missing, np.nan)))
         starts.append(0.0 if abs(times[inside[0]]) <= 1e-6 * step else float(times[inside[0]]))
-        notes += [f"without {outside} samples of {name} before or after the record"] if outside else []
-        notes += [f"CAUTION: only {share}: {check}"] if outside > used else []
+        notes += [f"without {found - used} samples of {name} before or after the record"] if used < found else []
+        notes += [f"CAUTION: only {share}: check time_unit and zero, and the record"] if used < found - used else []
         notes += [f"{name} ends {missing * step:.3g} s before the record"] if missing else []
     text = ", ".join([measured.description, *notes])
     return Measurements(measured.channels, measured.steps, rows, text, starts)

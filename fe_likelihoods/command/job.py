@@ -1,6 +1,5 @@
 """An update as its TOML file describes it, read and checked before anything is computed."""
 
-import re
 import tomllib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -26,7 +25,6 @@ class Job:
     kind: str  # of the model, one of `MODEL_KINDS`
     model: dict[str, Any]
     priors: dict[str, str]  # distributions as text, by parameter
-    events: dict[str, sections.Event]  # to be predicted, by name
     record: sections.Motion | None = None
     measurements: sections.Measured | None = None
     modes: sections.Modes | None = None
@@ -38,13 +36,10 @@ class Job:
     own_models: dict[str, tuple[str, dict[str, Any]]] = field(default_factory=dict)  # kind and model of data sets
     shared: tuple[str, ...] = ()  # data sets that one run of ``[model]`` answers
     model_section: str = "model"  # the section of the model, such as modes.model
-    event: str = ""  # to which record and measurements belong; empty for the calibration
 
     def where(self, section: str) -> str:
         """File and section, for messages."""
-        own = self.event and section in ("record", "measurements")
-        section = self.model_section if section == "model" else section
-        return f"{self.file.name}: [{f'events.{self.event}' if own else section}]"
+        return f"{self.file.name}: [{self.model_section if section == 'model' else section}]"
 
     def located(self, section: str, make: Any, *arguments: Any, **options: Any) -> Any:
         """What ``make(...)`` returns; its errors have file and section before them."""
@@ -54,51 +49,23 @@ class Job:
             known = str(error).startswith(f"{self.file.name}:")
             raise (error if known else ValueError(f"{self.where(section)} {error}")) from error
 
-    @property
-    def has_no_time(self) -> bool:
-        """Whether the data are modes or a load test alone."""
-        return self.measurements is None and (self.modes or self.load_test) is not None
-
-    @property
-    def marginal(self) -> bool:
-        """Whether the levels of the noise are integrated out."""
-        return self.noise is not None and self.noise.marginal
-
     def data_sets(self) -> dict[str, "Job"]:
         """The same update with one data set each, by section; the section may have a model of its own."""
         there = [name for name in DATA if getattr(self, name)] or ["measurements"]
         found = {}
         for name in there:
             kind, model = self.own_models.get(name, (self.kind, self.model))
-            others: dict[str, Any] = {other: None for other in DATA if other != name}
-            if name != "measurements" and len(there) > 1:
-                others |= {"record": None, "noise": None}
+            others = [other for other in DATA if other != name]
+            others += ["record", "noise"] if name != "measurements" and len(there) > 1 else []
             where = f"{name}.model" if name in self.own_models else "model"
-            found[name] = replace(self, kind=kind, model=model, model_section=where, **others)
+            found[name] = replace(self, kind=kind, model=model, model_section=where, **dict.fromkeys(others))
         return found
-
-    def of_event(self, name: str) -> "Job":
-        """The same update with record and measurements of one event; `measurements` is None without them."""
-        event, measured = self.events[name], None
-        if event.measured is not None:
-            alike = self.measurements is not None and not event.measured.lower().endswith(HDF5)
-            kept = self.measurements.given() if alike else {}
-            kept.pop("baseline", None)  # times are those of the other file
-            kept |= (
-                {"missing": [each for each in kept["missing"] if not isinstance(each, list)]}
-                if "missing" in kept
-                else {}
-            )
-            measured = sections.Measured(**kept | event.given("zero") | {"file": event.measured})
-        return replace(self, record=event, measurements=measured, event=name)
 
     def path(self, section: str, key: str, name: str) -> Path:
         """An existing file that a key names; ValueError if there is none."""
         path = self.folder / Path(name).expanduser()
-        if path.is_dir():
-            raise ValueError(f"{self.where(section)} {key}: expected a file; {name!r} is a folder")
         if not path.is_file():
-            near = f"there is no folder {path.parent}: files are relative to the folder of the TOML file"
+            near = "files are relative to the folder of the TOML file"
             if path.parent.is_dir():
                 near = did_you_mean(path.name, sorted(p.name for p in path.parent.iterdir() if p.is_file()))
             raise ValueError(f"{self.where(section)} {key}: there is no file {path}; {near}")
@@ -133,14 +100,9 @@ def parse_job(text: str, file: Path, folder: Path) -> Job:
             raise ValueError(f"{file.name}: {name}: expected a section [{name}]; got {value!r}")
     if "model" not in content:
         raise ValueError(f"{file.name}: [model]: this section is missing; it says what the structure is")
-    data = [name for name in DATA if name in content]
-    for name, what in (
-        ("record", "modes and load tests have no [record]"),
-        ("events", "an event is predicted with the model of [measurements]"),
-    ):
-        if name in content and data and "measurements" not in data:
-            raise ValueError(f"{file.name}: [{name}]: {what}, and the section [measurements] is missing")
-    base = content["model"]
+    data, base = [name for name in DATA if name in content], content["model"]
+    if "record" in content and data and "measurements" not in data:
+        raise ValueError(f"{file.name}: [record]: modes and load tests have no motion, and [measurements] is missing")
     given = {name: own for name in data if isinstance(own := content[name].pop("model", None), dict)}
     shared = tuple(name for name in given if "kind" not in given[name] and base.get("kind") in USER_MODELS)
     own = {
@@ -155,32 +117,19 @@ def parse_job(text: str, file: Path, folder: Path) -> Job:
         if name in content
     }
     values |= {"kind": kind, "model": model, "own_models": own, "shared": shared, "priors": content.get("priors", {})}
-    events = {name: _read_event(name, keys, file.name) for name, keys in content.get("events", {}).items()}
-    return Job(file=file, text=text, folder=folder, events=events, **values)
-
-
-def _read_event(name: str, keys: Any, file: str) -> sections.Event:
-    where = f"{file}: [events.{name}]"
-    if not isinstance(keys, dict):
-        raise ValueError(f"{file}: [events] {name}: expected a section [events.{name}]; got {keys!r}")
-    if not re.fullmatch(r"[\w-]+", name):
-        raise ValueError(f"{where}: expected a name of letters, digits, - and _, for names of files")
-    event = sections.Event(**read_keys(keys, keys_of(sections.Event, sections.Event.OTHERS), where))
-    for key, needed in (("zero", "measured"), ("rest", "from_state")):
-        if key in keys and needed not in keys:
-            raise ValueError(f"{where} {key}: this key has no effect without {needed}")
-    return event
+    return Job(file=file, text=text, folder=folder, **values)
 
 
 def _read_model(given: dict[str, Any], where: str) -> tuple[str, dict[str, Any]]:
     kind = given.get("kind")
     if kind not in MODEL_KINDS:
-        known = did_you_mean(kind, MODEL_KINDS) if isinstance(kind, str) else f"known are {', '.join(MODEL_KINDS)}"
-        raise ValueError(f"{where}] kind: expected the kind of the structure; got {kind!r}; {known}")
+        near = did_you_mean(kind, MODEL_KINDS)
+        raise ValueError(f"{where}] kind: expected the kind of the structure; got {kind!r}; {near}")
     keys, parts = model_keys(kind), part_keys(kind)
     known = *(key.name for key in keys), *parts  # the names of parts are proposed as well
-    check_known([name for name in given if name != "kind"], known, f"{where}]", f"unknown key of kind {kind}")
-    values = read_keys({name: given[name] for name in given if name not in (*parts, "kind")}, keys, f"{where}]")
+    own = {name: value for name, value in given.items() if name not in (*parts, "kind")}
+    check_known(own, known, f"{where}]", f"unknown key of kind {kind}")
+    values = read_keys(own, keys, f"{where}]")
     for name in given.keys() & parts.keys():
         if not isinstance(given[name], dict):
             section = f"{where.partition(': ')[2]}.{name}]"

@@ -93,7 +93,7 @@ def _is_text(value: Any) -> bool:
     return isinstance(value, str) and bool(value.strip())
 
 
-def _is_time(value: Any) -> bool:
+def _is_span(value: Any) -> bool:
     """Whether a value is a pair of times in order, or a name and such a pair."""
     times = value[1:] if isinstance(value, list) and value and _is_text(value[0]) else value
     return isinstance(times, list) and len(times) == 2 and all(map(_is_number, times)) and times[0] <= times[1]
@@ -104,26 +104,26 @@ def _are_points(value: Any) -> bool:
     if not isinstance(value, list) or not all(isinstance(point, list) and len(point) == 2 for point in value):
         return False
     right = all(_is_number(time) and (_is_number(level) or _is_text(level)) for time, level in value)
-    return bool(value) and right and len({time for time, _ in value}) == len(value)
+    return right and 0 < len({time for time, _ in value}) == len(value)
 
 
 def _whole(least: float) -> Callable[[Any], bool]:
     return lambda value: isinstance(value, int) and not isinstance(value, bool) and value >= least
 
 
-_Check = tuple[Callable[[Any], bool], str, str]
+_Check = tuple[Callable[[Any], bool], str]
 _ONE: dict[str, _Check] = {
-    "text": (_is_text, "text in quotes", '"abc"'),
-    "number": (_is_number, "number", "1.0"),
-    "whole number": (_whole(-math.inf), "whole number", "1"),
-    "whole number >= 0": (_whole(0), "whole number of 0 or more", "1"),
-    "whole number >= 1": (_whole(1), "whole number of 1 or more", "1"),
-    "yes or no": (lambda value: isinstance(value, bool), "value true or false", "true"),
-    "quantity": (lambda value: _is_number(value) or _is_text(value), "number with unit", '"0.01 g"'),
-    "points": (_are_points, "list of points of time and value", '[[0.0, "0.01 g"], [40.0, "0.03 g"]]'),
-    "time span": (_is_time, "time span in seconds", '["top", 12.3, 12.8]'),
+    "text": (_is_text, '"abc"'),
+    "number": (_is_number, "1.0"),
+    "whole number": (_whole(-math.inf), "1"),
+    "whole number >= 0": (_whole(0), "1"),
+    "whole number >= 1": (_whole(1), "1"),
+    "yes or no": (lambda value: isinstance(value, bool), "true"),
+    "number with unit": (lambda value: _is_number(value) or _is_text(value), '"0.01 g"'),
+    "points of time and value": (_are_points, '[[0.0, "0.01 g"], [40.0, "0.03 g"]]'),
+    "time span": (_is_span, '["top", 12.3, 12.8]'),
 }
-"""Check of a value, what a message says was expected, and an example, of the kinds that others are made of."""
+"""Check of a value, and an example, of the kinds that others are made of."""
 
 
 def _check_of(kind: str) -> _Check:
@@ -131,24 +131,22 @@ def _check_of(kind: str) -> _Check:
     if kind in _ONE:
         return _ONE[kind]
     container, _, inner = kind.partition(" of ")
-    mark = ", or " if ", or " in kind else " or "
-    if mark == ", or " or container not in ("list", "table"):
-        (fits, expected, _), (other, further, example) = map(_check_of, kind.split(mark, 1))
-        return lambda value: fits(value) or other(value), f"{expected}, or a {further}", example
-    fits, expected, example = _check_of(inner)
-    holds, form, brackets = (list, "list", "[{}]") if container == "list" else (dict, "table by name", "{{top = {}}}")
-
-    def are_all(value: Any) -> bool:
-        values = value.values() if holds is dict and isinstance(value, dict) else value
-        return isinstance(value, holds) and all(map(fits, values)) and (holds is list or bool(value))
-
-    return are_all, f"{form}, each a {expected}", brackets.format(example)
+    if ", or " in kind or container not in ("list", "table"):
+        (fits, _), (other, example) = map(_check_of, re.split(", or | or ", kind, maxsplit=1))
+        return lambda value: fits(value) or other(value), example
+    are, example = _check_of(inner)
+    if container == "list":
+        return lambda value: isinstance(value, list) and all(map(are, value)), f"[{example}]"
+    return (
+        lambda value: isinstance(value, dict) and 0 < len(value) == sum(map(are, value.values())),
+        f"{{top = {example}}}",
+    )
 
 
-def did_you_mean(given: str, known: Sequence[str]) -> str:
+def did_you_mean(given: Any, known: Sequence[str]) -> str:
     """The nearest known name as a question, or all known names."""
     lower = {name.lower(): name for name in reversed(known)}
-    near = difflib.get_close_matches(given.lower(), [*lower], n=1, cutoff=0.55)
+    near = difflib.get_close_matches(str(given).lower(), [*lower], n=1, cutoff=0.55)
     return f"did you mean {lower[near[0]]}?" if near else f"known are {', '.join(known)}"
 
 
@@ -159,32 +157,20 @@ def check_known(given: Iterable[str], known: Iterable[str], where: str, what: st
         raise ValueError(f"{where} {unknown[0]}: {what}; {did_you_mean(unknown[0], known)}")
 
 
-def _split_number(text: str) -> tuple[str, str]:
-    """Number and unit of a text, with or without a space between them."""
-    match = re.match(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", text.strip())
-    number, unit = text.strip().partition(" ")[::2] if match is None else (match[0], text.strip()[match.end() :])
-    return number, unit.strip()
+_QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?|[-+]?inf)\s*(.*?)\s*", re.IGNORECASE)
 
 
-def _parse(text: str, dimension: str | None, expected: str) -> float:
-    """The number in SI units in a text with a number and perhaps a unit; ValueError says what was `expected`."""
-    number, unit = _split_number(text)
-    try:
-        value = float(number)
-        if not math.isnan(value):
-            return to_si(value, unit, dimension).item() if unit else value
-    except ValueError as error:
-        why = f": {error}" if unit else ""
-        raise ValueError(f"expected {expected}; got {text!r}{why}") from None
-    raise ValueError(f"expected {expected}; got {text!r}")
+def _parse(text: Any, dimension: str | None) -> tuple[float, str]:
+    """The number in SI units in a text with a number and perhaps a unit, and this unit."""
+    match = _QUANTITY.fullmatch(text) if isinstance(text, str) else None
+    if match is None:
+        raise ValueError("it is no number with a unit")
+    number, unit = float(match[1]), match[2]
+    return to_si(number, unit, dimension).item() if unit else number, unit
 
 
 def read_quantity(value: Any, dimension: str) -> float:
-    """A number in SI units, from such a number or a text with number and unit; `dimension` is a key of `DIMENSIONS`.
-
-    ValueError if it is neither, the unit is unknown or of another dimension, or a stress without a unit is below
-    `SMALLEST_STRESS`.
-    """
+    """A number in SI units, from such a number or a text with number and unit; `dimension` is a key of `DIMENSIONS`."""
     if _is_number(value):
         if dimension == "stress" and 0.0 < abs(value) < SMALLEST_STRESS:
             raise ValueError(
@@ -192,16 +178,19 @@ def read_quantity(value: Any, dimension: str) -> float:
                 f'as "{value!r} MPa" or "{value!r} ksi"'
             )
         return float(value)
-    expected = f"a number in {DIMENSIONS[dimension]}, or a text with a unit such as '1 {DIMENSIONS[dimension]}'"
-    if not isinstance(value, str) or not math.isfinite(found := _parse(value, dimension, expected)):
-        raise ValueError(f"expected {expected}; got {value!r}")
-    if not _split_number(value)[1]:
-        raise ValueError(f"expected {expected}; {value!r} has no unit")
-    return found
+    try:
+        found, unit = _parse(value, dimension)
+        if unit and math.isfinite(found):
+            return found
+        why = "it has no unit" if not unit else "it is not finite"
+    except ValueError as error:
+        why = str(error)
+    si = DIMENSIONS[dimension]
+    raise ValueError(f"expected a number in {si}, or a text with a unit such as '1 {si}'; got {value!r}: {why}")
 
 
 def read_by_channel(given: Mapping[str, Any], channels: Sequence[Any], key: str) -> dict[str, float]:
-    """Standard deviations [SI] by the names of `channels`; ValueError, which names the key and the channel."""
+    """Standard deviations [SI] by the names of `channels`."""
     known, values = {channel.name: channel for channel in channels}, {}
     check_known(given, known, f"{key}:", "unknown channel")
     for name, value in given.items():
@@ -215,15 +204,12 @@ def read_by_channel(given: Mapping[str, Any], channels: Sequence[Any], key: str)
 
 
 def read_keys(given: Mapping[str, Any], keys: Sequence[Key], where: str) -> dict[str, Any]:
-    """Check the keys of a section as TOML gives it and convert its values, quantities to SI units.
-
-    ValueError, which names file and section (`where`), for an unknown or missing key, or a value of another kind.
-    """
+    """Check the keys of a section as TOML gives it, and convert quantities to SI units; errors name the section."""
     known = {each.name: each for each in keys}
     check_known(given, known, where, "unknown key")
     if missing := [each for each in keys if each.required and each.name not in given]:
         raise ValueError(f"{where} {missing[0].name}: this key is missing: {missing[0].meaning}")
-    return {name: _read_value(value, known[name].kind, f"{where} {name}") for name, value in given.items()}
+    return {name: _read_value(value, known[name].kind, f"{where} {name}:") for name, value in given.items()}
 
 
 def _read_value(value: Any, kind: str, where: str) -> Any:
@@ -237,47 +223,43 @@ def _read_value(value: Any, kind: str, where: str) -> Any:
         try:
             return read_quantity(value, kind)
         except ValueError as error:
-            raise ValueError(f"{where}: {error}") from None
+            raise ValueError(f"{where} {error}") from None
     if kind.startswith("one of "):
         choices = kind.removeprefix("one of ").split(", ")
-        if value in choices:
-            return value
-        near = did_you_mean(value, choices) if isinstance(value, str) else ""
-        raise ValueError(f"{where}: expected {kind}; got {value!r}{f'; {near}' if near.endswith('?') else ''}")
-    fits, expected, example = _check_of(kind)
+        if value not in choices:
+            raise ValueError(f"{where} expected {kind}; got {value!r}; {did_you_mean(value, choices)}")
+        return value
+    fits, example = _check_of(kind)
     if not fits(value):
-        raise ValueError(f"{where}: expected a {expected}, such as {example}; got {value!r}")
+        raise ValueError(f"{where} expected a {kind}, such as {example}; got {value!r}")
     return value
 
 
-FORMS: dict[str, tuple[type[Distribution], str, tuple[int, ...]]] = {
-    "normal": (TruncatedNormal, "normal(mean, sd) or normal(mean, sd, lower, upper); without bounds positive", (2, 4)),
-    "half-normal": (HalfNormal, "half-normal(sd), sd before taking the absolute value", (1,)),
-    "uniform": (Uniform, "uniform(low, high)", (2,)),
-    "log-normal": (LogNormal, "log-normal(median, sd of the natural logarithm)", (2,)),
+FORMS: dict[str, tuple[type[Distribution], str]] = {
+    "normal": (TruncatedNormal, "normal(mean, sd) or normal(mean, sd, lower, upper); without bounds positive"),
+    "half-normal": (HalfNormal, "half-normal(sd), sd before taking the absolute value"),
+    "uniform": (Uniform, "uniform(low, high)"),
+    "log-normal": (LogNormal, "log-normal(median, sd of the natural logarithm)"),
 }
-"""Distributions of ``[priors]`` by name: class, how it is written, and numbers of arguments."""
+"""Distributions of ``[priors]`` by name: class, and how it is written."""
 
 
 def parse_prior(text: str, dimension: str | None = None) -> Distribution:
-    """Make a distribution from its text, such as ``half-normal(0.1 g)``; numbers without a unit are in SI units.
-
-    Units must have the dimension, a key of `fe_likelihoods.units.DIMENSIONS`. ValueError for an unknown name, another
-    number of arguments, or values that the distribution refuses.
-    """
+    """Make a distribution from its text, such as ``half-normal(0.1 g)``; numbers without a unit are in SI units."""
     match = re.fullmatch(r"\s*([A-Za-z-]+)\s*\(([^()]*)\)\s*", text) if isinstance(text, str) else None
     if match is None or match[1].lower() not in FORMS:
-        forms = "; ".join(form for _, form, _ in FORMS.values())
+        forms = "; ".join(form for _, form in FORMS.values())
         raise ValueError(
             f'expected a distribution in quotes, such as "normal(1, 0.3)"; got {text!r}; known are {forms}'
         )
-    make, form, counts = FORMS[name := match[1].lower()]
-    arguments = [argument.strip() for argument in match[2].split(",") if argument.strip()]
-    if len(arguments) not in counts:
-        raise ValueError(f"expected {form}; got {text!r}")
-    if name == "log-normal" and _split_number(arguments[1])[1]:
-        raise ValueError(f"expected {form}, which has no unit; got {text!r}")
-    numbers = [_parse(each, dimension, "a number, or a number with a unit such as '0.1 g'") for each in arguments]
-    if name == "normal" and len(numbers) == 2 and numbers[0] <= 0.0:
-        raise ValueError(f"expected {form}, so a mean of zero or less needs bounds; got {text!r}")
-    return make(*numbers)
+    make, form = FORMS[name := match[1].lower()]
+    try:
+        found = [_parse(argument, dimension) for argument in match[2].split(",") if argument.strip()]
+        numbers = [number for number, _ in found]
+        if name == "log-normal" and found[-1][1]:
+            raise ValueError("a logarithm has no unit")
+        if name == "normal" and len(numbers) == 2 and numbers[0] <= 0.0:
+            raise ValueError("a mean of zero or less needs bounds")
+        return make(*numbers)
+    except (ValueError, TypeError) as error:  # also of another number of arguments
+        raise ValueError(f"expected {form}; got {text!r}: {error}") from None

@@ -2,63 +2,57 @@
 
 import json
 import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
-from ..checks.finding import NOTE
-from ..checks.screening import Screened, check_data, check_sensors, repair_lines, screen
-from ..checks.sensor_faults import find_sensor_faults
+from ..checks.screening import check_sensors, repair_lines, screen
 from ..modal.modal_readers import read_matlab, read_modal_data
+from ..signals.channels import Channel, Measurements
 from ..signals.datasets import read_dataset
+from ..signals.read import read_columns
 from ..signals.strong_motion import find_channels, recognise
 from ..signals.tables import (
-    Statements,
-    Table,
     clock_text,
-    column_values,
     dimension_of,
     read_table,
-    row_times,
     stated_unit,
-    table_start,
-    table_step,
     text_unit,
-    uniform_times,
     value_columns,
 )
 from ..text_tables import number, text_table
-from ..units import from_si, to_si
+from ..units import from_si
 from .job import HDF5
 
-__all__ = ["describe_data"]
+__all__ = ["describe", "describe_data"]
 
-_MOST_TEXTS = 3  # that stand for missing samples; a column with more is no column of numbers
-
-
-class _Lines(NamedTuple):
-    """Text about a file, and lines of sections such as ``[record]`` and ``[measurements]``."""
-
-    text: list[str]
-    sections: dict[str, list[str]]
+_MOST_ERRORS = 3  # of a file, each of which advises an option
+_WRITE = '    # write what is "?": the file does not state it'
+_Parts = tuple[list[str], list[str]]  # text, and lines of [measurements]
+_Lines = tuple[list[str], dict[str, list[str]]]  # text about a file, and lines of sections such as [measurements]
 
 
 def describe_data(path: Path) -> str:
-    """What a file of data holds, and the lines of a TOML file that read it; ValueError if it cannot be read.
-
-    It is a table, a ground motion in a supported format, a zip archive of V2 files, a data set (.h5), or a MATLAB file.
-    """
+    """What a file of data holds, and the lines of a TOML file that read it; ValueError if it cannot be read."""
     ending = path.suffix.lower()
-    if ending == ".toml":
-        raise ValueError(f"{path} names data: `fe-likelihoods check {path}` reads it; give the files that it names")
-    if ending in HDF5 or ending == ".mat":
-        found = _dataset(path) if ending in HDF5 else _matlab(path)
+    if ending in HDF5:
+        found = read_dataset(path)
+        described, repairs = _screened(found.measurements)
+        text = ["a data set", str(found.record), found.record.source, *described]
+        sections = {"record": [], "measurements": repairs}
+    elif ending == ".mat":
+        sizes = ((name, " x ".join(map(str, np.shape(each)))) for name, each in read_matlab(path).items())
+        text = ["a MATLAB file", text_table([("variable", "size"), *sizes])]
+        given = {"variables": {"frequencies": "?", "shapes": "?"}, "columns": {"sensor": "? row"}, "unit": "?"}
+        sections = {"modes": _keys(given)}
     else:
-        form = recognise(path)
-        found = _table(path) if form is None else _motions(path, form)
-    lines = [f"{path}: {found.text[0]}", *found.text[1:], "", "# lines for the TOML file"]
-    for section, given in found.sections.items():
+        text, sections = _table(path) if (form := recognise(path)) is None else _motions(path, form)
+    lines = [f"{path}: {text[0]}", *text[1:], "\n# lines for the TOML file; columns: channel of the model = column"]
+    for section, given in sections.items():
         lines += [f"[{section}]", f"file = {_toml(str(path))}", *given]
     return "\n".join(lines)
 
@@ -76,181 +70,122 @@ def _name_of_channel(text: str, taken: dict[str, object]) -> str:
     return next(name for k in range(1, len(taken) + 2) if (name := base if k == 1 else f"{base}_{k}") not in taken)
 
 
-def _screen(name: str, values: np.ndarray, unit: str, step: float, start: float = 0.0) -> list[Screened]:
-    """Faults of a channel in a unit, which is empty if it is not known."""
-    faults = find_sensor_faults(values, dimension_of(unit) or "displacement")
-    return [Screened(name, unit, step, start, faults)] if faults else []
+def _twice(names: Sequence[Any]) -> list[str]:
+    """What is said about names that are there several times, which readers cannot tell apart."""
+    return [f"{name!r} is there {n} times, and is left out" for name, n in Counter(names).items() if n > 1]
 
 
-def _cautions(channels: list[Screened]) -> list[str]:
-    return [f"CAUTION: {each.kind}: {each.text}" for each in check_sensors(channels)]
+def _advised(read: Callable[..., Any], options: dict[str, Any], above: int = 0) -> tuple[Any, list[str]]:
+    """What `read` returns with the options that its errors advise, which are added, or None; and these errors.
+
+    An option whose value is not known is "?"; `above` is the number of lines above a table.
+    """
+    said = list[str]()
+    while True:
+        try:
+            return read(**options), said
+        except ValueError as error:
+            said.append(str(error))
+            mark = re.search(r"got '(.+)'; if it stands for a missing sample|got (\S+) in \d+ rows", said[-1])
+            key = re.search(
+                r"(?:give|step,) (units|resample|time_unit|skip|dt)=(?: in seconds|([\d.e-]+\d)|)", said[-1]
+            )
+            if len(said) > _MOST_ERRORS or not (mark or key):
+                raise
+            if mark:
+                options["missing"] = [*options.get("missing", []), mark[1] or float(mark[2])]
+                continue
+            options[key[1]] = above if key[1] == "skip" else float(key[2]) if key[2] else "?"
+            if options[key[1]] == "?":
+                return None, said
+
+
+def _keys(options: dict[str, Any]) -> list[str]:
+    """Lines of keys, of which some have "?" for what the file does not state."""
+    texts = {key: _toml(value) for key, value in options.items()}
+    return [f"{key} = {text}{_WRITE * ('?' in text)}" for key, text in texts.items()]
+
+
+def describe(measured: Measurements, unstated: Iterable[str] = ()) -> list[str]:
+    """A table of channels, of which some have an `unstated` unit, and the description."""
+    rows = [("channel", "unit", "samples", "missing", "step [s]", "smallest", "largest")]
+    for channel, step, values in zip(measured.channels, measured.steps, measured.values, strict=True):
+        known = from_si(values[np.isfinite(values)], channel.unit)
+        ends = (number(known.min(), 4), number(known.max(), 4)) if known.size else ("-", "-")
+        counts = str(values.size), str(values.size - known.size), f"{step:g}" if measured.is_history else "-"
+        rows.append((channel.name, "?" if channel.name in unstated else channel.unit, *counts, *ends))
+    return [text_table(rows), *filter(None, [measured.description])]
+
+
+def _screened(measured: Measurements | None, marks: Sequence[Any] = (), unstated: Iterable[str] = ()) -> _Parts:
+    """The same with faults of sensors, and lines of ``[measurements]`` that deal with these."""
+    if measured is None:
+        return [], []
+    faults = [each._replace(unit="") if each.name in unstated else each for each in screen(measured)]
+    cautions = [f"CAUTION: {each.kind}: {each.text}" for each in check_sensors(faults)]
+    repairs = repair_lines(faults, {"missing": marks})
+    if marks and not any(each.startswith("missing") for each in repairs):
+        repairs.append(f"missing = {_toml(marks)}")
+    return [*describe(measured, unstated), *cautions], repairs
 
 
 def _motions(path: Path, form: str) -> _Lines:
     """Accelerations in a format of networks, which readers know by numbers or names if there are several."""
-    channels = find_channels(path, form)
-    files = [each.file.removeprefix(f"{path}/") if each.file != str(path) else path.name for each in channels]
-    numbers = [each.channel for each in channels]
-    given = [  # a V2 file without a number of its own is known by its name
-        each.channel if form != "v2" or (each.channel is not None and numbers.count(each.channel) == 1) else file
-        for each, file in zip(channels, files, strict=True)
+    found, columns, options = find_channels(path, form), dict[str, Any](), dict[str, Any]()
+    numbers = [each.channel for each in found]
+    known = [  # a V2 file without a number of its own is known by its name
+        each.file.removeprefix(f"{path}/")
+        if form == "v2" and (each.channel is None or numbers.count(each.channel) > 1)
+        else each.channel
+        for each in found
     ]
-    rows = [("channel", "samples", "step [s]", "duration [s]", "peak [g]", "label", "file")]
-    columns, said, screened, base = dict[str, object](), list[str](), list[Screened](), list[str]()
-    for each, column, file in zip(channels, given, files, strict=True):
-        try:
-            parsed = each.parse()
-            step = parsed.dt if parsed.times is None else uniform_times(parsed.times, None, str(column or path)).step
-        except ValueError as error:
-            if column is None:
-                raise
-            said.append(f"not read: {error}")
-            continue
-        values = from_si(to_si(parsed.values, parsed.unit or "g", "acceleration"), "g")
-        peak, duration = number(np.abs(values).max()), number((values.size - 1) * step, 4)
-        rows.append((str(each.channel or "-"), str(values.size), f"{step:g}", duration, peak, each.label, file))
-        if parsed.unit is None:
-            said.append("The unit is not stated: the peak is that of samples in g.")
-            base.append('units = "?"    # write it: the file does not state it')
-        if parsed.times is not None:
-            said.append(f"uneven times in channel {column or 1}: give resample = {step:.6g}")
-            base += [f"resample = {step:.6g}"] if column is None else []
-        if (count := given.count(column)) > 1:
-            said.append(f"{column!r} is there {count} times, and no number tells them apart")
-            continue
-        name = _name_of_channel(f"ch{column}" if isinstance(column, int) else column or "motion", columns)
-        columns[name] = column
-        screened += _screen(name, values, "g", step) if parsed.times is None else []
-    if len({row[1:3] for row in rows[1:]}) > 1:
-        said.append(
-            "The channels differ in samples or step: they may be of several recorders, whose clocks may differ."
-        )
-    text = [f"{len(columns)} channel(s) of acceleration", text_table(rows), *dict.fromkeys(said), *_cautions(screened)]
-    if given == [None]:
-        return _Lines(text, {"record": base})
-    sections = {}
-    if columns:
-        first = next(iter(columns.values()))
-        key = "channel" if isinstance(first, int) else "column"
-        measured = [f"columns = {_toml(columns)}    # channel of the model = channel of the file"]
-        sections = {"record": [f"{key} = {_toml(first)}    # the base motion"]}
-        sections["measurements"] = measured + repair_lines(screened)
-    return _Lines(text, sections)
-
-
-def _dataset(path: Path) -> _Lines:
-    found = read_dataset(path)
-    measured = found.measurements
-    rows = [("channel", "quantity", "samples", "step [s]", "missing")]
-    for channel, step, values in zip(measured.channels, measured.steps, measured.values, strict=True):
-        rows.append((channel.name, channel.quantity, str(values.size), f"{step:g}", str(int(np.isnan(values).sum()))))
-    text = ["a data set", str(found.record), found.record.source, text_table(rows), measured.description]
-    text += [f"CAUTION: {each}" for each in check_data(measured, found.record) if each.severity != NOTE]
-    return _Lines(text, {"record": [], "measurements": repair_lines(screen(measured))})
-
-
-def _matlab(path: Path) -> _Lines:
-    """Variables of a file that may have identified modes."""
-    found = read_matlab(path)
-    rows = [("variable", "size"), *((name, " x ".join(map(str, np.shape(each)))) for name, each in found.items())]
-    given = ['variables = {frequencies = "?", shapes = "?"}    # write them: names of variables; also damping']
-    given += ['columns = {"?" = "1"}    # write all: sensor of the model = row of the shapes']
-    given += ['unit = "Hz"    # or "rad/s"']
-    return _Lines(["a MATLAB file", text_table(rows)], {"modes": given})
-
-
-def _readable(path: Path) -> tuple[Table, list[str], list[float], list[str]]:
-    """A table, texts and numbers in it that may stand for missing samples, and what is said about them."""
-    texts, numbers, said = list[str](), list[float](), list[str]()
-    while True:
-        try:
-            table = read_table(path, missing=[*texts, *numbers] or None)
-            for place in value_columns(table):
-                column_values(table, place)
-            return table, texts, sorted(numbers), said
-        except ValueError as error:
-            text = re.search(r"got '(.+)'; if it stands for a missing sample", str(error))
-            value = re.search(r"got (\S+) in \d+ rows", str(error))
-            if value is None and (text is None or len(texts) == _MOST_TEXTS):
-                raise
-            texts += [] if value else [text[1]]
-            numbers += [float(value[1])] if value else []
-            said.append(str(error))
+    for column in (each for each in known if known.count(each) == 1):
+        columns[_name_of_channel(f"ch{column}" if isinstance(column, int) else column or "motion", columns)] = column
+    channels = [Channel(name, "acceleration", "g") for name in columns]
+    measured, text = _advised(lambda **more: read_columns(path, channels, [*columns.values()], **more), options)
+    described, repairs = _screened(measured)
+    text = [f"{len(columns)} channel(s) of acceleration", *described, *text, *_twice(known)]
+    if (first := next(iter(columns.values()))) is None:
+        return text, {"record": _keys(options)}
+    base = [f"{'channel' if isinstance(first, int) else 'column'} = {_toml(first)}    # the base motion"]
+    return text, {"record": base + _keys(options), "measurements": _keys({"columns": columns} | options) + repairs}
 
 
 def _table(path: Path) -> _Lines:
     """A table of samples, of modes or of load cases."""
-    table, texts, marks, said = _readable(path)
+    options, columns, units, unstated = dict[str, Any](), dict[str, str](), list[str](), dict[str, str]()
+    table, said = _advised(lambda missing=None: read_table(path, missing=missing), options)
     try:
         if table.time is None or table.clock is not None:  # days of several identifications are clocks as well
-            return _Lines(["a table of modes", str(read_modal_data(path))], {"modes": []})
+            return ["a table of modes", str(read_modal_data(path))], {"modes": []}
     except ValueError as error:
         if "unit of its frequency" in str(error) and table.clock is None:
-            return _Lines(["a table of modes"], {"modes": ['unit = "?"    # write it: the file does not state it']})
-    names = [column.name for column in table.columns]
-    places = re.search(r"case|load|truck|position|place", names[0], re.IGNORECASE)
-    cases = table.time is None and len(names) > 1 and (table.columns[0].kind == "text" or places)
-    options, remarks, step = ([], ["a line for each load case"], None) if cases else _sampling(table)
-    remarks += said
-    rows: list[tuple[str, ...]] = [("column", "unit", "numbers", "missing", "smallest", "largest")]
-    columns, unstated, screened = dict[str, object](), dict[str, str](), list[Screened]()
-    for k in value_columns(table):
-        name, values = names[k], column_values(table, k)
-        known = values[~np.isnan(values)]
-        ends = (number(known.min(), 4), number(known.max(), 4)) if known.size else ("-", "-")
+            return ["a table of modes"], {"modes": _keys({"unit": "?"})}
+    names, clock = [column.name for column in table.columns], table.clock and clock_text(table.clock)
+    of_cases = re.search(r"case|load|truck|position|place", names[0], re.IGNORECASE) or table.columns[0].kind == "text"
+    cases = bool(of_cases) and table.time is None and len(names) > 1
+    for k in (k for k in value_columns(table) if names.count(names[k]) == 1 and not (cases and k == 0)):
         unit = stated_unit(table, k) or text_unit(table, k, "acceleration")  # as the readers of accelerations take it
-        rows.append((name, unit or "not stated", str(known.size), str(values.size - known.size), *ends))
-        if names.count(name) > 1:
-            remarks.append(f"the name {name!r} is that of several columns: rename them")
-            continue
-        channel = _name_of_channel(name if table.named else f"column {name}", columns)
-        columns[channel] = name
-        if step is not None:
-            if any(each.startswith("resample") for each in options):
-                values = uniform_times(row_times(table), None, table.file).interpolate(values)
-            start = table_start(table, step, 0.0 if table.clock is None else clock_text(table.clock))
-            screened += _screen(channel, values, unit or "", step, start)
-        if unit is None or dimension_of(unit) is None:
-            unstated[channel] = "?"
-    text = [f"a table of {len(table.lines)} rows", text_table(rows), *remarks, *_cautions(screened)]
-    missing = [f"missing = {_toml([*texts, *marks])}"] if texts or marks else []
-    repairs = repair_lines(screened, {"missing": [*texts, *marks]})
-    repairs = ([] if any(each.startswith("missing") for each in repairs) else missing) + repairs
-    if not columns:
-        return _Lines(text, {})
-    columns = {name: column for name, column in columns.items() if not cases or column != names[0]}
-    measured = [f"columns = {_toml(columns)}    # channel of the model = column", *options]
-    if unknown := {name: unit for name, unit in unstated.items() if name in columns}:
-        measured.append(f"units = {_toml(unknown)}    # write them: the file does not state them")
+        name = _name_of_channel(names[k] if table.named else f"column {names[k]}", columns)
+        known = bool(unit and dimension_of(unit))
+        columns[name], unstated = names[k], unstated | ({} if known else {name: "?"})
+        units.append(unit if known else "1")
+    channels = [Channel(name, dimension_of(u) or "", u) for name, u in zip(columns, units, strict=True)]
+    given = {"dt": 1.0} if cases else {"zero": clock or 0.0}
+    measured, more = _advised(
+        lambda **more: read_columns(path, channels, [*columns.values()], units, **given, **more),
+        options,
+        table.lines[0] - 1 - table.named - any(column.below for column in table.columns),
+    )
+    measured = replace(measured, axis="load case") if cases else measured
+    marks = options.pop("missing", [])
+    described, repairs = _screened(measured, marks, unstated)
+    text = [f"a table of {len(table.lines)} rows", *described, *said, *more, *_twice(names)]
+    lines = _keys({"columns": columns} | options | ({"units": unstated} if unstated else {}))
     if cases:
-        return _Lines(text, {"load_test": measured})
-    if table.clock is not None:
-        zero = _toml(clock_text(table.clock))
-        measured.append(f"zero = {zero}    # or when the base motion begins, if it is in another file")
-    first = next(iter(columns))
-    base = [f"column = {_toml(columns[first])}    # the base motion, if it is in this file"]
-    base += [f"missing = {_toml(texts)}"] if texts else []
-    base += ['units = "?"    # write it: the file does not state it'] if first in unstated else []
-    return _Lines(text, {"record": [*base, *options], "measurements": measured + repairs})
-
-
-def _sampling(table: Table) -> tuple[list[str], list[str], float | None]:
-    """Keys that the times need, what is said about them, and the step that these keys give, if they do."""
-    try:
-        step = table_step(table)
-    except ValueError as error:
-        advised = re.search(r"give (resample|time_unit|skip|dt)=", str(error))  # what the message asks for is a key
-        key = advised[1] if advised and (advised[1] != "dt" or table.time is None) else ""
-        said, lines, step = [f"times: {error}"], [f'{key} = "?"    # write it: the file does not state it'], None
-        if key == "skip":
-            above = table.lines[0] - 1 - table.named - any(column.below for column in table.columns)
-            lines = [f"skip = {above}    # the step of the times, without the text above the table"] if above else []
-            step = table_step(table._replace(stated=Statements())) if above else None
-        elif key == "resample":
-            even = uniform_times(row_times(table), None, table.file)
-            said, lines, step = [f"times: uneven, to be {even.note}"], [f"resample = {even.step:.6g}"], even.step
-        return lines if key else [], said, step
-    column = None if table.time is None else table.columns[table.time]
-    start = "" if column is None else f", from {column.values[0]:.10g} in column {column.name!r}"
-    start += "" if table.clock is None else f", first clock time {clock_text(table.clock)}"
-    return [], [f"times: step {step:g} s ({1 / step:g} per second){start}"], step
+        return text, {"load_test": lines}
+    if clock:
+        lines.append(f"zero = {_toml(clock)}    # or when the base motion begins, if it is in another file")
+    base = {"column": next(iter(columns.values()))} | options | ({"units": "?"} if [*columns][0] in unstated else {})
+    base |= {"missing": texts} if (texts := [each for each in marks if isinstance(each, str)]) else {}
+    return text, {"record": _keys(base), "measurements": lines + repairs}

@@ -6,10 +6,8 @@ Exit codes: 0 when a command has done its work, 1 for an error in the file, the 
 ended and its verdict is "not usable", 130 after Ctrl-C.
 """
 
-import contextlib
 import shlex
 import warnings
-from collections.abc import Iterator
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -24,7 +22,6 @@ _FILE = click.Path(path_type=Path)
 _DATA = ("synthetic_record.csv", "synthetic_measured.csv")
 TEMPLATES = {
     "column": ("column.toml", "bridge_column_short.h5"),
-    "bridge": ("bridge.toml", "isolated_bridge.h5"),
     "function": ("function.toml", "my_function.py", *_DATA),
     "opensees": ("opensees.toml", "my_opensees.py", *_DATA),
     "modal": ("modal.toml", "synthetic_modes.csv"),
@@ -34,33 +31,17 @@ TEMPLATES = {
 """Files of each kind, in the folder ``templates`` of the bundled data."""
 
 
-@contextlib.contextmanager
-def _plain_warnings() -> Iterator[None]:
-    """Print warnings for users as sentences, without the file and the line of the library that issued them."""
-    usual = warnings.showwarning
-
-    def show(message: Any, category: type[Warning], *place: Any, **options: Any) -> None:
-        if issubclass(category, UserWarning):
-            click.echo(f"Warning: {message}", err=True)
-        else:
-            usual(message, category, *place, **options)
-
-    with warnings.catch_warnings():
-        warnings.showwarning = show
-        yield
-
-
 class _Commands(click.Group):
-    """A group whose errors are one message without a traceback, unless ``--debug`` is given."""
+    """A group whose errors are one message without a traceback, unless ``--debug`` is given, and warnings sentences."""
 
     def main(self, *args: Any, **kwargs: Any) -> Any:
         click.UsageError.exit_code = ERROR
         return super().main(*args, **kwargs)
 
     def invoke(self, ctx: click.Context) -> Any:
+        usual, warnings.formatwarning = warnings.formatwarning, lambda message, *place: f"Warning: {message}\n"
         try:
-            with _plain_warnings():
-                return super().invoke(ctx)
+            return super().invoke(ctx)
         except (KeyboardInterrupt, SystemExit) as error:  # exit code 0 of the user's code would say that all is done
             stopped = isinstance(error, KeyboardInterrupt)
             message = ctx.obj.get("interrupted", "Interrupted: nothing was changed.")
@@ -72,6 +53,8 @@ class _Commands(click.Group):
                 raise
             click.echo(f"Error: {error}", err=True)
             ctx.exit(ERROR)
+        finally:
+            warnings.formatwarning = usual
 
 
 @click.group(cls=_Commands, context_settings={"show_default": True, "help_option_names": ["-h", "--help"]})
@@ -94,55 +77,42 @@ def main(ctx: click.Context, debug: bool) -> None:
 @main.command()
 @click.argument("file", type=_FILE)
 @click.option("--out", type=_FILE, help="Folder of the run.", show_default="results-NAME for NAME.toml")
-@click.option("--overwrite", is_flag=True, help="Delete the run in the folder and start again.")
 @click.option("--quiet", is_flag=True, help="Show no progress bars.")
 @click.pass_context
-def run(ctx: click.Context, file: Path, out: Path | None, overwrite: bool, quiet: bool) -> None:
+def run(ctx: click.Context, file: Path, out: Path | None, quiet: bool) -> None:
     """Sample the posterior that FILE (TOML) describes; write report, tables and samples to a folder.
 
-    The same command continues a run that was killed. A folder with a run of other settings is refused; [budget],
-    [prediction] and [events] may change.
+    The same command continues a run that was killed. A folder with a run of other settings is refused; [budget] and
+    [prediction] may change.
     """
     from .runs import default_folder, run_job
 
     folder = out or default_folder(file)
     again = shlex.join(["fe-likelihoods", "run", str(file), *([] if out is None else ["--out", str(out)])])
     ctx.obj["interrupted"] = f"Interrupted. What was computed is kept in {folder}/; go on with: {again}"
-    outcome = run_job(file, out, overwrite, progress=not quiet)
+    outcome = run_job(file, out, progress=not quiet)
     _show(outcome)
     ctx.exit(0 if outcome.usable else NOT_USABLE)
 
 
 def _show(outcome: Any) -> None:
     click.echo((outcome.folder / "summary.txt").read_text(encoding="utf-8").rstrip())
-    posterior, assumed = outcome.problem.posterior, outcome.problem.assumed
-    for part, _ in posterior.likelihood.parts():
-        if "CAUTION" in part.measurements.description:
-            click.echo(f"Measurements: {part.measurements.description}")
-    for parameter in (each for each in posterior.parameters if each.name in assumed):
-        prior = assumed[parameter.name]
-        mean, sd = (parameter.shown(value) for value in prior.moments)
-        told = f"{type(prior).__name__}, mean {mean:.3g}, standard deviation {sd:.3g}"
-        click.echo(f"Assumed, since the file does not give it: prior of {parameter.label}: {told}")
-    for line in outcome.findings:
-        click.echo(line)
-    click.echo(f"Written to {outcome.folder}/: {', '.join(outcome.files)}")
+    click.echo(f"Written to {outcome.folder}/: report.html, summary.txt, summary.csv, stages.csv, posterior.nc")
 
 
 @main.command()
 @click.argument("file", type=_FILE)
-@click.option("--out", type=_FILE, help="PNG file of the prior predictive picture.", show_default="check-NAME.png")
 @click.option("--quiet", is_flag=True, help="Show no progress bars.")
-def check(file: Path, out: Path | None, quiet: bool) -> None:
-    """Read FILE and its data, test with about 100 simulations, and say what a run will do and cost.
+def check(file: Path, quiet: bool) -> None:
+    """Read FILE and its data, test with about 100 simulations, and say what was found.
 
     It tries whether the model is repeatable and follows its motion, whether units, signs, clocks and channels are
-    right, and whether step and mesh are fine enough for the data. A picture compares the measurements with simulations
-    at draws of the prior: the measurements should lie within their band.
+    right, and whether step and mesh are fine enough for the data. The picture check-NAME.png compares the measurements
+    with simulations at draws of the prior: the measurements should lie within their band.
     """
     from .checking import check_job
 
-    check_job(file, out or Path(f"check-{file.stem}.png"), click.echo, progress=not quiet)
+    check_job(file, Path(f"check-{file.stem}.png"), click.echo, progress=not quiet)
 
 
 @main.command()
@@ -159,17 +129,11 @@ def report(run: Path, run_code: bool) -> None:
 
 
 def write_templates(kind: str, folder: Path) -> tuple[str, ...]:
-    """Copy the templates of a kind, a key of `TEMPLATES`, to a folder, which is created; names of the files.
-
-    ValueError if one of the files exists.
-    """
-    names = TEMPLATES[kind]
+    """Copy the templates of a kind, a key of `TEMPLATES`, to a folder, which is created; names of the files."""
+    names, source = TEMPLATES[kind], resources.files("fe_likelihoods.data") / "templates"
     if there := [name for name in names if (folder / name).exists()]:
         raise ValueError(f"{folder} already contains {', '.join(there)}; give another folder")
-    if folder.is_file():
-        raise ValueError(f"{folder} is a file; give the folder to write to")
     folder.mkdir(parents=True, exist_ok=True)
-    source = resources.files("fe_likelihoods.data") / "templates"
     for name in names:
         (folder / name).write_bytes((source / name).read_bytes())
     return names
@@ -190,15 +154,9 @@ def new(kind: str, folder: Path) -> None:
 def data(files: tuple[Path, ...]) -> None:
     """List what data FILES hold (columns, channels, units, steps, gaps), and the lines of a TOML file that read them.
 
-    A file is a table of a logger, a ground motion, a zip archive of V2 files, or a data set.
+    A file is a table of a logger, a ground motion, a zip archive of V2 files, a data set, or a MATLAB file.
     """
     from .listing import describe_data
 
-    unread = []
     for file in files:
-        try:
-            click.echo(f"{describe_data(file)}\n")
-        except ValueError as error:
-            unread.append(str(error))
-    if unread:
-        raise ValueError("\nError: ".join(unread))
+        click.echo(f"{describe_data(file)}\n")

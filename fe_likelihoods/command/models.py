@@ -1,7 +1,6 @@
 """The posterior that a TOML file describes: its data sets, their models and likelihoods, and the priors."""
 
 import importlib
-import importlib.util
 import math
 import re
 import sys
@@ -10,8 +9,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
-
-import numpy as np
 
 from ..cache.simulation_cache import SimulationCache
 from ..likelihood.joint import JointLikelihood
@@ -32,7 +29,7 @@ from ..priors.distributions import Distribution, HalfNormal, LogNormal, Truncate
 from ..signals.channels import Channel, Measurements
 from ..signals.records import Record
 from ..simulation.model import Model
-from .data import is_dataset, read_base_motion, read_measured, read_supports, reduce_data
+from .data import first_part, is_dataset, read_base_motion, read_measured, read_supports
 from .job import Job
 from .keys import check_known, did_you_mean, parse_prior, read_by_channel
 from .sections import USER_MODELS, part_keys
@@ -67,11 +64,10 @@ class _DataSet(NamedTuple):
 def make_problem(job: Job, cache: SimulationCache | None = None) -> Problem:
     """Read the data, make the model and the posterior; ValueError, which names section and key, for any fault."""
     jobs = job.data_sets()
-    for each in jobs.values():
-        if each.budget.workers is not None and each.kind not in USER_MODELS and not each.has_no_time:
-            raise ValueError(
-                f"{job.where('budget')} workers: a built-in model uses all cores by itself; leave this key out"
-            )
+    if any(job.budget.workers and each.measurements and each.kind not in USER_MODELS for each in jobs.values()):
+        raise ValueError(
+            f"{job.where('budget')} workers: a built-in model uses all cores by itself; leave this key out"
+        )
     readers = {"measurements": _histories, "modes": _modes, "load_test": _load_test}
     sets = {name: each.located(name, readers[name], each, cache) for name, each in jobs.items()}
     models = _of_one_run(job, {name: sets[name] for name in job.shared})
@@ -80,31 +76,23 @@ def make_problem(job: Job, cache: SimulationCache | None = None) -> Problem:
         model = models[name] if name in models else each.job.located("model", each.make_model)
         made[name] = each.job.located(name, each.make_likelihood, model, job.budget.workers)
         known, record = known | dict(each.known), each.record or record
-    if twice := [name for name in known if name in job.priors]:
-        raise ValueError(
-            f"{job.where('priors')} {twice[0]}: this error is known from [load_test]: leave one of them out"
-        )
     likelihood = made.popitem()[1] if len(made) == 1 else job.located("model", JointLikelihood, made)
     priors, assumed = _make_priors(job, likelihood, known)
-    posterior = Posterior(likelihood, priors)
-    posterior = job.located("noise", posterior.marginal) if job.marginal else posterior
-    return Problem(posterior, record, assumed)
+    return Problem(Posterior(likelihood, priors), record, assumed)
 
 
 def _histories(job: Job, cache: SimulationCache | None) -> _DataSet:
     record, own = read_base_motion(job), job.kind in USER_MODELS
     channels: tuple[Channel, ...] = ()  # a data set has its channels
-    if own and not is_dataset(job, "measurements"):
-        channels = user_channels(job)
-    elif not is_dataset(job, "measurements"):
+    if not is_dataset(job, "measurements"):
         names = tuple((job.measurements and job.measurements.columns) or ()) or None
-        channels = job.located("model", built_in, job, record, names).channels
-    record, measured = reduce_data(job, record, read_measured(job, channels, record))
+        channels = user_channels(job) if own else job.located("model", built_in, job, record, names).channels
+    measured, record = first_part(job, read_measured(job, channels, record)), first_part(job, record)
 
     def make_model() -> Model:
         if own:
             return user_model(job, user_channels(job), record)
-        return built_in(job, record, tuple(channel.name for channel in measured.channels), measured)
+        return built_in(job, record, tuple(channel.name for channel in measured.channels))
 
     def make_likelihood(model: Model, pool: Any) -> FELikelihood:
         sensed = job.located("priors", _with_sensors, job, model)
@@ -116,23 +104,17 @@ def _histories(job: Job, cache: SimulationCache | None) -> _DataSet:
 
 
 def _modes(job: Job, cache: SimulationCache | None) -> _DataSet:
-    if job.kind == "oscillator":
-        raise ValueError(
-            f"{job.where('model')} kind: with [modes], an oscillator is a frame of one storey, whose parameter is "
-            'stiffness_1: kind = "frame", floors = {top = 1}, masses = [m], stiffnesses = [k]'
-        )
     _check_kind(job, "modes", STRUCTURES)
     if job.noise is not None:
         raise ValueError(f"{job.where('noise')} modes have no such errors: give frequency_cv and others in [modes]")
     data, held_out = _read_modes(job)
     unknown, options = job.modes.unknown_errors, job.modes.given("close", "student_t")
-    make, channels, n_modes = None, (), 0
+    channels, n_modes, sensors, make = (), 0, job.model.get("sensors"), None
     if job.kind in USER_MODELS:
-        sensors = job.model.get("sensors")
-        if sensors is None or "channels" in job.model:
+        if sensors is None:
             raise ValueError(
                 f"{job.where('model')} sensors: with [modes], give sensors = {{top = 0}} with the rows of the matrices "
-                "that the function returns, or a list of names, and no channels"
+                "that the function returns, or a list of names"
             )
         numbers = (data.n_modes, *data.mode_numbers, *(held_out.mode_numbers if held_out else ()))
         channels, n_modes = modal_channels(tuple(sensors)), job.modes.n_modes or 2 * max(numbers)
@@ -153,30 +135,22 @@ def _modes(job: Job, cache: SimulationCache | None) -> _DataSet:
 def _read_modes(job: Job) -> tuple[ModalData, ModalData | None]:
     """The data of ``[modes]``, and the modes that are held out."""
     given = job.modes
-    if given.n_modes is not None and job.kind in STRUCTURES:
-        raise ValueError(f"n_modes: a {job.kind} has a mode for each storey or shape; leave it out")
-    columns = given.columns or {}
-    if "shapes" in (given.variables or {}) and not columns:
+    columns, more = given.columns or {}, given.given("unit", "variables")
+    if "shapes" in more.get("variables", ()) and not columns:
         raise ValueError('columns: name the sensors of all rows of the shapes, in order, as columns = {roof = "1"}')
     sensors = tuple(columns if given.variables else columns.values())
-    data = read_modal_data(job.path("modes", "file", given.file), sensors, **given.given("unit", "variables"))
-    data = replace(data, sensors=tuple(columns)) if columns and not given.variables else data
-    data = replace(data, **given.given("temperatures"))
-    data = data.mean() if given.mean else data
-    errors = given.given("frequency_cv", "covariance", "shape_error")
-    every = {  # errors of all modes of the file, which those held out have as well
-        name: errors.pop(name)
-        for name in ("frequency_cv", "shape_error")
-        if name in errors and "covariance" not in errors and np.size(errors[name]) in (1, data.n_modes)
-    }
-    data = replace(data, **every)
-    held_out = None if given.held_out is None else data.select(given.held_out)
+    data = read_modal_data(job.path("modes", "file", given.file), sensors, **more)
+    data = replace(data, sensors=tuple(columns) or data.sensors, **given.given("temperatures"))
+    data = replace(data.mean() if given.mean else data, **given.given("frequency_cv", "shape_error"))
     if both := set(given.held_out or ()) & set(given.modes or ()):
         raise ValueError(f"held_out: the modes {sorted(both)} are in modes too: leave them out of one of them")
-    compared = given.modes or [each for each in data.mode_numbers if each not in (given.held_out or ())]
-    if "covariance" in errors:  # instead of a column of the file
-        errors = {"frequency_cv": None} | errors
-    return replace(data.select(compared), **errors), held_out
+    held_out = None if given.held_out is None else data.select(given.held_out)
+    data = data.select(given.modes or [each for each in data.mode_numbers if each not in (given.held_out or ())])
+    if given.covariance is not None:  # instead of a column of the file
+        data = replace(
+            data, covariance=given.covariance, frequency_cv=None if given.frequency_cv is None else data.frequency_cv
+        )
+    return data, held_out
 
 
 def _load_test(job: Job, cache: SimulationCache | None) -> _DataSet:
@@ -184,20 +158,16 @@ def _load_test(job: Job, cache: SimulationCache | None) -> _DataSet:
     channels, given = user_channels(job), job.load_test
     errors = read_by_channel(given.errors or {}, channels, "errors")
     path = job.path("load_test", "file", given.file)
-    test = read_load_test(path, channels, errors=errors, **given.given("columns", "units", "cases", "temperatures"))
-    size = len(test.cases)
-    for key, value in (("dt", 1.0), ("n_steps", size)):
-        if job.model.get(key, value) != value:
-            raise ValueError(f"{job.where('model')} {key}: a load test has {size} load cases and no time: leave it out")
+    test = read_load_test(path, channels, errors=errors, **given.given("columns", "units", "cases"))
+    steps = {"dt": 1.0, "n_steps": len(test.cases)}
 
     def make_likelihood(model: Model, pool: Any) -> FELikelihood:
         noise = None if job.noise is None else job.located("noise", _make_noise, job, channels)
-        return FELikelihood(test.at_temperatures(model), test.measurements, noise, pool, cache=cache)
+        return FELikelihood(model, test.measurements, noise, pool, cache=cache)
 
-    def make_model() -> Model:
-        return user_model(job, channels, dt=1.0, n_steps=size)
-
-    return _DataSet(job, make_model, make_likelihood, (channels, 1.0, size), test.known)
+    return _DataSet(
+        job, lambda: user_model(job, channels, **steps), make_likelihood, (channels, *steps.values()), test.known
+    )
 
 
 def _make_noise(job: Job, channels: tuple[Channel, ...]) -> Any:
@@ -223,9 +193,9 @@ def _of_one_run(job: Job, sets: Mapping[str, _DataSet]) -> Mapping[str, Any]:
     """Models of the data sets that one run of a user's function or program answers, by section."""
     if not sets:
         return {}
-    first = next(iter(sets.values())).job
     if job.record is not None and "measurements" in sets:
         raise ValueError(f"{job.where('record')} one run for several data sets reads its motion itself: leave this out")
+    first = next(iter(sets.values())).job
     output: Any = {name: each.job.model.get("output") for name, each in sets.items()}
     if first.kind != "executable":
         output = load_function(first, first.model["function"])
@@ -259,23 +229,24 @@ def _make_priors(
 ) -> tuple[dict[str, Any], dict[str, Distribution]]:
     """The priors of all parameters, numbers for `known` ones, and the assumed ones, which the file does not give."""
     names, parts, where = likelihood.parameter_names, [part for part, _ in likelihood.parts()], job.where("priors")
-    channels = {}  # of each parameter that is the noise level of a channel, by name
+    channels, given, assumed = {}, dict[str, Any](known), {}  # of each parameter that is a noise level, its channel
     for part in parts:
         channels |= channels_of_deviations(part.noise, part.model.channels)
     measured = {channel.name: part.measurements for part in parts for channel in part.model.channels}
-    given = {}
+    structural = {name for part in parts for name in part.model.parameter_names if name != SLOPE}
     check_known(job.priors, names, where, "the model has no such parameter")
     for name, text in job.priors.items():
+        if name in known:
+            raise ValueError(f"{where} {name}: this error is known from [load_test]: leave one of them out")
         try:
             given[name] = parse_prior(text, channels[name].dimension if name in channels else None)
         except ValueError as error:
             raise ValueError(f"{where} {name}: {error}") from None
-    for name in (name for part in parts for name in part.model.parameter_names if name != SLOPE):
-        if name not in given:
+    for name in (name for name in names if name not in given):
+        if name in structural:
             raise ValueError(f'{where} {name}: this prior is missing; write for example {name} = "normal(1, 0.3)"')
-    free = [name for name in names if name not in given and name not in known]
-    assumed = {name: _default_prior(name, channels.get(name), measured) for name in free}
-    return {name: (given | assumed | dict(known))[name] for name in names}, assumed
+        given[name] = assumed[name] = _default_prior(name, channels.get(name), measured)
+    return {name: given[name] for name in names}, assumed
 
 
 def _default_prior(name: str, channel: Channel | None, measured: Mapping[str, Measurements]) -> Distribution:
@@ -295,7 +266,7 @@ def _default_prior(name: str, channel: Channel | None, measured: Mapping[str, Me
 # structures -----------------------------------------------------------------------------------------------------------
 
 
-def built_in(job: Job, record: Record, names: tuple[str, ...] | None, measured: Measurements | None = None) -> Model:
+def built_in(job: Job, record: Record, names: tuple[str, ...] | None) -> Model:
     """A structure of the library with channels (None: its usual ones)."""
     values = dict(job.model)
     if job.kind == "column":
@@ -307,20 +278,8 @@ def built_in(job: Job, record: Record, names: tuple[str, ...] | None, measured: 
         values["analysis"] = replace(usual.analysis, **analysis)
         for part in values.keys() & part_keys("column").keys():  # a section of fatigue switches it on
             values[part] = _changed(job, part, getattr(usual, part) or LowCycleFatigue(), values[part])
-        if "units" in values:
-            values["units"] = tuple((dict(usual.units) | values["units"]).items())
+        values["units"] = tuple((dict(usual.units) | values.get("units", {})).items())
         return RCColumn.lhpost(record, **values, outputs=names)
-    if job.kind == "bridge":
-        from ..models.isolated_bridge import IsolatedBridge
-
-        usual = IsolatedBridge(record)
-        for part in ("pier", "bearing", "damper"):
-            both = enumerate(getattr(usual, f"{part}s"), 1)
-            values[f"{part}s"] = tuple(
-                _changed(job, f"{part}_{i}", one, values.pop(f"{part}_{i}", {})) for i, one in both
-            )
-        every = {} if measured is None else {"every": max(1, round(measured.dt / record.dt))}
-        return IsolatedBridge(record, **values, **every, outputs=names)
     if job.kind == "oscillator":
         from ..models.linear_oscillator import LinearOscillator
 
@@ -328,7 +287,7 @@ def built_in(job: Job, record: Record, names: tuple[str, ...] | None, measured: 
     from ..models.linear_structure import LinearStructure
 
     deck = job.kind == "bridge deck"
-    motion = [reduce_data(job, each, None)[0] for each in read_supports(job)] if deck else record
+    motion = [first_part(job, each) for each in read_supports(job)] if deck else record
     return LinearStructure(linear_parts(job), motion, outputs=names)
 
 
@@ -336,29 +295,26 @@ def linear_parts(job: Job) -> Any:
     """A shear frame, with groups of storeys or without, or a bridge deck."""
     from ..models.linear_structure_parts import BridgeDeck, ShearFrame
 
-    kind = ShearFrame if job.kind == "frame" else BridgeDeck
-    return job.located("model", kind, **job.model)
+    return job.located("model", ShearFrame if job.kind == "frame" else BridgeDeck, **job.model)
 
 
 def _changed(job: Job, part: str, usual: Any, changes: Mapping[str, Any]) -> Any:
-    """A part of the built-in structure with the values of the file."""
-    if part in ("bars", "hoops") and "diameter" in changes:
-        changes = {"area": None} | dict(changes)  # from the new diameter
+    """A part of the built-in structure with the values of the file; the area of bars is from a new diameter."""
+    area = {"area": None} if part in ("bars", "hoops") and "diameter" in changes else {}
     try:
-        return replace(usual, **changes)
+        return replace(usual, **area | dict(changes))
     except ValueError as error:
         raise ValueError(f"{job.file.name}: [model.{part}] {error}") from error
 
 
 def user_channels(job: Job) -> tuple[Channel, ...]:
     """Channels of a model of the user; ValueError, which names the channel, for a wrong quantity or unit."""
-    where = f"{job.where('model')} channels:"
+    where, channels = f"{job.where('model')} channels:", []
     if "channels" not in job.model or "sensors" in job.model:
         raise ValueError(
             f'{where} give the channels of the response, such as {{top = "relative displacement [mm]"}}; sensors are '
             "for [modes]"
         )
-    channels = []
     for name, text in job.model["channels"].items():
         match = re.fullmatch(r"\s*(.+?)\s*\[(.+)\]\s*", text)
         if match is None:
@@ -371,15 +327,12 @@ def user_channels(job: Job) -> tuple[Channel, ...]:
 
 
 def user_model(job: Job, channels: tuple[Channel, ...], record: Record | None = None, **options: Any) -> Model:
-    """A model of the user; `options` are the steps of data without a time, and ``make``, another model of a function.
-
-    ``output``, of one run that answers several data sets, is a function, or files by the names of data sets.
-    """
+    """A model of the user; `options`: steps, ``make`` (a class), ``output`` (of one run for several data sets)."""
     make, output = options.pop("make", None), options.pop("output", None)
-    given = {key: value for key, value in job.model.items() if key not in ("channels", "sensors")}
-    names = given.pop("parameters")
+    given = {key: value for key, value in job.model.items() if key not in ("channels", "sensors", "parameters")}
+    names = job.model["parameters"]
     given["depends_on"] = [job.path("model", "depends_on", name) for name in given.get("depends_on", ())]
-    given |= ({} if job.has_no_time or record is None else {"record": record}) | options
+    given |= ({} if record is None else {"record": record}) | options
     if job.kind == "executable":
         from ..models.executable import ExecutableModel
 
@@ -400,25 +353,20 @@ def user_model(job: Job, channels: tuple[Channel, ...], record: Record | None = 
 
 
 def load_function(job: Job, text: str) -> Callable:
-    """The function that ``"file.py:name"`` names, from a module that worker processes can import too.
-
-    ValueError if the file or the function does not exist, the file cannot be imported, or another module has its name.
-    """
-    where = f"{job.where('model')} function:"
-    file, _, name = text.rpartition(":")
+    """The function that ``"file.py:name"`` names, from a module that worker processes can import too."""
+    where, (file, _, name) = f"{job.where('model')} function:", text.rpartition(":")
     if not file or not name.isidentifier():
         raise ValueError(f'{where} expected "file.py:name of the function"; got {text!r}')
     path = job.path("model", "function", file).resolve()
     if str(path.parent) not in sys.path:
         sys.path.insert(0, str(path.parent))
     importlib.invalidate_caches()
-    found = importlib.util.find_spec(path.stem) if path.stem.isidentifier() else None
-    if found is None or found.origin is None or Path(found.origin).resolve() != path:
-        raise ValueError(f"{where} {path.name} cannot be imported by its name; rename it, for example to my_model.py")
     try:
         module = importlib.import_module(path.stem)
     except Exception as error:
         raise ValueError(f"{where} {path.name} cannot be imported: {type(error).__name__}: {error}") from error
+    if Path(module.__file__ or "").resolve() != path:
+        raise ValueError(f"{where} {path.name} cannot be imported by its name; rename it, for example to my_model.py")
     function = vars(module).get(name)
     if not callable(function):
         names = tuple(key for key, value in vars(module).items() if callable(value) and not key.startswith("_"))

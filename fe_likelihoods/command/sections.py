@@ -16,7 +16,6 @@ __all__ = [
     "SECTIONS",
     "USER",
     "USER_MODELS",
-    "Event",
     "LoadTest",
     "Measured",
     "Modes",
@@ -55,7 +54,7 @@ class Table(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class Motion(Table):
-    """``[record]``, the base motion of the calibration, or of an event."""
+    """``[record]``, the base motion."""
 
     file: Any = key("text", "Base acceleration: CSV, Excel, a data set (.h5), or a format of `read_record`")
     column: Any = key("text", "Column of a CSV file or workbook, component (GeoNet), or file in an archive (V2)")
@@ -68,19 +67,6 @@ class Motion(Table):
         "list of text",
         'Instead of file, "file.csv" or "file.csv:column" of column base, first end and second end of a bridge deck',
     )
-    every: Any = key("whole number >= 1", "Keep every n-th sample: a faster simulation with a longer step", 1)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Event(Motion):
-    """``[events.NAME]``, which is predicted after the run."""
-
-    OTHERS: ClassVar = "supports every"  # keys of the calibration alone
-
-    measured: Any = key("text", "Measured response in this event, to be compared: a file as in [measurements]")
-    zero: Any = key(CLOCK, "Time in this file at which the base motion begins; by default as in [measurements]")
-    from_state: Any = key("one of virgin, end", "End: begin with the state after the record", "virgin")
-    rest: Any = key("time", 'Pause before the motion, for "end"; 10 s by default')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,7 +83,9 @@ class Measured(Table):
         "list of number or text or time span",
         'What stands for missing samples, such as "OL", and times to leave out, ["channel", first, last]',
     )
-    baseline: Any = key("table of points", "Channel = points [time, value] of an offset or a drift that is subtracted")
+    baseline: Any = key(
+        "table of points of time and value", "Channel = points [time, value] of an offset or a drift that is subtracted"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,8 +122,7 @@ class LoadTest(Section):
     columns: Any = key("table of text", "Channel = name of its column; by default the column of this name")
     units: Any = key("table of text", "Channel = unit, if the file does not state it")
     cases: Any = key("text", "Column with the names of the load cases, or with positions; by default the first one")
-    errors: Any = key("table of quantity", 'Channel = known standard deviation of its sensor, such as "0.1 mm"')
-    temperatures: Any = key(NUMBERS, "Temperature of each load case [°C]; adds the parameter temperature_slope")
+    errors: Any = key("table of number with unit", 'Channel = known standard deviation of its sensor, such as "0.1 mm"')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,10 +132,9 @@ class Noise(Section):
     kind: Any = key("one of gaussian, autoregressive", "Autoregressive noise takes sensor only", "gaussian")
     groups: Any = key("one of channel, all, event", "What has a level: each channel, all, or each in each event")
     level: Any = key("one of si, measured, response", "Levels in SI units, or as shares of one of these signals")
-    sensor: Any = key("table of quantity", "Channel = known standard deviation of its sensor noise (zero)")
+    sensor: Any = key("table of number with unit", "Channel = known standard deviation of its sensor noise (zero)")
     window: Any = key("time", "Length of the moving window for the root mean square of the response")
     local: Any = key("number", 'For "response": weight of the response envelope in the variance, from 0 to 1 (0.25)')
-    marginal: Any = key("yes or no", "Integrate the levels out; for levels in SI units without sensor", False)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,9 +148,6 @@ class Sampler(Section):
     chains: Any = key("whole number >= 1", "Independent runs with successive seeds; the report is of the first", 1)
     guide: Any = key("yes or no", "Find the posterior from the responses, with hundreds of simulations", False)
     recycle: Any = key("yes or no", "Reuse every evaluated point; by default with 150 walkers or more")
-    ess_ratio: Any = key("number", "Share of effective walkers wanted at each stage, without recycling")
-    min_moves: Any = key("whole number", "Fewest sweeps per stage")
-    max_moves: Any = key("whole number >= 1", "Most sweeps per stage")
     max_failure_share: Any = key("number", "Share of failed evaluations at which the run stops (0.5)")
 
 
@@ -174,7 +157,6 @@ class Budget(Section):
 
     max_simulations: Any = key("whole number >= 1", "Most simulations; the run can be continued with more")
     workers: Any = key("whole number >= 1", "Processes, for a model of your own (1); built-in models use all cores")
-    cache: Any = key("yes or no", "Keep every simulation in a file of the folder", True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,7 +164,7 @@ class Predictions(Section):
     """``[prediction]``."""
 
     draws: Any = key("whole number >= 0", "Draws of the posterior whose response is predicted; 0 for none", 100)
-    noise: Any = key("yes or no", "Predict measurements, with their noise; by default only in events with measurements")
+    noise: Any = key("yes or no", "Predict measurements, with their noise", False)
 
 
 SECTIONS: dict[str, type[Section]] = {
@@ -197,8 +179,8 @@ SECTIONS: dict[str, type[Section]] = {
 }
 """Sections besides those of `FREE_SECTIONS`."""
 
-FREE_SECTIONS = "model", "priors", "events"
-"""Sections whose keys depend on the kind of the structure, its parameters, and names of events."""
+FREE_SECTIONS = "model", "priors"
+"""Sections whose keys depend on the kind of the structure and its parameters."""
 
 
 _LIMIT = Key("time_limit", "time", "Longest duration of a run; a longer run is stopped and counts as failed")
@@ -234,33 +216,29 @@ _OSCILLATOR = (
     Key("damping_ratio", "number", "Nominal fraction of critical damping, between 0 and 1"),
 )
 _COLUMN_PARTS = dict(concrete="Concrete", steel="Steel", bars="Bars", hoops="Hoops", fatigue="LowCycleFatigue")
-_BRIDGE_PARTS = {f"{name.lower()}_{i}": name for name in ("Pier", "Bearing", "Damper") for i in (1, 2)}
-_BUILT_IN = {  # modules, classes, and fields that are no keys
-    "column": (("rc_column", "RCColumn", "outputs"), ("rc_column_parts", "ColumnAnalysis", "max_increment")),
-    "bridge": (("isolated_bridge", "IsolatedBridge", "outputs every"),),
-    "frame": (("linear_structure_parts", "ShearFrame", ""),),
-    "bridge deck": (("linear_structure_parts", "BridgeDeck", ""),),
+_BUILT_IN = {  # modules and classes
+    "column": (("rc_column", "RCColumn"), ("rc_column_parts", "ColumnAnalysis")),
+    "frame": (("linear_structure_parts", "ShearFrame"),),
+    "bridge deck": (("linear_structure_parts", "BridgeDeck"),),
 }
-_PARTS = {"column": _COLUMN_PARTS, "bridge": _BRIDGE_PARTS}
 MODEL_KINDS = (*_BUILT_IN, "oscillator", *_OWN)
 """Kinds of ``[model]``."""
 USER_MODELS = tuple(_OWN)
 """Those that run a function or a program of the user."""
 
 
-def _keys_of(module: str, name: str, without: str, optional: bool) -> tuple[Key, ...]:
+def _keys_of(module: str, name: str, optional: bool) -> tuple[Key, ...]:
     """Keys of a class of `fe_likelihoods.models`, imported where a file needs it: some import numba."""
     owner = getattr(importlib.import_module(f"fe_likelihoods.models.{module}"), name)
-    return keys_of(owner, without, optional)
+    return keys_of(owner, "outputs max_increment", optional)
 
 
 def model_keys(kind: str) -> tuple[Key, ...]:
     """Keys of ``[model]`` for one of `MODEL_KINDS`."""
     own = _OWN | {"oscillator": _OSCILLATOR}
-    return own[kind] if kind in own else sum((_keys_of(*each, kind in _PARTS) for each in _BUILT_IN[kind]), ())
+    return own[kind] if kind in own else sum((_keys_of(*each, kind == "column") for each in _BUILT_IN[kind]), ())
 
 
 def part_keys(kind: str) -> dict[str, tuple[Key, ...]]:
-    """Keys of the tables below ``[model]`` by name; a key that is left out has the value of the built-in structure."""
-    names, module = _PARTS.get(kind, {}), f"{_BUILT_IN[kind][0][0]}_parts" if kind in _PARTS else ""
-    return {part: _keys_of(module, name, "", True) for part, name in names.items()}
+    """Keys of the tables below ``[model]`` by name; a key that is left out has the value of the built-in column."""
+    return {part: _keys_of("rc_column_parts", name, True) for part, name in _COLUMN_PARTS.items() if kind == "column"}

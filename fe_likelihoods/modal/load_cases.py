@@ -13,8 +13,6 @@ from ..signals.channels import Channel, Measurements
 from ..signals.read import units_of
 from ..signals.tables import read_table, table_values
 from ..units import to_si
-from .modal_data import DEGREES, TEMPERATURES, checked_numbers
-from .temperature import StaticAtTemperatures
 
 __all__ = ["LoadTest", "read_load_test"]
 
@@ -37,9 +35,6 @@ class LoadTest:
         Measured values [SI]; NaN where one is missing.
     errors : mapping of str to float, optional
         Known standard deviations of sensors [SI], by the names of channels.
-    temperatures : float or (n_cases,) array_like, optional
-        Temperature of the structure under each load case [°C]. `model` and `at_temperatures` then have the parameter
-        ``temperature_slope`` [1/K], that of frequencies (`fe_likelihoods.modal.temperature`); models are at 20 °C.
     axis : str
         What the load cases are, for figures, such as "position of the truck [m]".
     description : str
@@ -48,7 +43,7 @@ class LoadTest:
     Raises
     ------
     ValueError
-        If names repeat, a shape does not fit, or an error or a temperature is not possible.
+        If names repeat, a shape does not fit, or an error is not possible.
 
     Examples
     --------
@@ -65,7 +60,6 @@ class LoadTest:
     values: Any
     _: KW_ONLY
     errors: Mapping[str, float] | None = None
-    temperatures: Any = None
     axis: str = "load case"
     description: str = "load test"
 
@@ -80,10 +74,6 @@ class LoadTest:
             )
         measurements = Measurements(channels, 1.0, self.values, self.description, axis=self.axis, points=cases)
         found = {"channels": channels, "cases": cases, "values": measurements.values, "errors": errors}
-        if self.temperatures is not None:
-            expected = f"{DEGREES} {len(cases)} load cases, from -80 to 80"
-            given = "LoadTest: temperatures", self.temperatures, (len(cases),), TEMPERATURES, expected
-            found["temperatures"] = checked_numbers(*given)
         for name, value in (found | {"measurements": measurements}).items():
             object.__setattr__(self, name, value)
 
@@ -94,12 +84,7 @@ class LoadTest:
 
     def model(self, function: Callable[..., Any], parameter_names: Sequence[str], **options: Any) -> Any:
         """Model of a function of theta that returns (n_channels, n_cases) [SI], options of `FunctionModel`."""
-        model = FunctionModel(function, parameter_names, self.channels, 1.0, len(self.cases), **options)
-        return self.at_temperatures(model)
-
-    def at_temperatures(self, model: Any) -> Any:
-        """The model at the temperatures of the load cases, or as it is if there are none."""
-        return model if self.temperatures is None else StaticAtTemperatures(model, self.temperatures)
+        return FunctionModel(function, parameter_names, self.channels, 1.0, len(self.cases), **options)
 
 
 def read_load_test(
@@ -109,15 +94,14 @@ def read_load_test(
     units: str | Sequence[str] | Mapping[str, str] | None = None,
     cases: str | None = None,
     errors: Mapping[str, float] | None = None,
-    temperatures: float | Sequence[float] | None = None,
 ) -> LoadTest:
     """Read a load test from a CSV file or workbook with a header line and a line for each load case.
 
     `columns` has names of columns by the names of channels, where the column has not the name of the channel (with or
     without a unit); `units` are for files that state none, as in `read_columns`. `cases` is the column with the
     names of the load cases, or with numbers such as positions; default: the first column, if it is no channel, else
-    numbers from 1. `errors` and `temperatures` are those of `LoadTest`. Raises ValueError if a column is missing, or a
-    unit is unknown or not stated.
+    numbers from 1. `errors` are those of `LoadTest`. Raises ValueError if a column is missing, or a unit is unknown or
+    not stated.
     """
     table = read_table(path, labels=cases or "")
     names = [column.name for column in table.columns]
@@ -131,7 +115,7 @@ def read_load_test(
     wanted = [(column_of(each), each.dimension, unit, each.name) for each, unit in given]
     values = [to_si(*each) for each in table_values(table, wanted, stacklevel=2)]
     chosen = cases or next((name for name in names[:1] if name not in [each[0] for each in wanted]), None)
-    options = {"errors": errors, "temperatures": temperatures, "description": f"load test of {Path(path).name}"}
+    options = {"errors": errors, "description": f"load test of {Path(path).name}"}
     if chosen is None:
         return LoadTest(channels, [str(k + 1) for k in range(len(table.lines))], values, **options)
     if chosen not in names:

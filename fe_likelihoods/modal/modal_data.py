@@ -11,9 +11,7 @@ from ..signals.sampling import array_digest
 from ..text_tables import text_table
 from .pairing import close_groups
 
-__all__ = ["DEGREES", "TEMPERATURES", "ModalData", "checked_numbers", "real_shapes"]
-
-TEMPERATURES, DEGREES = (-80.0, 80.0), "a number [°C] for each of"
+__all__ = ["ModalData", "real_shapes"]
 
 _LARGEST_SHARE = 0.5  # above it, an error was given in percent or in hertz
 _ABOVE_ZERO = np.finfo(float).tiny
@@ -83,15 +81,13 @@ class ModalData:
 
     def __post_init__(self) -> None:
         expected = "positive numbers [Hz] of shape (m,) or (n_sets, m), NaN where one of several missed the mode"
-        frequencies = np.atleast_2d(
-            checked_numbers("ModalData: frequencies", self.frequencies, None, (_ABOVE_ZERO, np.inf), expected)
-        )
+        frequencies = np.atleast_2d(_numbers("frequencies", self.frequencies, None, (_ABOVE_ZERO, np.inf), expected))
         known, (n_sets, m) = ~np.isnan(frequencies), frequencies.shape
         if not known.any(axis=0).all():
             raise ValueError("ModalData: a mode has no frequency: leave out modes that were never identified")
         numbers = range(1, m + 1) if self.mode_numbers is None else self.mode_numbers
         expected = f"{m} different whole numbers from 1 on"
-        numbers = checked_numbers("ModalData: mode_numbers", list(numbers), (m,), (1.0, 1e9), expected)
+        numbers = _numbers("mode_numbers", list(numbers), (m,), (1.0, 1e9), expected)
         if len(set(numbers)) < m or (numbers % 1.0).any():
             raise ValueError(f"ModalData: mode_numbers must be {expected}; got {self.mode_numbers!r}")
         sensors = tuple(self.sensors)
@@ -108,12 +104,17 @@ class ModalData:
         for what, shape, limits, expected in (
             ("frequency_cv", (m,), (_ABOVE_ZERO, _LARGEST_SHARE), f"{share} 0.005 for 0.5 %"),
             ("shape_error", (m,), (_ABOVE_ZERO, _LARGEST_SHARE), f"{share} 0.02, for shapes with a norm of 1"),
-            ("temperatures", (n_sets,), TEMPERATURES, f"{DEGREES} {n_sets} identifications, from -80 to 80"),
+            (
+                "temperatures",
+                (n_sets,),
+                (-80.0, 80.0),
+                f"a [°C] for each of {n_sets} identifications, from -80 to 80",
+            ),
             ("damping", (n_sets, m), (0.0, 1.0), ratios),
             ("covariance", (m, m), (-np.inf, np.inf), f"a matrix ({m}, {m}) [Hz²], symmetric positive definite"),
         ):
             if (given := getattr(self, what)) is not None:
-                values[what] = checked_numbers(f"ModalData: {what}", given, shape, limits, expected)
+                values[what] = _numbers(what, given, shape, limits, expected)
         if (covariance := values.get("covariance")) is not None and (
             self.frequency_cv is not None
             or not known.all()
@@ -164,25 +165,15 @@ class ModalData:
 
     def select(self, mode_numbers: Sequence[int]) -> "ModalData":
         """Return the modes with these numbers; ValueError for an unknown one."""
-        rows = _places("modes", mode_numbers, self.mode_numbers)
+        if unknown := [number for number in mode_numbers if number not in self.mode_numbers]:
+            raise ValueError(f"ModalData has no modes {unknown}; the modes are {str(self.mode_numbers)[1:-1]}")
+        rows = [self.mode_numbers.index(number) for number in mode_numbers]
         names = ("frequencies", "damping", "frequency_cv", "shape_error")
         per_mode = {name: each[..., rows] for name in names if (each := getattr(self, name)) is not None}
         covariance = None if self.covariance is None else self.covariance[np.ix_(rows, rows)]
         return replace(
             self, **per_mode, covariance=covariance, shapes=self.shapes[:, rows], mode_numbers=tuple(mode_numbers)
         )
-
-    def at(self, sensors: Sequence[str]) -> "ModalData":
-        """Return the shapes at some of the sensors; ValueError for an unknown one.
-
-        A known `shape_error` is that of the same measurements, for shapes whose norm at these sensors is 1.
-        """
-        shapes, error = self.shapes[:, :, _places("sensors", sensors, self.sensors)], self.shape_error
-        if error is not None:
-            norms = np.sqrt(np.nansum(np.square(shapes), axis=(0, 2)) / np.maximum(self.has_shape.sum(axis=0), 1))
-            # at most half, with which a shape tells nothing
-            error = np.minimum(error / np.maximum(norms, _ABOVE_ZERO), np.nextafter(_LARGEST_SHARE, 0.0))
-        return replace(self, shapes=shapes, sensors=sensors, shape_error=error)
 
     def mean(self) -> "ModalData":
         """Return the mean of several identifications, with their scatter as the errors `frequency_cv`, `shape_error`.
@@ -241,13 +232,7 @@ def real_shapes(shapes: Any) -> tuple[np.ndarray, np.ndarray]:
     return turned.real, np.degrees(np.arctan2(*left))
 
 
-def _places(what: str, wanted: Sequence[Any], names: Sequence[Any]) -> list[int]:
-    if unknown := [name for name in wanted if name not in names]:
-        raise ValueError(f"ModalData has no {what} {unknown}; the {what} are {', '.join(map(str, names))}")
-    return [names.index(name) for name in wanted]
-
-
-def checked_numbers(
+def _numbers(
     what: str, given: Any, shape: tuple[int, ...] | None, limits: tuple[float, float], expected: str
 ) -> np.ndarray:
     """Numbers from a limit to below another one, repeated to a shape; NaN where an identification has none."""
@@ -256,19 +241,10 @@ def checked_numbers(
     except (TypeError, ValueError):  # texts, complex numbers, rows of different lengths
         values = np.array([])
     fits = values.ndim in (1, 2) if shape is None else values.shape in ((), shape, shape[-1:])
-    inside = (values >= limits[0]) & (values < limits[1]) | np.isnan(values) & (
-        what.endswith(("frequencies", "damping"))
-    )
-    if not fits or not values.size:
-        raise ValueError(f"{what} must be {expected}; got {given!r}")
-    if not inside.all():
-        places = np.argwhere(~inside)[:3]
-        got = (
-            ", ".join(f"{values[tuple(place)]:g} at {(place + 1).tolist()}" for place in places)
-            if values.ndim
-            else given
-        )
-        raise ValueError(f"{what} must be {expected}; got {got}: correct or leave out")
+    wrong = ~((values >= limits[0]) & (values < limits[1]) | np.isnan(values) & (what in ("frequencies", "damping")))
+    if not fits or not values.size or wrong.any():
+        places = "".join(f", {values[tuple(k)]:g} at {(k + 1).tolist()}" for k in np.argwhere(wrong)[:3] if values.ndim)
+        raise ValueError(f"ModalData: {what} must be {expected}; got {given!r}{places}: correct or leave out")
     return values if shape is None else np.broadcast_to(values, shape).copy()
 
 

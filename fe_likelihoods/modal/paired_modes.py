@@ -36,7 +36,7 @@ def sensor_rows(model: Model, data: ModalData) -> list[int]:
     if unknown := [name for name in data.sensors if name not in names[1:]]:
         raise ValueError(
             f"the model has no sensors {', '.join(unknown)}; its sensors are {', '.join(names[1:]) or 'none'}: rename "
-            'them, or leave them out with data.at(sensors); in a TOML file, columns = {sensor = "its column"}'
+            'them, or leave them out (read_modal_data(sensors=)); in a TOML file, columns = {sensor = "its column"}'
         )
     if max(data.n_modes, *np.where(data.has_shape.any(axis=0), 0, data.mode_numbers)) > model.n_steps:
         raise ValueError(

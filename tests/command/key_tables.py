@@ -10,8 +10,6 @@ from fe_likelihoods.command.sections import (
     SECTIONS,
     USER,
     USER_MODELS,
-    Event,
-    Motion,
     model_keys,
     part_keys,
 )
@@ -62,9 +60,7 @@ def key_tables() -> str:
     kinds = ", ".join(f'``"{kind}"``' for kind in USER_MODELS)
     blocks.append(_table(f"``[model]`` of the kinds {kinds}", USER))
     blocks += [_table(f"``[{section}]``", keys_of(each)) for section, each in SECTIONS.items()]
-    title = "``[events.NAME]``: the keys of ``[record]`` without ``supports`` and ``every``, and these"
-    blocks.append(_table(title, _without(keys_of(Event), keys_of(Motion))))
-    forms = "".join(f"* {form}\n" for _, form, _ in FORMS.values())
+    forms = "".join(f"* {form}\n" for _, form in FORMS.values())
     blocks.append(f"Distributions of ``[priors]``:\n\n{forms}")
     return "\n".join(blocks)
 

@@ -16,7 +16,7 @@ from click.testing import CliRunner
 from fe_likelihoods import Channel, LinearOscillator, SimulationCache, read_columns, read_record
 from fe_likelihoods.command.job import parse_job, read_job
 from fe_likelihoods.command.keys import parse_prior, read_quantity
-from fe_likelihoods.command.main import TEMPLATES, _plain_warnings, main
+from fe_likelihoods.command.main import TEMPLATES, main
 from fe_likelihoods.command.models import make_problem
 from fe_likelihoods.models.rc_column_parts import LowCycleFatigue
 from samplers import SamplingWarning
@@ -221,12 +221,10 @@ def test_check_says_what_was_read(folder, monkeypatch):
     # the mean of the prior is simulated four times
     assert len(simulated) - len(set(simulated)) <= 3
     assert "Record: base, 301 samples at 0.02 s" in output
-    assert "displacement: 301 samples" in output and "One simulation takes" in output
+    assert " 301 " in output and "One simulation takes" in output
     assert (folder / "check-oscillator.png").stat().st_size > 10_000
-    made = int(re.search(r"This check made (\d+) simulations", output)[1])
-    stored = SimulationCache(folder / "results-oscillator" / "simulations.sqlite").info().simulations
-    assert 20 < stored <= made
-    assert all(path.name.startswith("simulations.sqlite") for path in (folder / "results-oscillator").iterdir())
+    assert int(re.search(r"This check made (\d+) simulations", output)[1]) > 20
+    assert not (folder / "results-oscillator").exists()
     (folder / "other").mkdir()
     (folder / "other" / "notes.txt").write_text("no run")
     assert "is not the folder of a run" in call("run", "oscillator.toml", "--out", "other", code=1)
@@ -253,7 +251,6 @@ def test_run_writes_its_files(run_once):
         "report.html",
         "summary.txt",
         "summary.csv",
-        "fit.csv",
         "stages.csv",
         "posterior.nc",
         "run.h5",
@@ -276,24 +273,19 @@ def test_a_run_with_other_settings_is_refused(finished):
     first = (finished / "results-oscillator" / "summary.csv").read_text()
     (finished / "oscillator.toml").write_text(OSCILLATOR.replace("walkers = 20", "walkers = 24"))
     message = call("run", "oscillator.toml", "--quiet", code=1)
-    assert "[sampler] walkers differ" in message and "--overwrite" in message
+    assert "[sampler] walkers differ" in message and "--out" in message
     assert (finished / "results-oscillator" / "summary.csv").read_text() == first
 
 
 @pytest.mark.slow
-def test_a_finished_run_is_not_repeated_unless_it_is_overwritten(finished, caplog):
+def test_a_finished_run_is_not_repeated(finished):
     results = finished / "results-oscillator"
     first = (results / "summary.csv").read_text()
     assert "Written to" in call("run", "oscillator.toml", "--quiet")
-    caplog.clear()
     assert (results / "summary.csv").read_text() == first
     (results / "summary.csv").unlink()
     call("report", "results-oscillator/run.h5")
-    assert "nothing is added" not in caplog.text and "Continuing" not in caplog.text
     assert (results / "summary.csv").read_text() == first
-    (finished / "oscillator.toml").write_text(OSCILLATOR.replace("walkers = 20", "walkers = 24"))
-    call("run", "oscillator.toml", "--quiet", "--overwrite")
-    assert (results / "summary.csv").read_text() != first
 
 
 def test_another_file_of_the_same_name_is_refused(finished):
@@ -306,7 +298,7 @@ def test_another_file_of_the_same_name_is_refused(finished):
     (folder / "other" / "base.csv").write_text("\n".join([*lines[:-1], "6.00,0.1"]))
     before = (folder / "results-oscillator" / "origin.json").read_text()
     output = call("run", "other/oscillator.toml", "--quiet", code=1)
-    assert "results-oscillator contains a run with other data or another model" in output and "--overwrite" in output
+    assert "results-oscillator contains a run with other data or another model" in output and "--out" in output
     assert (folder / "results-oscillator" / "origin.json").read_text() == before
 
 
@@ -324,7 +316,7 @@ def test_another_file_of_the_same_name_is_refused(finished):
         ("displacement =", "displ =", "[measurements] columns: displ: unknown channel; did you mean displacement?"),
         ('acceleration = "top [g]", ', "", "[measurements] columns: expected a column for each channel of the model"),
         ("walkers = 20", "walkers = 2", "[sampler]"),
-        ("draws = 10", "draws = -5", "[prediction] draws: expected a whole number of 0 or more, such as 1; got -5"),
+        ("draws = 10", "draws = -5", "[prediction] draws: expected a whole number >= 0, such as 1; got -5"),
         ("half-normal(5 mm)", "halfnormal(5)", "[priors] sigma_displacement: expected a distribution in quotes"),
         ("damping =", "dampng =", "[priors] dampng: the model has no such parameter; did you mean damping?"),
         ('damping = "normal(1, 0.3)"', "", '[priors] damping: this prior is missing; write for example damping = "n'),
@@ -406,9 +398,6 @@ def test_uneven_times_are_resampled(folder):
 
 
 def test_files_and_folders_that_cannot_be_used_are_told(folder):
-    text = OSCILLATOR.replace('"top.csv"', '"."')
-    (folder / "oscillator.toml").write_text(text)
-    assert "[measurements] file: expected a file; '.' is a folder" in call("check", "oscillator.toml", code=1)
     (folder / "oscillator.toml").write_text(OSCILLATOR, encoding="utf-8-sig")
     (folder / "a file").write_text("")
     output = call("run", "oscillator.toml", "--out", "a file/results", code=1)
@@ -440,8 +429,7 @@ def test_check_warns_of_what_is_likely_wrong(folder):
     (folder / "top.csv").write_text("\n".join(lines))
     (folder / "oscillator.toml").write_text(text.replace("[prediction]", "[budget]\nmax_simulations = 5\n[prediction]"))
     output = call("check", "oscillator.toml")
-    assert "displacement: 291 samples, 10 missing" in output
-    assert "The run stops at 5 simulations" in output
+    assert re.search(r"displacement +\w+ +301 +10 ", output) and "The run stops at 5 simulations" in output
     times = [float(lines[k].split(",")[0]) for k in (100, 119)]
     assert "CAUTION: A sensor was stuck: acceleration stands still at" in output
     assert f'missing = [["acceleration", {times[0]:.3f}, {times[1]:.3f}]]' in output
@@ -502,9 +490,11 @@ def test_quantities_and_priors_as_text():
         parse_job("", Path("a.toml"), Path("."))
 
 
-def test_warnings_are_sentences_without_file_and_line(capsys):
-    with pytest.warns(RuntimeWarning, match="of another library") as shown, _plain_warnings():
-        warnings.warn("the samples are few", SamplingWarning, stacklevel=1)
-        warnings.warn("of another library", RuntimeWarning, stacklevel=1)
-    told = "Warning: the samples are few\n"
-    assert capsys.readouterr().err == told and len(shown) == 1
+def test_warnings_are_sentences_without_file_and_line(monkeypatch):
+    def warns(*arguments, **options):
+        print(warnings.formatwarning(SamplingWarning("the samples are few"), SamplingWarning, "a.py", 3), end="")
+        raise ValueError("and no more")
+
+    monkeypatch.setattr("fe_likelihoods.command.runs.run_job", warns)
+    said = call("run", "nothing.toml", code=1).splitlines()
+    assert sorted(said) == ["Error: and no more", "Warning: the samples are few"]

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from tests.command.test_command import OSCILLATOR, ROOT, folder, function_settings
+from tests.command.test_command import OSCILLATOR, ROOT, folder
 
 __all__ = ["folder"]  # the fixture
 
 SLOW_STEPS = OSCILLATOR.replace("steps = 2", "steps = 100")
-SAME = ("summary.csv", "fit.csv")  # the verdict in summary.txt counts the simulations of one process
+SAME = ("summary.csv",)  # the verdict in summary.txt counts the simulations of one process
 
 
 def start(out: str, file: str = "oscillator.toml") -> subprocess.Popen:
@@ -61,42 +61,3 @@ def test_a_killed_run_is_continued_by_the_same_command(folder):
         whole = (folder / "whole" / name).read_text()
         assert (folder / "killed" / name).read_text() == whole
         assert (folder / "stopped" / name).read_text() == whole
-
-
-FUNCTION = """
-import time
-import numpy as np
-from fe_likelihoods import LinearOscillator
-
-def simulate(theta, record):
-    if record.name == "event":
-        with open("simulated.txt", "a") as file:
-            file.write(f"{theta[0]!r}\\n")
-        time.sleep(0.3)
-    return LinearOscillator(record, 0.8).simulate([*theta])
-"""
-OWN = function_settings("my_model")
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
-def test_a_killed_prediction_of_an_event_repeats_nothing(folder):
-    """Of 10 simulations of an event, those that ended before kill -9 are not run again, but for two to verify."""
-    (folder / "my_model.py").write_text(FUNCTION)
-    (folder / "event.csv").write_text((folder / "base.csv").read_text())
-    (folder / "own.toml").write_text(OWN + '[events.second]\nfile = "event.csv"\nscale = 0.9\n')
-    simulated = folder / "simulated.txt"
-    killed = start("r", "own.toml")
-    while not (simulated.exists() and len(simulated.read_text().splitlines()) >= 6):
-        assert killed.poll() is None, killed.communicate()
-        time.sleep(0.01)
-    killed.kill()
-    killed.communicate()
-    before = len(simulated.read_text().splitlines())
-    assert before < 10 and not (folder / "r" / "events.csv").exists()
-    again = start("r", "own.toml")
-    assert again.wait(timeout=500) == 0, again.communicate()
-    lines = simulated.read_text().splitlines()
-    assert len(set(lines)) == 10
-    assert len(lines) <= 10 + 1 + 2, lines  # the one that was killed, and two that are verified
-    assert (folder / "r" / "events.csv").exists()

@@ -68,20 +68,3 @@ def test_a_file_has_a_line_for_each_load_case(tmp_path):
     ):
         with pytest.raises(ValueError, match=text):
             read_load_test(path, CHANNELS[:1], **options)
-
-
-def test_load_cases_at_other_temperatures_have_the_slope_of_frequencies():
-    """Deflections follow stiffnesses, which are the squares of frequencies; the model is at 20 °C."""
-    test = LoadTest(CHANNELS, CASES, VALUES, errors={"midspan": 2e-5, "bottom": 1e-6}, temperatures=[-5.0, 20.0, 35.0])
-    model = test.model(lambda theta: theta[0] * UNIT, ("flexibility",), jacobian=lambda theta: UNIT[None])
-    assert model.parameter_names == ("flexibility", "temperature_slope")
-    theta = np.array([1.1, -2e-3])
-    np.testing.assert_allclose(model.simulate(theta), 1.1 * UNIT / np.array([1.05, 1.0, 0.97]) ** 2, rtol=1e-14)
-    for found, unit in zip(model.jacobian(theta), np.eye(2), strict=True):
-        difference = (model.simulate(theta + 1e-6 * unit) - model.simulate(theta - 1e-6 * unit)) / 2e-6
-        np.testing.assert_allclose(found, difference, rtol=1e-6, atol=1e-12)
-    reaction = LoadTest([Channel("reaction", "force", "N")], CASES, VALUES[:1], temperatures=-5.0)
-    np.testing.assert_array_equal(reaction.model(lambda theta: UNIT[:1], ("E",)).simulate(theta), UNIT[:1])
-    assert test.at_temperatures(model.model).fingerprint == model.fingerprint != model.model.fingerprint
-    with pytest.raises(ValueError, match="for each of 3 load cases, from -80 to 80; got 290"):
-        LoadTest(CHANNELS, CASES, VALUES, temperatures=290.0)

@@ -1,5 +1,7 @@
 """Modal data: what they are, what is refused, and what several identifications have in common."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -15,19 +17,17 @@ def test_shapes_have_a_norm_of_one_and_keep_their_signs():
     assert (data.n_sets, data.n_modes, data.n_sensors) == (1, 2, 3) and data.frequency_cv.tolist() == [0.005, 0.005]
     assert "mode  f [Hz]  damping  floor 1  floor 2  floor 3" in repr(data) and "2 %   -0.667" in repr(data)
     same = ModalData([1.0, 3.0], np.multiply(SHAPES, 7.0), FLOORS)
-    assert same.fingerprint == data.fingerprint != data.at(["floor 1", "floor 3"]).fingerprint
+    assert same.fingerprint == data.fingerprint != data.select([1]).fingerprint
 
 
 def test_modes_and_sensors_can_be_selected():
     data = ModalData([[1.0, 3.0]], [SHAPES], FLOORS, covariance=[[1e-4, 1e-5], [1e-5, 4e-4]], mode_numbers=[2, 5])
     one = data.select([5])
     assert one.frequencies.tolist() == [[3.0]] and one.mode_numbers == (5,) and one.covariance.tolist() == [[4e-4]]
-    np.testing.assert_allclose(data.at(["floor 3"]).shapes[0], [[1.0], [1.0]])
     alone = ModalData([1.0, 3.0]).select([2])
     assert alone.frequencies.tolist() == [[3.0]] and not alone.has_shape.any()
-    for call, text in ((lambda: data.select([1]), "the modes are 2, 5"), (lambda: data.at(["roof"]), "floor 1")):
-        with pytest.raises(ValueError, match=text):
-            call()
+    with pytest.raises(ValueError, match="the modes are 2, 5"):
+        data.select([1])
 
 
 def test_the_mean_of_identifications_has_their_scatter(rng):
@@ -109,12 +109,4 @@ def test_bad_options_are_refused(options, text):
 def test_close_modes_are_a_group_unless_their_plane_takes_up_all_sensors():
     data = ModalData([2.01, 1.0, 2.0], [*SHAPES, [1.0, 0.0, 0.0]], FLOORS)
     assert data.groups(0.02) == ((1,), (2, 0)) and data.groups(0.0) == ((1,), (2,), (0,))
-    assert len(data.at(FLOORS[:2]).groups(0.02)) == 3
-
-
-def test_a_known_error_is_that_of_the_same_components_at_fewer_sensors():
-    """Else shapes at sensors near a node would have errors of a tenth of the true ones."""
-    data = ModalData([1.0, 3.0, 5.0], [*SHAPES, [np.nan] * 3], FLOORS, shape_error=0.02)
-    norms = np.linalg.norm(data.shapes[0, :2, :2], axis=1)
-    np.testing.assert_allclose(data.at(FLOORS[:2]).shape_error[:2], 0.02 / norms, rtol=1e-12)
-    np.testing.assert_allclose(data.at(FLOORS).shape_error[:2], 0.02, rtol=1e-12)
+    assert len(replace(data, shapes=data.shapes[..., :2], sensors=FLOORS[:2]).groups(0.02)) == 3

@@ -71,7 +71,7 @@ def frame_of_two(errors="known", sensors=("floor 1", "floor 2"), **priors):
     shapes = modes[1:].T / np.linalg.norm(modes[1:], axis=0)[:, None] + 0.03 * rng.normal(size=(3, 2, 2))
     frequencies[1, 1], shapes[1, 1] = np.nan, np.nan
     known = {"frequency_cv": 0.01, "shape_error": 0.03} if errors == "known" else {}
-    data = ModalData(frequencies, shapes, ("floor 1", "floor 2"), **known).at(sensors)
+    data = ModalData(frequencies, shapes[..., -len(sensors) :], sensors, **known)
     prior = {"k1": Uniform(0.7, 1.3), "k2": Uniform(0.6, 1.2)} | priors
     return Posterior(ModalLikelihood(model, data), prior)
 

@@ -492,10 +492,10 @@ def test_outputs_without_a_header_line_are_listed_by_numbers(tmp_path):
 
 def test_components_and_columns_that_are_there_twice_are_listed_in_valid_toml(tmp_path):
     path = tmp_path / "a.V2A"
-    path.write_text(text(*geonet({"N 1": VALUES, "Up": VALUES}, 0.02), *geonet({"Up": VALUES, "n": VALUES}, 0.02)))
+    path.write_text(text(*geonet({"N 1": VALUES, "Up": VALUES}, 0.02), *geonet({"Up": VALUES, "E": VALUES}, 0.02)))
     found = describe_data(path)
     assert "'Up' is there 2 times" in found
-    assert sorted(sections(found)["measurements"]["columns"].values()) == ["N", "n"]
+    assert sorted(sections(found)["measurements"]["columns"].values()) == ["E", "N"]
     path = tmp_path / "a.csv"
     path.write_text("time_s,Top (g),top [g],a_g,a_g\n0.00,1,2,3,4\n0.01,1,2,3,4\n")
     found = describe_data(path)
