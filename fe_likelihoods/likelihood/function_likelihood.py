@@ -32,8 +32,6 @@ class FunctionLikelihood(SumOfParts):
         Names of the parameters in theta.
     vectorize : bool
         Whether the function takes points (n, ndim), as in emcee.
-    units : mapping of str to str, optional
-        Units of parameters, for labels.
 
     Raises
     ------
@@ -56,24 +54,20 @@ class FunctionLikelihood(SumOfParts):
         function: Callable,
         parameter_names: Sequence[str],
         vectorize: bool = False,
-        units: dict[str, str] | None = None,
     ) -> None:
         names = () if isinstance(parameter_names, str) else tuple(parameter_names)
         if not callable(function):
             raise ValueError(f"FunctionLikelihood: expected a function of the parameters; got {function!r}")
         if not names or len(set(names)) != len(names) or not all(isinstance(name, str) and name for name in names):
             raise ValueError(f"FunctionLikelihood: expected different names of parameters; got {parameter_names!r}")
-        if unknown := set(units or ()) - set(names):
-            raise ValueError(f"FunctionLikelihood: units of {', '.join(sorted(unknown))}, which are no parameters")
         self.function, self.parameter_names, self.vectorize = function, names, vectorize
-        self._units = dict(units or {})
         self._failures = FailureLog(names)
         self._evaluations = 0
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """Names and units of the parameters."""
-        return tuple(Parameter(name, self._units.get(name, "")) for name in self.parameter_names)
+        """Names of the parameters."""
+        return tuple(map(Parameter, self.parameter_names))
 
     def log_likelihood(self, x: Any, inside: Any = True) -> np.ndarray | float:
         """Log-likelihood (n,) of points (n, ndim), or a float; -inf where the function fails and not `inside`."""

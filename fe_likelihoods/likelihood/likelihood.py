@@ -159,11 +159,6 @@ class FELikelihood(SumOfParts):
         """What responses are compared with: values (n_channels, n_steps), or a `Comparison` if samples are missing."""
         return self.simulator.measured
 
-    @property
-    def fingerprint(self) -> str:
-        """Hex digest of everything the statistics are known to depend on, see `Simulator.fingerprint`."""
-        return self.simulator.fingerprint
-
     def first(self, seconds: float) -> "FELikelihood":
         """The likelihood of the first part of the measurements, for models that can be shortened (`first_part`).
 
@@ -256,7 +251,7 @@ class FELikelihood(SumOfParts):
     def density_parts(self) -> list[str]:
         """Fingerprint of the statistics, and class, parameters and repr of the noise."""
         noise = self.noise
-        return [self.fingerprint, type(noise).__qualname__, *noise.parameter_names, complete_repr(noise)]
+        return [self.simulator.fingerprint, type(noise).__qualname__, *noise.parameter_names, complete_repr(noise)]
 
     def report(self) -> dict:
         """Summary of the simulations, see `Posterior.report`.

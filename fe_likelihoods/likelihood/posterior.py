@@ -27,7 +27,7 @@ from .gradient import likelihood_gradient, slopes_along
 from .joint import JointLikelihood
 from .likelihood import FELikelihood
 from .parameters import Parameter
-from .predictive_draws import MeasuredHistory, PredictiveDraws, measured_data, predictive_draws
+from .predictive_draws import MeasuredHistory, measured_data, predictive_draws
 
 if TYPE_CHECKING:
     from ..emulation.guide import ResponseGuide
@@ -410,8 +410,8 @@ class Posterior:
         """The measurements, without missing samples; nothing is simulated."""
         return measured_data(self.likelihood)
 
-    def predictive_draws(self, samples: Any, seed: int = 0) -> PredictiveDraws:
-        """Predictions of the measurements by samples of the posterior, without and with a draw of the noise.
+    def predictive_draws(self, samples: Any, seed: int = 0) -> dict[str, np.ndarray]:
+        """Measurements that samples of the posterior predict: simulated response plus one draw of the noise.
 
         The responses are cached, like those for a guide; cached ones are not simulated again.
 
@@ -424,7 +424,8 @@ class Posterior:
 
         Returns
         -------
-        PredictiveDraws
+        dict of str to (n, n_samples) float
+            By the names of `measured_data` [SI]; without those whose noise cannot be drawn from.
 
         Raises
         ------

@@ -3,15 +3,14 @@
 Samplers know no structures. They ask a posterior for these plain arrays by the names of its methods.
 """
 
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 
 from ..noise.draws import SampleNoise, sample_noise
 from ..noise.marginal import MarginalNoise
-from ..noise.protocol import Noise, noise_statistic, noise_title
+from ..noise.protocol import Noise, noise_statistic
 from ..noise.statistics import needs_response
 from ..signals.channels import Channel
 from ..signals.comparison import Comparison
@@ -19,7 +18,7 @@ from ..simulation.model import SimulationFailed
 from .likelihood import FELikelihood
 from .sum_of_parts import SumOfParts
 
-__all__ = ["MeasuredHistory", "PredictiveDraws", "measured_data", "predictive_draws"]
+__all__ = ["MeasuredHistory", "measured_data", "predictive_draws"]
 
 
 class MeasuredHistory(NamedTuple):
@@ -43,25 +42,6 @@ class MeasuredHistory(NamedTuple):
     values: np.ndarray
 
 
-class PredictiveDraws(NamedTuple):
-    """Predictions of the measurements by samples of the posterior.
-
-    Attributes
-    ----------
-    responses : dict of str to ndarray, shape (n, n_samples)
-        Simulated response at the measured samples [SI], by the names of `MeasuredHistory`.
-    replicates : dict of str to ndarray, shape (n, n_samples)
-        Response plus one draw of the noise: measurements that the sample predicts [SI]. Empty where the noise cannot be
-        drawn from.
-    notes : tuple of str
-        What is left out, and why.
-    """
-
-    responses: dict[str, np.ndarray]
-    replicates: dict[str, np.ndarray]
-    notes: tuple[str, ...]
-
-
 def measured_data(likelihood: SumOfParts) -> tuple[MeasuredHistory, ...]:
     """Measurements of a likelihood; nothing is simulated."""
     found = []
@@ -72,28 +52,22 @@ def measured_data(likelihood: SumOfParts) -> tuple[MeasuredHistory, ...]:
     return tuple(found)
 
 
-def predictive_draws(likelihood: SumOfParts, samples: np.ndarray, seed: int = 0) -> PredictiveDraws:
-    """Responses and replicated measurements of samples, see `Posterior.predictive_draws`."""
+def predictive_draws(likelihood: SumOfParts, samples: np.ndarray, seed: int = 0) -> dict[str, np.ndarray]:
+    """Replicated measurements (n, n_samples) by the names of `MeasuredHistory`, see `Posterior.predictive_draws`."""
     samples = np.atleast_2d(np.asarray(samples, dtype=float))
     if samples.shape[1] != likelihood.ndim or not len(samples):
         raise ValueError(f"expected samples of shape (n, {likelihood.ndim}); got {samples.shape}")
-    rng = np.random.default_rng(seed)
-    responses: dict[str, np.ndarray] = {}
-    replicates: dict[str, np.ndarray] = {}
-    notes = []
+    rng, found = np.random.default_rng(seed), {}
     for prefix, each, columns in _named_parts(likelihood):
         noise, rows = _with_noise_parameters(each, samples[:, columns], rng)
         simulated, values = _responses(each, rows), _compared(each)
-        residuals = -np.stack([each.residuals_of(response) for response in simulated])
         errors = _errors(each, noise, rows[:, len(each.model.parameter_names) :], simulated, rng)
-        if errors is None:
-            notes.append(f"{prefix}no replicated measurements: {noise_title(noise)} cannot be drawn from")
-        for place, channel in enumerate(each.measurements.channels):
-            there, name = ~np.isnan(values[place]), f"{prefix}{channel.name}"
-            responses[name] = (residuals[:, place] + values[place])[:, there]
-            if errors is not None:
-                replicates[name] = responses[name] + errors[:, place, there]
-    return PredictiveDraws(responses, replicates, tuple(notes))
+        if errors is not None:
+            errors -= np.stack([each.residuals_of(response) for response in simulated])
+            for place, channel in enumerate(each.measurements.channels):
+                there = ~np.isnan(values[place])
+                found[f"{prefix}{channel.name}"] = (values[place] + errors[:, place])[:, there]
+    return found
 
 
 def _named_parts(likelihood: SumOfParts) -> Iterator[tuple[str, FELikelihood, list[int]]]:
@@ -135,10 +109,13 @@ def _errors(
 ) -> np.ndarray | None:
     """One draw of the errors per row, (n, n_channels, n_samples) [SI]; None for a noise that cannot be drawn from."""
     n_channels, n_samples = _compared(likelihood).shape
+    measured, apart = likelihood.measured, isinstance(likelihood.measured, Comparison)
     follows = needs_response(noise_statistic(noise))
     if follows:
         drawn = sample_noise(noise, parameters, n_channels, likelihood.model.dt, at_samples=True)
-        responses = np.stack([_at_samples(likelihood, response) for response in responses])
+        if apart:
+            at_samples = (measured.at_samples(response) for response in responses)
+            responses = np.stack([np.where(measured.missing, np.nan, each) for each in at_samples])
     elif hasattr(noise, "deviations_per_event"):
         deviations = np.nan_to_num(noise.deviations_per_event(parameters))
         drawn = SampleNoise(deviations, None, tuple(slice(*window) for window in noise.statistic.windows))
@@ -146,23 +123,11 @@ def _errors(
         drawn = sample_noise(noise, parameters, n_channels, likelihood.model.dt)
     else:
         return None
-    if drawn.of_response and not follows and isinstance(likelihood.measured, Comparison):
-        # deviations at the steps of the model, then at the times of the samples, where interpolation may overshoot
-        drawn = drawn._replace(of_response=partial(_deviations_at_samples, likelihood.measured, drawn.of_response))
+    if (of_response := drawn.of_response) and not follows and apart:
+
+        def between(parameters: np.ndarray, response: np.ndarray) -> np.ndarray:
+            """Deviations at the steps of the model, then at the samples, where interpolation may overshoot."""
+            return np.maximum(measured.at_samples(np.ascontiguousarray(of_response(parameters, response))), 0.0)
+
+        drawn = drawn._replace(of_response=between)
     return np.stack([drawn.draw(row, n_samples, rng, response) for row, response in enumerate(responses)])
-
-
-def _at_samples(likelihood: FELikelihood, response: np.ndarray) -> np.ndarray:
-    """A response at the measured samples (n_channels, n_samples) [SI], NaN where one is missing."""
-    if not isinstance(likelihood.measured, Comparison):
-        return response
-    return np.where(likelihood.measured.missing, np.nan, likelihood.measured.at_samples(response))
-
-
-def _deviations_at_samples(
-    comparison: Comparison,
-    of_response: Callable[[np.ndarray, np.ndarray], np.ndarray],
-    parameters: np.ndarray,
-    response: np.ndarray,
-) -> np.ndarray:
-    return np.maximum(comparison.at_samples(np.ascontiguousarray(of_response(parameters, response))), 0.0)

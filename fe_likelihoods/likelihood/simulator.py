@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError, Future
 from contextlib import suppress
 from functools import cached_property
-from queue import Empty, SimpleQueue
+from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
@@ -212,20 +212,19 @@ class Simulator(VerifiedModel):
         outcomes = [request.outcomes[key] for key in keys]
         if not full:
             return self._rows(outcomes, which)
-        found = [request.responses[keys[place]] for place in which]
-        return self._rows(outcomes, which), SimulationBatch(self._as_responses(found), list(map(_reason, found)))
+        return self._rows(outcomes, which), self._as_batch([request.responses[keys[place]] for place in which])
 
     def _rows(self, outcomes: Sequence[bytes | str], which: Sequence[int]) -> np.ndarray:
         """Statistics (n, n_numbers) of n rows, each of which has one of the outcomes."""
         statistics = statistics_in(outcomes, self.n_numbers)
         return statistics if len(outcomes) == len(which) else statistics[which]
 
-    def _as_responses(self, found: Sequence[np.ndarray | str]) -> np.ndarray:
-        """Responses (n, n_channels, n_steps); NaN for failures."""
+    def _as_batch(self, found: Sequence[np.ndarray | str]) -> SimulationBatch:
+        """Responses or reasons of failures as a batch."""
         responses = np.full((len(found), len(self.model.channels), self.model.n_steps), np.nan)
         for row, each in zip(responses, found, strict=True):
             row[...] = np.nan if isinstance(each, str) else each
-        return responses
+        return SimulationBatch(responses, list(map(_reason, found)))
 
     def _thetas(self, keys: Sequence[bytes]) -> np.ndarray:
         return thetas_of(keys, self.n_structural)
@@ -237,15 +236,14 @@ class Simulator(VerifiedModel):
         cache on disk. Without statistics, only failures are cached.
         """
         keys, which = distinct_keys(thetas)
-        known, last = self.memory_cache.look_up(keys), dict(zip(which, range(len(thetas)), strict=True))
-        rows = [row for place, row in last.items() if known[place] is None and np.isfinite(thetas[row]).all()]
-        new = [row for row in rows if keys[which[row]] not in self._recalled]
-        self._recalled.update(keys[which[row]] for row in new)
-        self.failures.count_outcomes(thetas[new], [reasons[row] for row in new])
-        if statistics is None:
-            rows = [row for row in rows if reasons[row]]
-        outcomes = {keys[which[row]]: reasons[row] or statistics[row].tobytes() for row in rows}
-        self.memory_cache.store(outcomes, outcomes.values())
+        known = self.memory_cache.look_up(keys)
+        for place, row in dict(zip(which, range(len(thetas)), strict=True)).items():
+            if known[place] is None and np.isfinite(thetas[row]).all():
+                if keys[place] not in self._recalled:
+                    self._recalled.add(keys[place])
+                    self.failures.count_outcomes(thetas[[row]], [reasons[row]])
+                if reasons[row] or statistics is not None:
+                    self.memory_cache.store([keys[place]], [reasons[row] or statistics[row].tobytes()])
 
     def reason(self, point: np.ndarray) -> str:
         """Reason of a failure that is cached at parameters (n,), the structural ones first; empty for others."""
@@ -283,25 +281,24 @@ class Simulator(VerifiedModel):
 
     def _take_responses(self, request: _Request) -> list[bytes]:
         """Fill in stored responses, and statistics that are not known; returns keys of responses from the disk."""
-        memory, on_disk, left, size = self.response_memory, [], request.left, most_responses(self.model)
-        if self.cache is None and not len(memory):
+        on_disk, left, size = [], request.left, most_responses(self.model)
+        if self.cache is None and not len(self.response_memory):
             return []
         for start in range(0, len(left), size):
             keys, fingerprint = left[start : start + size], request.fingerprint
-            found = dict(zip(keys, memory.look_up([(fingerprint, key) for key in keys]), strict=True))
-            missing = [key for key in keys if found[key] is None]
+            in_memory = self.response_memory.look_up([(fingerprint, key) for key in keys])
+            found = {key: each for key, each in zip(keys, in_memory, strict=True) if each is not None}
+            missing = [key for key in keys if key not in found]
             if self.cache is not None and missing:
-                read = dict(zip(missing, self._stored_responses(self._thetas(missing), fingerprint), strict=True))
-                found |= read
-                on_disk += (new := [key for key in missing if read[key] is not None])
+                read = zip(missing, self._stored_responses(self._thetas(missing), fingerprint), strict=True)
+                found |= (read := {key: each for key, each in read if each is not None})
+                on_disk += read
                 if request.full:
-                    memory.store([(fingerprint, key) for key in new], [read[key] for key in new])
-            found = {key: outcome for key, outcome in found.items() if outcome is not None}
+                    self.response_memory.store([(fingerprint, key) for key in read], read.values())
             if request.full:
                 request.responses |= found
             if new := [key for key in found if key not in request.outcomes]:
-                batch = self._as_responses([found[key] for key in new]), [_reason(found[key]) for key in new]
-                statistics, reasons = self.statistics_of(*batch)
+                statistics, reasons = self.statistics_of(*self._as_batch([found[key] for key in new]))
                 self._enter(request, _outcomes(new, statistics, reasons))
                 if self.cache is not None and not self._responses_only:
                     self._store(self._thetas(new), statistics, reasons, None, fingerprint)
@@ -349,8 +346,8 @@ class Simulator(VerifiedModel):
             request = self._look_up(keys, which, full)
             left = self._send(request, arrived)
         try:
-            while left:
-                self._receive(request, left, take_all(arrived))
+            while left:  # all that have ended, which are stored together
+                self._receive(request, left, [arrived.get() for _ in range(max(1, arrived.qsize()))])
         except BaseException:
             self.pool.give_up(list(left))
             with suppress(Exception):  # simulations that have ended are cached
@@ -408,13 +405,12 @@ class Simulator(VerifiedModel):
             raise error
 
     def _returns_responses(self, full: bool) -> bool:
-        is_kept = full or self._keeps_responses or (self.cache is not None and self.cache.responses)
+        is_kept = self._keeps_responses(full) or (self.cache is not None and self.cache.responses)
         return is_kept or hasattr(self.model, "simulate_together")
 
-    @property
-    def _keeps_responses(self) -> bool:
-        """Whether responses that were not requested are kept in memory: gradients or predictions may follow."""
-        return self.stores_responses or has_jacobian(self.model)
+    def _keeps_responses(self, full: bool) -> bool:
+        """Whether responses are kept in memory: they were requested, or gradients or predictions may follow."""
+        return full or self.stores_responses or has_jacobian(self.model)
 
     def _record(
         self, request: _Request, keys: Sequence[bytes], values: np.ndarray, reasons: list[str], seconds: float
@@ -425,7 +421,7 @@ class Simulator(VerifiedModel):
         if they are stored on disk.
         """
         thetas, statistics, why = self._thetas(keys), values, reasons
-        keeps = request.full or self._keeps_responses
+        keeps = self._keeps_responses(request.full)
         if values.ndim == 3:
             statistics, why = self.statistics_of(values, reasons)
         with self._running.lock:
@@ -456,12 +452,3 @@ def _outcomes(keys: Sequence[bytes], statistics: np.ndarray, reasons: Sequence[s
 def _reason(outcome: Any) -> str:
     """The reason of a failure; empty for others."""
     return outcome if isinstance(outcome, str) else ""
-
-
-def take_all(arrived: SimpleQueue) -> list[Future]:
-    """All items of a queue, at least one."""
-    items = [arrived.get()]
-    with suppress(Empty):
-        while True:
-            items.append(arrived.get_nowait())
-    return items

@@ -147,12 +147,6 @@ class SumOfParts:
         return tuple(described[name] for name in self.parameter_names)
 
     @property
-    def fingerprint(self) -> str:
-        """Hex digest of everything the cached statistics are known to depend on, see `Simulator.fingerprint`."""
-        parts = json.dumps([part.fingerprint for part in self.likelihoods.values()])
-        return hashlib.blake2b(parts.encode(), digest_size=16).hexdigest()
-
-    @property
     def data_fingerprint(self) -> str:
         """Hex digest of the samples that are compared: equal for likelihoods of the same data.
 

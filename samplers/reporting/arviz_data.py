@@ -262,11 +262,10 @@ def _predictive_group(
     chosen = np.unique(np.linspace(0, n_draws - 1, min(n_draws, -(-int(draws) // n_chains))).round().astype(int))
     found = posterior.predictive_draws(chains[:, chosen].reshape(-1, ndim), seed)
     shape, coordinates = (n_chains, len(chosen)), _coordinates(n_chains, chosen)
-    if not found.replicates:
-        return {}
     variables = {
         name: (("chain", "draw", *observed[name].dims), values.reshape(*shape, -1), observed[name].attrs)
-        for name, values in found.replicates.items()
+        for name, values in found.items()
     }
-    note = "\n".join(["simulated response plus one draw of the noise per sample", *found.notes])
-    return {"posterior_predictive": xarray.Dataset(variables, {**observed.coords, **coordinates}, {"note": note})}
+    note = {"note": "simulated response plus one draw of the noise per sample"}
+    group = xarray.Dataset(variables, {**observed.coords, **coordinates}, note)
+    return {"posterior_predictive": group} if found else {}

@@ -176,7 +176,7 @@ def test_channels_are_matched_by_name(oscillator, measurements):
     straight = FELikelihood(oscillator, measurements)
     likelihood = FELikelihood(oscillator, turned)
     assert likelihood.log_likelihood(x) == straight.log_likelihood(x)
-    assert likelihood.fingerprint == straight.fingerprint
+    assert likelihood.simulator.fingerprint == straight.simulator.fingerprint
 
 
 def test_measurements_that_do_not_fit_are_refused(oscillator, measurements):

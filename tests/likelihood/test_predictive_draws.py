@@ -56,14 +56,12 @@ def test_replicates_have_the_noise_of_the_sample(options, rho, data, rng):
     floors = (options or {}).get("sensor", (0.0, 0.0))
     for place, history in enumerate(posterior.measured_data()):
         name, sigma = history.name, np.hypot(floors[place], rows[0, 2 + place])
-        assert np.allclose(draws.responses[name], _at(place, history.time), atol=2e-3)
-        errors = draws.replicates[name] - draws.responses[name]
+        errors = draws[name] - _at(place, history.time)
         assert errors.std() == pytest.approx(sigma, rel=8.0 / np.sqrt(2.0 * errors.size))
         if rho and not data:
             found = np.mean(errors[:, 1:] * errors[:, :-1]) / sigma**2
             assert found == pytest.approx(rho[place], abs=8.0 / np.sqrt(errors.size))
-    again = posterior.predictive_draws(rows, seed=3).replicates["top"]
-    assert np.array_equal(again, draws.replicates["top"])
+    assert np.array_equal(posterior.predictive_draws(rows, seed=3)["top"], draws["top"])
 
 
 def _at(place, times):
@@ -77,7 +75,7 @@ def test_noise_that_was_integrated_out_is_drawn(rng):
     full = Posterior(likelihood, prior | {"sigma_top": HalfNormal(1.0), "sigma_base": HalfNormal(1.0)}).marginal()
     points = np.ones((2000, 2))
     draws, sigma = full.predictive_draws(points), full.draw_noise(points, 5)["sigma_top"]
-    drawn = (draws.replicates["top"] - draws.responses["top"]).std(axis=1)
+    drawn = (draws["top"] - _at(0, TIME)).std(axis=1)
     assert drawn.mean() == pytest.approx(sigma.mean(), rel=0.01)
     # the spread of the standard deviations, and of the estimate from 120 samples
     assert drawn.std() == pytest.approx(np.hypot(sigma.std(), sigma.mean() / np.sqrt(2 * N)), rel=0.15)
@@ -97,9 +95,10 @@ def test_levels_per_event_and_joint_likelihoods(rng):
     levels = dict(zip(likelihood.noise.parameter_names, (0.1, 0.3), strict=True))
     point = dict.fromkeys(posterior.parameter_names, 0.9) | levels
     draws = posterior.predictive_draws(np.repeat([[point[n] for n in posterior.parameter_names]], 100, axis=0))
-    assert set(draws.replicates) == {"events_base", "other_top", "other_base"}
-    assert [each.name for each in posterior.measured_data()] == list(draws.replicates)
-    errors = draws.replicates["events_base"] - draws.responses["events_base"]
+    assert (
+        [each.name for each in posterior.measured_data()] == list(draws) == ["events_base", "other_top", "other_base"]
+    )
+    errors = draws["events_base"] - 0.9 * np.tile(record.acceleration, 2)
     assert [errors[:, :50].std(), errors[:, -50:].std()] == pytest.approx([0.1, 0.3], rel=0.05)
 
 

@@ -142,7 +142,7 @@ def test_likelihood_with_gaps(rng, tmp_path, noise):
     np.testing.assert_array_equal(again.log_likelihood(x), likelihood.log_likelihood(x))
     assert again.simulations == 0
     shifted = FELikelihood(model, measured(rng, there), noise(CHANNELS), cache=SimulationCache(tmp_path / "cache.db"))
-    assert shifted.fingerprint != likelihood.fingerprint
+    assert shifted.simulator.fingerprint != likelihood.simulator.fingerprint
 
 
 class Unaware:

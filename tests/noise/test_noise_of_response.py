@@ -89,7 +89,7 @@ def test_draws_have_the_deviations_of_the_density():
     for c, channel in enumerate(CHANNELS):
         sd = deviations(simulated[c], parameters, c)
         np.testing.assert_allclose(prediction.sd[c], sd, rtol=1e-9)
-        errors = (draws.replicates[channel.name] - draws.responses[channel.name]) / sd
+        errors = (draws[channel.name] - simulated[c]) / sd
         # variances of n draws have a relative standard error of sqrt(2 / n)
         assert np.abs(errors.var(axis=0) - 1.0).max() < 5.0 * np.sqrt(2.0 / n)
         assert np.abs((errors[:, 1:] * errors[:, :-1]).mean(axis=0)).max() < 5.0 * np.sqrt(2.0 / n)
@@ -133,7 +133,10 @@ def test_caches_pools_pickles_and_joint_likelihoods(rng, tmp_path):
     assert again.simulations == 0 and again.simulator.disk_hits == 6
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(likelihood))(rows), expected)
     white = again.with_noise(GaussianNoise(CHANNELS))
-    assert white.fingerprint != likelihood.fingerprint and white.density_parts() != likelihood.density_parts()
+    assert (
+        white.simulator.fingerprint != likelihood.simulator.fingerprint
+        and white.density_parts() != likelihood.density_parts()
+    )
     joint = JointLikelihood({"one": likelihood, "two": again}, separate=likelihood.noise.parameter_names)
     point = np.concatenate([[1.1], parameters, parameters])
     assert joint(point) == pytest.approx(2.0 * likelihood([1.1, *parameters]), rel=1e-12)
