@@ -40,8 +40,8 @@ class FailureLog:
     `outcomes` counts simulations with a known outcome (run here, read from the disk, or recalled), `count` failures,
     and `transient` failures whose cause is not the model, so that a later run simulates the point again. `records` has
     ``{"parameters": {name: value}, "reason": str}`` of the first 1000 failures of each of these two kinds, with
-    ``"transient": True`` of the second. `reasons` counts failures per reason; after the first 100
-    reasons by their text without numbers, and after 100 of these together.
+    ``"transient": True`` of the second. `reasons` counts failures per reason; after the first 100 reasons by their text
+    without numbers, and after 100 of these together.
     """
 
     def __init__(self, parameter_names: Sequence[str]) -> None:

@@ -253,18 +253,6 @@ class FELikelihood(SumOfParts):
         noise = self.noise
         return [self.simulator.fingerprint, type(noise).__qualname__, *noise.parameter_names, complete_repr(noise)]
 
-    def report(self) -> dict:
-        """Summary of the simulations, see `Posterior.report`.
-
-        Examples
-        --------
-        >>> once = FELikelihood(model, measurements)
-        >>> values = once.log_likelihood([[1.1, 0.9, 0.5, 0.02], [1.1, 0.9, 0.6, 0.02]])  # another noise: no simulation
-        >>> once.report()["simulations"]
-        1
-        """
-        return self.simulator.report()
-
     def with_noise(self, noise: Noise) -> "FELikelihood":
         """The same likelihood with another noise.
 
@@ -278,5 +266,6 @@ class FELikelihood(SumOfParts):
         options = {"memory_rows": own.memory_cache.most, "memory_bytes": own.response_memory.most}
         other = copy.copy(self)
         FELikelihood.__init__(other, model, measurements, noise, own.pool, cache=own.cache, **options)
-        other.simulator.share(own)
+        other.simulator.response_memory = own.response_memory
+        other.simulator.share_trust(own)
         return other

@@ -4,7 +4,7 @@ Densities and samplers work with plain numbers: structural parameters in the mod
 nominal values, and noise parameters in SI units. `Parameter` says how to show such a number to a reader.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -93,13 +93,11 @@ def channels_of_deviations(noise: Noise, default: Sequence[Channel]) -> dict[str
     return {f"sigma_{channel.name}": channel for channel in noise_channels(sampled, default)}
 
 
-def _of_noise(noise: Noise, default: Sequence[Channel]) -> list[Parameter]:
-    sampled, channels, described = sampled_noise(noise), channels_of_deviations(noise, default), []
+def _of_noise(noise: Noise, default: Sequence[Channel]) -> Iterator[Parameter]:
+    sampled, channels = sampled_noise(noise), channels_of_deviations(noise, default)
     for name in noise.parameter_names:
-        if name in channels:
-            channel = channels[name]
-            described.append(Parameter(name, channel.unit, find_unit(channel.unit, channel.dimension).factor))
+        if (channel := channels.get(name)) is not None:
+            yield Parameter(name, channel.unit, find_unit(channel.unit, channel.dimension).factor)
         else:
             dimensionless = name.startswith(("rho_", "share_")) or isinstance(sampled, GaussianNoise)
-            described.append(Parameter(name, "-" if dimensionless else ""))
-    return described
+            yield Parameter(name, "-" if dimensionless else "")

@@ -9,7 +9,6 @@ density is zero.
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 
@@ -181,11 +180,11 @@ class Posterior:
         >>> posterior.grad_log_prob([1.1, 0.9, 0.5, 0.02]).shape
         (4,)
         """
-        return self._gradient(x, with_prior=True)
+        return self._gradient(x, True)
 
     def grad_log_likelihood(self, x: Any) -> np.ndarray:
         """Gradient of `log_likelihood`; see `grad_log_prob`, of which it is the part without the prior."""
-        return self._gradient(x, with_prior=False)
+        return self._gradient(x, False)
 
     def _gradient(self, x: Any, with_prior: bool) -> np.ndarray:
         if not self.is_differentiable:
@@ -200,18 +199,12 @@ class Posterior:
         gradient, bounds = np.zeros(rows.shape), self.prior.bounds
         inside = np.flatnonzero(self.possible(rows))
         if len(inside):
-            sd = self._scales
+            ahead, behind = (self.prior.from_normal(half * np.eye(self.ndim)) for half in (0.5, -0.5))
+            sd = np.diag(ahead - behind)  # of each parameter in the middle of the prior, about
             gradient[inside], good = likelihood_gradient(self.likelihood, rows[inside], sd, bounds)
             for k in inside[good] if with_prior else ():
                 gradient[k] += slopes_along(self.prior.logpdf, rows[k], sd, bounds)
         return gradient if points.ndim == 2 else gradient[0]
-
-    @cached_property
-    def _scales(self) -> np.ndarray:
-        """Standard deviation (ndim,) of each parameter in the middle of the prior, about."""
-        return np.diag(
-            self.prior.from_normal(0.5 * np.eye(self.ndim)) - self.prior.from_normal(-0.5 * np.eye(self.ndim))
-        )
 
     def possible(self, x: Any) -> np.ndarray | bool:
         """Whether the density may be positive, as far as prior and noise parameters tell; nothing is simulated.
@@ -261,16 +254,6 @@ class Posterior:
                 f"{what} needs the responses of a model, and {type(self.likelihood).__name__} has none: describe the "
                 "data by an FELikelihood, with FunctionModel for a model of your own"
             )
-
-    def first(self, seconds: float) -> "Posterior":
-        """The posterior of the first part of the measurements, see `FELikelihood.first`.
-
-        Examples
-        --------
-        >>> posterior.first(5.0).likelihood.n_samples
-        101
-        """
-        return Posterior(self.likelihood.first(seconds), self.prior)
 
     def marginal(self) -> "Posterior":
         """The same posterior with the standard deviations of its white noise integrated out.

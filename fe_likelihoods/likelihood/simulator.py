@@ -156,11 +156,6 @@ class Simulator(VerifiedModel):
         """Keys under which a `SimulationCache` stores the statistics and the responses, as `forget` takes them."""
         return self.simulation_key, self.model.fingerprint
 
-    def share(self, other: "Simulator") -> None:
-        """Use the responses in memory of another simulator, and trust the rows that it has verified."""
-        self.response_memory = other.response_memory
-        self.share_trust(other)
-
     # requests -----------------------------------------------------------------------------------------------------
 
     def statistics(self, thetas: np.ndarray) -> np.ndarray:
@@ -252,15 +247,24 @@ class Simulator(VerifiedModel):
     # known simulations --------------------------------------------------------------------------------------------
 
     def _look_up(self, keys: list[bytes], which: Sequence[int], full: bool) -> _Request:
-        """What is known of distinct keys, which is counted; `which` has the key of every requested row."""
+        """What is known of distinct keys, which is counted; `which` has the key of every requested row.
+
+        Some stored statistics are verified by runs.
+        """
         finite = np.isfinite(self._thetas(keys)).all(axis=1)
         with self._running.lock:
             request, known = _Request(keys, full, self.model), zip(keys, self.memory_cache.look_up(keys), strict=True)
             skipped = [key for key, fine in zip(keys, finite, strict=True) if not fine]
             outcomes = {key: outcome for key, outcome in known if outcome is not None}
             request.enter(outcomes | dict.fromkeys(skipped, "the parameters are not finite"))
+            on_disk: set[bytes] = set()
             try:
-                on_disk = {*self._take_statistics(request), *self._take_responses(request)}
+                if self.cache is not None and not full and not self._responses_only and (left := request.left):
+                    rows = self._stored(self._key, self._thetas(left), request.fingerprint, self.n_numbers)
+                    found = {key: row.outcome for key, row in zip(left, rows, strict=True) if row is not None}
+                    self._enter(request, found)
+                    on_disk.update(found)
+                on_disk.update(self._take_responses(request))
             except StaleCache:  # results in memory may belong to another model
                 self._clear()
                 raise
@@ -268,16 +272,6 @@ class Simulator(VerifiedModel):
                 self.cache_hits += sum(keys[place] in found for place in which)
                 self.disk_hits += sum(keys[place] in on_disk for place in which)
         return request
-
-    def _take_statistics(self, request: _Request) -> list[bytes]:
-        """Fill in stored statistics, unless responses are wanted; returns their keys. Some are verified by runs."""
-        if self.cache is None or request.full or self._responses_only or not (left := request.left):
-            return []
-        rows = self._stored(self._key, self._thetas(left), request.fingerprint, self.n_numbers)
-        found = {key: row.outcome for key, row in zip(left, rows, strict=True) if row is not None}
-        if found:
-            self._enter(request, found)
-        return list(found)
 
     def _take_responses(self, request: _Request) -> list[bytes]:
         """Fill in stored responses, and statistics that are not known; returns keys of responses from the disk."""
@@ -306,6 +300,8 @@ class Simulator(VerifiedModel):
 
     def _enter(self, request: _Request, outcomes: dict[bytes, bytes | str]) -> None:
         """Fill in statistics and reasons of failures, count these, and cache both in memory."""
+        if not outcomes:
+            return
         self.failures.outcomes += len(outcomes)
         for key, outcome in outcomes.items():
             if isinstance(outcome, str):
@@ -340,11 +336,20 @@ class Simulator(VerifiedModel):
     @interrupts_end_the_run()
     def _run_in_pool(self, keys: list[bytes], which: Sequence[int], full: bool) -> _Request:
         """Run what is not known in the pool, and record each as it arrives, after what runs for another request."""
-        running, arrived = self._running, SimpleQueue()
+        running, arrived, left = self._running, SimpleQueue(), {}
         with running.lock:  # so that nothing arrives between the two
             running.lock.wait_for(lambda: running.keys.isdisjoint(keys))
             request = self._look_up(keys, which, full)
-            left = self._send(request, arrived)
+            if new := request.left:
+                self._check_before()
+                if not running.keys:
+                    running.counted_until = time.perf_counter()
+                measured = () if self._returns_responses(full) else (self.measured, self.statistic)
+                function = Observed(sent_simulation(self.model, *measured))
+                left = dict(zip(self.pool.submit_all(function, list(self._thetas(new))), new, strict=True))
+                running.keys |= set(new)
+        for future in list(left):
+            future.add_done_callback(arrived.put)
         try:
             while left:  # all that have ended, which are stored together
                 self._receive(request, left, [arrived.get() for _ in range(max(1, arrived.qsize()))])
@@ -358,22 +363,6 @@ class Simulator(VerifiedModel):
                 running.keys -= set(left.values())
                 running.lock.notify_all()
         return request
-
-    def _send(self, request: _Request, arrived: SimpleQueue) -> dict[Future, bytes]:
-        """Submit what is left of a request to the pool; the futures, whose keys are returned, come through a queue."""
-        if not (keys := request.left):
-            return {}
-        self._check_before()
-        running = self._running
-        if not running.keys:
-            running.counted_until = time.perf_counter()
-        measured = () if self._returns_responses(request.full) else (self.measured, self.statistic)
-        function = Observed(sent_simulation(self.model, *measured))
-        futures = self.pool.submit_all(function, list(self._thetas(keys)))
-        running.keys |= set(keys)
-        for future in futures:
-            future.add_done_callback(arrived.put)
-        return dict(zip(futures, keys, strict=True))
 
     def _receive(self, request: _Request, left: dict[Future, bytes], ended: Sequence[Future]) -> None:
         """Record simulations that have ended, which are taken from those that are `left`; raises the error of one.

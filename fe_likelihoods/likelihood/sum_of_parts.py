@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, ClassVar, Self
 
@@ -63,11 +63,15 @@ class SumOfParts:
                 f"a number in the prior is a known parameter of the noise; the noise has no {', '.join(others)}, its "
                 f"parameters are {', '.join(noise) or 'none'}: fix others in the model, or give a distribution"
             )
+        return self._with_noises(lambda noise, own: KnownNoise(noise, own) if own else noise, known)
+
+    def _with_noises(self, make: Callable[[Any, dict], Any], values: Mapping[str, Any]) -> Self:
+        """The same likelihood with noises made of each noise, and of the values of its parameters by its own names."""
         parts = {}
         for key, part in self.likelihoods.items():
-            names = {name: self.name_of(key, name) for name in part.noise.parameter_names}
-            own = {name: known[ours] for name, ours in names.items() if ours in known}
-            parts[key] = part.with_noise(KnownNoise(part.noise, own)) if own else part
+            names = ((name, self.name_of(key, name)) for name in part.noise.parameter_names)
+            noise = make(part.noise, {name: values[ours] for name, ours in names if ours in values})
+            parts[key] = part if noise is part.noise else part.with_noise(noise)
         return self.with_likelihoods(parts)
 
     # densities ----------------------------------------------------------------------------------------------------
@@ -172,8 +176,10 @@ class SumOfParts:
         return parts
 
     def report(self) -> dict:
-        """Summary of all simulations, and under ``"likelihoods"`` a summary for each, see `Posterior.report`."""
-        parts = {key: part.report() for key, part in self.likelihoods.items()}
+        """Summary of all simulations, and of several likelihoods one for each, see `Posterior.report`."""
+        parts = {key: part.simulator.report() for key, part in self.likelihoods.items()}
+        if "" in parts:
+            return parts[""]
         total = {name: sum(part[name] for part in parts.values()) for name in COUNTS}
         total["failures"] = [{"likelihood": key, **each} for key, part in parts.items() for each in part["failures"]]
         total["failure_reasons"] = dict(sum((Counter(part["failure_reasons"]) for part in parts.values()), Counter()))
@@ -205,12 +211,8 @@ class SumOfParts:
                 f"{', '.join(shared)} belong to several likelihoods and cannot be integrated out; give each likelihood "
                 f"its own with separate={shared!r}"
             )
-        parts = {}
-        for key, part in self.likelihoods.items():
-            names = {name: self.name_of(key, name) for name in part.noise.parameter_names}
-            known = {name: as_distribution(name, priors[ours]) for name, ours in names.items()}
-            parts[key] = part.with_noise(MarginalNoise(part.noise, known))
-        return self.with_likelihoods(parts)
+        priors = {name: as_distribution(name, priors[name]) for name in noise}
+        return self._with_noises(MarginalNoise, priors)
 
     def draw_noise(self, x: Any, rng: RandomState = None) -> dict[str, np.ndarray]:
         """Complete samples (n,) of all parameters from structural ones (n, ndim), see `Posterior.draw_noise`."""
