@@ -109,9 +109,8 @@ class ResponseTarget:
         parts = []
         for seconds in growing_durations(steps, measurements.dt, shares)[:-1] if steps.any() else ():
             try:
-                parts.append(
-                    ResponseTarget(type(self.posterior)(likelihood.first(measurements.start + seconds), self._prior))
-                )
+                part = likelihood.first(measurements.start + seconds)
+                parts.append(ResponseTarget(type(self.posterior)(part, self._prior)))
             except ValueError:
                 if missing is None:
                     raise  # else a channel has no sample in this part

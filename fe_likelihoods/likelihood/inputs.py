@@ -8,13 +8,7 @@ from ..signals.channels import Measurements
 from ..signals.comparison import Comparison
 from ..simulation.model import Model
 
-__all__ = [
-    "check_model",
-    "check_noise",
-    "check_statistic",
-    "match_measurements",
-    "name_of_statistic",
-]
+__all__ = ["check_model", "check_noise", "check_statistic", "match_measurements", "name_of_statistic"]
 
 _MODEL_MEMBERS = ("parameter_names", "channels", "dt", "n_steps", "fingerprint", "simulate")
 

@@ -156,8 +156,7 @@ class JointLikelihood(SumOfParts):
 def _unit(likelihood: FELikelihood, name: str) -> str | None:
     """Unit of a parameter in words, None where it is not known."""
     model = likelihood.model
-    if name in model.parameter_names:
-        # optional members of models of the user
+    if name in model.parameter_names:  # these are optional members of models of the user
         units, nominal = getattr(model, "parameter_units", {}), getattr(model, "nominal", {})
         if name in units:
             return str(units[name])

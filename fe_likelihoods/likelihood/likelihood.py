@@ -22,7 +22,6 @@ from ..priors.points import as_rows, complete_repr
 from ..signals.channels import Measurements
 from ..signals.comparison import Comparison
 from ..signals.events import join_measurements
-from ..signals.sampling import same_step
 from ..simulation.model import Model, SimulationBatch, first_part
 from .inputs import check_model, check_noise, match_measurements
 from .simulator import Simulator
@@ -186,12 +185,8 @@ class FELikelihood(SumOfParts):
         """
         measurements = self.measurements.trim(0.0, seconds)
         # the time of a sample, which leaves no doubt about the length of the response
-        if measurements.simultaneous and measurements.start == 0.0 and same_step(self.model.dt, measurements.dt):
-            last = (measurements.n_steps - 1) * measurements.dt
-        else:
-            steps = math.ceil(measurements.end / self.model.dt - 1e-6)
-            last = min(steps, self.model.n_steps - 1) * self.model.dt
-        model = first_part(self.model, last)
+        steps = math.ceil(measurements.end / self.model.dt - 1e-6)
+        model = first_part(self.model, min(steps, self.model.n_steps - 1) * self.model.dt)
         self.shortened.append(self._with(model, measurements, self.noise))
         return self.shortened[-1]
 

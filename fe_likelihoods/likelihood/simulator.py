@@ -200,9 +200,8 @@ class Simulator(VerifiedModel):
                     values, reasons = run_each(run, self._thetas(some), (self.n_numbers,), self.pool)
             self._record(request, some, values, reasons, time.perf_counter() - start)
             # the size grows by steps: the first simulations may be failures that took no time
-            self.chunk_size = min(
-                4 * len(some), 1 + int(_SECONDS_PER_CHUNK * len(some) / (time.perf_counter() - start))
-            )
+            rate = len(some) / (time.perf_counter() - start)
+            self.chunk_size = min(4 * len(some), 1 + int(_SECONDS_PER_CHUNK * rate))
             left = left[len(some) :]
         outcomes = [request.outcomes[key] for key in keys]
         if not full:
@@ -329,9 +328,8 @@ class Simulator(VerifiedModel):
         if self.cache is None and (self.when_simulated is None or self.pool is not None):
             return min(n, most)
         workers = (os.cpu_count() or 1) if self.pool is None else self.pool.n_workers or n
-        one_by_one = self.pool is None and not has_batch_method(self.model)
-        smallest = 1 if one_by_one else _ROUNDS_PER_CHUNK * workers  # so that all workers are busy
-        return min(max(smallest, self.chunk_size), most)
+        together = self.pool is not None or has_batch_method(self.model)  # then all workers are to be busy
+        return min(max(_ROUNDS_PER_CHUNK * workers if together else 1, self.chunk_size), most)
 
     @interrupts_end_the_run()
     def _run_in_pool(self, keys: list[bytes], which: Sequence[int], full: bool) -> _Request:
