@@ -83,7 +83,7 @@ def test_the_likelihood_of_the_first_part(pool, rng, tmp_path):
     np.testing.assert_array_equal(part.log_likelihood(x), expected.log_likelihood(x))
     assert (part.log_likelihood(x) != whole.log_likelihood(x)).all()
     assert (part.simulations, whole.simulations) == (2, 2)
-    assert part.fingerprint == expected.fingerprint != whole.fingerprint
+    assert part.simulator.fingerprint == expected.simulator.fingerprint != whole.simulator.fingerprint
     assert whole.simulator.cache.info().simulations == 4
     if pool is not None:
         whole.simulator.pool.close()
@@ -110,7 +110,7 @@ class Building:
 def test_a_model_with_a_record_can_be_shortened():
     whole = FELikelihood(Building(RECORD), Measurements(Building.channels, RECORD.dt, np.ones((1, RECORD.n_steps))))
     part = whole.first(5.003)
-    assert part.fingerprint != whole.fingerprint
+    assert part.simulator.fingerprint != whole.simulator.fingerprint
     response = whole.model.simulate([1.0, 1.0])[:, : part.measurements.n_steps]
     np.testing.assert_array_equal(part.model.simulate([1.0, 1.0]), response)
 
