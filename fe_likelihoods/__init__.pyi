@@ -63,7 +63,7 @@ from .signals.alignment import align
 from .signals.channels import Channel, Measurements
 from .signals.error_measures import rrmse
 from .signals.events import Events
-from .signals.read import read_columns, read_imposed_test, read_record
+from .signals.read import read_columns, read_record
 from .signals.records import DisplacementHistory, Record
 from .simulation.executors import DaskExecutor
 from .simulation.model import SimulationFailed
@@ -160,7 +160,6 @@ __all__ = [
     "propagate",
     "rank_sensors",
     "read_columns",
-    "read_imposed_test",
     "read_modal_data",
     "read_record",
     "report",

@@ -6,14 +6,14 @@ the file or the arguments; ValueError is raised if neither states them or if the
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from ..units import to_si
 from .channels import Channel, Measurements
-from .records import DisplacementHistory, Record
-from .strong_motion import OF_OBSPY, Series, read_series, recognise
+from .records import Record
+from .strong_motion import Series, read_series, recognise
 from .tables import (
     WORKBOOKS,
     agree_on_unit,
@@ -26,9 +26,7 @@ from .tables import (
 )
 
 __all__ = [
-    "ImposedTest",
     "read_columns",
-    "read_imposed_test",
     "read_record",
     "units_of",
 ]
@@ -49,7 +47,6 @@ def read_record(
     time: int | str | None = None,
     time_unit: str | None = None,
     skip: int | None = None,
-    inventory: str | Path | None = None,
 ) -> Record:
     """Read a ground motion from a file in any supported format, which is recognised by the first lines.
 
@@ -98,9 +95,6 @@ def read_record(
         times, unless `time` is another one.
     skip : int, optional
         Number of lines above the table, if they are not found. What they state is ignored.
-    inventory : str or path, optional
-        StationXML file of the recorder, with which counts in a miniSEED file become m/s2 (obspy's
-        ``remove_response``). The lowest frequencies of a seismometer for velocities are not restored.
 
     Returns
     -------
@@ -126,8 +120,6 @@ def read_record(
         raise ValueError(f"{path}: give channel= or column=, not both; they name the same")
     channel = column if channel is None else channel
     form, file = recognise(path), str(path)
-    if inventory is not None and form not in OF_OBSPY:
-        raise ValueError(f"{path}: inventory= is for miniSEED, SAC and GSE2 files; leave it out")
     options = {"time": time, "time_unit": time_unit, "skip": skip, "missing": missing}
     if form is None:
         try:
@@ -142,7 +134,7 @@ def read_record(
     elif unused := ", ".join(name for name, option in options.items() if option is not None):
         raise ValueError(f"{path}: a file of format {form} states its times and samples; leave {unused} out")
     else:
-        series = read_series(path, form, channel, member, inventory)
+        series = read_series(path, form, channel, member)
     unit = agree_on_unit(series.unit, units, "acceleration", series.file or file)
     # The source has the file name without its folder, because it is written into data sets that are shared.
     source = series.source or Path(file).name + (f": {series.title}" if series.title else "")
@@ -187,13 +179,6 @@ def _table_series(
 
 
 # measured responses ---------------------------------------------------------------------------------------------------
-
-
-class ImposedTest(NamedTuple):
-    """A laboratory test with an imposed displacement, and the channels measured at its steps."""
-
-    history: DisplacementHistory
-    measurements: Measurements  # with ``dt = 1``, one step
 
 
 def read_columns(
@@ -257,13 +242,16 @@ def read_columns(
     array([[0.    , 0.0015, 0.002 ]])
     """
     wanted = _wanted(path, channels, columns, units)
-    if (form := recognise(path)) is not None:
-        if not all(option is None for option in (units, dt, time, time_unit, skip, missing)):
-            raise ValueError(
-                f"{path}: a file of format {form} states units and times; leave units, dt, time, time_unit, skip and "
-                "missing out"
-            )
-        return _recorded(path, channels, columns, description, zero, resample)
+    if recognise(path) is not None:
+        options = {
+            "resample": resample,
+            "dt": dt,
+            "time": time,
+            "time_unit": time_unit,
+            "skip": skip,
+            "missing": missing,
+        }
+        return _recorded(path, channels, wanted, description, zero, **options)
     table = read_table(path, skip, time_unit, time, missing=missing)
     values = np.array([to_si(*each) for each in table_values(table, wanted, stacklevel=2)])
     if resample is None:
@@ -278,10 +266,10 @@ def read_columns(
 def _recorded(
     path: str | Path,
     channels: Sequence[Channel],
-    columns: Sequence[str | int],
+    wanted: Sequence[tuple],
     description: str,
     zero: float | str,
-    resample: float | None,
+    **options: Any,
 ) -> Measurements:
     """Measured accelerations in a file of a strong-motion network or a zip archive of such files."""
     if isinstance(zero, str):
@@ -291,55 +279,11 @@ def _recorded(
             f"{path}: accelerations are read from files of this format, and the channel {other.name!r} is a "
             f"{other.dimension}; leave it out, or write its samples to a CSV file"
         )
-    records = [read_record(path, column, resample=resample) for column in columns]
+    records = [read_record(path, column, unit, **options) for column, _, unit, _ in wanted]
     labels = [f"{channel.name} is {record.name}" for channel, record in zip(channels, records, strict=True)]
     text = ", ".join(filter(None, (description, *labels)))
     steps, rows = [record.dt for record in records], [record.acceleration for record in records]
     return Measurements(tuple(channels), steps, rows, text, 0.0 - zero)
-
-
-def read_imposed_test(
-    path: str | Path,
-    displacement: str,
-    channels: Sequence[Channel],
-    columns: Sequence[str],
-    units: str | Sequence[str] | Mapping[str, str] | None = None,
-    displacement_unit: str | None = None,
-    description: str = "",
-    *,
-    skip: int | None = None,
-    missing: Sequence[float | str] | None = None,
-) -> ImposedTest:
-    """Read a quasi-static laboratory test from a CSV file: the imposed displacement, and channels at its steps.
-
-    Parameters
-    ----------
-    displacement : str
-        Name of the column with the imposed displacement.
-    displacement_unit : str, optional
-        Unit of the displacement, if the column name does not end with it.
-    path, channels, columns, units, description, skip, missing
-        As in `read_columns`.
-
-    Returns
-    -------
-    ImposedTest
-        The history, named after the file, and the measurements. ValueError as `read_columns`, but for times.
-
-    Examples
-    --------
-    >>> table = [[0.0, 0.0], [10.0, 120.0], [-10.0, -115.0]]
-    >>> np.savetxt("cyclic.csv", table, delimiter=",", header="top_mm,force_kN", comments="")
-    >>> test = read_imposed_test("cyclic.csv", "top_mm", [Channel("force", "force", "kN")], ["force_kN"])
-    >>> test.history.displacement  # m
-    array([ 0.  ,  0.01, -0.01])
-    """
-    imposed = (displacement, "displacement", displacement_unit, f"{path}, column {displacement!r}")
-    wanted = [imposed, *_wanted(path, channels, columns, units)]
-    found = table_values(read_table(path, skip, missing=missing), wanted, stacklevel=2)
-    history, *values = (to_si(*each) for each in found)
-    measurements = Measurements(tuple(channels), 1.0, values, description)
-    return ImposedTest(DisplacementHistory(Path(path).stem, history, Path(path).name), measurements)
 
 
 def units_of(channels: Sequence[Channel], units: str | Sequence[str] | Mapping[str, str] | None) -> list[str | None]:

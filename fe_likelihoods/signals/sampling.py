@@ -14,6 +14,7 @@ __all__ = [
     "as_number",
     "check_samples",
     "check_step",
+    "expect",
     "rest_samples",
     "same_sampling",
     "same_step",
@@ -22,6 +23,13 @@ __all__ = [
 
 _TIME_TOLERANCE = 1e-9  # in steps: round-off in times that are multiples of the step
 _STEP_TOLERANCE = 1e-9  # relative difference up to which two steps are equal
+
+
+def expect(fits: object, where: object, expected: str, got: object = None, advice: str = "") -> None:
+    """ValueError that says what was expected in a file, what came and what to do, unless it `fits`."""
+    if not fits:
+        came = "" if got is None else f", got {got}"
+        raise ValueError(f"{where}: expected {expected}{came}" + (f"; {advice}" if advice else ""))
 
 
 def check_samples(values: ArrayLike, what: str, name: str) -> NDArray[np.float64]:

@@ -82,9 +82,7 @@ class Found(NamedTuple):
     parse: Callable[[], Series]
 
 
-def read_series(
-    path: str | Path, form: str, channel: int | str | None, member: str | None, inventory: str | Path | None
-) -> Series:
+def read_series(path: str | Path, form: str, channel: int | str | None = None, member: str | None = None) -> Series:
     """The samples of the only channel with a number or name in a file of a format that `recognise` names.
 
     ValueError if there are several, which lists them. A text for V2 files is a number too, or the end of a file's name.
@@ -93,7 +91,7 @@ def read_series(
         series = _SINGLE[form](_text(path), str(path))
         return series._replace(name=Path(path).name) if form == "knet" else series  # the ending is the direction
     if form in OF_OBSPY:
-        return _parse_obspy(path, form, channel, inventory)
+        return _parse_obspy(path, form, channel)
     if form == "v2" and isinstance(channel, str):
         channel, member = (int(channel), member) if channel.isdecimal() else (None, channel)
     candidates = find_channels(path, form, member)
@@ -379,7 +377,7 @@ _ZIP_DAMAGE = (zipfile.BadZipFile, RuntimeError, NotImplementedError, OSError, E
 def find_channels(path: str | Path, form: str, member: str | None = None) -> list[Found]:
     """The accelerations in a file, or in the V2, else V1 files of an archive."""
     if form in _SINGLE or form in OF_OBSPY:
-        return [Found(None, Path(path).name, str(path), partial(read_series, path, form, None, None, None))]
+        return [Found(None, Path(path).name, str(path), partial(read_series, path, form))]
     if form == "geonet":
         return _parse_geonet(_text(path), str(path))
     content = read_bytes(path)
@@ -493,7 +491,7 @@ def _parse_v2(block: Block) -> Series:
     values = block.samples(index + 1, int((csmip or _COSMOS_DATA.match(line))[1]), form)
     if csmip:
         decimals = decimals_of(lines[index + 1][: form[1]].strip())
-        check_peaks(read_statements(lines[:_V2_TEXT]).peaks, ("",), 0, values, decimals, unit, block.file)
+        check_peaks(read_statements(lines[:_V2_TEXT]).peaks_of([""], 0), values, decimals, unit, block.file)
     uncorrected = ", uncorrected" if re.match(r"\s*uncorrected", lines[0], re.IGNORECASE) else ""
     return Series(block.label + uncorrected, dt, unit, values)
 
@@ -690,8 +688,8 @@ _SINGLE = {"at2": _parse_at2, "smc": _parse_smc, "knet": _parse_knet, "esm": _pa
 _NO_ACCELERATION = {6: "displacement", 7: "velocity"}  # IDEP in a SAC header
 
 
-def _parse_obspy(path: str | Path, form: str, channel: str | None, inventory: str | Path | None) -> Series:
-    """The samples of one trace in a miniSEED, SAC or GSE2 file, in m/s2 with the `inventory` of its recorder."""
+def _parse_obspy(path: str | Path, form: str, channel: str | None) -> Series:
+    """The samples of one trace in a miniSEED, SAC or GSE2 file."""
     try:
         import obspy
     except ImportError as error:
@@ -715,20 +713,10 @@ def _parse_obspy(path: str | Path, form: str, channel: str | None, inventory: st
             f"{path}: {trace.id} lacks {np.ma.count_masked(trace.data)} samples; an excitation needs all samples: cut "
             "the record, or fill the gaps in obspy"
         )
-    if inventory is not None:
-        try:
-            # neither taper nor mean are removed: the record of an event may begin and end with motion
-            stations = obspy.read_inventory(io.BytesIO(read_bytes(inventory)), format="STATIONXML")
-            trace.remove_response(stations, output="ACC", water_level=60.0, zero_mean=False, taper=False)
-        except Exception as error:  # no response of this channel at this time, or anything else
-            raise ValueError(
-                f"{path}: obspy cannot apply the inventory {inventory} to {trace.id} ({error}); give the StationXML "
-                "file with the response of this channel at the time of the record"
-            ) from error
-    elif not np.issubdtype(trace.data.dtype, np.floating):
+    if not np.issubdtype(trace.data.dtype, np.floating):
         raise ValueError(
-            f"{path}: the samples of {trace.id} are whole numbers, counts of a recorder; give the StationXML file "
-            "of the station, inventory="
+            f"{path}: the samples of {trace.id} are whole numbers, counts of a recorder; remove its response in obspy "
+            "(trace.remove_response with output='ACC') and make a Record of the samples"
         )
     quantity = _NO_ACCELERATION.get(trace.stats.get("sac", {}).get("idep"))
     if quantity is not None:
@@ -737,5 +725,4 @@ def _parse_obspy(path: str | Path, form: str, channel: str | None, inventory: st
         )
     rate = round(1.0 / trace.stats.delta)  # SAC has the step in single precision
     dt = 1.0 / rate if rate and abs(rate * trace.stats.delta - 1.0) < 1e-6 else trace.stats.delta
-    unit = None if inventory is None else "m/s2"
-    return Series(trace.id, float(dt), unit, np.asarray(trace.data, dtype=np.float64), name=trace.id)
+    return Series(trace.id, float(dt), None, np.asarray(trace.data, dtype=np.float64), name=trace.id)

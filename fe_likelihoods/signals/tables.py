@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..units import DIMENSIONS, UNITS, find_unit
-from .sampling import check_step
+from .sampling import check_step, expect
 
 __all__ = [
     "LINE_END",
@@ -76,15 +76,13 @@ _LARGEST_FILE = 256 * 2**20  # bytes of a text file or an archive; long records 
 _PADDING = " \t\n\f\0\x1a"
 _CLOSING = re.compile(r"[^\d,;\t]{0,80}(?<![A-Za-z])(?:end|eof)[^\d,;\t]{0,80}", re.IGNORECASE)  # *** End data ***
 _LAST_DECIMALS = re.compile(r"\.(\d+)([eEdD][-+]?\d+)?\s*$")
-_FORTRAN_EXPONENT = re.compile(r"(?<=[\d.])[dD](?=[-+]?\d)")  # the letter of double precision
 
 
 def read_bytes(path: str | Path) -> bytes:
     """The content of a file; ValueError if it cannot be read or is too large."""
     try:
         size = Path(path).stat().st_size
-        if size > _LARGEST_FILE:
-            raise ValueError(f"{path}: expected at most {_LARGEST_FILE} bytes, got {size}; cut the file")
+        expect(size <= _LARGEST_FILE, path, f"at most {_LARGEST_FILE} bytes", size, "cut the file")
         return Path(path).read_bytes()
     except OSError as error:
         raise ValueError(f"cannot read {path}: {error.strerror}; check the path") from error
@@ -126,34 +124,25 @@ def number_cells(line: str) -> list[str]:
     return [field.strip() for field in fields] if split and "".join(fields) == line.rstrip() else cells
 
 
-def _as_float(field: str) -> float:
-    """A number, also with an exponent of Fortran (1.0D-03); ValueError for digits grouped by underscores."""
-    if "_" in field:
-        raise ValueError
-    try:
-        return float(field)
-    except ValueError:
-        return float(_FORTRAN_EXPONENT.sub("e", field))
+def _number(field: str) -> float | None:
+    """The number in a field, also with an exponent of Fortran (1.0D-03), or None; digits are not grouped by "_"."""
+    with suppress(ValueError):
+        return None if "_" in field else float(field.lower().replace("d", "e"))
+    return None
 
 
 def is_number(field: str) -> bool:
     """Whether a field of a file is a number."""
-    try:
-        _as_float(field)
-    except ValueError:
-        return False
-    return True
+    return _number(field) is not None
 
 
 def parse_number(field: str, where: str) -> float:
     """The finite number in a field of a file; ValueError for anything else."""
-    try:
-        value = _as_float(field)
-    except ValueError:
+    value = _number(field)
+    if value is None or not math.isfinite(value):
+        what = "a number" if value is None else "a finite number"
         clock = ", or a clock time such as '03:19:53.010' or '2019-07-06T03:19:53.010'" if ":" in field else ""
-        raise ValueError(f"{where}: expected a number{clock}, got {field[:100]!r}") from None
-    if not math.isfinite(value):
-        raise ValueError(f"{where}: expected a finite number, got {field[:100]!r}")
+        raise ValueError(f"{where}: expected {what}{clock}, got {field[:100]!r}")
     return value
 
 
@@ -240,104 +229,79 @@ _LONGEST = 10_000  # letters of a line that are searched
 _LARGEST_ROUNDING = 0.005  # relative, of a number with three digits; with fewer ones, such as 0.01, a step is exact
 
 
-class StatedStep(NamedTuple):
-    """A step of the samples, in the words of a file."""
-
-    text: str
-    steps: tuple[float, ...]  # [s]; several if the unit is not stated
-    rounding: float  # largest relative error of the printed number
-
-
-class StatedPeak(NamedTuple):
-    """Peak accelerations, in the words of a file."""
-
-    text: str
-    unit: str | None
-    printed: dict[str, str]  # by the name of the column, "" for a peak without name
-
-    def of(self, names: Sequence[str], index: int) -> str | None:
-        """The number for one of the columns of values: by its name, or where no name is there by its place."""
-        if any(name in self.printed for name in names):
-            return self.printed.get(names[index])
-        return list(self.printed.values())[index] if len(self.printed) == len(names) else None
-
-
 class Statements(NamedTuple):
-    """What lines state: steps, and the words and values of sample counts, units and peaks."""
+    """What lines of text state, in their words."""
 
-    steps: tuple[StatedStep, ...] = ()
-    counts: tuple[tuple[str, str], ...] = ()
-    units: tuple[tuple[str, str], ...] = ()
-    peaks: tuple[StatedPeak, ...] = ()
+    # words, steps [s], several if their unit is not stated, and the largest relative error of the printed number
+    steps: tuple[tuple[str, tuple[float, ...], float], ...] = ()
+    counts: tuple[tuple[str, str], ...] = ()  # words and number of samples
+    units: tuple[str, ...] = ()
+    # words, unit, and peak accelerations by the names of columns, "" for one without a name
+    peaks: tuple[tuple[str, str | None, dict[str, str]], ...] = ()
+
+    def peaks_of(self, names: Sequence[str], index: int) -> list[tuple[str, str | None, str]]:
+        """Words, unit and number of peaks of one column of values: by its name, or where no name is there its place."""
+        found = []
+        for text, unit, printed in self.peaks:
+            if any(name in printed for name in names):
+                number = printed.get(names[index])
+            else:
+                number = [*printed.values()][index] if len(printed) == len(names) else None
+            found += [] if number is None else [(text, unit, number)]
+        return found
 
 
 def read_statements(lines: Sequence[str], decimal_commas: bool = False) -> Statements:
-    """What lines of text state."""
+    """What lines of text state; nothing for a step of zero, and for numbers of something else."""
     steps, counts, units, peaks = [], [], [], []
     for line in lines:
         line = re.sub(r"(?<=\d),(?=\d)", ".", line[:_LONGEST]) if decimal_commas else line[:_LONGEST]
-        steps += [_stated_step(found, form is _RATE) for form in (_STEP, _RATE) for found in form.finditer(line)]
+        for is_rate, found in ((k, each) for k, form in enumerate((_STEP, _RATE)) for each in form.finditer(line)):
+            number, unit, bracket = float(found["number"]), found["unit"] or "", found["bracket"]
+            if is_rate:
+                stated = (unit or bracket or "").lower()
+                factors = [1e3 if stated == "khz" else 1.0] if stated else [1.0, 1e3]
+            else:
+                stated = [each for each in (found["ending"], bracket, unit) if each and dimension_of(each) == "time"]
+                factors = [find_unit(each).factor for each in stated[:1]] or [1.0, 1e-3, 1e-6] * (not bracket)
+            if number > 0.0 and unit.lower() not in _LONGER and factors:
+                found_steps = tuple(1.0 / (number * each) if is_rate else number * each for each in factors)
+                rounding = min(0.5 * 10.0 ** -decimals_of(found["number"]) / number, _LARGEST_ROUNDING)
+                steps.append((found[0].strip(), found_steps, rounding))
         counts += [(found[0][:60], found[1] or found[2]) for found in _COUNT.finditer(line)]
-        units += [(found[0], found[1]) for found in _UNIT_LINE.finditer(line)]
-        units += [(each[0], each[1]) for each in _UNITS_ARE.finditer(line) if dimension_of(each[1]) == "acceleration"]
-        peaks += [_stated_peak(found) for found in _PEAK.finditer(line)]
-    return Statements(tuple(filter(None, steps)), tuple(counts), tuple(units), tuple(filter(None, peaks)))
-
-
-def _stated_step(found: re.Match[str], is_rate: bool) -> StatedStep | None:
-    """A step, or the step of a rate; None for zero, and for a number of something else."""
-    number, unit, bracket = float(found["number"]), found["unit"] or "", found["bracket"]
-    if not number > 0.0 or unit.lower() in _LONGER:
-        return None
-    if is_rate:
-        stated = (unit or bracket or "").lower()
-        steps = tuple(1.0 / (number * each) for each in ([1e3 if stated == "khz" else 1.0] if stated else [1.0, 1e3]))
-    else:
-        stated = [each for each in (found["ending"], bracket, unit) if each and dimension_of(each) == "time"]
-        if bracket and not stated:  # brackets around something else
-            return None
-        steps = tuple(number * each for each in [find_unit(each).factor for each in stated[:1]] or [1.0, 1e-3, 1e-6])
-    rounding = 0.5 * 10.0 ** -decimals_of(found["number"]) / number
-    return StatedStep(found[0].strip(), steps, min(rounding, _LARGEST_ROUNDING))
-
-
-def _stated_peak(found: re.Match[str]) -> StatedPeak | None:
-    """Peaks by name, or one without; None for other text, and a value that may be no acceleration."""
-    unit, printed = found["unit"], {name.strip(): number for name, number in _NAMED.findall(found["numbers"])}
-    if not printed and (plain := _PLAIN.match(found["numbers"])):
-        unit, printed = unit or plain[2].rstrip(",;"), {"": plain[1]}
-    unit = unit if unit and dimension_of(unit) == "acceleration" else None
-    return StatedPeak(found[0].strip(), unit, printed) if printed and (unit or not found["any"]) else None
+        units += [found[1] for found in _UNIT_LINE.finditer(line)]
+        units += [each[1] for each in _UNITS_ARE.finditer(line) if dimension_of(each[1]) == "acceleration"]
+        for found in _PEAK.finditer(line):
+            unit, printed = found["unit"], {name.strip(): number for name, number in _NAMED.findall(found["numbers"])}
+            if not printed and (plain := _PLAIN.match(found["numbers"])):
+                unit, printed = unit or plain[2].rstrip(",;"), {"": plain[1]}
+            unit = unit if unit and dimension_of(unit) == "acceleration" else None
+            if printed and (unit or not found["any"]):  # a peak value may be no acceleration
+                peaks.append((found[0].strip(), unit, printed))
+    return Statements(tuple(steps), tuple(counts), tuple(units), tuple(peaks))
 
 
 def check_peaks(
-    peaks: Sequence[StatedPeak],
-    names: Sequence[str],
-    index: int,
+    peaks: Sequence[tuple[str, str | None, str]],
     values: NDArray[np.float64],
     decimals: int,
     unit: str,
     file: str,
     advice: str = "",
 ) -> None:
-    """ValueError if a stated peak is not the peak of a column, with its mean or without it.
-
-    The column is number `index` of `names`, with printed values (n_rows,) without missing ones; `advice` ends the
-    message.
-    """
+    """ValueError if a stated peak is not the peak of printed values (n_rows,), with their mean or without it."""
     factor, digit = find_unit(unit).factor, 1.01 * 10.0**-decimals
     found = [float(np.abs(each).max()) for each in (values, values - values.mean())]
-    for peak in peaks:
-        printed = peak.of(names, index)
-        known = [peak.unit] if peak.unit else [name for name in UNITS if UNITS[name].dimension == "acceleration"]
+    for text, stated, printed in peaks:
+        known = [stated] if stated else [name for name in UNITS if UNITS[name].dimension == "acceleration"]
         ratios = [find_unit(each).factor / factor for each in known]
-        if printed is not None and not any(
+        if not any(
             abs(each - ratio * abs(float(printed))) <= digit + 0.505 * ratio * 10.0 ** -decimals_of(printed)
             for each in found
             for ratio in ratios
         ):
             raise ValueError(
-                f"{file}: the file states {peak.text!r}, the samples have a peak of {found[0]:g} {unit}; the unit is "
+                f"{file}: the file states {text!r}, the samples have a peak of {found[0]:g} {unit}; the unit is "
                 f"wrong, or the file is damaged{advice}"
             )
 
@@ -354,7 +318,6 @@ _DATE_FORMAT = re.compile(
     r"([DTJGMYAHS])\1+(?:(?:[-/.:, ]{1,2}|T(?=HH))([DTJGMYAHS])\2+)+(?:[.,](?:0+|F+))?(?: ?AM/PM)?", re.IGNORECASE
 )
 _HOUR, _DAY = 3600, 86400
-_EPOCH = datetime.date(1970, 1, 1).toordinal()
 
 
 class ClockTime(NamedTuple):
@@ -365,6 +328,9 @@ class ClockTime(NamedTuple):
     decimals: int  # of the seconds
     zone: int | None  # minutes by which the clock is before UTC, None without a time zone
     halves: bool = False  # hours from 1 to 12 with AM and PM
+
+
+_UNIX_EPOCH = ClockTime(datetime.date(1970, 1, 1).toordinal(), 0.0, 0, 0)
 
 
 def is_clock(cell: str) -> bool:
@@ -380,29 +346,26 @@ def clock_text(clock: ClockTime) -> str:
 
 def _parse_clock(cell: str, where: str) -> ClockTime:
     """The clock time in a cell; ValueError for anything else."""
-    found, got = _CLOCK.fullmatch(cell), f"got {cell[:100]!r}"
-    if found is None:
-        raise ValueError(f"{where}: expected a clock time such as '03:19:53.010' or '2019-07-06T03:19:53.010', {got}")
+    found, got = _CLOCK.fullmatch(cell), f"{cell[:100]!r}"
+    expect(found, where, "a clock time such as '03:19:53.010' or '2019-07-06T03:19:53.010'", got)
     *_, hour, minute, second, fraction, half, zone = found.groups()
-    if not (1 <= int(hour) <= 12 if half else int(hour) <= 24):
-        hours = "with AM and PM have hours from 1 to 12" if half else "have hours from 0 to 23"
-        raise ValueError(f"{where}: clock times {hours}; {got}")
+    expect(
+        1 <= int(hour) <= 12 if half else int(hour) <= 24, where, f"hours from {'1 to 12' if half else '0 to 23'}", got
+    )
     hours = int(hour) % 12 + 12 * (half in ("P", "p")) if half else int(hour)
     if zone is not None:  # minutes of a time zone such as +02:00; Z and UTC are zero
         zone = 0 if zone.upper() in ("Z", "UTC") else int(f"{zone[0]}1") * (60 * int(zone[1:3]) + int(zone[-2:]))
     seconds = float(f"{_HOUR * hours + 60 * int(minute) + int(second)}.{fraction or 0}")
     year, day, number = found["first"], found["last"], None
     if year is not None:
-        if len(year) != 4 and (found["mark"] != "." or len(day) != 4):
-            raise ValueError(
-                f"{where}: expected a date such as 2019-07-06 or 06.07.2019, {got}, which may begin with the day or "
-                "the month; write the year first"
-            )
+        certain = len(year) == 4 or (found["mark"] == "." and len(day) == 4)
+        got += "" if certain else ", which may begin with the day or the month"
+        expect(certain, where, "a date such as 2019-07-06 or 06.07.2019", got, "write the year first")
         year, day = (year, day) if len(year) == 4 else (day, year)
         try:
             number = datetime.date(int(year), int(found["month"]), int(day)).toordinal()
         except ValueError as error:
-            raise ValueError(f"{where}: expected a date, {got} ({error})") from None
+            raise ValueError(f"{where}: expected a date, got {got} ({error})") from None
     return ClockTime(number, seconds, len(fraction or ""), zone, bool(half))
 
 
@@ -413,24 +376,19 @@ def _seconds_of(times: list[ClockTime | None], file: str) -> list[float]:
     after 12 o'clock is refused: it is on a 12-hour clock.
     """
     known = [time for time in times if time is not None]
-    zones = {time.zone for time in known}
-    for differ, expected in (
-        (len({time.day is None for time in known}) > 1, "a date in all clock times or in none"),
-        (len(zones) > 1, f"one time zone in all clock times, got {len(zones)}"),
-        (len({time.halves for time in known}) > 1, "AM or PM in all clock times or in none"),
+    for kinds, expected in (
+        ({time.day is None for time in known}, "a date in all clock times or in none"),
+        ({time.zone for time in known}, "one time zone in all clock times"),
+        ({time.halves for time in known}, "AM or PM in all clock times or in none"),
     ):
-        if differ:
-            raise ValueError(f"{file}: expected {expected}; write them alike")
+        expect(len(kinds) == 1, file, expected, f"{len(kinds)} kinds", "write them alike")
     day, last, found = 0, 0.0, []
     for time in times:
         if time is None:
             found.append(math.nan)
             continue
-        if not time.halves and 12 * _HOUR <= last < 13 * _HOUR and _HOUR <= time.seconds < 2 * _HOUR:
-            raise ValueError(
-                f"{file}: the clock times go back from 12 to 1 o'clock, as on a clock of 12 hours; write hours from 0 "
-                "to 23"
-            )
+        back = not time.halves and 12 * _HOUR <= last < 13 * _HOUR and _HOUR <= time.seconds < 2 * _HOUR
+        expect(not back, file, "hours from 0 to 23", "1 after 12 o'clock, as on a clock of 12 hours")
         day = time.day - known[0].day if time.day is not None else day + (time.seconds < last - _DAY / 2)
         last = time.seconds
         found.append(day * _DAY + time.seconds)
@@ -445,28 +403,23 @@ WORKBOOKS = (".xlsx", ".xlsm")
 _SEPARATORS = (";", "\t", ",", " ")
 _LAST_LINES = 50  # lines that determine the separator
 _MISSING = frozenset({"", "nan", "#n/a", "n/a", "na", "null", "-", "--"})
-_DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?$")
-_THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}$")  # 1,000: a thousand, or one with three decimals
-# Separators of thousands that cannot be decimal marks: another mark or a second group follows
-_GROUPED = re.compile(r"[-+]?[1-9]\d{0,2}(?:(?:,\d{3})+\.\d*|(?:\.\d{3})+,\d*|(?:,\d{3}){2,}|(?:\.\d{3}){2,})$")
-_SPACED = re.compile(r"[-+]?[1-9]\d{0,2}(?:['\u2019\u00a0\u202f ]\d{3})+(?:[.,]\d*)?$")
-_SPACE = re.compile(r"\d['\u2019\u00a0\u202f ]\d{3}")
-_SPACES = str.maketrans("", "", "'\u2019\u00a0\u202f ")
-_HUNDREDS = re.compile(r"[-+]?[1-9]\d{2}$")
-_NUMBERS = re.compile(r"[\s\d.+\-eEdD]*")
+_BLANKS = "'\u2019\u00a0\u202f "  # between groups of three digits
+_SPELLINGS = {  # of numbers, by the decimal mark and the mark between groups of three digits
+    (mark, group): re.compile(
+        rf"[-+]?(?:(?:\d+|[1-9]\d{{0,2}}(?:[{group}]\d{{3}})+)(?:[{mark}]\d{least})?|[{mark}]\d+)"
+        r"(?:[eEdD][-+]?\d+)?"
+    )
+    for mark, group, least in ((".", _BLANKS, "*"), (",", _BLANKS, "+"), (".", ",", "*"), (",", ".", "+"))
+}
+_MARKED = re.compile(rf"[,{_BLANKS}]|\..*\.")
+_THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}")  # 1,000: a thousand, or one with three decimals
+_HUNDREDS = re.compile(r"[-+]?[1-9]\d{2}")
 _BELOW_ONE = re.compile(r"0?\.\d+|\d(?:\.\d+)?[eEdD]-\d+")
+_NUMBERS = re.compile(r"[\s\d.+\-eEdD]*")
 _POINTS = "Numbers with decimal commas need another separator between columns, such as ';'"
 _SKIP = "If the text is about other samples, give skip= to leave it out"
 
 _Line = tuple[int, list[str]]  # its number and cells
-
-
-class Missing(NamedTuple):
-    """What stands for missing samples, as the caller says."""
-
-    numbers: NDArray[np.float64]
-    texts: list[str]
-    stated: bool  # whether the caller says it; it may be nothing
 
 
 class Column(NamedTuple):
@@ -489,8 +442,8 @@ class Table(NamedTuple):
     lines: tuple[int, ...]  # line numbers of the rows
     title: str  # the first comment
     stated: Statements  # what comments and the text above state
-    missing: Missing
-    found: frozenset[str]  # texts of missing samples that rows have
+    missing: tuple[float | str, ...] | None  # what stands for missing samples, if the caller says it
+    found: set[str]  # texts of missing samples that rows have
     clock: ClockTime | None = None  # the first clock time
     time: int | None = None  # column of times
     time_unit: str | None = None  # as given by the caller
@@ -524,23 +477,26 @@ def read_table(
     separator = "\t" if is_book else _separator([line for _, line in lines[-_LAST_LINES:]])
     rows = [(number, _split(line, separator, f"{file}, line {number}")) for number, line in lines]
     rows, stated = _logger_table(rows, file)
-    absent = _listed(missing)
-    there = _blank(rows, absent.texts)
+    missing, found = _checked_missing(missing), set[str]()
+    marks = [each for each in missing or () if isinstance(each, str)]
+    for _, cells in rows if marks else ():  # but names of columns
+        if any(map(_known, cells)) or all(cell in marks or _is_missing(cell) for cell in cells):
+            found |= {*cells} & {*marks}
+            cells[:] = ["nan" if cell in marks else cell for cell in cells]
     along_rows = along_rows and not any("rows" in row for _, row in rows[:_LAST_LINES])
     announced = None if along_rows or stated else _announced(rows, file)
     if announced:
-        rows, stated = announced
-    elif rows:
-        _check_names(rows, separator, along_rows, file)
-        rows = _along_rows(rows, file) if along_rows else rows
-    names, below, rows = _header(rows, file)
+        names, below, (rows, stated) = [], [], announced
+    else:
+        names, below, rows = _header(rows, separator, along_rows, file)
+    expect(rows, file, "rows of numbers, found none")
     rows, commas = _with_points(rows, separator, file)
-    columns, clock = _columns(names, below, rows, file, absent.texts, labels)
+    columns, clock = _columns(names, below, rows, file, marks, labels)
     above = [line for number, line in lines if number < rows[0][0]]
-    found = read_statements([*comments, *stated, *above], commas)
+    statements = read_statements([*comments, *stated, *above], commas)
     title, numbers = "".join([*comments, *stated][:1]), tuple(number for number, _ in rows)
-    table = Table(file, bool(names), columns, numbers, title, found, absent, there, clock, None, time_unit)
-    for words, count in found.counts:
+    table = Table(file, bool(names), columns, numbers, title, statements, missing, found, clock, None, time_unit)
+    for words, count in statements.counts:
         check_count(len(rows), count, f"{file}: {words!r}", f". {_SKIP}")
     if time is None:
         return table._replace(time=_time_column(table))
@@ -563,81 +519,60 @@ def _workbook(path: str | Path) -> list[str]:
     read_bytes(path)  # the checks of existence and size
     try:
         sheet = load_workbook(path, read_only=True, data_only=True).worksheets[0]
-        rows = [list(map(_cell_text, row)) for row in sheet.iter_rows(values_only=True)]
+        rows = [
+            [repr(float(each)) if type(each) in (int, float) else " ".join(str(each or "").split()) for each in row]
+            for row in sheet.iter_rows(values_only=True)
+        ]
     except Exception as error:  # a damaged workbook may raise anything
         raise ValueError(f"{path}: not a readable Excel workbook ({error}); save it as CSV") from error
     width = max(map(len, rows), default=0)
     return ["\t".join(row + [""] * (width - len(row))) for row in rows]
 
 
-def _cell_text(value: object) -> str:
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    return repr(float(value)) if number else " ".join(str("" if value is None else value).split())
-
-
 # rows of cells --------------------------------------------------------------------------------------------------------
 
 
-def _split(line: str, separator: str, where: str) -> list[str]:
+def _split(line: str, separator: str, where: str = "") -> list[str]:
     if separator == " ":
         return number_cells(line) if _NUMBERS.fullmatch(line) else line.split()
     try:
         cells = next(csv.reader([line], delimiter=separator, skipinitialspace=separator != "\t"))
     except csv.Error as error:
         raise ValueError(f"{where}: expected cells separated by {separator!r} ({error})") from None
-    cells = [cell.strip() for cell in cells]
-    if not _SPACE.search(line):
-        return cells
-    return [cell.translate(_SPACES) if _SPACED.match(cell) else cell for cell in cells]
+    return [cell.strip() for cell in cells]
 
 
 def _separator(lines: Sequence[str]) -> str:
     """The separator that splits most lines into several numbers, or into one number if no separator does."""
-    best, most = " ", (0, 0)
-    for separator in _SEPARATORS:
+
+    def score(separator: str) -> tuple[int, ...]:
         widths: Counter[int] = Counter()
         for line in lines:
             with suppress(ValueError):
-                cells = _split(line, separator, "")
+                cells = _split(line, separator)
                 widths[len(cells)] += _is_data(cells)
         width, count = max(widths.items(), key=lambda item: item[1], default=(0, 0))
-        if (count * (width > 1), count) > most:
-            best, most = separator, (count * (width > 1), count)
-    if most == (0, 0):  # no line of numbers: the separator that is there, for the message
-        best = next((each for each in _SEPARATORS if any(each in line for line in lines)), " ")
-    return best
+        return count * (width > 1), count, not count and any(separator in line for line in lines)
 
-
-def _blank(rows: Sequence[_Line], marks: Sequence[str]) -> frozenset[str]:
-    """Write NaN for the marks of missing samples in rows, which have a number or nothing else; the marks found."""
-    found = set()
-    for _, cells in rows if marks else ():
-        if any(map(_known, cells)) or all(cell in marks or _is_missing(cell) for cell in cells):
-            found |= {*cells} & {*marks}
-            cells[:] = ["nan" if cell in marks else cell for cell in cells]
-    return frozenset(found)
+    return max(_SEPARATORS, key=score)
 
 
 def _is_missing(cell: str) -> bool:
     return cell.lower() in _MISSING
 
 
-def _is_date(cell: str) -> bool:
-    """Whether a cell is a date without a time, in any order of day, month and year."""
-    return _DAY_ONLY.fullmatch(cell) is not None
+def _is_value(cell: str) -> bool:
+    """Whether a cell is a number in any spelling, and not missing."""
+    return not _is_missing(cell) and (is_number(cell) or any(form.fullmatch(cell) for form in _SPELLINGS.values()))
 
 
 def _known(cell: str) -> bool:
-    """Whether a cell is a number in any spelling, a clock time or a date."""
-    if _is_missing(cell):
-        return False
-    return bool(
-        is_number(cell) or _DECIMAL_COMMA.match(cell) or _GROUPED.match(cell) or is_clock(cell) or _is_date(cell)
-    )
+    """Whether a cell is a number, a clock time, or a date in any order of day, month and year."""
+    return _is_value(cell) or is_clock(cell) or _DAY_ONLY.fullmatch(cell) is not None
 
 
 def _is_data(cells: Sequence[str]) -> bool:
-    return any(map(_known, cells)) and all(_known(cell) or _is_missing(cell) for cell in cells)
+    return any(map(_known, cells)) and all(_is_missing(cell) or _known(cell) for cell in cells)
 
 
 def _is_text(cells: Sequence[str]) -> bool:
@@ -654,10 +589,10 @@ def _along_rows(lines: list[_Line], file: str) -> list[_Line]:
     rows = [*itertools.dropwhile(is_text, lines)]
     for number, cells in rows:
         width = len(rows[0][1])
-        if wrong := [cell for cell in cells if not _known(cell)]:
-            raise ValueError(f"{file}, line {number}: expected numbers below lines of text, got {wrong[0][:100]!r}")
-        if len(cells) > width or (len(cells) < width and number != rows[-1][0]):
-            raise ValueError(f"{file}, line {number}: expected {width} numbers as in the first row, got {len(cells)}")
+        where, wrong = f"{file}, line {number}", [cell for cell in cells if not _known(cell)]
+        expect(not wrong, where, "numbers below lines of text", repr("".join(wrong[:1])[:100]))
+        fits = len(cells) == width or (len(cells) < width and number == rows[-1][0])
+        expect(fits, where, f"{width} numbers as in the first row", len(cells))
     return [(number, [cell]) for number, cells in rows for cell in cells]
 
 
@@ -671,13 +606,12 @@ def _announced(lines: list[_Line], file: str) -> tuple[list[_Line], list[str]] |
     place = next((k for k, head in enumerate(heads[:-1]) if head and all(map(is_number, head))), None)
     if place is None or not 2 <= len(head := heads[place]) <= 3 or len(heads[place + 1]) == len(head):
         return None
-    if not all(map(str.isdecimal, (head[0], *head[2:]))) or not _BELOW_ONE.fullmatch(head[1]):
+    numbers = all(_known(cell) for _, cells in lines[place + 1 :] for cell in cells)
+    if not numbers or not all(map(str.isdecimal, (head[0], *head[2:]))) or not _BELOW_ONE.fullmatch(head[1]):
         return None
-    if not all(_known(cell) for _, cells in lines[place + 1 :] for cell in cells):
-        return None
-    numbers = _along_rows(lines[place + 1 :], file)
-    check_count(len(numbers), head[0], f"{file}, line {lines[place][0]}")
-    return numbers, [*(" ".join(cells) for _, cells in lines[: min(place, 1)]), f"dt = {head[1]} s"]
+    rows = _along_rows(lines[place + 1 :], file)
+    check_count(len(rows), head[0], f"{file}, line {lines[place][0]}")
+    return rows, [*(" ".join(cells) for _, cells in lines[: min(place, 1)]), f"dt = {head[1]} s"]
 
 
 def _logger_table(lines: list[_Line], file: str) -> tuple[list[_Line], list[str]]:
@@ -695,19 +629,13 @@ def _logger_table(lines: list[_Line], file: str) -> tuple[list[_Line], list[str]
     if not first.startswith("LabVIEW Measurement"):
         return lines, []
     ends = [place for place, (_, cells) in enumerate(lines) if cells[0] == "***End_of_Header***"]
-    if len(ends) != 2:
-        raise ValueError(
-            f"{file}: expected a LabVIEW file with one segment, found {max(len(ends) - 1, 0)}; write a file for each "
-            "segment (option 'Overwrite file' or 'One header only')"
-        )
+    advice = "write a file for each segment (option 'Overwrite file' or 'One header only')"
+    expect(len(ends) == 2, file, "a LabVIEW file with one segment", max(len(ends) - 1, 0), advice)
     tags = {cells[0]: cells[1:] for _, cells in lines[: ends[1]]}
     (number, header), rows = lines[ends[1] + 1] if lines[ends[1] + 1 :] else (0, [""]), lines[ends[1] + 2 :]
     columns, axis = (next(iter(tags.get(tag, ())), "") for tag in ("X_Columns", "X_Dimension"))
-    if header[0] != "X_Value" or (axis or "Time") != "Time":
-        raise ValueError(
-            f"{file}: expected a LabVIEW file whose first column X_Value has times, got {header[0]!r} and X_Dimension "
-            f"{axis!r}; write it with times"
-        )
+    there = header[0] == "X_Value" and (axis or "Time") == "Time"
+    expect(there, file, "times in the first column X_Value", f"{header[0]!r} and X_Dimension {axis!r}", "write them")
     width = len(header) - (header[-1] == "Comment")
     labels = ["", *tags.get("Y_Unit_Label", []), *[""] * width]
     names = ["time [s]" if name == "X_Value" else name for name in header[:width]]
@@ -720,74 +648,62 @@ def _logger_table(lines: list[_Line], file: str) -> tuple[list[_Line], list[str]
     if columns != "No":
         return table, []
     steps = sorted({cell for cell in tags.get("Delta_X", []) if cell})
-    if len(steps) != 1:
-        raise ValueError(f"{file}: expected one step Delta_X, got {', '.join(steps) or 'none'}; write it with times")
+    expect(len(steps) == 1, file, "one step Delta_X", ", ".join(steps) or "none", "write it with times")
     return [(number, cells[1:]) for number, cells in table], [f"dt = {steps[0].replace(',', '.')} s"]
 
 
 # header line and decimal marks ----------------------------------------------------------------------------------------
 
 
-def _first_row(lines: Sequence[_Line]) -> tuple[int, int]:
-    """Place and width of the first row that is as wide as most first rows: a number above the table is no row."""
-    places = [*itertools.islice((k for k, (_, cells) in enumerate(lines) if _is_data(cells)), _LAST_LINES)]
-    if not places:
-        return len(lines), max((len(cells) for _, cells in lines), default=0)
-    width = Counter(len(lines[k][1]) for k in places).most_common(1)[0][0]
-    return next(k for k in places if len(lines[k][1]) == width), width
+def _header(
+    lines: list[_Line], separator: str, along_rows: bool, file: str
+) -> tuple[list[str], list[str], list[_Line]]:
+    """Names, units below them, and rows of equal width, without columns that have neither a name nor a number.
 
-
-def _header(lines: list[_Line], file: str) -> tuple[list[str], list[str], list[_Line]]:
-    """Names, units below them, and rows of equal width, without columns that have neither a name nor a number."""
-    first, width = _first_row(lines)
-    spare = not any(cells[-1] for _, cells in lines[first:] if len(cells) == width)
-    names, below, after = _names(lines[:first], width, spare)
+    The first row is as wide as most rows of numbers; the names are the last line of words above it that is as wide.
+    Separators at the ends of the rows may be missing at its end, and the other way round. Only then, if the last cells
+    of all rows are empty, it may have one cell less.
+    """
+    data = [*itertools.islice((k for k, (_, cells) in enumerate(lines) if _is_data(cells)), _LAST_LINES)]
+    widths = [len(lines[k][1]) for k in data] or [max((len(cells) for _, cells in lines), default=0)]
+    width = Counter(widths).most_common(1)[0][0]
+    first = next((k for k in data if len(lines[k][1]) == width), len(lines))
+    if first:  # half as many names as cells: commas separate cells and decimals; one too few: the rows have names
+        (number, above), rows = lines[first - 1], [cells for _, cells in lines[first : first + _LAST_LINES]]
+        half = separator == "," and 2 * len(above) == width and not any("." in cell for cells in rows for cell in cells)
+        short = len(above) == width - 1 > 1 and any(cells[-1] for cells in rows) and not along_rows
+        wrong = rows and (half or short) and _is_text(above) and all(above)
+        expected, advice = f"a name for each of the {width} cells in a row", "in R with row.names = FALSE"
+        advice = f"write decimal points, or leave out the names of rows, {advice}. {_POINTS}"
+        expect(not wrong, f"{file}, line {number}", expected, len(above), advice)
+    if along_rows:
+        return [], [], _along_rows(lines, file)
+    spare = width > 2 and not any(cells[-1] for _, cells in lines[first:] if len(cells) == width)
+    found: list[tuple[int, list[str]]] = []
+    for place, (_, cells) in enumerate(lines[:first]):
+        words = cells if any(cells[width:]) else [*cells, *[""] * spare][:width]
+        states = width == 1 and any(read_statements(words))  # a line such as "Time step: 10 ms" names no column
+        if len(words) == width and _is_text(words) and not states:
+            found.append((place, words))
+    after, names = found[-1] if found else (first, [])
+    below: list[str] = []
+    if len(found) > 1 and found[-2][0] == after - 1 and _are_units(names):
+        below = ["" if _states_nothing(cell) else cell.strip("[]() ") for cell in names]
+        names = found[-2][1]
     if not names:
         # a damaged first row is an error and no text above the table, and a row of missing samples is a row
-        after = next((k for k in range(first) if len(lines[k][1]) == width and _is_row(lines[k][1])), first)
-    rows = lines[after:]
-    if not rows:
-        raise ValueError(f"{file}: expected rows of numbers, found none")
+        whole = (k for k, (_, cells) in enumerate(lines[:first]) if len(cells) == width and any(cells))
+        after = next((k for k in whole if any(map(_known, lines[k][1])) or all(map(_is_missing, lines[k][1]))), first)
+    rows = lines[after + bool(names) :]
     for number, cells in rows:
         if len(cells) != width:
             last = not names and len(cells) < width and number == rows[-1][0] and all(map(_known, cells))
-            advice = "; if the samples follow each other along the rows, give column='rows' and dt=" if last else ""
-            raise ValueError(
-                f"{file}, line {number}: expected {width} cells as in the first line, got {len(cells)}{advice}"
-            )
+            advice = "if the samples follow each other along the rows, give column='rows' and dt=" if last else ""
+            expect(False, f"{file}, line {number}", f"{width} cells as in the first line", len(cells), advice)
     kept = [k for k in range(width) if (names and names[k]) or not all(_is_missing(cells[k]) for _, cells in rows)]
     kept = kept or [*range(width)]  # the others are empty after a separator at the end of each line
     names, below = ([each[k] for k in kept] if each else [] for each in (names, below))
     return names, below, [(number, [cells[k] for k in kept]) for number, cells in rows]
-
-
-def _is_row(cells: Sequence[str]) -> bool:
-    """Whether some cells are numbers, or all are missing and not all empty."""
-    return any(map(_known, cells)) or (any(cells) and all(map(_is_missing, cells)))
-
-
-def _names(lines: Sequence[_Line], width: int, spare: bool) -> tuple[list[str], list[str], int]:
-    """Names, units and the place after them: the last line of words as wide as the rows, and a line of units below.
-
-    Separators at the ends of the rows may be missing at the end of the header line, and the other way round. Only then,
-    if the last cells of all rows are empty (`spare`), the header line may have one cell less.
-    """
-    found: list[tuple[int, list[str]]] = []
-    for place, (_, cells) in enumerate(lines):
-        words = list(cells)
-        while len(words) > width and not words[-1]:
-            words.pop()
-        if spare and len(words) == width - 1 and width > 2:
-            words.append("")
-        states = width == 1 and any(read_statements(words))  # a line such as "Time step: 10 ms" names no column
-        if len(words) == width and _is_text(words) and not states:
-            found.append((place, words))
-    if not found:
-        return [], [], len(lines)
-    place, last = found[-1]
-    if len(found) > 1 and found[-2][0] == place - 1 and _are_units(last):
-        return found[-2][1], ["" if _states_nothing(cell) else cell.strip("[]() ") for cell in last], place + 1
-    return last, [], place + 1
 
 
 def _are_units(cells: Sequence[str]) -> bool:
@@ -807,66 +723,42 @@ def _states_nothing(cell: str) -> bool:
     return not cell.strip("-\u2013") or _DATE_FORMAT.fullmatch(cell.strip("[]() ")) is not None
 
 
-def _check_names(lines: Sequence[_Line], separator: str, along_rows: bool, file: str) -> None:
-    """ValueError if the line above the rows has half as many names as they have cells, or one name too few.
-
-    Commas then separate cells and decimals, or the rows have names.
-    """
-    first, width = _first_row(lines)
-    (number, names), rows = lines[first - 1], [cells for _, cells in lines[first : first + _LAST_LINES]]
-    half = separator == "," and 2 * len(names) == width and not any("." in cell for cells in rows for cell in cells)
-    short = len(names) == width - 1 > 1 and any(cells[-1] for cells in rows) and not along_rows
-    if first and rows and (half or short) and _is_text(names) and all(names):
-        raise ValueError(
-            f"{file}, line {number}: expected a name for each of the {width} cells in a row, got {len(names)}; write "
-            f"decimal points, or leave out the names of rows, in R with row.names = FALSE. {_POINTS}"
-        )
-
-
 def _with_points(lines: list[_Line], separator: str, file: str) -> tuple[list[_Line], bool]:
     """Rows with decimal points and without separators of thousands, "" for missing cells; whether commas were decimal.
 
-    Separators of thousands go if a number such as ``1,234.5`` or ``1.234.567`` shows which mark it is. Cells such as
-    ``1,000`` have three decimals unless commas separate the cells and the file has no other decimal comma, or the
-    column has no other decimal comma and integers of three digits: then they are refused.
+    All numbers have one spelling. Commas and points between groups of digits need a number that shows them, such as
+    ``1,234.5`` or ``1.234.567``. Cells such as ``1,000`` have three decimals unless commas separate the cells and no
+    number shows that they are decimal, or the column has no other decimal comma and integers of three digits.
     """
     rows = [(number, ["" if _is_missing(cell) else cell for cell in cells]) for number, cells in lines]
-    alike = "write all numbers alike, without separators of thousands"
-
-    def first(fits):
-        return next(((number, cell) for number, row in rows for cell in row if fits(cell)), None)
-
-    if shown := first(lambda cell: ("," in cell or cell.count(".") > 1) and _GROUPED.match(cell)):
-        mark = next(letter for letter in shown[1] if letter in ",.")
-        grouped = re.compile(rf"[-+]?[1-9]\d{{0,2}}(?:\{mark}\d{{3}})+(?:\{'.' if mark == ',' else ','}\d*)?$")
-        for number, row in rows:
-            for k, cell in enumerate(row):
-                if mark in cell and grouped.match(cell):
-                    row[k] = cell.replace(mark, "")
-                elif mark in cell and _known(cell) and not (is_clock(cell) or _is_date(cell)):
-                    raise ValueError(
-                        f"{file}: {mark!r} separates thousands in {shown[1]!r}, line {shown[0]}, but not in {cell!r}, "
-                        f"line {number}; {alike}"
-                    )
-    comma = first(_DECIMAL_COMMA.match)
-    if comma is None:
+    if not any(_MARKED.search(cell) for _, cells in rows for cell in cells):
         return rows, False
-    columns = [[(number, row[k]) for number, row in rows] for k in range(len(rows[0][1]))]
-    decimals = [any(_DECIMAL_COMMA.match(c) and not _THOUSANDS.match(c) for _, c in column) for column in columns]
-    for column, own in zip(columns, decimals, strict=True):
-        found = next((each for each in column if _THOUSANDS.match(each[1])), None)
-        hundreds = not own and any(_HUNDREDS.match(cell) for _, cell in column)
-        if found and (hundreds or (separator == "," and not any(decimals))):
-            raise ValueError(
-                f"{file}, line {found[0]}: expected a number, got {found[1]!r}, which may have a separator of "
-                "thousands or a decimal comma; write it without separators of thousands and with a decimal point"
-            )
-    if point := first(lambda cell: "." in cell and is_number(cell)):
-        raise ValueError(
-            f"{file}: expected decimal points or decimal commas, got {comma[1]!r} in line {comma[0]} and {point[1]!r} "
-            f"in line {point[0]}; {alike}"
+    left, shown, seen = set(_SPELLINGS), set[tuple[str, str]](), list[tuple[str, int]]()
+    for number, cells in rows:
+        for cell in cells:
+            fit = {each for each, form in _SPELLINGS.items() if form.fullmatch(cell)}
+            shown |= fit if len(fit) == 1 else set()
+            if fit and not left <= fit:
+                left, seen = left & fit, [*seen[:1], (cell, number)]
+    spellings = [each for each in _SPELLINGS if each in left and (each[1] == _BLANKS or each in shown)]
+    pairs = " and ".join(f"{cell!r} in line {number}" for cell, number in seen[:1] + seen[-1:])
+    expect(spellings, file, "one decimal mark", pairs, "write all numbers alike, without separators of thousands")
+    mark, group = spellings[0]
+    for column in zip(*(cells for _, cells in rows), strict=True) if (mark, group) == (",", _BLANKS) else ():
+        doubtful = [k for k, cell in enumerate(column) if _THOUSANDS.fullmatch(cell)]
+        own = any("," in cell and _is_value(cell) and not _THOUSANDS.fullmatch(cell) for cell in column)
+        alone = separator == "," and (".", ",") in left
+        wrong = doubtful and not own and (alone or any(map(_HUNDREDS.fullmatch, column)))
+        got = ", ".join(
+            f"{column[k]!r}, which may have a separator of thousands or a decimal comma" for k in doubtful[:1]
         )
-    return [(n, [cell.replace(",", ".") if _known(cell) else cell for cell in row]) for n, row in rows], True
+        where = f"{file}, line {rows[doubtful[0]][0]}" if doubtful else file
+        expect(not wrong, where, "a number", got, "write it without separators of thousands and with a decimal point")
+    form, plain = _SPELLINGS[mark, group], str.maketrans({**dict.fromkeys(group), mark: "."})
+    rows = [
+        (number, [cell.translate(plain) if form.fullmatch(cell) else cell for cell in cells]) for number, cells in rows
+    ]
+    return rows, mark == ","
 
 
 # columns and units ----------------------------------------------------------------------------------------------------
@@ -885,35 +777,29 @@ def _columns(
     for k, cells in enumerate(zip(*(row for _, row in rows), strict=True)):
         filled = [cell for cell in cells if cell]
         kind, decimals, values = "number", 0, [math.nan] * len(cells)
-        is_label = names and labels in (names[k], "" if k == 0 else names[k])
-        if is_label and not all(map(is_number, filled)):
+        is_label = names and labels in (names[k], "" if k == 0 else names[k]) and not all(map(is_number, filled))
+        if is_label or (filled and all(_DAY_ONLY.fullmatch(cell) or _is_word(cell) for cell in filled)):
             kind = "text"
         elif any(map(is_clock, filled)):
             kind = "clock"
             times = [_parse_clock(cell, where) if cell else None for cell, where in zip(cells, lines, strict=True)]
             values, known = _seconds_of(times, file), [time for time in times if time is not None]
             first, decimals = first or known[0], max(time.decimals for time in known)
-        elif filled and all(_is_date(cell) or _is_word(cell) for cell in filled):
-            kind = "text"
         else:
-            for place, (cell, where) in enumerate(zip(cells, lines, strict=True)):
+            for place, cell in enumerate(cells):
                 try:
-                    values[place] = parse_number(cell, where) if cell else math.nan
+                    values[place] = parse_number(cell, lines[place]) if cell else math.nan
                 except ValueError as error:
-                    raise ValueError(f"{error}{_advice(cell, rows[place][1], names, marks)}") from None
+                    # text may be a missing sample, unless it is a damaged number or in a second header line
+                    alone = len(rows[place][1]) == 1 and cell not in names
+                    word = _is_word(cell) or not any(map(str.isdigit, cell))
+                    mark = word and (alone or any(map(_known, rows[place][1])))
+                    advice = f"; if it stands for a missing sample, give missing={[*marks, cell[:100]]}" if mark else ""
+                    raise ValueError(f"{error}{advice}") from None
             decimals = max(map(decimals_of, filled), default=0)
         name, unit = names[k] if names else str(k + 1), below[k] if below else ""
         columns.append(Column(name, np.array(values), decimals, unit, kind, cells))
     return tuple(columns), first
-
-
-def _advice(cell: str, row: Sequence[str], names: Sequence[str], marks: Sequence[str]) -> str:
-    """How text in a row is read as a missing sample; nothing for a damaged number, and for a second header line."""
-    word = _is_word(cell) or not any(map(str.isdigit, cell))
-    alone = len(row) == 1 and cell not in names
-    if not word or not (alone or any(map(_known, row))):
-        return ""
-    return f"; if it stands for a missing sample, give missing={[*marks, cell[:100]]}"
 
 
 def _is_word(cell: str) -> bool:
@@ -957,7 +843,7 @@ def text_unit(table: Table, place: int, dimension: str, others: bool = False) ->
     With other units known (`others`), text that is no unit is ignored, except for counts.
     """
     places = value_columns(table)
-    for _, unit in table.stated.units:
+    for unit in table.stated.units:
         known = dimension_of(unit)
         alone = len(places) == 1 and known != "time" and (known or not others or "count" in unit.lower())
         if alone or known == dimension:
@@ -965,7 +851,7 @@ def text_unit(table: Table, place: int, dimension: str, others: bool = False) ->
     if dimension != "acceleration" or others or place not in places:
         return None
     names = [table.columns[k].name for k in places]
-    return next((peak.unit for peak in table.stated.peaks if peak.unit and peak.of(names, places.index(place))), None)
+    return next((unit for _, unit, _ in table.stated.peaks_of(names, places.index(place)) if unit), None)
 
 
 def column_unit(
@@ -978,8 +864,8 @@ def column_unit(
     unit = agree_on_unit(stated, given, dimension, where)
     if dimension == "acceleration" and not np.isnan(values).any():
         places, decimals = value_columns(table), table.columns[place].decimals
-        names = [table.columns[k].name for k in places]
-        check_peaks(table.stated.peaks, names, places.index(place), values, decimals, unit, table.file, f". {_SKIP}")
+        peaks = table.stated.peaks_of([table.columns[k].name for k in places], places.index(place))
+        check_peaks(peaks, values, decimals, unit, table.file, f". {_SKIP}")
     return unit
 
 
@@ -1018,33 +904,33 @@ def column_values(table: Table, place: int) -> NDArray[np.float64]:
     measured: the column has other numbers within 1 % of it, or, for -999 and the limits of integers, other numbers of
     half its size, like the samples next to a measured peak.
     """
-    listed, marks, stated = table.missing
+    given = table.missing or ()
+    listed = [each for each in given if not isinstance(each, str)]
     values = np.where(np.isin(table.columns[place].values, listed), np.nan, table.columns[place].values)
-    for sentinel in (*_SENTINELS, *_PLAUSIBLE_SENTINELS) if listed.size or marks or not stated else ():
+    for sentinel in (*_SENTINELS, *_PLAUSIBLE_SENTINELS) if table.missing != () else ():
         found, size = np.flatnonzero(values == sentinel), abs(sentinel)
         close = sentinel in _SENTINELS
         similar = np.abs(values - sentinel) <= 0.01 * size if close else np.abs(values) >= 0.5 * size
         if found.size and np.count_nonzero(similar) == found.size:
-            numbers = ", ".join([*map(repr, marks), *(f"{number:g}" for number in (*listed, sentinel))])
-            raise ValueError(
-                f"{table.file}, line {table.lines[found[0]]}: expected a measured number, got {sentinel:g} in "
-                f"{found.size} rows, which usually stands for a missing sample; give missing=[{numbers}] to read it "
-                "as NaN, or missing=[] if it was measured"
-            )
+            numbers = ", ".join(repr(each) if isinstance(each, str) else f"{each:g}" for each in (*given, sentinel))
+            got = f"{sentinel:g} in {found.size} rows, which usually stands for a missing sample"
+            advice = f"give missing=[{numbers}] to read it as NaN, or missing=[] if it was measured"
+            expect(False, f"{table.file}, line {table.lines[found[0]]}", "a measured number", got, advice)
     return values
 
 
-def _listed(missing: Sequence[float | str] | None) -> Missing:
+def _checked_missing(missing: Sequence[float | str] | None) -> tuple[float | str, ...] | None:
     """Numbers and texts that stand for missing samples; ValueError for other values, and for numbers in quotes."""
-    given = [] if missing is None else [missing] if np.ndim(missing) == 0 else list(missing)
-    marks = [each.strip() for each in given if isinstance(each, str)]
-    numbers = [each for each in given if not isinstance(each, str)]
-    quoted = any(not mark or (_known(mark) and any(map(str.isdigit, mark))) for mark in marks)
-    if quoted or not all(isinstance(number, Real) and math.isfinite(number) for number in numbers):
-        raise ValueError(
-            f"missing must be finite numbers and texts, such as (-9999, 'OL'), or () for none; got {missing!r}"
-        )
-    return Missing(np.array(numbers, dtype=float), marks, missing is not None)
+    if missing is None:
+        return None
+    given = [each.strip() if isinstance(each, str) else each for each in np.atleast_1d(np.array(missing, dtype=object))]
+    for each in given:
+        text = isinstance(each, str) and each and not (_known(each) and any(map(str.isdigit, each)))
+        if not text and not (isinstance(each, Real) and math.isfinite(each)):
+            raise ValueError(
+                f"missing must be finite numbers and texts, such as (-9999, 'OL'), or () for none; got {missing!r}"
+            )
+    return tuple(given)
 
 
 def table_values(
@@ -1059,9 +945,12 @@ def table_values(
     for place, (_, dimension, unit, where) in zip(places, columns, strict=True):
         values = column_values(table, place)
         found.append((values, column_unit(table, place, values, unit, dimension, where), dimension))
-    listed, marks, _ = table.missing
-    absent = [f"{each:g}" for each in listed[~np.isin(listed, [table.columns[place].values for place in places])]]
-    absent += [repr(mark) for mark in marks if mark not in table.found]
+    absent = []
+    for each in table.missing or ():
+        if isinstance(each, str):
+            absent += [] if each in table.found else [repr(each)]
+        elif not any(each in table.columns[place].values for place in places):
+            absent.append(f"{each:g}")
     if absent:
         warnings.warn(
             f"{table.file}: missing={', '.join(absent)} is in none of the columns that "
@@ -1115,9 +1004,8 @@ def _times(table: Table) -> NDArray[np.float64]:
     """Times of the rows [s]; ValueError if some are missing, or another column has different times."""
     unit, own = _time_unit(table), table.columns[table.time]
     times = own.values * unit
-    if np.isnan(times).any():
-        line = table.lines[int(np.argmax(np.isnan(times)))]
-        raise ValueError(f"{table.file}, line {line}: expected a time, got an empty cell or NaN; write all times")
+    line = table.lines[int(np.argmax(np.isnan(times)))]
+    expect(not np.isnan(times).any(), f"{table.file}, line {line}", "a time", "an empty cell or NaN", "write all times")
     for place, other in enumerate(() if table.chosen or not table.named else table.columns):
         if place == table.time or other.kind != own.kind:
             continue
@@ -1133,11 +1021,10 @@ def _times(table: Table) -> NDArray[np.float64]:
         others_unit = unit if stated is None else find_unit(stated, "time").factor
         ahead = other.values * others_unit - times
         ahead = ahead - ahead[0] if _is_unix(abs(ahead[0])) else ahead  # a Unix time beside an elapsed one
-        if not np.all(np.abs(ahead) <= max(unit * 10.0**-own.decimals, others_unit * 10.0**-other.decimals)):
-            raise ValueError(
-                f"{table.file}: expected one column of times, the columns {own.name!r} and {other.name!r} have "
-                "different times; write one file for each of them with its columns of values, or name one, time="
-            )
+        alike = np.all(np.abs(ahead) <= max(unit * 10.0**-own.decimals, others_unit * 10.0**-other.decimals))
+        got = f"the columns {own.name!r} and {other.name!r} with different times"
+        advice = "write one file for each of them with its columns of values, or name one, time="
+        expect(alike, table.file, "one column of times", got, advice)
     return times
 
 
@@ -1160,11 +1047,9 @@ def _uniform_step(table: Table) -> tuple[float, float]:
     within 1e-4 of a step and round-off.
     """
     times, column = _times(table), table.columns[table.time]
-    if times.size < 2 or not times[-1] > times[0]:
-        raise ValueError(
-            f"{table.file}: expected times that increase over 2 rows or more, got {times.size} row(s); print the times "
-            "with more digits, or leave the column out and give dt="
-        )
+    advice = "print the times with more digits, or leave the column out and give dt="
+    increasing = times.size > 1 and times[-1] > times[0]
+    expect(increasing, table.file, "times that increase over 2 rows or more", f"{times.size} row(s)", advice)
     increments = np.diff(times)
     step, largest = float(times[-1] - times[0]) / increments.size, float(np.abs(times).max())
     digit = 10.0**-column.decimals
@@ -1186,10 +1071,9 @@ def _uniform_step(table: Table) -> tuple[float, float]:
         with suppress(ValueError):
             even = uniform_times(times, None, table.file)
             advice += f", or give resample={even.step:.6g} to interpolate to a uniform step"
-        raise ValueError(
-            f"{table.file}, line {table.lines[index + 1]}: expected a uniform time step of about {usual:g} s, got "
-            f"{increments[index]:g} s from {times[index]:g} to {times[index + 1]:g} s; {advice}"
-        )
+        got = f"{increments[index]:g} s from {times[index]:g} to {times[index + 1]:g} s"
+        where = f"{table.file}, line {table.lines[index + 1]}"
+        expect(False, where, f"a uniform time step of about {usual:g} s", got, advice)
     tolerance /= increments.size
     rate = round(1 / step) if 1 / step < 1e15 else 0
     return (1 / rate if rate and abs(1 / rate - step) < min(tolerance, 1e-4 * step) else step), tolerance
@@ -1203,10 +1087,10 @@ def table_step(table: Table, dt: float | None = None) -> float:
     """
     step, tolerance = (None, 0.0) if table.time is None else _uniform_step(table)
     known = [("the argument dt", dt)] if dt is not None else []
-    known += [(repr(each.text), each.steps[0]) for each in table.stated.steps if len(each.steps) == 1]
+    known += [(repr(text), steps[0]) for text, steps, _ in table.stated.steps if len(steps) == 1]
     known += [("the time column", step)] if step is not None else []
     if not known:
-        unclear = "".join(f", and states {each.text!r} without a unit" for each in table.stated.steps[:1])
+        unclear = "".join(f", and states {text!r} without a unit" for text, *_ in table.stated.steps[:1])
         raise ValueError(
             f"{table.file} has no times (column time_s) and no comment 'dt = ... s'{unclear}: give dt= in seconds, or "
             "the column of times, time="
@@ -1218,11 +1102,10 @@ def table_step(table: Table, dt: float | None = None) -> float:
                 f"{table.file}: the step is {chosen} s by {first} but {step} s by the time column; correct one"
             )
         first, chosen = known[-1]  # the times show a step that the text rounds
-    for each in table.stated.steps:
-        allowed = tolerance + (each.rounding + 1e-6) * chosen
-        if not any(abs(other - chosen) <= allowed for other in each.steps):
+    for text, steps, error in table.stated.steps:
+        if not any(abs(other - chosen) <= tolerance + (error + 1e-6) * chosen for other in steps):
             raise ValueError(
-                f"{table.file}: the step is {chosen} s by {first} but {each.steps[0]} s by {each.text!r}; correct one, "
+                f"{table.file}: the step is {chosen} s by {first} but {steps[0]} s by {text!r}; correct one, "
                 "or give skip= to leave out text that is about other samples"
             )
     return chosen
@@ -1234,37 +1117,28 @@ def table_start(table: Table, step: float, zero: float | str = 0.0) -> float:
     With ``zero=0``, a start within the rounding of its printed digits from a whole number of steps is set to this
     number; for another `zero`, within round-off.
     """
-    if isinstance(zero, str):
-        zero = _clock_zero(table, zero)
-    if table.time is None:
+    column, file = None if table.time is None else table.columns[table.time], table.file
+    unit = 1.0 if column is None else _time_unit(table)
+    if isinstance(zero, str):  # what it does not state is as in the first row
+        text, zero, first = zero, _parse_clock(zero, "zero"), table.clock
+        if column is None or column.kind != "clock":
+            first, is_unix = _UNIX_EPOCH, column is not None and _is_unix(column.values[0] * unit)
+            if not is_unix or zero.day is None or zero.zone is None:
+                advice = "a column of clock times; give zero in seconds"
+                advice = "date and time zone, as in '2019-07-06T03:19:53Z', for Unix times" if is_unix else advice
+                raise ValueError(f"{file}: zero={text!r} needs {advice}")
+        for what, given, known in (("date", zero.day, first.day), ("time zone", zero.zone, first.zone)):
+            if given is not None and known is None:
+                raise ValueError(f"{file}: the times have no {what}; give zero={text!r} without one, as in the file")
+        days = 0 if zero.day is None else zero.day - first.day
+        zero = _DAY * days + zero.seconds - (0 if zero.zone is None else 60 * (zero.zone - first.zone))
+    if column is None:
         return 0.0 - zero
-    unit, column = _time_unit(table), table.columns[table.time]
     first, digit = float(column.values[0]) * unit, unit * 10.0**-column.decimals
     start = first - zero
     rounding = 0.5 * digit * (1 + 1e-6) if zero == 0.0 else 4 * float(np.spacing(max(abs(first), abs(zero))))
     nearest = round(start / step)
     return nearest * step if abs(start - nearest * step) <= rounding + 1e-9 * step else start
-
-
-def _clock_zero(table: Table, text: str) -> float:
-    """The clock time `zero` in the times of the table [s]; what it does not state is as in the first row."""
-    zero, first, file = _parse_clock(text, "zero"), table.clock, table.file
-    column = None if table.time is None else table.columns[table.time]
-    if column is None or column.kind != "clock":
-        if column is None or not _is_unix(column.values[0] * _time_unit(table)):
-            raise ValueError(f"{file}: zero={text!r} needs a column of clock times; give zero in seconds")
-        if zero.day is None or zero.zone is None:
-            raise ValueError(
-                f"{file}: the times are Unix times: give zero={text!r} with date and time zone, as in "
-                "'2019-07-06T03:19:53Z'"
-            )
-        return _DAY * (zero.day - _EPOCH) + zero.seconds - 60 * zero.zone
-    if zero.day is not None and first.day is None:
-        raise ValueError(f"{file}: the times have no date; give zero={text!r} without one")
-    if zero.zone is not None and first.zone is None:
-        raise ValueError(f"{file}: the times have no time zone; give zero={text!r} without one, as in the file")
-    days = 0 if zero.day is None else zero.day - first.day
-    return _DAY * days + zero.seconds - (0 if zero.zone is None else 60 * (zero.zone - first.zone))
 
 
 # uneven times, from a clock with jitter or a logger that loses packets ------------------------------------------------
@@ -1331,29 +1205,24 @@ def uniform_times(times: NDArray[np.float64], step: float | None, where: str) ->
     increments = np.diff(times)
     if times.size < 2 or not np.all(increments > 0.0):
         place = int(np.argmax(~(increments > 0.0))) if times.size > 1 else 0
-        raise ValueError(
-            f"{where}: expected times that increase, got {times[min(place + 1, times.size - 1)]:.15g} s after "
-            f"{times[place]:.15g} s; if the times are those of packets, leave the column of times out and give dt=; "
-            "if the clock was set back, correct the later times"
+        got = f"{times[min(place + 1, times.size - 1)]:.15g} s after {times[place]:.15g} s"
+        advice = (
+            "if the times are those of packets, leave the column of times out and give dt=; if the clock was set back"
         )
+        expect(False, where, "times that increase", got, f"{advice}, correct the later times")
     usual = float(increments[increments <= _GAP * np.median(increments)].mean())
     if step is None:
         whole = 1.0 / max(round(1.0 / usual), 1) if usual > 1e-9 else usual
         step = whole if abs(whole - usual) < 0.999 * _LARGEST_DIFFERENCE * usual else usual
-    if abs(step - usual) > _LARGEST_DIFFERENCE * usual:
-        raise ValueError(
-            f"{where}: expected the nominal step of the samples, about {usual:.4g} s, got resample={step:g}; resample "
-            "the record or decimate the measurements afterwards"
-        )
+    advice = "resample the record or decimate the measurements afterwards"
+    nominal = abs(step - usual) <= _LARGEST_DIFFERENCE * usual
+    expect(nominal, where, f"the nominal step of the samples, about {usual:.4g} s", f"resample={step:g}", advice)
     gaps, others = (increments[chosen] for chosen in (increments > _GAP * usual, increments <= _GAP * usual))
     note = f"interpolated linearly to a step of {step:g} s from steps of {others.min():.4g} to {others.max():.4g} s"
     note += f", with {gaps.size} gap(s) of up to {gaps.max():.4g} s" if gaps.size else ""
     note += f", without {repeated} row(s) of a repeated time, the first at {first_repeated:g} s" if repeated else ""
     duration = times[-1] - times[0]
-    if duration > 2 * times.size * step:
-        raise ValueError(
-            f"{where}: expected samples at most times, got {times.size} in {duration:.4g} s with a gap of "
-            f"{gaps.max():.4g} s; cut the file at its long gaps"
-        )
+    got = f"{times.size} in {duration:.4g} s with a gap of {gaps.max(initial=0.0):.4g} s"
+    expect(duration <= 2 * times.size * step, where, "samples at most times", got, "cut the file at its long gaps")
     uniform = times[0] + step * np.arange(int(duration / step + 1e-6) + 1)
     return UniformTimes(times, step, uniform, usual, gaps, note, kept)

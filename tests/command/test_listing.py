@@ -173,7 +173,7 @@ def test_data_without_time_have_sections_of_their_own(path, text, section, given
     [
         ({"channels": [Channel("top", "displacement", "mm")]}, "accelerations are read from files of this format, and"),
         ({"zero": "10:32:07"}, "has no clock times; give zero in seconds"),
-        ({"dt": 0.01}, "a file of format v2 states units and times; leave units, dt"),
+        ({"dt": 0.01}, "states a step of 0.02 s but dt = 0.01 was given"),
         (
             {"columns": [8]},
             "expected one channel with channel = 8, .*found 0; choose with channel= and member=, or in a TOML file",

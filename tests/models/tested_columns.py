@@ -20,7 +20,7 @@ from fe_likelihoods import (
     LowCycleFatigue,
     RCColumn,
     Steel,
-    read_imposed_test,
+    read_columns,
     to_si,
 )
 
@@ -36,8 +36,8 @@ def read_column(folder: Path, history: str, every: int, geometry: str = "linear"
     def si(key: str, unit: str, name: str = "{} ({})") -> float:
         return to_si(abs(float(row[name.format(key, unit)])), unit).item()
 
-    data = read_imposed_test(folder / history, "disp_in", [Channel("force", "lateral force", "kip")], ["force_kip"])
-    displacement, force = data.history.displacement, data.measurements.values[0]
+    channels = Channel("top", "displacement", "in"), Channel("force", "lateral force", "kip")
+    displacement, force = read_columns(folder / history, channels, ["disp_in", "force_kip"], dt=1.0).values
     moves = np.flatnonzero(np.diff(displacement))
     turns = moves[1:][np.diff(np.sign(np.diff(displacement)[moves])) != 0]
     kept = np.unique(np.concatenate([np.arange(0, len(displacement), every), turns, [len(displacement) - 1]]))

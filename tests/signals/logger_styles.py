@@ -120,16 +120,16 @@ REFUSED = {
     ),
     "two decimal marks": (
         _table("time_s;acc [mm/s2]", _seconds, lambda k: f"{IN_MM[k]:,.1f}".translate({44: 46, 46: 44}), ";"),
-        r"'\.' separates thousands in '10\.438,2', line 3, but not in '0\.00', line 2; write all numbers alike",
+        r"expected one decimal mark, got '0\.00' in line 2 and '0,0' in line 2; write all numbers alike",
     ),
     "LabVIEW, two segments": (
         LABVIEW.format(columns="One") + "0.0\t1.0\n" + "Channels\t1\n***End_of_Header***\nX_Value\tTop\n0.02\t1.0\n",
-        "LabVIEW file with one segment, found 2; write a file for each segment",
+        "LabVIEW file with one segment, got 2; write a file for each segment",
     ),
     "LabVIEW, different times": (
         LABVIEW.format(columns="Multi").replace("X_Value\tTop", "X_Value\tTop\tX_Value\tDeck")
         + _rows(lambda k: [f"{k * STEP:.6f}", "1.0", f"{k * STEP + 0.01:.6f}", "2.0"], "\t"),
-        "the columns 'time .s.' and 'time .s.' have different times; write one file for each",
+        "the columns 'time .s.' and 'time .s.' with different times; write one file for each",
     ),
 }
 """Texts that are refused, and what the message says."""

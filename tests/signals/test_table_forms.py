@@ -111,12 +111,15 @@ def test_clock_times_begin_at_the_zero_of_the_record(path):
         ("12:00:00.00,1\n,2\n12:00:00.02,3\n", "line 3: expected a time, got an empty cell"),
         ("2019-02-30T12:00:00,1\n2019-02-30T12:00:01,2\n", "line 2: expected a date, got '2019-02-30T12:00:00'"),
         ("2019-02-03T12:00:00,1\n12:00:01,2\n", "expected a date in all clock times or in none"),
-        ("12:00:00Z,1\n12:00:01+02:00,2\n", "expected one time zone in all clock times, got 2; write them alike"),
-        ("12:59:59.99,1\n1:00:00.00,2\n1:00:00.01,3\n", "back from 12 to 1 o'clock, as on a clock of 12 hours"),
-        ("13:00:00 PM,1\n13:00:01 PM,2\n", "line 2: .* hours from 1 to 12; got '13:00:00 PM'"),
-        ("0:00:00 AM,1\n0:00:01 AM,2\n", "line 2: .* hours from 1 to 12; got '0:00:00 AM'"),
+        ("12:00:00Z,1\n12:00:01+02:00,2\n", "expected one time zone in all clock times, got 2 kinds; write them alike"),
+        (
+            "12:59:59.99,1\n1:00:00.00,2\n1:00:00.01,3\n",
+            "hours from 0 to 23, got 1 after 12 o'clock, as on a clock of 12 hours",
+        ),
+        ("13:00:00 PM,1\n13:00:01 PM,2\n", "line 2: .* hours from 1 to 12, got '13:00:00 PM'"),
+        ("0:00:00 AM,1\n0:00:01 AM,2\n", "line 2: .* hours from 1 to 12, got '0:00:00 AM'"),
         ("11:59:59 AM,1\n12:00:00,2\n", "expected AM or PM in all clock times or in none"),
-        ("99:00:00,1\n99:00:01,2\n", "line 2: .*hours from 0 to 23; got '99:00:00'"),
+        ("99:00:00,1\n99:00:01,2\n", "line 2: .*hours from 0 to 23, got '99:00:00'"),
     ],
 )
 def test_clock_times_that_are_refused(path, text, message):
