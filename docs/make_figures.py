@@ -140,12 +140,16 @@ def correlated_errors() -> dict[str, Figure]:
     """What white noise does to a posterior when the errors are correlated: intervals too narrow, and how to see it."""
     measured, model, truth = _oscillator(SEED)
     runs = {"white noise": _sample(measured, model, False, SEED), "AR(1) noise": _sample(measured, model, True, SEED)}
-    labels = [parameter.label for parameter in runs["white noise"][0].parameters[:2]]
-    samples = {label: x[:, :2] for label, (_, x) in runs.items()}
+    figure, axes = plt.subplots(figsize=(5.0, 4.0), layout="constrained")
+    for label, (_, x) in runs.items():
+        axes.plot(x[:, 0], x[:, 1], ".", markersize=3, label=label)
+    axes.plot(*truth, "k+", markersize=12, label="true value")
+    axes.legend(title="synthetic data")
     posterior, x = runs["white noise"]
+    axes.set(xlabel=posterior.parameters[0].label, ylabel=posterior.parameters[1].label)
     residuals = posterior.likelihood.residuals_of(model.simulate(x[:, :2].mean(axis=0)))
     return {
-        "wrong_noise": plot_corner(samples, labels=labels, truths=truth, title="Correlated errors (synthetic data)"),
+        "wrong_noise": figure,
         "wrong_noise_residuals": plot_residuals(residuals, model.channels, model.dt),
     }
 

@@ -4,6 +4,7 @@ import base64
 import io
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -83,11 +84,10 @@ def drawn_samples(run: FinishedRun) -> tuple[np.ndarray, str]:
 
 def draw_posterior(run: FinishedRun) -> list[Picture]:
     """Prior and posterior of each parameter, and samples of all pairs."""
-    described = hasattr(run.posterior, "parameters")
+    described = run.posterior if hasattr(run.posterior, "parameters") else SimpleNamespace(parameter_names=run.names)
     samples, drawn = drawn_samples(run)
     options = {
-        "posterior": run.posterior if described else None,
-        "labels": None if described else run.names,
+        "posterior": described,
         "truths": run.truth if np.isfinite(run.truth).any() else None,
     }
     return [

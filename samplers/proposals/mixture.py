@@ -52,8 +52,6 @@ PROPOSAL, TRIAL, ACCURATE, AGAIN = (30, 1e-3), (4, 1e-3), (100, 1e-6), (20, 1e-6
 RIDGE = 1e-10
 # Points with less than this share of the mean weight are left out of the fit.
 NEGLIGIBLE = 1e-3
-# Scale of the map for a single bound, as a multiple of the usual scale, with which the map is a logarithm.
-LOGARITHMIC = 1e3
 # Numbers per shear that the criterion counts: mean, sd, linear and quadratic coefficient.
 PARAMETERS_PER_SHEAR = 4
 # With fewer effective points per dimension, correlations are shrunk towards zero.
@@ -175,16 +173,11 @@ def fit_mixture(
     near = None if bounds is None else near_bounds(bounds, coords, weights)
     if near is None or not np.any(np.isfinite([near.low, near.high])):
         return mixture
+    unbounded, other = _fit_with_shears(to_unbounded(near, coords), weights, max_components)
+    # the criterion of a density in the parameters contains the Jacobian determinant of the transformation
     kept = weights > 0.0
-    # near a bound a population may be exponential, or vary by factors: the map with a large scale is the logarithm
-    for scale in (1.0, LOGARITHMIC) if np.any(np.isfinite(near.low) != np.isfinite(near.high)) else (1.0,):
-        tried = near._replace(span=scale * near.span)
-        unbounded, other = _fit_with_shears(to_unbounded(tried, coords), weights, max_components)
-        # the criterion of a density in the parameters contains the Jacobian determinant of the transformation
-        other -= 2.0 / (weights @ weights) * float(weights[kept] @ log_abs_det_jacobian(tried, coords[kept]))
-        if other < criterion:
-            mixture, criterion = unbounded._replace(bounds=tried), other
-    return mixture
+    other -= 2.0 / (weights @ weights) * float(weights[kept] @ log_abs_det_jacobian(near, coords[kept]))
+    return unbounded._replace(bounds=near) if other < criterion else mixture
 
 
 def fit_normals(coords: np.ndarray, effective: float, start: Mixture | None = None) -> Mixture:

@@ -27,7 +27,7 @@ BLUE = "#1f5a8c"
 ORANGE = "#d9822b"
 GREY = "#8a8f98"
 RED = "#b03a48"
-COLOURS = (BLUE, ORANGE, "#5b8c5a", "#7b5ea7", "#3aa0a8", "#6b4a2f")  # of several samplers, repeated after the last
+HISTOGRAM = {"density": True, "linewidth": 1.2, "histtype": "stepfilled", "fc": BLUE + "40", "ec": BLUE}
 LEVELS = (0.5, 0.9)
 FEW_POINTS = 150  # fewer distinct samples are drawn as points, since a contour through them shows chance
 MOST_PARAMETERS = 12  # of a corner plot without names
@@ -39,23 +39,13 @@ class _Drawn(NamedTuple):
     """The k parameters of a figure; all values in the units of the labels, NaN for a value that is not marked."""
 
     labels: list[str]
-    samples: dict[str, np.ndarray]  # (n, k) by the label of the sampler
+    samples: np.ndarray  # (n, k)
     truths: np.ndarray
     nominal: np.ndarray
     densities: list[Callable[[np.ndarray], np.ndarray]]  # of values (m,); none without a prior
     prior_draws: np.ndarray | None  # (m, k)
     limits: np.ndarray  # (k, 2) of the panels
     note: str
-
-    def shades(self) -> list[tuple[str, str]]:
-        """Label and colour of each sampler."""
-        return [(label, COLOURS[n % len(COLOURS)]) for n, label in enumerate(self.samples)]
-
-    def histogram(self, colour: str) -> dict[str, Any]:
-        """Style of a histogram: filled for one sampler, outlined for several."""
-        if len(self.samples) > 1:
-            return {"density": True, "linewidth": 1.2, "histtype": "step"}
-        return {"density": True, "linewidth": 1.2, "histtype": "stepfilled", "fc": colour + "40", "ec": colour}
 
 
 @cache
@@ -69,34 +59,30 @@ def _corner() -> ModuleType:
 
 
 def plot_corner(
-    samples: np.ndarray | Mapping[str, np.ndarray],
+    samples: np.ndarray,
     posterior: Any = None,
     *,
     truths: Values | None = None,
     names: Sequence[str] | None = None,
-    labels: Sequence[str] | None = None,
     title: str = "",
 ) -> "Figure":
     """Plot the posterior for all pairs of parameters by `corner.corner`, with the prior on the diagonal.
 
     See Foreman-Mackey (2016), corner.py, Journal of Open Source Software 1(2), 24, doi:10.21105/joss.00024. The
-    contours hold 50 and 90 % of the samples. Fewer than 150 distinct samples from one sampler are drawn as points.
+    contours hold 50 and 90 % of the samples. Fewer than 150 distinct samples are drawn as points.
 
     Parameters
     ----------
-    samples : array_like, shape (n, ndim), or mapping of str to array_like
-        Samples of the posterior, as ``get_chain(flat=True)`` returns, or samples of several samplers by their labels,
-        which are drawn over each other. At least as many samples as parameters.
+    samples : array_like, shape (n, ndim)
+        Samples of the posterior, as ``get_chain(flat=True)`` returns, at least as many as parameters.
     posterior : Posterior, optional
         Gives units, labels and nominal values (``posterior.parameters``, as grey dashed lines) and the prior
-        (``posterior.prior``). A function of your own may have ``parameter_names`` and ``prior``.
+        (``posterior.prior``). An object of your own may have ``parameter_names`` and ``prior``.
     truths : sequence of float, shape (ndim,), or mapping of str to float, optional
         True values in the units of the samples, as red lines; NaN for none. The panels are widened to show a true or
         nominal value if that is near.
     names : sequence of str, optional
         Names of the parameters to draw. Default: all, or the first 12; the figure says how many are left out.
-    labels : sequence of str, shape (ndim,), optional
-        Labels for all parameters, instead of the posterior's labels.
     title : str
         Title of the figure.
 
@@ -111,53 +97,42 @@ def plot_corner(
     """
     import matplotlib.pyplot as plt
 
-    drawn, corner = _choose(samples, posterior, truths, labels, names, MOST_PARAMETERS), _corner()
-    k, several = len(drawn.labels), len(drawn.samples) > 1
+    drawn, corner = _choose(samples, posterior, truths, names, MOST_PARAMETERS), _corner()
+    k, few = len(drawn.labels), len(np.unique(drawn.samples, axis=0)) < FEW_POINTS
     size = float(np.clip(1.8 * k + 1.0, 4.5, 15.0))  # [in]
     figure = plt.figure(figsize=(size, size))
-    points = False
-    for label, colour in drawn.shades():
-        x = drawn.samples[label]
-        few = len(np.unique(x, axis=0)) < FEW_POINTS
-        points = points or few
-        with plt.rc_context({"axes.formatter.useoffset": False}):
-            corner.corner_impl(
-                x,
-                bins=_bins(x),
-                range=[tuple(each) for each in drawn.limits],
-                color=colour,
-                labels=drawn.labels,
-                fig=figure,
-                labelpad=0.08,  # beside rotated numbers
-                max_n_ticks=4,
-                hist_kwargs=drawn.histogram(colour),
-                levels=LEVELS,
-                smooth=1.0,
-                plot_density=False,
-                plot_datapoints=few,
-                plot_contours=not few,
-                fill_contours=not several,
-                no_fill_contours=several,  # a white interior would hide the samplers drawn before
-                quiet=True,
-            )
+    with plt.rc_context({"axes.formatter.useoffset": False}):
+        corner.corner_impl(
+            drawn.samples,
+            bins=_bins(drawn.samples),
+            range=[tuple(each) for each in drawn.limits],
+            color=BLUE,
+            labels=drawn.labels,
+            fig=figure,
+            labelpad=0.08,  # beside rotated numbers
+            max_n_ticks=4,
+            hist_kwargs=HISTOGRAM,
+            levels=LEVELS,
+            smooth=1.0,
+            plot_density=False,
+            plot_datapoints=few,
+            plot_contours=not few,
+            fill_contours=True,
+            quiet=True,
+        )
     for values, colour, dashes in ((drawn.nominal, GREY, "--"), (drawn.truths, RED, "-")):
         marks = [x if np.isfinite(x) else None for x in values]
         corner.overplot_lines(figure, marks, color=colour, linestyle=dashes, linewidth=1.1)
     for i, axes in enumerate(np.array(figure.axes).reshape(k, k).diagonal()):
         _finish_panel(axes, drawn, i)
-    note = f"points: fewer than {FEW_POINTS} samples" if points else "contours hold 50 and 90 % of the samples"
+    note = f"points: fewer than {FEW_POINTS} samples" if few else "contours hold 50 and 90 % of the samples"
     title = "\n".join(text for text in (title, note, drawn.note) if text)
     figure.legend(handles=_legend_handles(drawn), loc="upper right", title=title, frameon=False)
     return figure
 
 
 def plot_marginals(
-    samples: np.ndarray | Mapping[str, np.ndarray],
-    posterior: Any = None,
-    *,
-    truths: Values | None = None,
-    labels: Sequence[str] | None = None,
-    title: str = "",
+    samples: np.ndarray, posterior: Any = None, *, truths: Values | None = None, title: str = ""
 ) -> "Figure":
     """Plot the prior and posterior density of each parameter, which shows what the data have changed.
 
@@ -172,18 +147,16 @@ def plot_marginals(
     """
     import matplotlib.pyplot as plt
 
-    drawn = _choose(samples, posterior, truths, labels)
+    drawn = _choose(samples, posterior, truths)
     columns = min(4, len(drawn.labels))
     rows = -(-len(drawn.labels) // columns)
     figure = plt.figure(figsize=(max(2.7 * columns, 4.0), 2.25 * rows + 0.5), layout="constrained")
     for i, label in enumerate(drawn.labels):
         axes, note = figure.add_subplot(rows, columns, i + 1, xlabel=label, yticks=[]), ""
         low, high = drawn.limits[i]
-        for name, colour in drawn.shades():
-            x = drawn.samples[name]
-            axes.hist(x[:, i], _bins(x), range=(low, high), color=colour, **drawn.histogram(colour))
+        axes.hist(drawn.samples[:, i], _bins(drawn.samples), range=(low, high), **HISTOGRAM)
         if drawn.prior_draws is not None:
-            draws, spread = drawn.prior_draws[:, i], max(float(x[:, i].std()) for x in drawn.samples.values())
+            draws, spread = drawn.prior_draws[:, i], float(drawn.samples[:, i].std())
             room, prior = 0.5 * (LARGEST_PANEL - 1.0) * (high - low), np.quantile(draws, [0.005, 0.995])
             if (prior[0] < low - room or prior[1] > high + room) and spread > 1e-12 * abs(high):
                 note = f"\nprior {float(f'{draws.std() / spread:.2g}'):.0f} times wider"
@@ -202,25 +175,26 @@ def plot_marginals(
 
 
 def _choose(
-    samples: Any,
-    posterior: Any,
-    truths: Values | None,
-    labels: Sequence[str] | None,
-    names: Sequence[str] | None = None,
-    most: int | None = None,
+    samples: Any, posterior: Any, truths: Values | None, names: Sequence[str] | None = None, most: int | None = None
 ) -> _Drawn:
     """Check the arguments of a figure, and convert what it shows to the units of its labels."""
-    given = samples if isinstance(samples, Mapping) else {"": samples}
-    arrays = {str(label): _checked(x, label) for label, x in given.items()}
-    widths = {label: x.shape[1] for label, x in arrays.items()}
-    if len(set(widths.values())) != 1:
+    samples = np.asarray(samples, dtype=float)
+    if samples.ndim != 2 or len(samples) < 2 or not 1 <= samples.shape[1] <= len(samples):
         raise ValueError(
-            "samples must be an array (n, ndim), or a mapping of labels to such arrays of the same parameters; the "
-            f"numbers of columns are {widths}"
+            "samples must be an array (n, ndim) with n >= 2 and n >= ndim, as get_chain(flat=True) returns; "
+            f"got {samples.shape}"
         )
-    ndim = next(iter(widths.values()))
-    parameters = _parameters_of(posterior, labels, ndim)
+    if bad := np.count_nonzero(~np.isfinite(samples).all(axis=1)):
+        raise ValueError(f"samples must be finite; {bad} of {len(samples)} rows are not: leave these rows out")
+    ndim, parameters = samples.shape[1], getattr(posterior, "parameters", None)
+    if parameters is None:
+        known = getattr(posterior, "parameter_names", None) or [f"x{i}" for i in range(ndim)]
+        parameters = [SimpleNamespace(name=str(name), label=str(name), factor=1.0, nominal=np.nan) for name in known]
     known = [each.name for each in parameters]
+    if len(known) != ndim:
+        raise ValueError(
+            f"the posterior has {len(known)} parameters ({', '.join(known)}), but the samples have {ndim} columns"
+        )
     wanted, note = known[:most] if names is None else names, ""
     if names is None and len(wanted) < ndim:
         note = f"the first {most} of {ndim} parameters; names= chooses others"
@@ -228,40 +202,14 @@ def _choose(
         what = f"unknown: {', '.join(unknown)}" if len(wanted) else "got none"
         raise ValueError(f"names must be some of the parameters {', '.join(known)}; {what}")
     columns = [known.index(name) for name in wanted]
-    factors = np.array([parameters[i].factor for i in columns])
-    arrays = {label: x[:, columns] / factors for label, x in arrays.items()}
-    nominal = np.array([parameters[i].nominal for i in columns], dtype=float) / factors
+    shown = [parameters[i] for i in columns]
+    factors = np.array([each.factor for each in shown])
+    samples = samples[:, columns] / factors
+    nominal = np.array([each.nominal for each in shown], dtype=float) / factors
     truths = _true_values(truths, known)[columns] / factors
-    shown = [parameters[i].label if labels is None else labels[i] for i in columns]
-    limits = _limits(arrays, np.stack([truths, nominal]))
-    return _Drawn(shown, arrays, truths, nominal, *_priors(posterior, wanted, columns, factors), limits, note)
-
-
-def _parameters_of(posterior: Any, labels: Sequence[str] | None, ndim: int) -> Sequence[Any]:
-    """Name, label, unit (``factor``) and nominal value for each of `ndim` parameters; ValueError for another number."""
-    described = getattr(posterior, "parameters", None)
-    if described is None:
-        names = getattr(posterior, "parameter_names", None) or labels or [f"x{i}" for i in range(ndim)]
-        described = [SimpleNamespace(name=str(name), label=str(name), factor=1.0, nominal=np.nan) for name in names]
-    if len(described) != ndim or len(labels or described) != ndim:
-        raise ValueError(
-            f"expected one parameter and one label for each of {ndim} columns of the samples; got {len(described)} "
-            f"parameters ({', '.join(each.name for each in described)}) and the labels {labels}"
-        )
-    return described
-
-
-def _checked(samples: Any, label: str) -> np.ndarray:
-    samples, where = np.asarray(samples, dtype=float), f" of {label!r}" if label else ""
-    if samples.ndim != 2 or len(samples) < 2 or not 1 <= samples.shape[1] <= len(samples):
-        raise ValueError(
-            f"samples{where} must be an array (n, ndim) with n >= 2 and n >= ndim, as get_chain(flat=True) returns; "
-            f"got {samples.shape}"
-        )
-    if not np.isfinite(samples).all():
-        bad = np.count_nonzero(~np.isfinite(samples).all(axis=1))
-        raise ValueError(f"samples{where} must be finite; {bad} of {len(samples)} rows are not: leave these rows out")
-    return samples
+    limits = _limits(samples, np.stack([truths, nominal]))
+    priors = _priors(posterior, wanted, columns, factors)
+    return _Drawn([each.label for each in shown], samples, truths, nominal, *priors, limits, note)
 
 
 def _true_values(given: Values | None, known: list[str]) -> np.ndarray:
@@ -298,10 +246,9 @@ def _priors(posterior: Any, names: Sequence[str], columns: list[int], factors: n
     return [density(i) for i in range(len(columns))], draws
 
 
-def _limits(samples: Mapping[str, np.ndarray], marks: np.ndarray) -> np.ndarray:
+def _limits(samples: np.ndarray, marks: np.ndarray) -> np.ndarray:
     """Limits (k, 2) of the panels: the range of the samples, wider by up to half its size for marks (m, k)."""
-    quantiles = np.array([np.quantile(x, [0.002, 0.998], axis=0) for x in samples.values()])
-    low, high = quantiles[:, 0].min(axis=0), quantiles[:, 1].max(axis=0)
+    low, high = np.quantile(samples, [0.002, 0.998], axis=0)
     near = np.where((marks > low - 0.5 * (high - low)) & (marks < high + 0.5 * (high - low)), marks, np.nan)
     low, high = np.fmin(low, np.fmin.reduce(near)), np.fmax(high, np.fmax.reduce(near))
     varies = high - low > 1e-12 * np.maximum(np.abs(low), np.abs(high))
@@ -317,7 +264,7 @@ def _bins(x: np.ndarray) -> int:
 def _finish_panel(axes: "Axes", drawn: _Drawn, i: int, note: str = "") -> None:
     """Prior density of one parameter, and a title with mean and standard deviation, or marks outside the panel."""
     low, high = drawn.limits[i]
-    highest = 1.1 * max(patch.get_xy()[:, 1].max() for patch in axes.patches)  # corner's limit is of the last sampler
+    highest = 1.1 * max(patch.get_xy()[:, 1].max() for patch in axes.patches)
     if drawn.densities:
         places = np.linspace(low, high, 200)
         density = drawn.densities[i](places)
@@ -327,21 +274,17 @@ def _finish_panel(axes: "Axes", drawn: _Drawn, i: int, note: str = "") -> None:
     for value, name in ((drawn.nominal[i], "nominal"), (drawn.truths[i], "true")):
         if value < low or value > high:
             note += f"\n{name}: {value:.4g}"
-    if len(drawn.samples) == 1:
-        (x,) = drawn.samples.values()
-        mean, deviation = float(x[:, i].mean()), float(x[:, i].std())
-        decimals = max(0, 1 - int(np.floor(np.log10(deviation)))) if deviation > 0.0 else 0
-        note = (
-            f"{mean:.{decimals}f} ± {deviation:.{decimals}f}" if decimals < 5 else f"{mean:.4g} ± {deviation:.2g}"
-        ) + note
-    axes.set_title(note.strip(), fontsize=8.0)
+    mean, deviation = float(drawn.samples[:, i].mean()), float(drawn.samples[:, i].std())
+    decimals = max(0, 1 - int(np.floor(np.log10(deviation)))) if deviation > 0.0 else 0
+    form = f".{decimals}f" if decimals < 5 else ".4g"
+    axes.set_title(f"{mean:{form}} ± {deviation:{form if decimals < 5 else '.2g'}}{note}", fontsize=8.0)
 
 
 def _legend_handles(drawn: _Drawn) -> list:
-    """Lines of the legend: samplers, prior, nominal and true values, as far as they are drawn."""
+    """Lines of the legend: posterior, prior, nominal and true values, as far as they are drawn."""
     from matplotlib.lines import Line2D
 
-    entries = [(label or "posterior", colour, "-") for label, colour in drawn.shades()]
+    entries = [("posterior", BLUE, "-")]
     entries += [("prior", "0.25", ":")] if drawn.densities else []
     entries += [("nominal value", GREY, "--")] if np.isfinite(drawn.nominal).any() else []
     entries += [("true value", RED, "-")] if np.isfinite(drawn.truths).any() else []

@@ -22,8 +22,8 @@ class ModelComparison(NamedTuple):
         Names of the models.
     log_evidence, log_evidence_error : ndarray, shape (n,)
         Log-evidences and their standard errors.
-    prior, probability : ndarray, shape (n,)
-        Prior and posterior probabilities of the models.
+    probability : ndarray, shape (n,)
+        Posterior probabilities of the models, with equal prior probabilities.
     lower, upper : ndarray, shape (n,)
         95 % intervals of the posterior probabilities, from the log-odds.
     summaries : tuple of str
@@ -33,7 +33,6 @@ class ModelComparison(NamedTuple):
     names: tuple[str, ...]
     log_evidence: np.ndarray
     log_evidence_error: np.ndarray
-    prior: np.ndarray
     probability: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
@@ -51,14 +50,13 @@ class ModelComparison(NamedTuple):
 
     def table(self) -> str:
         """Table with one line per model, the most probable first, and the verdict of each run."""
-        table = [("model", "log evidence", "difference", "prior", "probability", "95 % interval")]
+        table = [("model", "log evidence", "difference", "probability", "95 % interval")]
         for k in np.argsort(-self.probability, kind="stable"):
             table.append(
                 (
                     self.names[k],
                     f"{self.log_evidence[k]:.3f} +- {self.log_evidence_error[k]:.3f}",
                     f"{self.log_evidence[k] - self.log_evidence.max():.3f}",
-                    f"{self.prior[k]:.3g}",
                     f"{self.probability[k]:.4g}",
                     f"{self.lower[k]:.4g} ... {self.upper[k]:.4g}",
                 )
@@ -69,17 +67,16 @@ class ModelComparison(NamedTuple):
     __str__ = __repr__ = table
 
 
-def compare_models(models: Mapping[str, Any], prior: Mapping[str, float] | None = None) -> ModelComparison:
-    """Posterior probabilities of models for the same data.
+def compare_models(models: Mapping[str, Any]) -> ModelComparison:
+    """Posterior probabilities of models for the same data, with equal prior probabilities.
+
+    Other prior probabilities are added to the log-evidences of pairs, as logarithms.
 
     Parameters
     ----------
     models : mapping of str to (sampler or tuple of float)
         For each name a sampler that has run (any object with ``log_evidence`` and ``log_evidence_error``), or a pair
         (log-evidence, standard error). Prior and likelihood must be normalised, and the measurements the same.
-    prior : mapping of str to float, optional
-        Prior probabilities of the models, by the same names; equal by default.
-
     Returns
     -------
     ModelComparison
@@ -90,9 +87,9 @@ def compare_models(models: Mapping[str, Any], prior: Mapping[str, float] | None 
     >>> comparison.best
     'inelastic'
     >>> print(comparison)
-    model           log evidence  difference  prior  probability      95 % interval
-    inelastic  -118.900 +- 0.100       0.000    0.5       0.8022  0.7545 ... 0.8425
-    elastic    -120.300 +- 0.100      -1.400    0.5       0.1978  0.1575 ... 0.2455
+    model           log evidence  difference  probability      95 % interval
+    inelastic  -118.900 +- 0.100       0.000       0.8022  0.7545 ... 0.8425
+    elastic    -120.300 +- 0.100      -1.400       0.1978  0.1575 ... 0.2455
     """
     if not isinstance(models, Mapping) or len(models) < 2:
         raise ValueError(f"compare_models needs a mapping with two models or more, by name; got {models!r}")
@@ -105,20 +102,17 @@ def compare_models(models: Mapping[str, Any], prior: Mapping[str, float] | None 
             "models the same measurements"
         )
     log_evidence, error = np.array([_evidence(name, model) for name, model in models.items()]).T
-    before = _prior(names, prior)
-    with np.errstate(divide="ignore"):  # a prior of zero excludes a model
-        score = np.log(before) + log_evidence
-    probability = np.exp(score - logsumexp(score))
+    probability = np.exp(log_evidence - logsumexp(log_evidence))
 
     # d logit(p_k) / d log Z_j = delta_kj - (1 - delta_kj) p_j / (1 - p_k)
     odds, odds_error = np.empty((2, len(names)))
     for k in range(len(names)):
-        rest = logsumexp(np.delete(score, k))
-        odds[k] = score[k] - rest
-        share = np.exp(np.delete(score, k) - rest) if rest > -np.inf else 0.0
+        rest = logsumexp(np.delete(log_evidence, k))
+        odds[k] = log_evidence[k] - rest
+        share = np.exp(np.delete(log_evidence, k) - rest)
         odds_error[k] = math.hypot(error[k], *(share * np.delete(error, k)))
     reach = ndtri(0.975) * odds_error
-    shares = before, probability, expit(odds - reach), expit(odds + reach)
+    shares = probability, expit(odds - reach), expit(odds + reach)
     return ModelComparison(names, log_evidence, error, *shares, tuple(map(verdict_summary_of, models.values())))
 
 
@@ -132,14 +126,3 @@ def _evidence(name: str, model: Any) -> tuple[float, float]:
         f"model {name!r}: expected a sampler with log_evidence and log_evidence_error, or a pair of numbers, which are "
         f"finite, and the error not negative; got {pair!r}"
     )
-
-
-def _prior(names: tuple[str, ...], prior: Mapping[str, float] | None) -> np.ndarray:
-    if prior is None:
-        return np.full(len(names), 1.0 / len(names))
-    if not isinstance(prior, Mapping) or set(prior) != set(names):
-        raise ValueError(f"expected one prior probability for each of {', '.join(names)}; got {prior!r}")
-    values = np.array([prior[name] for name in names], dtype=float)
-    if not (np.all(values >= 0.0) and abs(values.sum() - 1.0) < 1e-9):
-        raise ValueError(f"prior probabilities must be non-negative and sum to one; got {dict(prior)}")
-    return values

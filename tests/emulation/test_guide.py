@@ -208,11 +208,11 @@ def test_a_posterior_that_excludes_probable_simulations_is_refused(simulated, em
     assert all("ends of a ridge" in each.text for each in found)
 
 
-def test_a_rough_response_is_no_ridge(rng):
+def test_a_rough_response_is_refused_too(rng):
     """Its log-densities scatter around the emulated ones everywhere, and not only at the ends."""
     emulated = -rng.uniform(0.0, 3.0, 60)
     (found,) = check_excluded_runs(emulated + 2.0 * rng.standard_normal(60), emulated)
-    assert "the response is rough" in found.text and "ridge" not in found.text
+    assert "the response is rough" in found.text
 
 
 def test_a_search_that_ends_below_the_modes_is_refused():

@@ -88,16 +88,6 @@ def test_corner_shows_units_prior_truth_and_nominal_values(updated):
     assert axes[0, 0].get_title() == f"{updated[:, 0].mean():.3f} ± {updated[:, 0].std():.3f}"
 
 
-def test_several_samplers_have_common_axes_and_a_legend(updated, rng):
-    figure = plot_corner({"SMC": updated, "TMCMC": updated + 0.01, "emcee": updated}, truths={"x1": 1.0})
-    axes = grid(figure)
-    assert [each.get_xlabel() for each in axes[-1]] == ["x0", "x1", "x2"]
-    assert legend(figure) == ["SMC", "TMCMC", "emcee", "true value"]
-    assert len(axes[0, 0].patches) == 3 and axes[0, 0].get_title() == ""
-    with pytest.raises(ValueError, match="columns are {'a': 3, 'b': 2}"):
-        plot_corner({"a": updated, "b": updated[:, :2]})
-
-
 @pytest.mark.parametrize(
     ("change", "arguments", "message"),
     [
@@ -106,12 +96,10 @@ def test_several_samplers_have_common_axes_and_a_legend(updated, rng):
         (
             lambda x: x[:, :2],
             {"posterior": Posterior()},
-            r"each of 2 columns of the samples; got 3 parameters \(k, c, sigma\)",
+            r"3 parameters \(k, c, sigma\), but the samples have 2 columns",
         ),
         (lambda x: x, {"truths": [1.0]}, "truths must have one value for each of 3"),
         (lambda x: x, {"posterior": Posterior(), "truths": {"mass": 1.0}}, "unknown parameters mass; known are k, c"),
-        (lambda x: x, {"labels": ["a"]}, "one label for each of 3 columns"),
-        (lambda x: {}, {}, "a mapping of labels to such arrays"),
         (lambda x: x[:2], {}, "n >= ndim"),
     ],
 )

@@ -51,15 +51,11 @@ def test_conjugate_models_by_smc(seed, rng):
 @pytest.mark.parametrize("values", [(0.0, -1.0), (0.0, -0.3, -2.0), (5000.0, 4999.0, 4990.0)])
 def test_errors_against_monte_carlo(values, rng):
     errors = np.linspace(0.02, 0.08, len(values))
-    prior = np.arange(1.0, len(values) + 1.0)
-    prior /= prior.sum()
     names = [f"m{k}" for k in range(len(values))]
-    found = compare_models(
-        dict(zip(names, zip(values, errors, strict=True), strict=True)), dict(zip(names, prior, strict=True))
-    )
+    found = compare_models(dict(zip(names, zip(values, errors, strict=True), strict=True)))
     draws = rng.normal(values, errors, size=(20_000, len(values)))
-    probabilities = softmax(np.log(prior) + draws, axis=1)
-    assert np.allclose(found.probability, softmax(np.log(prior) + np.array(values)))
+    probabilities = softmax(draws, axis=1)
+    assert np.allclose(found.probability, softmax(values))
     low, high = np.quantile(probabilities, [0.025, 0.975], axis=0)
     assert np.allclose(found.upper - found.lower, high - low, rtol=0.07)
     assert found.best == "m0"
@@ -75,31 +71,20 @@ def test_the_interval_is_right_for_large_errors(rng):
     assert np.all((found.lower >= 0.0) & (found.upper <= 1.0))
 
 
-def test_a_model_excluded_by_its_prior():
-    found = compare_models({"a": (0.0, 0.1), "b": (3.0, 0.1)}, prior={"a": 1.0, "b": 0.0})
-    assert found.probability.tolist() == [1.0, 0.0]
-    assert np.isfinite(found.lower).all() and np.isfinite(found.upper).all()
-    assert found.best == "b"
-
-
 @pytest.mark.parametrize(
-    ("models", "prior", "message"),
+    ("models", "message"),
     [
-        ({"a": (0.0, 0.1)}, None, "two models or more"),
-        ([(0.0, 0.1), (1.0, 0.1)], None, "by name"),
-        ({"a": (0.0, 0.1), "b": (np.nan, 0.1)}, None, "'b'.*finite"),
-        ({"a": (0.0, 0.1), "b": (-np.inf, 0.1)}, None, "'b'.*finite"),
-        ({"a": (0.0, -0.1), "b": (0.0, 0.1)}, None, "'a'.*negative"),
-        ({"a": (0.0, 0.1), "b": 3.0}, None, "'b'.*expected a sampler"),
-        ({"a": (0.0, 0.1), "b": (1.0, 0.1)}, {"a": 0.5, "b": 0.4}, "sum to one"),
-        ({"a": (0.0, 0.1), "b": (1.0, 0.1)}, {"a": 1.5, "b": -0.5}, "non-negative"),
-        ({"a": (0.0, 0.1), "b": (1.0, 0.1)}, {"a": 0.5, "c": 0.5}, "one prior probability for each of a, b"),
-        ({"a": (0.0, 0.1), "b": (1.0, 0.1)}, {"a": np.nan, "b": 0.5}, "non-negative"),
+        ({"a": (0.0, 0.1)}, "two models or more"),
+        ([(0.0, 0.1), (1.0, 0.1)], "by name"),
+        ({"a": (0.0, 0.1), "b": (np.nan, 0.1)}, "'b'.*finite"),
+        ({"a": (0.0, 0.1), "b": (-np.inf, 0.1)}, "'b'.*finite"),
+        ({"a": (0.0, -0.1), "b": (0.0, 0.1)}, "'a'.*negative"),
+        ({"a": (0.0, 0.1), "b": 3.0}, "'b'.*expected a sampler"),
     ],
 )
-def test_refused(models, prior, message):
+def test_refused(models, message):
     with pytest.raises(ValueError, match=message):
-        compare_models(models, prior)
+        compare_models(models)
 
 
 def finished(data_fingerprint=None):
