@@ -29,7 +29,6 @@ from .rows import as_table, machine, write_json
 
 BENCHMARKS: dict[str, Callable[..., Iterable[tuple]]] = {
     "badge": badge.badge,
-    "supports": badge.supports,
     "new_events": new_events.new_events,
     "simulation": column.simulation,
     "batch": column.batch,
@@ -46,7 +45,6 @@ BENCHMARKS: dict[str, Callable[..., Iterable[tuple]]] = {
 }
 QUICK: dict[str, dict[str, Any]] = {
     "badge": {"structures": ("Meloland",)},
-    "supports": {"structures": ("Meloland", "Painter Street")},
     "new_events": {"structures": ("frame two floors",), "sizes": (1,), "subsets": 1},
     "truth": {"families": ("sharp", "two"), "ratios": (1.0,), "walkers": (200,)},
     "samplers": {"targets": ("T3",)},

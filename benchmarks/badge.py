@@ -12,7 +12,6 @@ A row counts, for a fault, the cases whose judgement is not "use" and names the 
 The data are no part of this project (docs/real_data.rst). Set FE_SHARED to a folder that has them in ``measured``.
 """
 
-import itertools
 import warnings
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
@@ -40,7 +39,6 @@ from fe_likelihoods import (
     read_columns,
     read_record,
 )
-from fe_likelihoods.checks.faults import slow_motions, supports_apart
 from fe_likelihoods.checks.finding import Judgement, judge
 from fe_likelihoods.emulation.modes import Mode, find_modes
 from fe_likelihoods.emulation.target import ResponseTarget
@@ -48,7 +46,7 @@ from fe_likelihoods.emulation.target import ResponseTarget
 from .rows import Row
 from .targets import SHARED
 
-__all__ = ["STRUCTURES", "Deck", "badge", "best_mode", "posterior_of", "supports"]
+__all__ = ["STRUCTURES", "Deck", "badge", "best_mode", "posterior_of"]
 
 _FOLDER = SHARED / "measured"
 _MEMBERS = ("CHAN{:d}.V2", "CHAN{:02d}.V2", "CHAN{:03d}.V2", "chan{:03d}.v2")
@@ -175,48 +173,6 @@ def badge(repeats: int = 1, structures: tuple[str, ...] = tuple(STRUCTURES), eve
     for fault, each in counts.items():
         note = "; ".join(f"{text} {count}" for text, count in notes[fault].most_common())
         rows += [Row(fault, status, float(count), f"of {each.total()}", note) for status, count in each.most_common()]
-    return rows
-
-
-def supports(repeats: int = 1, structures: tuple[str, ...] = tuple(STRUCTURES)) -> list[Row]:
-    """Gain and sign of supports by the slow motion of the others; limits chosen with the other bridges alone.
-
-    Each support has 2 times, half, the negative of its motion, and g read as m/s². The limits with the fewest right
-    events named, then the most wrong ones, then the largest ratio and coherence, are chosen from a grid; "as set" are
-    the limits of the library.
-    """
-    decks = [name for name in structures if isinstance(STRUCTURES[name], Deck)]
-    grid = [*itertools.product((0.8, 0.85, 0.9, 0.95), (7, 14, 21, 28), (1.3, 1.4, 1.5, 1.75, 2.0)), None]
-    scores: dict[str, np.ndarray] = {}  # right events named, and wrong ones named, by limits (n_limits, 2)
-    sizes: dict[str, np.ndarray] = {}
-    for name in decks:
-        scores[name], sizes[name] = np.zeros((len(grid), 2)), np.zeros(2)
-        for event in STRUCTURES[name].events():
-            motions = [each.acceleration for each in event.model.supports]
-            step, known = event.model.supports[0].dt, {}
-            wrong = [(k, factor) for k in range(len(motions)) for factor in (2.0, 0.5, -1.0, 1.0 / 9.80665)]
-            sizes[name] += 1, len(wrong)
-            for row, limits in enumerate(grid):
-                options, limit = ((), ()) if limits is None else (limits[:2], limits[2:])
-                if options not in known:
-                    slow = slow_motions(motions, step, *options)
-                    known[options] = {pair: each._replace(lag=0.0) for pair, each in slow.items()}  # gains alone
-                scores[name][row, 0] += bool(dict(supports_apart(known[options], range(3), *limit)))
-                for k, factor in wrong:
-                    spoiled = {
-                        pair: each._replace(gain=each.gain * factor ** ((pair[0] == k) - (pair[1] == k)))
-                        for pair, each in known[options].items()
-                    }
-                    scores[name][row, 1] += k in dict(supports_apart(spoiled, range(3), *limit))
-    rows = []
-    for name in decks:
-        others = sum(scores[each] for each in decks if each.split()[0] != name.split()[0])
-        order = {row: (*others[row], limits) for row, limits in enumerate(grid[:-1])}
-        best = min(order, key=lambda row: (order[row][0], -order[row][1], -order[row][2][2], -order[row][2][0]))
-        (false, named), (events, cases) = scores[name][best], sizes[name]
-        note = f"of {cases:.0f}; {false:.0f} of {events:.0f} right ones; coherence, lines, ratio {grid[best]}"
-        note += f"; as set {scores[name][-1, 1]:.0f} and {scores[name][-1, 0]:.0f}"
-        rows.append(Row("supports named", name, named, "", note))
     return rows
 
 

@@ -20,9 +20,8 @@ from ..signals.events import find_events
 from ..simulation.faults import ChangedModel
 from ..simulation.model import SimulationFailed
 from ..text_tables import listed
-from .faults import FEWEST_DRAWS
+from .faults import FEWEST_DRAWS, MOST_DRAWS
 from .run import FinishedRun
-from .tables import MOST_DRAWS
 
 __all__ = [
     "ChannelFit",
@@ -47,7 +46,6 @@ class ModalFit(NamedTuple):
     title: str  # name of the data set; empty if there is one only
     likelihood: Any
     draws: Any  # modes at draws of the prior; None if none can be simulated
-    deviations: np.ndarray  # (2, m) of errors of frequencies, as shares, and of components of shapes, at these draws
     points: np.ndarray | None = None  # samples of the posterior (n, ndim); None before a run
     samples: Any = None  # modes at samples, as `predict_modes` takes them
     held_out: Any = None  # modes that were measured, but not compared, at these samples
@@ -75,9 +73,10 @@ class Fit:
     before: np.ndarray | None = None  # the same before the update
     white: np.ndarray | None = None  # residuals of the fit as the noise whitens them; None without time
     assumed: np.ndarray | None = None  # (n_channels,) independent samples that the noise assumes at most
-    deviations: np.ndarray | None = None  # of the errors (n_channels, 1); None if not known
-    expected: np.ndarray | None = None  # the same at draws of the prior, of data without time
+    deviations: np.ndarray | None = None  # (n_channels, 1) of errors without time, at draws of the prior
+    stated: bool = False  # whether the errors are known
     modal: ModalFit | None = None  # modes, instead of responses
+    failed: str = ""  # why a response is missing
 
     @property
     def residuals(self) -> np.ndarray | None:
@@ -112,7 +111,6 @@ class Fits(NamedTuple):
     before: str
     after: str
     simulations: int  # run for the fits
-    failures: tuple[str, ...]  # simulations that failed, in words
 
 
 def checks_of(residuals: np.ndarray) -> ResidualChecks | None:
@@ -152,59 +150,49 @@ def compare(
     point: np.ndarray | None = None,
     start: np.ndarray | None = None,
     samples: np.ndarray | None = None,
-) -> tuple[list[Fit], dict[str, str]]:
-    """The fits of a data set with the name `key`, and reasons of failures "before" and "after" the update.
+) -> list[Fit]:
+    """The fits of a data set with the name `key`.
 
     Draws of the prior (n, ndim), the fit at a `point`, the `start` before the update (ndim,); of modal data, modes at
     draws and at as many `samples` of the posterior.
     """
     measured, n = likelihood.measurements, len(likelihood.model.parameter_names)
     if likelihood.is_modal:
-        return [Fit(key, measured, np.empty(0), modal=_modes(key, likelihood, draws, samples))], {}
-    found, failed = {}, {}
+        return [Fit(key, measured, np.empty(0), modal=_modes(key, likelihood, draws, samples))]
+    found, failed = dict[str, np.ndarray](), list[str]()
     for name, theta in (("before", start), ("after", point)):
         batch = None if theta is None else likelihood.simulate(theta[None, :n])
         if batch is not None and batch.reasons[0]:
-            failed[name] = batch.reasons[0]
+            failed.append(f"{name} the update: the simulation failed ({batch.reasons[0]})")
         elif batch is not None:
             found[name] = measured.values - likelihood.residuals_of(batch.response[0])
-    drawn = np.empty((0, *measured.values.shape))
+    found["draws"] = np.empty((0, *measured.values.shape))
     try:
         batch = likelihood.simulate(draws[:, :n])
-        good = [not reason for reason in batch.reasons]
-        drawn = np.array([measured.values - likelihood.residuals_of(each) for each in batch.response[good]] or drawn)
+        good = [likelihood.residuals_of(batch.response[k]) for k, why in enumerate(batch.reasons) if not why]
+        found["draws"] = measured.values - np.reshape(good, (-1, *measured.values.shape))
     except (ChangedModel, StaleCache) as error:  # concerns the next sampling, not this result
         logger.warning("the fit is compared with no draws of the prior: %s", error)
-    white, deviations = _errors(likelihood, found.get("after"), point)
-    expected = None
-    if len(draws) and not measured.is_history:
-        expected = _errors(likelihood, np.empty(0), np.median(draws, axis=0))[1]
-    assumed = getattr(sampled_noise(likelihood.noise), "effective_samples", None)
-    assumed = None if assumed is None else np.broadcast_to(assumed, measured.n_channels)
-    fits, by_sample = [], found | {"draws": drawn, "white": white}
-    by_channel = {"assumed": assumed, "deviations": deviations, "expected": expected}
+    noise = sampled_noise(likelihood.noise)
+    by_channel = {"assumed": getattr(noise, "effective_samples", None)}
+
+    def at(theta: np.ndarray) -> np.ndarray:
+        values = dict(zip(likelihood.parameter_names, theta, strict=True))
+        return np.array([values.get(name, np.nan) for name in noise.parameter_names])
+
+    if measured.is_history and "after" in found and point is not None:
+        found["white"] = measured.values - found["after"]
+        if hasattr(noise, "whitened"):
+            found["white"] = noise.whitened(found["white"], found["after"], at(point))
+    elif not measured.is_history and len(draws) and hasattr(noise, "standard_deviations"):
+        by_channel["deviations"] = noise.standard_deviations(at(np.median(draws, axis=0))[None])[0][:, None]
+    fits, stated = [], not noise.parameter_names
     for title, part, rows, inside in _events(likelihood, key):
         cut = {name: each[rows] for name, each in by_channel.items() if each is not None}
-        for name, each in by_sample.items():
-            if each is not None:
-                cut[name] = np.where(inside, each, np.nan)[..., rows, :][..., inside[rows].any(axis=0)]
-        fits.append(Fit(title, part, **cut))
-    return fits, failed
-
-
-def _errors(
-    likelihood: FELikelihood, response: np.ndarray | None, point: np.ndarray | None
-) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Residuals of a history as the noise whitens them; of data without time, standard deviations of the errors."""
-    if response is None or point is None:
-        return None, None
-    sampled, values = sampled_noise(likelihood.noise), dict(zip(likelihood.parameter_names, point, strict=True))
-    parameters = np.array([values.get(name, np.nan) for name in sampled.parameter_names])
-    if not likelihood.measurements.is_history:
-        known = hasattr(sampled, "standard_deviations") and np.isfinite(parameters).all()
-        return None, sampled.standard_deviations(parameters[None])[0][:, None] if known else None
-    residuals = likelihood.measurements.values - response
-    return sampled.whitened(residuals, response, parameters) if hasattr(sampled, "whitened") else residuals, None
+        for name, each in found.items():
+            cut[name] = np.where(inside, each, np.nan)[..., rows, :][..., inside[rows].any(axis=0)]
+        fits.append(Fit(title, part, stated=stated, failed="; ".join(failed), **cut))
+    return fits
 
 
 def _events(likelihood: FELikelihood, key: str) -> Iterator[tuple[str, Measurements, np.ndarray, np.ndarray]]:
@@ -241,26 +229,21 @@ def _modes(key: str, likelihood: Any, draws: np.ndarray, samples: np.ndarray | N
             found.append(None)
     few = None if samples is None else samples[:: -(-len(samples) // max(len(draws), 1))]
     held_out = None if None in (found[1], likelihood.held_out) else found[1].against(likelihood.held_out)
-    deviations = np.median(likelihood.noise.deviations(draws[:, len(likelihood.model.parameter_names) :]), axis=1)
-    return ModalFit(key, likelihood, found[0], deviations, few, found[1], held_out)
+    return ModalFit(key, likelihood, found[0], few, found[1], held_out)
 
 
 def fit_data_sets(run: FinishedRun) -> Fits:
     """Simulate two points of each data set, before and after the update; empty without a likelihood of this package."""
     if run.likelihood is None:
-        return Fits((), "", "", 0, ())
+        return Fits((), "", "", 0)
     start, start_name = _before(run)
-    names = {"before": f"before: {start_name}", "after": f"after: {run.centre_name}"}
-    fits, failures, before = list[Fit](), list[str](), run.likelihood.simulations
+    made, fits = run.likelihood.simulations, list[Fit]()
+    points = draws_to_compare(run.posterior), run.centre, start, run.samples
     for key, likelihood, columns in data_sets_of(run):
-        points = draws_to_compare(run.posterior), run.centre, start, run.samples
         draws, point, first, samples = (each[..., columns] for each in points)
-        found, failed = compare(likelihood, draws, key, point, first, samples)
-        fits += found
-        failures += [
-            f"{key}{', ' if key else ''}{names[when]}: the simulation failed ({why})" for when, why in failed.items()
-        ]
-    return Fits(tuple(fits), *names.values(), run.likelihood.simulations - before, tuple(failures))
+        fits += compare(likelihood, draws, key, point, first, samples)
+    names = f"before: {start_name}", f"after: {run.centre_name}"
+    return Fits(tuple(fits), *names, run.likelihood.simulations - made)
 
 
 def _before(run: FinishedRun) -> tuple[np.ndarray, str]:

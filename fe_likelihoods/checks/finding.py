@@ -19,7 +19,7 @@ __all__ = [
     "Judgement",
     "about",
     "by_severity",
-    "grouped",
+    "in_order",
     "judge",
     "labelled",
     "percent",
@@ -31,7 +31,6 @@ TAIL = 0.05  # share of samples or draws that is as much as a tail of a 90 % int
 HALF = 0.5  # of a power, or of what is inside a band: the other half is missed
 CORRELATED = "The errors are correlated"
 STATUS = {WRONG: "do not use", CARE: "use with care", NOTE: "use"}
-FIRST, LATER, KNOW = "Fix first", "May follow from it", "Good to know"
 ORDER = ("input", "data", "fit", "samples")
 
 
@@ -40,21 +39,12 @@ def about(what: str, findings: Iterable[Finding]) -> list[Finding]:
     return [each._replace(about=what) for each in findings]
 
 
-def grouped(findings: Iterable[Finding]) -> dict[str, tuple[Finding, ...]]:
-    """Findings as causes, what may follow from them, and notes, by title; one group without a title if nothing follows.
+def in_order(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """Findings with causes before what may follow from them, and notes last.
 
-    A check relies on what stands before it in `ORDER`: a fit on right data, samples on a fit. So causes are the first
-    of them that are more than notes. In a group the most severe finding comes first.
+    A check relies on what stands before it in `ORDER`: a fit on right data, samples on a fit.
     """
-    found = by_severity(findings)
-    places = [ORDER.index(each.about) for each in found if each.severity != NOTE]
-    if not places or min(places) == max(places):
-        return {"": found} if found else {}
-    groups: dict[str, tuple[Finding, ...]] = dict.fromkeys((FIRST, LATER, KNOW), ())
-    for each in found:
-        title = KNOW if each.severity == NOTE else FIRST if ORDER.index(each.about) == min(places) else LATER
-        groups[title] += (each,)
-    return {title: group for title, group in groups.items() if group}
+    return tuple(sorted(by_severity(findings), key=lambda each: (each.severity == NOTE, ORDER.index(each.about))))
 
 
 class Judgement(NamedTuple):
@@ -65,17 +55,14 @@ class Judgement(NamedTuple):
     tests: tuple[tuple[str, str], ...] = ()  # names of the tests, and what was tested or why it was not
 
     def __str__(self) -> str:
-        groups = grouped(self.findings)
-        causes, later = groups.get(FIRST, ()), groups.get(LATER, ())
-        deciding = (each for each in self.findings if STATUS[each.severity] == self.status != "use")
-        reasons = list(dict.fromkeys(each.kind for each in causes or deciding))
-        if later:
-            others = f"{len(later)} other finding{'s' if len(later) > 1 else ''}"
-            reasons.append(f"fix this first, {others} may follow from it")
+        kinds = list(dict.fromkeys(each.kind for each in self.findings if each.severity != NOTE))
+        reasons = [f"{kind[0].lower()}{kind[1:]}" for kind in kinds[:1]]
+        if others := len(kinds) - 1 if kinds else 0:
+            reasons.append(f"fix this first, {others} other finding{'s' if others > 1 else ''} may follow from it")
         if self.width_factor > 1.0:
             reasons.append(f"multiply standard deviations by {self.width_factor:.2g}, because errors are correlated")
         text = f"{self.status[0].upper()}{self.status[1:]}"
-        return f"{text}: {'; '.join(f'{kind[0].lower()}{kind[1:]}' for kind in reasons)}." if reasons else f"{text}."
+        return f"{text}: {'; '.join(reasons)}." if reasons else f"{text}."
 
     __repr__ = __str__
 
@@ -87,9 +74,8 @@ class Judgement(NamedTuple):
 
 def judge(findings: Iterable[Finding], tests: Iterable[tuple[str, str]] = ()) -> Judgement:
     """The judgement that follows from findings: the most severe one decides."""
-    groups = grouped(found := tuple(findings))
-    status = STATUS[by_severity(found)[0].severity] if found else "use"
-    return Judgement(status, sum(groups.values(), ()), tuple(tests))
+    found = tuple(findings)
+    return Judgement(STATUS[by_severity(found)[0].severity] if found else "use", in_order(found), tuple(tests))
 
 
 class FindingWarning(UserWarning):
@@ -104,15 +90,8 @@ def warn(findings: Iterable[Finding], stacklevel: int = 2) -> None:
 
 
 def labelled(findings: Iterable[Finding], of: str = "") -> list[str]:
-    """Findings as lines of a text, which begin with CAUTION unless they are notes, and say what to fix first.
-
-    `of` is what they are about, such as "event EQ2: ".
-    """
-    lines = []
-    for title, group in grouped(findings).items():
-        how = f", {title[0].lower()}{title[1:]}" if title in (FIRST, LATER) else ""
-        lines += [f"{'Note' if each.severity == NOTE else f'CAUTION{how}'}: {of}{each}" for each in group]
-    return lines
+    """Findings as lines of a text, which begin with CAUTION unless they are notes; `of` is what they are about."""
+    return [f"{'Note' if each.severity == NOTE else 'CAUTION'}: {of}{each}" for each in in_order(findings)]
 
 
 def percent(share: float) -> str:

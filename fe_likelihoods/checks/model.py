@@ -12,7 +12,7 @@ Simulations that a sampler has made cannot show this error, because all of them 
 
 from collections.abc import Callable, Iterator
 from dataclasses import fields, is_dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -20,18 +20,15 @@ from ..likelihood.posterior import Posterior
 from ..signals.events import motions_of
 from ..signals.records import Record
 from ..simulation.model import SimulationBatch, simulate_batch
-from .finding import CARE, WRONG, Finding
+from .finding import CARE, WRONG, Finding, percent
 
 __all__ = [
     "LARGE_SHIFT",
-    "NO_STEP",
     "STEP",
-    "StepTest",
     "check_chance",
     "check_same_response",
     "check_stronger_motion",
     "halve_steps",
-    "halved",
     "has_steps",
     "motions_to_replace",
     "refuse_chance",
@@ -51,23 +48,18 @@ Simulate = Callable[[Any, np.ndarray], SimulationBatch]
 """Simulates a model at points (n, n_parameters)."""
 
 
-class StepTest(NamedTuple):
-    """What halving step and mesh has shown: findings, and what was tested, by name."""
-
-    findings: list[Finding]
-    tests: dict[str, str]
-
-
 def has_steps(likelihood: Any) -> bool:
     """Whether any data of a likelihood, or None, may be histories; modes and load cases have no steps."""
     return likelihood is None or any(part.measurements.is_history for part, _ in likelihood.parts())
 
 
-def halve_steps(posterior: Posterior, point: np.ndarray, sd: np.ndarray, simulate: Simulate) -> StepTest:
+def halve_steps(
+    posterior: Posterior, point: np.ndarray, sd: np.ndarray, simulate: Simulate
+) -> tuple[list[Finding], dict[str, str]]:
     """Halve step and mesh at a fit (ndim,), and compare the parameters' change with their standard deviations (ndim,).
 
-    ``simulate(model, points)`` returns a `SimulationBatch`. A model that fails with half a step, or whose response does
-    not change, keeps a step of its own, which is not tested.
+    Returns findings, and what was tested, by name. ``simulate(model, points)`` returns a `SimulationBatch`. A model
+    that fails with half a step, or whose response does not change, keeps a step of its own, which is not tested.
     """
     widths = sd / np.array([row[3] for row in posterior.prior.table()[1]])
     precision = np.diag(np.square(np.where(np.isfinite(widths), widths, 0.0)))
@@ -77,47 +69,34 @@ def halve_steps(posterior: Posterior, point: np.ndarray, sd: np.ndarray, simulat
         theta, at = point[columns][:n], columns[:n]
         batch = simulate(model, theta + np.vstack([np.zeros(n), np.diag(sd[at])]))
         if reason := next(filter(None, batch.reasons), ""):
-            return StepTest([], {STEP: f"not tested: a simulation failed ({reason})"})
-        response, slopes = batch.response[0], batch.response[1:] - batch.response[0]
-        sigma = np.sqrt(np.nanmean(np.square(likelihood.residuals_of(response)), axis=1))
-        used = sigma > 0.0
-        jacobian = (slopes[:, used] / sigma[used, None]).reshape(n, -1)
+            return [], {STEP: f"not tested: a simulation failed ({reason})"}
+        response = batch.response[0]
+        sigma = np.sqrt(np.nanmean(np.square(likelihood.residuals_of(response)), axis=1))[:, None]
+        weights = np.divide(1.0, sigma, out=np.zeros_like(sigma), where=sigma > 0.0)
+        jacobian = ((batch.response[1:] - response) * weights).reshape(n, -1)
         precision[np.ix_(at, at)] += jacobian @ jacobian.T
-        for name, what, change, why in halved(model, theta, response, simulate):
-            tests[name] = f"not tested: {why}" if why else f"{what} was halved at the fit"
-            if change is not None:
-                pull = pulls.setdefault(what, np.zeros(len(sd)))
-                pull[at] += jacobian @ (change[used] / sigma[used, None]).ravel()
-                size = np.square(change).sum(), np.square(response).sum()
-                squares[what] = squares.get(what, np.zeros(2)) + size
+        for what, name, finer, every in _finer(model):
+            fine = simulate(finer, theta[None])
+            if fine.reasons[0]:
+                tests[name] = f"not tested: with half of {what} the simulation fails ({fine.reasons[0]})"
+                continue
+            change = fine.response[0][:, ::every] - response
+            tests[name] = f"{what} was halved at the fit"
+            if relative_difference(change, response) <= NOTHING:
+                tests[name] = f"not tested: half of {what} changes nothing: the model has its own, or it is exact"
+            pulls.setdefault(what, np.zeros(len(sd)))[at] += jacobian @ (change * weights).ravel()
+            squares[what] = squares.get(what, 0.0) + np.array([np.square(each).sum() for each in (change, response)])
     found = []
     for what, pull in pulls.items():
         shift = np.abs(np.linalg.lstsq(precision, pull)[0])
         numbers = {posterior.parameter_names[i]: float(shift[i]) for i in np.flatnonzero(shift >= SHIFT)}
         moves = ", ".join(f"{name} by {by:.2g}" for name, by in numbers.items())
-        change = 100.0 * np.sqrt(squares[what][0] / squares[what][1])
-        text = (
-            f"Half of {what} changes the response by {change:.2g} %, which moves {moves} posterior standard deviations."
-        )
+        change = percent(np.sqrt(squares[what][0] / squares[what][1]))
+        text = f"Half of {what} changes the response by {change}, which moves {moves} posterior standard deviations."
         severity, action = WRONG if (shift > LARGE_SHIFT).any() else CARE, f"Halve {what} until this is small."
         title = "The model is too coarse for its data"
         found += [Finding(title, severity, text, action, numbers, "fit")] if numbers else []
-    return StepTest(found, tests)
-
-
-def halved(
-    model: Any, theta: np.ndarray, response: np.ndarray, simulate: Simulate
-) -> Iterator[tuple[str, str, np.ndarray | None, str]]:
-    """Name of each step, what is halved, the change of the response (n_channels, n_steps), why this says nothing."""
-    for what, name, finer, every in _finer(model):
-        fine = simulate(finer, theta[None])
-        if fine.reasons[0]:
-            yield name, what, None, f"with half of {what} the simulation fails ({fine.reasons[0]})"
-            continue
-        change = fine.response[0][:, ::every] - response
-        nothing = relative_difference(change, response) <= NOTHING
-        why = f"half of {what} changes nothing: the model keeps a step of its own, or its step is exact"
-        yield name, what, change, why if nothing else ""
+    return found, tests
 
 
 def check_stronger_motion(model: Any, theta: np.ndarray, response: np.ndarray, simulate: Simulate) -> list[Finding]:

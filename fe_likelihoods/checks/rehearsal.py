@@ -10,11 +10,11 @@ from tqdm import tqdm
 from ..likelihood.posterior import Posterior
 from ..simulation.model import SimulationBatch, simulate_batch
 from .compared import SECONDS, Fit, compare, data_sets_of, draws_to_compare
-from .finding import CARE, Finding, grouped, percent
+from .faults import MOST_DRAWS
+from .finding import CARE, Finding, in_order
 from .fit import check_responses, check_supports
-from .model import NO_STEP, STEP, check_chance, check_stronger_motion, halved, motions_to_replace, relative_difference
-from .screening import check_data, check_gaps
-from .tables import MOST_DRAWS
+from .model import check_chance, check_stronger_motion, motions_to_replace
+from .screening import check_data
 
 __all__ = ["ModelCheck", "check_model"]
 
@@ -23,7 +23,6 @@ class ModelCheck(NamedTuple):
     """What `check_model` has found, causes first."""
 
     findings: tuple[Finding, ...]
-    steps: dict[str, str]  # what half of step and mesh changes at the mean of the prior, in words, by name
     simulations: int  # number of simulations made
     seconds: float  # per simulation [s]
     fits: tuple[Fit, ...]  # measurements beside the draws of the prior that were simulated
@@ -32,10 +31,10 @@ class ModelCheck(NamedTuple):
 def check_model(posterior: Posterior, *, progress: bool = False) -> ModelCheck:
     """Try the model and the data of a posterior before a run.
 
-    It simulates the mean of the prior twice, under twice the motion, with half of step and mesh, and draws of the
-    prior, which are compared with the measurements as in `fe_likelihoods.check_fit`.
-    `fe_likelihoods.check_data` looks at the data. Whether the steps are fine enough is judged after a run
-    (`fe_likelihoods.check_result`), where the precision of the parameters is known.
+    It simulates the mean of the prior twice, under twice the motion, and draws of the prior, which are compared with
+    the measurements as in `fe_likelihoods.check_fit`. `fe_likelihoods.check_data` looks at the data. Whether step and
+    mesh are fine enough is judged after a run (`fe_likelihoods.check_result`), where the precision of the parameters
+    is known.
 
     Parameters
     ----------
@@ -59,7 +58,7 @@ def check_model(posterior: Posterior, *, progress: bool = False) -> ModelCheck:
     []
     """
     mean, found, fits, seconds, before = posterior.prior.mean(), list[Finding](), list[Fit](), 0.0, _made(posterior)
-    steps, made = dict[str, str](), 0
+    made = 0
     with tqdm(disable=not progress, unit="simulation", desc="check") as bar:
         posterior.when_simulated(bar.update)
 
@@ -71,38 +70,27 @@ def check_model(posterior: Posterior, *, progress: bool = False) -> ModelCheck:
 
         try:
             for key, likelihood, columns in data_sets_of(posterior):
-                model = likelihood.model
+                model, pool = likelihood.model, likelihood.simulator.pool
                 theta = mean[columns][: len(model.parameter_names)]
                 batch = likelihood.simulate(theta[None])
                 if batch.reasons[0]:
                     raise ValueError(
                         f"the simulation at the mean of the prior has failed: {batch.reasons[0]}; check model, priors"
                     )
-                response = batch.response[0]
                 for _ in range(2):  # a first simulation may start a process, which would leave time for few draws
                     start = perf_counter()
                     again = simulate(model, theta[None])
                     if not SECONDS / MOST_DRAWS < (took := perf_counter() - start) < SECONDS:
                         break
-                pool = likelihood.simulator.pool
+                seconds += took
                 at_once = 1 if pool is None else pool.n_workers or 1
-                fits += compare(likelihood, draws_to_compare(posterior, took / at_once)[:, columns], key)[0]
+                fits += compare(likelihood, draws_to_compare(posterior, took / at_once)[:, columns], key)
                 # generators of workers have moved on meanwhile
-                chance = check_chance(response, again) or check_chance(
-                    response, simulate(model, np.tile(theta, (2, 1)), pool)
-                )
+                response, later = batch.response[0], simulate(model, np.tile(theta, (2, 1)), pool)
+                chance = check_chance(response, again) or check_chance(response, later)
                 # where responses differ by chance, other differences say nothing
                 found += chance or check_stronger_motion(model, theta, response, simulate)
-                end = f" ({key})" if key else ""
-                if likelihood.measurements.is_history and not chance:
-                    steps[f"{STEP}{end}"] = f"not tested: {NO_STEP}"
-                    for name, what, change, why in halved(model, theta, response, simulate):
-                        share = "" if why else percent(relative_difference(change, response))
-                        text = f"half of {what} changes the response at the mean of the prior by {share}"
-                        steps[f"{name}{end}"] = f"not tested: {why}" if why else text
                 found += check_supports(model) + list(check_data(likelihood.measurements, motions_to_replace(model)))
-                found += check_gaps(likelihood.noise)
-                seconds += took
         finally:
             posterior.when_simulated(None)
     found += check_responses(fits)
@@ -111,7 +99,7 @@ def check_model(posterior: Posterior, *, progress: bool = False) -> ModelCheck:
         text = f"{report['failure_count']} of the simulations of this check failed, {count} of them: {reason}."
         action = "A failed simulation counts as impossible: mend the model where its parameters are plausible."
         found.append(Finding("Simulations failed", CARE, text, action, {"count": report["failure_count"]}))
-    return ModelCheck(sum(grouped(found).values(), ()), steps, made + _made(posterior) - before, seconds, tuple(fits))
+    return ModelCheck(in_order(found), made + _made(posterior) - before, seconds, tuple(fits))
 
 
 def _made(posterior: Posterior) -> int:

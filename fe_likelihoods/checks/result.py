@@ -18,9 +18,9 @@ from .fit import (
     check_stated_errors,
     check_supports,
 )
-from .model import STEP, StepTest, check_stronger_motion, halve_steps, has_steps, motions_to_replace
+from .model import STEP, check_stronger_motion, halve_steps, has_steps, motions_to_replace
 from .run import Failures, FinishedRun, ParameterRow, failures, moments_of, read_run, rows_of
-from .screening import check_data, check_gaps
+from .screening import check_data
 
 __all__ = ["JudgedRun", "check_failures", "check_result", "judge_run"]
 
@@ -80,21 +80,25 @@ def judge_run(run: FinishedRun) -> JudgedRun:
     A run that says nothing about the parameters gets no findings that compare its samples with prior, truth or noise.
     """
     rows, fits = rows_of(run.parameters, run.prior, moments_of(run), run.truth), fit_data_sets(run)
-    model, made = _check_model(run)
+    of_model, tested, made = _check_model(run)
     failed, fits = failures(run), fits._replace(simulations=fits.simulations + made)  # failures of the fits included
-    found = check_responses(fits.fits) + model.findings  # first, because they explain a sampling that is not good
+    found = check_responses(fits.fits) + of_model  # first, because they explain a sampling that is not good
     found += _check_sampling(run) + _check_chain(run) + check_failures(run, failed)
-    for text in fits.failures:
-        action = "Use another point or mend the model."
-        found.append(Finding("A response is missing", CARE, f"{text}.", action, about="fit"))
-    for likelihood, _ in [] if run.likelihood is None else run.likelihood.parts():
-        found += check_supports(likelihood.model) + _check_range(likelihood) + check_gaps(likelihood.noise)
-        found += check_data(likelihood.measurements, motions_to_replace(likelihood.model))
+    parts = [] if run.likelihood is None else [likelihood for likelihood, _ in run.likelihood.parts()]
+    for each in parts:
+        found += check_supports(each.model)
+        found += check_data(each.measurements, motions_to_replace(each.model))
+        if text := getattr(each.model, "range_remark", ""):  # also of simulations that verify stored rows
+            action = "See whether samples of the posterior are concerned, or only draws far from it."
+            kind = "Beyond the range of a law of the model"
+            found.append(Finding(kind, CARE, f"{text[0].upper()}{text[1:]}.", action))
     if not run.is_inconclusive:
-        found += check_parameters(rows, run, run.centre)
+        found += check_parameters(rows)
         if all(each.severity != WRONG for each in found):  # a fault explains the residuals
             found += check_residuals(fits.fits) + check_stated_errors(fits.fits)
-            found += check_other_events([row for row in rows if row.name in _of_one_event(run)])
+            events = [find_events(each.model) for each in parts]
+            if len(parts) == 1 and has_steps(run.likelihood) and (events[0] is None or len(events[0].names) == 1):
+                found += check_other_events([row for row in rows if row.name in parts[0].model.parameter_names])
     checked = sum(each.checks is not None for fit in fits.fits for each in fit.channels)
     responses = max((len(each.modal.points if each.modal else each.draws) for each in fits.fits), default=0)
     alone = "the length of the chain alone: a Markov chain gives no verdict"
@@ -105,24 +109,16 @@ def judge_run(run: FinishedRun) -> JudgedRun:
         "Residuals": f"channels: {checked}" if checked else "not tested: there are none",
     }
     unique = dict.fromkeys(found)  # data sets may share a description or a motion
-    return JudgedRun(rows, fits, failed, judge(unique, (tests | model.tests).items()))
+    return JudgedRun(rows, fits, failed, judge(unique, (tests | tested).items()))
 
 
-def _of_one_event(run: FinishedRun) -> tuple[str, ...]:
-    """The structural parameters of a run with the history of one event; none for several, or for other data."""
-    parts = [] if run.likelihood is None else [likelihood for likelihood, _ in run.likelihood.parts()]
-    events = [find_events(likelihood.model) for likelihood in parts]
-    is_one = len(parts) == 1 and has_steps(run.likelihood) and (events[0] is None or len(events[0].names) == 1)
-    return tuple(parts[0].model.parameter_names) if is_one else ()
-
-
-def _check_model(run: FinishedRun) -> tuple[StepTest, int]:
+def _check_model(run: FinishedRun) -> tuple[list[Finding], dict[str, str], int]:
     """Whether the model reads its motion, the error of step and mesh at the centre of the samples, and simulations.
 
     These are one for each parameter and more; where they are many and take long, step and mesh are not tested.
     """
     if run.likelihood is None or run.prior is None or not has_steps(run.likelihood):
-        return StepTest([], {}), 0
+        return [], {}, 0
     known = {likelihood.model.fingerprint: likelihood for likelihood, _ in run.likelihood.parts()}
     report, others = run.likelihood.report(), 0
 
@@ -133,27 +129,24 @@ def _check_model(run: FinishedRun) -> tuple[StepTest, int]:
         others += len(points)
         return simulate_batch(model, points)
 
-    unread, motion = [], "not tested: no model has a motion that can be replaced"
+    found, tests = list[Finding](), {"Motion": "not tested: no model has a motion that can be replaced"}
     for _, likelihood, columns in data_sets_of(run):
         theta = run.centre[columns][: len(likelihood.model.parameter_names)]
         batch = likelihood.simulate(theta[None])
         if not batch.reasons[0] and motions_to_replace(likelihood.model):
-            motion = "twice the motion was simulated"
-            found = check_stronger_motion(likelihood.model, theta, batch.response[0], simulate)
-            unread += [each for each in found if each.severity == WRONG]  # failures are said where they are predicted
+            tests["Motion"] = "twice the motion was simulated"
+            stronger = check_stronger_motion(likelihood.model, theta, batch.response[0], simulate)
+            found += [each for each in stronger if each.severity == WRONG]  # failures are said where they are predicted
     needed = sum(2 + len(likelihood.model.parameter_names) for likelihood, _ in run.likelihood.parts())
     seconds = report["seconds"] / max(report["simulations"], 1)
-    if unread or run.is_inconclusive:
-        test = StepTest([], {})
-    elif run.n_modes > 1:
-        why = "the samples have several modes, which have no common standard deviation"
-        test = StepTest([], {STEP: f"not tested: {why}"})
+    if run.n_modes > 1:
+        tests[STEP] = "not tested: the samples have several modes, which have no common standard deviation"
     elif needed > LARGEST_TEST * report["simulations"] and needed * seconds > TEST_SECONDS:
-        test = StepTest([], {STEP: f"not tested: the test takes about {needed} simulations of {seconds:.2g} s"})
-    else:
-        test = halve_steps(run.posterior, run.centre, run.samples.std(axis=0), simulate)
-    made = run.likelihood.simulations - report["simulations"] + others
-    return StepTest(unread + test.findings, {"Motion": motion} | test.tests), made
+        tests[STEP] = f"not tested: the test takes about {needed} simulations of {seconds:.2g} s"
+    elif not found and not run.is_inconclusive:
+        coarse, halved = halve_steps(run.posterior, run.centre, run.samples.std(axis=0), simulate)
+        found, tests = coarse, tests | halved
+    return found, tests, run.likelihood.simulations - report["simulations"] + others
 
 
 def _check_sampling(run: FinishedRun) -> list[Finding]:
@@ -208,11 +201,3 @@ def check_failures(run: FinishedRun, failed: Failures) -> list[Finding]:
     found = [Finding("Simulations failed", CARE if share > TAIL else NOTE, text, action, {"share": share})]
     said = run.verdict is not None and run.verdict.near_failures is not None
     return found if said or (run.is_inconclusive and not run.tempered) else found + check_failed_region(failed.near)
-
-
-def _check_range(likelihood: Any) -> list[Finding]:
-    """What a model has said about simulations beyond the range of its laws, also those that verify stored rows."""
-    text = getattr(likelihood.model, "range_remark", "")
-    action = "See whether samples of the posterior are concerned, or only draws far from it."
-    title = "Beyond the range of a law of the model"
-    return [Finding(title, CARE, f"{text[0].upper()}{text[1:]}.", action)] if text else []

@@ -222,14 +222,6 @@ class ParameterRow(NamedTuple):
     lower: float  # bound of the prior; infinite where there is none or it is not known
     upper: float  # bound of the prior; infinite where there is none or it is not known
 
-    def widened(self, factor: float) -> float:
-        """Standard deviation if the precision of the data, beyond the prior's, is divided by the square of a factor."""
-        if not self.sd > 0.0:
-            return self.sd
-        prior = 1.0 / self.prior_sd**2 if self.prior_sd > 0.0 else 0.0
-        data = max(1.0 / self.sd**2 - prior, 0.0)
-        return max(self.sd, (prior + data / factor**2) ** -0.5)
-
 
 def rows_of(
     parameters: Sequence[Parameter], prior: Prior | None, moments: Moments, truth: np.ndarray | None = None

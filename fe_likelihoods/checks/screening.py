@@ -3,21 +3,20 @@
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from ..signals.channels import Measurements
 from ..signals.records import Record
 from ..units import from_si
-from .finding import CARE, NOTE, TAIL, Finding, about, by_severity
+from .finding import CARE, NOTE, Finding, about, by_severity
 from .sensor_faults import SensorFault, find_sensor_faults, straight_parts
 
 __all__ = [
     "Screened",
     "check_data",
-    "check_gaps",
     "check_phases",
     "check_sensors",
     "check_steps_of_mass",
@@ -50,7 +49,7 @@ def check_data(measurements: Measurements, record: Record | Sequence[Record] | N
     -------
     tuple of Finding
         The most severe first, empty if nothing was found: faults of sensors, sizes that are not plausible in SI units,
-        channels that never change, and synthetic data.
+        and channels that never change.
 
     Examples
     --------
@@ -79,9 +78,6 @@ def check_data(measurements: Measurements, record: Record | Sequence[Record] | N
     if silent:
         text, action = f"All samples of {', '.join(silent)} are equal.", "Leave it out, or read another column."
         found.append(Finding("A sensor was silent", CARE, text, action))
-    if "synthetic" in measurements.description.lower():
-        text = "The measurements were computed with a model, not measured."
-        found.append(Finding("Synthetic data", NOTE, text, "Say so wherever you show the numbers."))
     return by_severity(about("input", found))
 
 
@@ -136,20 +132,17 @@ def screen_motion(motion: Record) -> list[Screened]:
     return [Screened(motion.name, "m/s²", motion.dt, 0.0, tuple(found), is_motion=True)]
 
 
-def repair_lines(channels: Sequence[Screened], given: Mapping[str, Any] | None = None) -> list[str]:
-    """Lines of ``[measurements]`` that deal with all faults; `given` are the values of these keys in the file."""
-    given = given or {}
-    missing = [json.dumps(each, ensure_ascii=False) for each in given.get("missing", ())]
-    old = len(missing)
+def repair_lines(channels: Sequence[Screened], marks: Sequence[str | float] = ()) -> list[str]:
+    """Lines of ``[measurements]`` that deal with all faults, and with texts or numbers that stand for no sample."""
+    missing = [json.dumps(each, ensure_ascii=False) for each in marks]
     missing += [f"[{json.dumps(c.name)}, {first}, {last}]" for c in channels for first, last in c.missing()]
-    lines = [f"missing = [{', '.join(missing)}]"] if len(missing) > old else []
-    points = {c.name: f"[{', '.join(c.baseline())}]" for c in channels if c.baseline()}
-    kept = {name: json.dumps(each, ensure_ascii=False) for name, each in given.get("baseline", {}).items()}
-    if points:
-        lines.append(f"baseline = {{{', '.join(f'{_key(name)} = {each}' for name, each in (kept | points).items())}}}")
-    if noisy := [c.name for c in channels if any(each.kind == "noise" for each in c.faults)]:
-        lines.append(f"# leave out of columns, or of channels: {', '.join(noisy)}")
-    return lines
+    points = [f"{_key(c.name)} = [{', '.join(c.baseline())}]" for c in channels if c.baseline()]
+    noisy = [c.name for c in channels if any(each.kind == "noise" for each in c.faults)]
+    return [
+        *([f"missing = [{', '.join(missing)}]"] if missing else []),
+        *([f"baseline = {{{', '.join(points)}}}"] if points else []),
+        *([f"# leave out of columns, or of channels: {', '.join(noisy)}"] if noisy else []),
+    ]
 
 
 def _key(name: str) -> str:
@@ -188,20 +181,6 @@ def check_sensors(channels: Sequence[Screened]) -> list[Finding]:
         severity = NOTE if fault.kind == "noise" else CARE
         found.append(Finding(kind, severity, f"{name} {text}", action, {channel.name: float(fault.size)}))
     return found
-
-
-def check_gaps(noise: Any) -> list[Finding]:
-    """Gaps in the measurements of a noise whose shares refer to the level of the measured part of a motion."""
-    shares = noise.gap_shares() if hasattr(noise, "gap_shares") else {}
-    large = {name: share for name, share in shares.items() if share > TAIL}
-    if not large:
-        return []
-    text = (
-        f"Samples are missing in {', '.join(f'{name} ({share:.0%})' for name, share in large.items())}: the share of "
-        f"{noise.title} refers to the others, and is too large if the strong part is missing."
-    )
-    action = "Use local=1, whose level is taken from samples near by."
-    return [Finding("Gaps in the data", CARE, text, action, large, "input")]
 
 
 def check_steps_of_mass(names: Sequence[str], step: float) -> list[Finding]:

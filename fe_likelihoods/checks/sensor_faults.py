@@ -18,11 +18,9 @@ MATTERS = 0.25  # of the peak, or of the standard deviation: smaller parts hardl
 DIGITS = 3.0  # the steps beside, in smallest steps; without it, 10 of 181 right channels are named for 4
 STILL = 3  # equal samples at an extremum, half of those elsewhere; right channels: 2, or between small steps
 LONG, VANISHED = 1.5, 10.0  # for so many periods a signal is never so much smaller than beside; right: 5.8
-FAINT = 4.0  # the same for white noise; right: 2.5
 SPIKE = 18.0  # ratio to the errors of interpolation around it; right channels: 15.9
 LEVEL = 0.02  # smallest mean of a tenth of a channel, or change of such means, in peaks; right channels: 0.012
 SMOOTH = 0.9  # share of the variance of these means in a polynomial; right channels: 0.8
-STEADY = HALF  # rate of a drift in the first and last third, as a share of the whole; after yielding: 0
 WHITE = 0.25  # largest autocorrelation at lags of one to six samples; right channels: 0.37; noise is 3/4 of the power
 STRAIGHT = 15  # equal steps of a motion in a row; right motions: 11; found in 99 % of 2355 gaps of 0.2 to 1 s
 WIDEST, AROUND, MOST_SPIKES = 3, 10, 200  # samples of a spike, samples around it that are looked at, and their number
@@ -43,28 +41,19 @@ def find_sensor_faults(values: np.ndarray, dimension: str = "") -> tuple[SensorF
     An acceleration returns to zero, and a displacement begins there; forces and strains of dead loads do not.
     """
     x, found = np.array(values, dtype=float), list[SensorFault]()
-    for kind, look in (("spikes", _spikes), ("clipped", _clipped), ("stuck", _stuck)):
-        if not _is_judged(x):
+    for kind, look in (("spikes", _spikes), ("clipped", _clipped), ("stuck", _stuck), ("", None)):
+        # enough neighbouring samples, and not all equal
+        if np.isfinite(np.diff(x)).sum() < FEWEST or not np.nanmax(x) > np.nanmin(x):
             return tuple(found)
-        if spans := look(x):
+        if look is not None and (spans := look(x)):
             found.append(SensorFault(kind, spans, sum(last - first + 1 for first, last in spans) / len(x)))
             for first, last in spans:
                 x[first : last + 1] = np.nan
-    if not _is_judged(x):
-        return tuple(found)
-    whole = ((0, len(x) - 1),)
-    peak, level = _peak(x), _baseline(x, dimension)
-    if level:
-        found.append(SensorFault("offset" if len(level) == 1 else "drift", whole, np.ptp((0.0, *level)) / peak, level))
-    correlation = _correlation(x)
-    if correlation < WHITE:
-        found.append(SensorFault("noise", whole, correlation))
-    return tuple(found)
-
-
-def _is_judged(x: np.ndarray) -> bool:
-    """Whether enough neighbouring samples are there, and not all equal."""
-    return bool(np.isfinite(np.diff(x)).sum() >= FEWEST and np.nanmax(x) > np.nanmin(x))
+    whole, correlation = ((0, len(x) - 1),), _correlation(x)
+    if level := _baseline(x, dimension):
+        size = float(np.ptp((0.0, *level))) / _peak(x)
+        found.append(SensorFault("offset" if len(level) == 1 else "drift", whole, size, level))
+    return (*found, SensorFault("noise", whole, correlation)) if correlation < WHITE else tuple(found)
 
 
 def _peak(x: np.ndarray) -> float:
@@ -84,31 +73,28 @@ def runs_of(true: np.ndarray) -> list[tuple[int, int]]:
 def _flat_parts(x: np.ndarray) -> list[tuple[int, int]]:
     """First and last samples of parts of equal samples between steep steps, which the top of a wave has not."""
     steps, equal = np.abs(np.diff(x)), _round_off(x)
-    known, found = steps[np.isfinite(steps)], []
-    least = DIGITS * known[known > equal].min(initial=np.inf)
-    if np.count_nonzero(known > equal) < FEWEST:  # steps are what it consists of
-        return []
-    for first, last in runs_of(steps <= equal):
+    moving = steps[steps > equal]
+    found = []
+    for first, last in runs_of(steps <= equal) if len(moving) >= FEWEST else ():  # else it consists of steps
         sides = (steps[max(first - 2 * STILL, 0) : first], steps[last : last + 2 * STILL])
         beside = [np.square(side[np.isfinite(side)]).mean() for side in sides if np.isfinite(side).any()]
-        if beside and min(beside) >= least**2:
+        if beside and min(beside) >= (DIGITS * moving.min()) ** 2:
             found.append((first, last))
     return found
 
 
 def _clipped(x: np.ndarray) -> tuple[tuple[int, int], ...]:
     """Samples at the largest or smallest value, if several in a row have it between steep parts."""
-    equal, found = _round_off(x), list[tuple[int, int]]()
-    flat = _flat_parts(x)
+    found, flat = list[tuple[int, int]](), _flat_parts(x)
     for top in (np.nanmax(x), np.nanmin(x)):
-        at = np.abs(x - top) <= equal
+        at = np.abs(x - top) <= _round_off(x)
         if sum(last - first + 1 for first, last in flat if at[first]) >= STILL:
             found += [(first, stop - 1) for first, stop in runs_of(at)]
     return tuple(sorted(found))
 
 
 def _stuck(x: np.ndarray) -> tuple[tuple[int, int], ...]:
-    """Samples at which the sensor stood still, or had only electronic noise for longer than a period of the motion."""
+    """Samples at which the sensor stood still, or hardly moved for longer than a period of the motion."""
     still, level = np.zeros(len(x), dtype=bool), float(np.nanstd(x))
     for first, last in _flat_parts(x):
         still[first : last + 1] |= last - first >= 2 * STILL
@@ -116,15 +102,11 @@ def _stuck(x: np.ndarray) -> tuple[tuple[int, int], ...]:
     length, beside = max(int(LONG * period), 2 * STILL), max(int(0.5 * period), 3)
     if len(x) > 2 * (length + beside):
         quiet, sides = _moving_deviation(x, length), _moving_deviation(x, beside)
-        for least in MATTERS * 2.0 ** np.arange(4):
-            for ratio in (VANISHED, FAINT):
-                for start, stop in runs_of(quiet <= least * level / ratio):
-                    first, after = start, stop - 1 + length
-                    if first < beside or after + beside > len(x) or still[start:stop].any():
-                        continue
-                    found = np.minimum(sides[first - beside], sides[after])
-                    noisy = ratio == VANISHED or _correlation(x[first:after]) < WHITE
-                    still[first:after] |= bool(np.isfinite(found) and found >= least * level and noisy)
+        for least in MATTERS * level * 2.0 ** np.arange(4):
+            for first, stop in runs_of(quiet <= least / VANISHED):
+                after = stop - 1 + length
+                if first >= beside and after + beside <= len(x) and not still[first:stop].any():
+                    still[first:after] |= bool(least <= min(sides[first - beside], sides[after]) < np.inf)
     # a quiet start, as of a shake table, is no fault
     return tuple((first, stop - 1) for first, stop in runs_of(still) if first > 0 or stop == len(x))
 
@@ -165,18 +147,16 @@ def _spikes(x: np.ndarray) -> tuple[tuple[int, int], ...]:
         peak, best = _peak(x), (SPIKE, 0, 0)
         errors = np.convolve(x, cubic, "same")
         errors[:2] = errors[-2:] = np.nan
-        there = np.isfinite(errors)
-        errors = np.where(there, errors, 0.0)
+        there, errors = np.isfinite(errors), np.nan_to_num(errors)
         for width in range(1, WIDEST + 1):
-            pattern = np.convolve(np.ones(width), cubic)
-            pattern = np.pad(pattern, AROUND - 2)
-            size, window = np.correlate(errors, pattern, "same") / (pattern @ pattern), np.ones(len(pattern))
-            left = np.convolve(np.square(errors), window, "same") - np.square(size) * (pattern @ pattern)
+            pattern = np.pad(np.convolve(np.ones(width), cubic), AROUND - 2)
+            power, window = pattern @ pattern, np.ones(len(pattern))
+            size = np.correlate(errors, pattern, "same") / power
+            left = np.convolve(np.square(errors), window, "same") - np.square(size) * power
             count = np.convolve(there, window, "same")
             noise = np.sqrt(np.maximum(left, 0.0) / np.maximum(count - 1.0, 1.0)) + 1e-4 * peak
             ratio = np.where((np.abs(size) > MATTERS * peak) & (count > AROUND), np.abs(size) / noise, 0.0)
-            k = int(np.argmax(ratio))
-            best = max(best, (float(ratio[k]), k - width // 2, width))
+            best = max(best, (float(ratio.max()), int(np.argmax(ratio)) - width // 2, width))
         _, first, width = best
         if not width:
             break
@@ -194,23 +174,21 @@ def _baseline(x: np.ndarray, dimension: str) -> tuple[float, ...]:
     """
     parts = np.array([np.nan if np.isnan(part).all() else np.nanmean(part) for part in np.array_split(x, 10)])
     places, parts = np.linspace(-0.9, 0.9, 10)[np.isfinite(parts)], parts[np.isfinite(parts)]
-    peak, spread = _peak(x), np.square(parts - parts.mean()).sum()
+    peak, spread, third = _peak(x), np.square(parts - parts.mean()).sum(), len(parts) // 3
     returns, first = dimension in ("acceleration", "velocity"), float(np.mean(x[np.isfinite(x)][:STILL]))
-    third = len(parts) // 3
     for degree in (1, 2) if len(parts) > 4 else ():
         line = np.polynomial.Polynomial.fit(places, parts, degree, domain=[-1, 1])
         ends = line(np.linspace(-1.0, 1.0, degree + 1))
         smooth = np.square(parts - line(places)).sum() < (1.0 - SMOOTH) * spread
-        # a structure that yields moves in the strong part of the motion alone
+        # a structure that yields moves in the strong part of the motion alone: the rate of its ends is zero
         rates = [np.polyfit(places[part], parts[part], 1)[0] for part in (slice(third + 1), slice(-third - 1, None))]
-        steady = degree == 1 and min(2.0 * rate / (ends[1] - ends[0]) for rate in rates) > STEADY
+        steady = degree == 1 and min(2.0 * rate / (ends[1] - ends[0]) for rate in rates) > HALF
         if np.ptp(line(places)) > LEVEL * peak and smooth and (returns or steady):
             return tuple(ends.tolist())
     level = parts if returns else np.append(parts, first)
     large = np.abs(level).min() > LEVEL * peak and (np.sign(level) == np.sign(level[0])).all()
-    if large and (returns or dimension in ("displacement", "rotation")):
-        return (float(np.median(parts)) if returns else first,)
-    return ()
+    known = large and (returns or dimension in ("displacement", "rotation"))
+    return (float(np.median(parts)) if returns else first,) if known else ()
 
 
 def _correlation(x: np.ndarray) -> float:

@@ -1,7 +1,6 @@
 """Findings about predictions, populations of stored posteriors and compared stiffnesses, from numbers."""
 
 from collections.abc import Mapping, Sequence
-from typing import Protocol
 
 import numpy as np
 
@@ -13,7 +12,6 @@ __all__ = [
     "check_event",
     "check_final_values",
     "check_most",
-    "check_normal",
     "check_peaks",
     "check_reweighting",
 ]
@@ -23,20 +21,11 @@ PEAK_RATIO = 2.0
 NARROW = 0.2  # bandwidth of a motion by that of the calibration; earthquakes of one structure differ by 0.38 or more
 UNSETTLED = 0.1  # half the range in the last two seconds by the final value, which is then known to 10 % at best
 NO_MOTION = 0.01  # half the range there by the largest response: a motion that does not matter
-# Limits with study `hierarchy_warnings` of docs/results.rst, where the exact result is known.
-LARGEST_SHAPE = 0.8  # Pareto shape; up to here, right results have it as well
+LARGEST_SHAPE = 0.8  # Pareto shape of weights; up to here, right results have it as well (study `hierarchy_warnings`)
 HARMLESS_ERROR = 0.15  # of the means [posterior sd], up to which uneven weights and mixtures do no harm
-# Skewness and excess kurtosis of the logarithms in any direction, assumed: a uniform distribution has the excess
-# kurtosis -1.2, a double exponential one 3, and an exponential one the skewness 2.
-NORMAL = (-1.0, 1.0), (-1.2, 3.0)
 # Standard deviations of the prior by which the median of a common factor may differ from its mean: named in 1 of 120
 # right cases, and in 120 of 120 in which all stiffnesses, known to 2 %, have lost 14 or 20 %.
 COMMON = 1.96
-
-
-class _Reweighted(Protocol):
-    pareto_shape: float
-    shift: float
 
 
 def check_peaks(
@@ -88,43 +77,25 @@ def check_final_values(ends: Mapping[str, Sequence[float]]) -> list[Finding]:
     return [Finding("A final value still moves", CARE, text, action, numbers)] if numbers else []
 
 
-def check_event(reason: str) -> list[Finding]:
+def check_event(reason: str) -> Finding:
     """An event that cannot be predicted, with the `reason` of the failures."""
-    text, action = (
-        f"It could not be predicted: {reason}.",
-        "Mend the model for this motion; the samples stay as they are.",
+    action = "Mend the model for this motion; the samples stay as they are."
+    return Finding("An event is not predicted", CARE, f"It could not be predicted: {reason}.", action)
+
+
+def check_reweighting(shapes: Mapping[str, float], error: float, parameters: Sequence[str]) -> list[Finding]:
+    """Whether the stored samples of each test suffice, by the Pareto shapes of weights and the largest error [sd]."""
+    wide = {name: shape for name, shape in shapes.items() if shape > LARGEST_SHAPE}
+    names, shown = ", ".join(map(repr, wide)), ", ".join(f"{each:.2f}" for each in wide.values())
+    text = f"test {names}: the population reaches values that the prior leaves out (Pareto shape {shown})."
+    action = f"Sample this test again with a wider prior of {', '.join(parameters)}."
+    if wide:
+        return [Finding("The prior of a test is too narrow", CARE, text, action, wide)]
+    text = f"Tests have too few samples: the means have errors of up to {error:.1f} posterior sd."
+    action = "Give more samples of the tests, or draw fresh ones with the population as their prior."
+    return (
+        [Finding("Too few samples of a test", CARE, text, action, {"error": error})] if error > HARMLESS_ERROR else []
     )
-    return [Finding("An event is not predicted", CARE, text, action)]
-
-
-def check_reweighting(tests: Mapping[str, _Reweighted], error: float, parameters: Sequence[str]) -> list[Finding]:
-    """Whether the stored samples of each test suffice; `error` is the largest error of a mean [posterior sd]."""
-    found = []
-    for name, each in tests.items():
-        if each.pareto_shape > LARGEST_SHAPE:
-            text = (
-                f"test {name!r}: the population reaches values that the prior of this test leaves out (Pareto shape "
-                f"{each.pareto_shape:.2f}, above {LARGEST_SHAPE:g}): the spread between tests is not reliable."
-            )
-            action = f"Sample this test again with a wider prior of {', '.join(parameters)}."
-            numbers = {"shape": each.pareto_shape, "error": error}
-            found.append(Finding("The prior of a test is too narrow", CARE, text, action, numbers))
-    if not found and error > HARMLESS_ERROR:
-        worst = max(tests, key=lambda name: tests[name].shift)
-        text = f"test {worst!r}: the means have errors of up to {error:.1f} posterior sd, from too few samples."
-        action = "Give more samples of this test, or draw fresh samples with the population as its prior."
-        found.append(Finding("Too few samples of a test", CARE, text, action, {"error": error}))
-    return found
-
-
-def check_normal(skewness: np.ndarray, kurtosis: np.ndarray) -> list[Finding]:
-    """Whether the logarithms of the stiffnesses are normal, by skewness and excess kurtosis (n,) in n directions."""
-    numbers = zip((skewness, kurtosis), NORMAL, strict=True)
-    if all(low < np.min(each) and np.max(each) < high for each, (low, high) in numbers):
-        return []
-    shown = f"skewness {np.max(np.abs(skewness)):.1f}, excess kurtosis {np.min(kurtosis):.1f} to {np.max(kurtosis):.1f}"
-    text = f"The logarithms of the stiffnesses are not normal ({shown}): ridges and several modes are not represented."
-    return [Finding("A calibration is not normal", CARE, text, "Use narrower priors, or fix what is not identified.")]
 
 
 def check_common(factors: np.ndarray, expected: float, sd: float) -> list[Finding]:

@@ -65,7 +65,7 @@ def _say_simulation(problem: Problem, checked: ModelCheck, say: Callable[[str], 
         errors = rrmse(measured.values - part.residuals_of(part.simulate(theta).response[0]), measured.values)
         fit = ", ".join(f"{c.name} {100 * e:.0f} %" for c, e in zip(measured.channels, errors, strict=True))
         say(f"At the mean of the prior the error of the response (RRMSE) is {fit}")
-    for line in (*labelled(checked.findings), *(f"{name}: {how}" for name, how in checked.steps.items())):
+    for line in labelled(checked.findings):
         say(line)
 
 

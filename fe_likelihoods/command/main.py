@@ -106,8 +106,8 @@ def _show(outcome: Any) -> None:
 def check(file: Path, quiet: bool) -> None:
     """Read FILE and its data, test with about 100 simulations, and say what was found.
 
-    It tries whether the model is repeatable and follows its motion, whether units, signs, clocks and channels are
-    right, and whether step and mesh are fine enough for the data. The picture check-NAME.png compares the measurements
+    It tries whether the model is repeatable and follows its motion, and whether units, signs, clocks and channels are
+    right. The picture check-NAME.png compares the measurements
     with simulations at draws of the prior: the measurements should lie within their band.
     """
     from .checking import check_job

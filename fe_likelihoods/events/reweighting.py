@@ -76,11 +76,12 @@ def check_hierarchy(posterior: "HierarchicalPosterior", samples: np.ndarray, see
         )
     errors, evidence = _mean_errors(used, np.sum(changes, axis=0))
     evidences = sum(test.log_evidence_error**2 for test in posterior.tests.values())
+    shapes = {name: each.pareto_shape for name, each in found.items()}
     return HierarchyChecks(
         found,
         dict(zip(posterior.parameter_names, errors.tolist(), strict=True)),
         float(np.sqrt(evidence**2 + evidences)),
-        tuple(check_reweighting(found, float(errors.max()), list(posterior.varying))),
+        tuple(check_reweighting(shapes, float(errors.max()), list(posterior.varying))),
     )
 
 

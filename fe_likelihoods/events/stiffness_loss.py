@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..checks.finding import Finding, judge, labelled
-from ..checks.transfer import check_common, check_most, check_normal
+from ..checks.transfer import check_common, check_most
 from ..priors.distributions import Distribution, HalfNormal, LogNormal
 from ..text_tables import text_table
 from .scales import Scales
@@ -220,10 +220,7 @@ def _state(stored: StoredPosterior, names: tuple[str, ...]) -> _State:
     offset = directions.T @ np.linalg.solve(factor, mean - center) * seen
     axes = factor @ directions
     peak, errors = center + axes @ (offset * (1.0 + 1.0 / information)), axes / information @ axes.T
-    scores = np.column_stack([apart, apart @ np.linalg.solve(factor.T, directions[:, seen])])
-    scores /= np.sqrt(weights @ np.square(scores))
-    findings = (*stored.findings, *check_normal(weights @ scores**3, weights @ scores**4 - 3.0))
-    return _State(peak, errors, int((~seen).sum()), center, prior_covariance, findings)
+    return _State(peak, errors, int((~seen).sum()), center, prior_covariance, tuple(stored.findings))
 
 
 class _Node:

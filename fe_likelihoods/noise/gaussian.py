@@ -363,26 +363,6 @@ class GaussianNoise:
                 "or use a noise for all samples"
             )
 
-    def gap_shares(self) -> dict[str, float]:
-        """Share of the samples that are missing within the measured motion, by channel [-].
-
-        Empty for a noise whose levels do not follow the response over time, without measurements, and for ``local=1``.
-        An event without any sample of a channel is no gap, since mean squares are computed per event.
-        """
-        if self.level != "response" or self.layout is None or self.local == 1.0:
-            return {}
-        shares, counts, events = {}, np.array(self.layout.counts), self.of_parts
-        for channel, step, row in zip(self.channels, self.layout.steps, counts.T, strict=True):
-            known = np.flatnonzero(row)
-            inside = np.arange(known[0] + 1, known[-1]) if known.size else known  # without the first and last part
-            if events:  # odd numbers; nothing needs to be measured in the pauses
-                of_parts = np.array(events)[np.minimum(np.arange(len(row)), len(events) - 1)]
-                measured = np.unique(of_parts[row > 0])  # each event has its own mean square
-                inside = inside[(of_parts[inside] % 2 == 1) & np.isin(of_parts[inside], measured)]
-            expected = self.window / _PARTS / step * inside.size
-            shares[channel.name] = float(1.0 - row[inside].sum() / expected) if inside.size else 0.0
-        return shares
-
     def with_channels(self, channels: Sequence[Channel], weights: np.ndarray) -> "tuple[GaussianNoise, np.ndarray]":
         """Noise of other channels, with the weights of the parameters; see `fe_likelihoods.noise.protocol.Noise`.
 

@@ -46,8 +46,6 @@ class Noise(Protocol):
     * ``with_channels(channels, weights)``, for predictions of channels that were not measured. ``weights`` (n_others,
       n_channels) expresses each new channel by the noise's channels. It returns the noise of the new channels, and the
       weights (n_others_noise, n_noise) that express the new noise's parameters by the parameters of this noise.
-    * ``gap_shares()``, which returns the share of missing samples by channel where gaps change the level of the noise;
-      `fe_likelihoods.checks` judges them.
     """
 
     @property

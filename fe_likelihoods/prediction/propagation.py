@@ -27,7 +27,6 @@ from samplers.evaluation.values import most_common_reasons
 from ..cache.simulation_cache import SimulationCache
 from ..checks.finding import warn
 from ..checks.model import check_same_response
-from ..checks.screening import check_gaps
 from ..checks.transfer import check_bandwidth, check_final_values, check_peaks
 from ..likelihood.simulator import Simulator
 from ..noise.protocol import noise_under
@@ -230,8 +229,6 @@ def propagate(
         findings += check_bandwidth(bandwidth(model), bandwidth(calibration.model))
     if first is not None:
         findings += check_same_response(difference_of_responses(calibration, model, *first))
-    if noise and source.likelihood is not None:
-        findings += check_gaps(source.likelihood.noise)
     warn(findings)
     measured = None if source.likelihood is None or other else source.likelihood.measurements
     data = None if measured is None or measured.is_history else measured

@@ -90,8 +90,7 @@ def describe_event(
 ) -> OtherEvent:
     """Describe and score the predictions of an event, or the error that `propagate` raises if all simulations fail."""
     if isinstance(predictions, SimulationFailed):
-        failed = tuple(check_event(predictions.reason))
-        return OtherEvent(name, {}, measured, (), (), (), "There is no prediction.", failed)
+        return OtherEvent(name, {}, measured, (), (), (), "There is no prediction.", (check_event(predictions.reason),))
     findings = list(dict.fromkeys(found for each in predictions.values() for found in each.findings))
     first = next(iter(predictions.values()))
     reasons = "; ".join(f"{count}: {reason}" for reason, count in first.failure_reasons.items())

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from ..checks.finding import grouped
 from ..checks.result import JudgedRun, judge_run
 from ..checks.run import FinishedRun, read_run
 from ..information.identifiability import of_samples
@@ -155,7 +154,7 @@ def gather(
         "date": datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
         "status": judgement.status,
         "summary": summary_sentences(run, rows, fits, judgement),
-        "findings": grouped(judgement.findings),
+        "findings": judgement.findings,
         "data": sets,
         "rows": rows,
         "factor": judgement.width_factor,

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import Channel, LinearOscillator, Measurements
-from fe_likelihoods.checks.fault_words import describe_unit
-from fe_likelihoods.checks.faults import find_faults
+from fe_likelihoods.checks.faults import describe_unit, find_faults
 from fe_likelihoods.problems import table_motion
 
 MOTION = table_motion().trim(0.0, 10.0).resample(0.02)

@@ -88,12 +88,6 @@ def test_a_late_recorder_of_an_input_is_not_used():
     assert names(check_fit(posterior, fitted(posterior, starts=2)))
 
 
-def test_parameters_at_bounds_and_far_from_their_prior_are_named():
-    model, measured = deck()
-    posterior = posterior_of(model, measured, DECK | {"frequency": Uniform(2.0, 3.0)})
-    assert "At the edge of the prior" in {each.kind for each in check_fit(posterior, fitted(posterior, starts=2))}
-
-
 @pytest.mark.slow
 def test_the_fault_of_one_event_is_named_with_it():
     events = Events([MOTION, MOTION.scale(0.5)], rest=2.0, names=("EQ1", "EQ2"))

@@ -1,4 +1,4 @@
-"""Findings about load tests: exchanged cases, one wrong value, wrong units; right ones are not named."""
+"""Findings about load tests: swapped channels, wrong units and signs; right ones are not named."""
 
 import numpy as np
 import pytest
@@ -32,21 +32,13 @@ def findings(change, seed, known):
     return check_fit(posterior), check_fit(posterior, samples)
 
 
-def typo(y):
-    y[1, 2] += 1.5e-3
-    return y
-
-
 @pytest.mark.parametrize("known", [True, False])
 @pytest.mark.parametrize(
     ("kind", "words", "change"),
     [
         ("", "", lambda y: y),
-        ("Values may be exchanged", "truck at 4 m and truck at 13 m", lambda y: y[:, [2, 1, 0, 3, 4]]),
-        ("Values may be exchanged", "reversed order", lambda y: y[:, ::-1]),
         ("Channels may be swapped", "at 6 m and at 12 m", lambda y: y[[1, 0, 2]]),
-        ("A value may be wrong", "at 12 m of truck at 13 m", typo),
-        ("A unit may be wrong", "kN and N of the loads", lambda y: 1e-3 * y),
+        ("A unit may be wrong", "m and mm", lambda y: 1e-3 * y),
         ("A sign may be wrong", "at 6 m", lambda y: y * [[-1.0], [1.0], [1.0]]),
     ],
 )

@@ -83,21 +83,6 @@ def test_correlated_errors_are_a_note_with_the_factor_in_the_first_sentence(rng)
     assert describe_residuals(residual_checks(np.array([[1.0, -2.0]])))[0].startswith("Not checked: 2 samples")
 
 
-def test_a_wider_standard_deviation_is_between_that_of_the_data_and_the_prior():
-    nan = float("nan")
-
-    def row(sd, prior_sd):
-        return ParameterRow(
-            "k", "k", "", "", 1.0, prior_sd, 1.0, nan, sd, nan, sd, 0.0, 1.0, 2.0, nan, nan, 0.0, np.inf
-        )
-
-    assert row(0.01, 1e6).widened(3.0) == pytest.approx(0.03)
-    assert row(0.01, nan).widened(3.0) == pytest.approx(0.03)
-    assert row(0.99, 1.0).widened(100.0) == pytest.approx(1.0, abs=1e-3)
-    assert row(0.5, 1.0).widened(1.0) == pytest.approx(0.5)
-    assert row(1.2, 1.0).widened(3.0) == 1.2 and row(0.0, 1.0).widened(3.0) == 0.0
-
-
 def test_one_event_says_by_which_factor_its_errors_are_too_small_for_another_one():
     """Two events differ by the square root of two times the spread between events; other parameters are not named."""
     nan = float("nan")

@@ -41,12 +41,10 @@ def test_sizes_that_no_structure_has_are_named(factors, scale):
     assert found.kind == "A size is not plausible" and found.severity == "care" and found.numbers["peak"] > 0.0
 
 
-def test_a_channel_that_never_changes_is_named_and_synthetic_data_are_a_note():
+def test_a_channel_that_never_changes_is_named():
     silent = VALUES.copy()
     silent[0] = 0.01
     assert kinds(silent) == ["A sensor was silent"]
-    (found,) = check_data(Measurements([TOP, DECK], 0.02, VALUES, "SYNTHETIC: a column"))
-    assert (found.kind, found.severity) == ("Synthetic data", "note")
 
 
 def test_long_steps_are_named_for_accelerations_below_the_top():

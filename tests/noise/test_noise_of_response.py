@@ -23,7 +23,6 @@ from fe_likelihoods import (
     TruncatedNormal,
     propagate,
 )
-from fe_likelihoods.checks.screening import check_gaps
 from fe_likelihoods.emulation.target import ResponseTarget
 
 N, DT = 240, 0.02
@@ -104,7 +103,6 @@ def test_gaps_and_times_of_channels(rng):
     gap, parameters, simulated = values.copy(), PARAMETERS, response([1.2])
     gap[0, 100:130] = np.nan
     likelihood = likelihood_of(gap)
-    assert [[*each.numbers] for each in check_gaps(likelihood.noise)] == [["top"]]
     there = np.where(np.isnan(gap), np.nan, simulated)  # the envelope is that of the samples that are there
     sd = likelihood.noise.response_deviations(parameters, there)
     expected = np.nansum(stats.norm.logpdf(gap, simulated, sd))
@@ -192,7 +190,7 @@ def test_events_have_levels_of_their_own_response(rng):
     assert likelihood.noise.under(LinearOscillator(strong)).of_parts == ()
 
 
-def test_a_gap_makes_the_share_that_of_another_level_and_is_named(rng):
+def test_a_gap_makes_the_share_that_of_another_level(rng):
     """The share of the whole response is too large beside a gap in the strong part; that of the envelope is not."""
     motion = response([1.0])
     strong = slice(*np.searchsorted(np.cumsum(motion[0] ** 2) / np.sum(motion[0] ** 2), [0.2, 0.8]))
@@ -206,7 +204,6 @@ def test_a_gap_makes_the_share_that_of_another_level_and_is_named(rng):
         if gap:
             values[0, strong] = np.nan
         likelihood = FELikelihood(MODEL, Measurements(CHANNELS, DT, values), noise)
-        assert [each.kind for each in check_gaps(likelihood.noise)] == ["Gaps in the data"] * (gap and local == 0.0)
         grid = np.column_stack([np.ones(400), shares, np.full(400, 0.2)])
         return shares[np.argmax(likelihood(grid))]
 

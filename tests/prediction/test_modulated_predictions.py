@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import Events, FELikelihood, GaussianNoise, LinearOscillator, Measurements, Record, propagate
-from fe_likelihoods.checks.screening import check_gaps
 
 DT, WINDOW = 0.02, 0.6
 SAMPLES = np.array([[1.0, 1.0, 0.1, 0.1]] * 10)
@@ -25,14 +24,6 @@ def noise_for(model, **options):
     return GaussianNoise(model.channels, level="response", window=WINDOW, sensor=deviations, **options)
 
 
-def with_gap(**options) -> FELikelihood:
-    """A likelihood with 2 s missing in the strong part."""
-    model = LinearOscillator(quake(1))
-    values = model.simulate([1.0, 1.0])
-    values[:, 200:300] = np.nan
-    return FELikelihood(model, Measurements(model.channels, DT, values), noise_for(model, **options))
-
-
 def test_pauses_of_the_calibration_are_no_gap_of_another_record():
     events = Events([quake(1), quake(2)], rest=10.0, names=["a", "b"])
     model = LinearOscillator(events)
@@ -43,17 +34,6 @@ def test_pauses_of_the_calibration_are_no_gap_of_another_record():
         likelihood = FELikelihood(model, single, noise_for(model))
         found = propagate(likelihood, SAMPLES, record=quake(3), **OPTIONS)
     assert found.findings == ()
-
-
-@pytest.mark.parametrize("of_events", [False, True])
-def test_a_gap_of_the_calibration_is_a_finding_of_every_prediction_with_noise(of_events):
-    likelihood = with_gap()
-    record = Events([quake(4, 4.0), quake(5, 4.0)], rest=6.0) if of_events else quake(3)
-    with pytest.warns(UserWarning, match="Samples are missing"):
-        found = [propagate(likelihood, SAMPLES, record=record, **OPTIONS) for _ in range(2)]
-    assert found[0].findings == found[1].findings == tuple(check_gaps(likelihood.noise))
-    assert "CAUTION: Gaps in the data" in str(found[0])
-    assert propagate(likelihood, SAMPLES, record=record, **OPTIONS | {"noise": False}).findings == ()
 
 
 @pytest.mark.parametrize(
