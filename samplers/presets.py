@@ -11,9 +11,10 @@ literal
 
 The scale of their random walk is not given; 2.38 / sqrt(ndim) is used.
 
-`CHING_CHEN_2007` is for `TMCMCSampler`: coefficient of variation 1, multinomial leaders, one Metropolis step per point,
-covariance 0.04 times the weighted covariance (Ching & Chen 2007, doi:10.1061/(ASCE)0733-9399(2007)133:7(816)). It can
-collapse on sharp posteriors; the default of `TMCMCSampler` does not.
+`CHING_CHEN_2007` is for `TMCMCSampler`: coefficient of variation 1 of the weights (an effective sample size of half the
+walkers), multinomial leaders, one Metropolis step per point, covariance 0.04 times the weighted covariance (Ching &
+Chen 2007, doi:10.1061/(ASCE)0733-9399(2007)133:7(816)). It can collapse on sharp posteriors; the default of
+`TMCMCSampler` does not.
 
 None of these settings makes sweeps over fast parameters, which are not in the papers.
 
@@ -46,7 +47,6 @@ RAMANCHA_2022_LITERAL: Mapping[str, Any] = MappingProxyType({**_COMMON, "ess_rul
 CHING_CHEN_2007: Mapping[str, Any] = MappingProxyType(
     {
         "moves": RandomWalkMove(scale=0.2),
-        "coefficient_of_variation": 1.0,
         "resampling": "multinomial",
         "chains": "leaders",
         "burn_in": 0,

@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from .budget import as_limit
 from .estimates.control_variates import SignedSample
 from .estimates.genealogy import standard_error_of_mean, student_factor
 from .estimates.importance import EvidenceCheck
@@ -11,6 +10,7 @@ from .judgement.checks import OF_MEAN
 from .judgement.clusters import error_between_modes
 from .judgement.failures import NearFailures
 from .judgement.verdict import Verdict
+from .record import as_limit
 from .reports import GuidedRound, Stage
 from .tempering.guide import Guide
 
@@ -200,11 +200,11 @@ class RunResults:
 
         A limit below the number of simulations already made has no effect on these simulations.
         """
-        return self._budget.limit
+        return self._record.limit
 
     @max_simulations.setter
     def max_simulations(self, value: float | None) -> None:
-        self._budget.limit = as_limit(value)
+        self._record.limit = as_limit(value)
 
     @property
     def simulations(self) -> float:
@@ -213,13 +213,13 @@ class RunResults:
         Points that differ only in ``log_prob_fn.fast_parameters`` count once. An interrupted run that is continued is
         included. A cache of `log_prob_fn` can make some simulations unnecessary.
         """
-        return self._budget.simulations
+        return self._record.simulations
 
     @property
     def simulations_of_guides(self) -> float:
         """The part of `simulations` that guides have made for their search; simulations of first parts of a record
         count as fractions."""
-        return self._budget.of_guides
+        return self._record.of_guides
 
     @property
     def seed(self) -> int | list[int] | None:

@@ -5,7 +5,6 @@ Every default is defined only here. Constants that no user changes are beside th
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
-from difflib import get_close_matches
 from numbers import Integral
 from typing import Any
 
@@ -35,14 +34,12 @@ class Settings:
     ----------
     ess_ratio : float
         Wanted effective sample size of each stage, relative to the number of walkers (`ess_rule` "constant") or to the
-        previous stage's target ("declining"); between 0 and 1.
+        previous stage's target ("declining"); between 0 and 1. Papers on TMCMC give a coefficient of variation c of the
+        weights instead: 1 / (1 + c²).
     ess_rule : {"constant", "declining"}
         What `ess_ratio` refers to.
     ess_floor : float
         Lower limit of the declining target.
-    coefficient_of_variation : float, optional
-        Wanted coefficient of variation of the incremental weights in each stage. It replaces `ess_ratio`: n weights
-        with this coefficient have an effective sample size of n / (1 + coefficient²).
     resampling : {"systematic", "multinomial"}
         Scheme of `samplers.resampling`.
     min_moves, max_moves : int
@@ -83,7 +80,6 @@ class Settings:
     ess_ratio: float = 0.5
     ess_rule: str = "constant"
     ess_floor: float = 0.0
-    coefficient_of_variation: float | None = None
     resampling: str = "systematic"
     min_moves: int = 2
     max_moves: int = 7
@@ -106,12 +102,11 @@ class Settings:
                 object.__setattr__(self, name, bool(value))
             elif not isinstance(value, bool) and (value is not None or name == "asynchronous"):
                 raise ValueError(f"{name} must be {allowed}; got {value!r}")
-        variation, check_draws = self.coefficient_of_variation, self.check_draws
+        check_draws = self.check_draws
         for name, possible, wanted in (
             ("ess_ratio", 0.0 < self.ess_ratio < 1.0, "between 0 and 1 (both excluded)"),
             ("ess_rule", self.ess_rule in ("constant", "declining"), '"constant" or "declining"'),
             ("ess_floor", self.ess_floor >= 0.0, "non-negative"),
-            ("coefficient_of_variation", variation is None or 0.0 < variation < np.inf, "positive and finite"),
             ("resampling", self.resampling in RESAMPLING, f"in {[*RESAMPLING]}"),
             ("min_moves", 1 <= self.min_moves <= self.max_moves, f"between 1 and max_moves = {self.max_moves}"),
             ("max_correlation", 0.0 < self.max_correlation <= 1.0, "above 0 and at most 1"),
@@ -135,9 +130,7 @@ class Settings:
 
     def target(self, last_target: float, n_walkers: int) -> float:
         """Wanted effective sample size of a stage, from the previous target (n_walkers before the first stage)."""
-        variation = self.coefficient_of_variation
-        ratio = self.ess_ratio if variation is None else 1.0 / (1.0 + variation**2)
-        return max(ratio * (n_walkers if self.ess_rule == "constant" else last_target), self.ess_floor)
+        return max(self.ess_ratio * (n_walkers if self.ess_rule == "constant" else last_target), self.ess_floor)
 
 
 def most_moves(ndim: int) -> int:
@@ -150,15 +143,13 @@ def most_moves(ndim: int) -> int:
 def check_names(sampler: str, names: Collection[str], given: Collection[str], arguments: Collection[str]) -> None:
     """Raise TypeError for a keyword that is neither a setting (one of `names`) nor one of the other `arguments`."""
     if unknown := set(given) - set(names):
-        name = min(unknown)
-        near = get_close_matches(name, [*names, *arguments], n=1, cutoff=0.6)
         raise TypeError(
-            f"{sampler}() got an unexpected keyword argument {name!r}{f': did you mean {near[0]}?' if near else ''}; "
-            f"arguments, besides those in emcee, are {', '.join(arguments)}; settings are {', '.join(sorted(names))}"
+            f"{sampler}() got an unexpected keyword argument {min(unknown)!r}; arguments, besides those in emcee, are "
+            f"{', '.join(arguments)}; settings are {', '.join(sorted(names))}"
         )
 
 
-def check_arguments(pool: Any, backend: Any, seed: Any, ndim: int, vectorize: bool, names: Any) -> None:
+def check_arguments(pool: Any, backend: Any, seed: Any) -> None:
     """Raise ValueError for arguments that emcee or NumPy would refuse later or with an unclear error."""
     if pool is not None and not (hasattr(pool, "map") or hasattr(pool, "submit")):
         raise ValueError(f"pool must be an object with a method map, such as multiprocessing.Pool(4); got {pool!r}")
@@ -166,14 +157,3 @@ def check_arguments(pool: Any, backend: Any, seed: Any, ndim: int, vectorize: bo
         raise ValueError(f"backend must be a backend of emcee, as emcee.backends.HDFBackend('run.h5'); got {backend!r}")
     if seed is not None and not all(isinstance(each, Integral) for each in np.ravel(seed)):
         raise ValueError(f"seed must be a whole number, several of them, or None; got {seed!r}")
-    if names is None:
-        return
-    if vectorize:
-        raise ValueError("parameter_names needs vectorize=False: a function of a batch takes an array (n, ndim)")
-    places = names if isinstance(names, dict) else {name: place for place, name in enumerate(names)}
-    found = {place for each in places.values() for place in np.ravel(each).tolist()}
-    if not isinstance(names, list | dict) or found != set(range(ndim)) or len(names) > ndim:
-        raise ValueError(
-            f"parameter_names must be a list of {ndim} different names, or a dict of names with their indices, 0 to "
-            f"{ndim - 1} in all; got {names!r}"
-        )

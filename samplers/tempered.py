@@ -9,7 +9,7 @@ Therefore any emcee move works below beta = 1, and a change of beta needs no eva
 
 Private attributes of emcee that are used, ``_random``, ``_moves``, ``_weights`` and ``_previous_state``, are pinned by
 `tests.contract.test_emcee_contract`. The user's function is evaluated by `samplers.evaluation.evaluator.Evaluator`, its
-values are kept by `samplers.record.Record`, and ladder and verdict are stored by `samplers.output.Output`.
+values are kept by `samplers.record.Record`, and ladder and verdict are stored by `samplers.chain.Chain`.
 """
 
 import copy
@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from .budget import Budget, BudgetExhausted, as_limit
+from .chain import Chain, open_record
 from .emcee_names import EnsembleSampler, State
 from .estimates.importance import EvidenceCheck
 from .evaluation.asynchronous import AsynchronousEvaluator, check_asynchronous
@@ -36,8 +36,7 @@ from .judgement.checks import check_end, check_likelihood, check_prior
 from .judgement.failures import KEPT_POINTS, judged_failures
 from .judgement.verdict import CONVERGED, describe_early_stop, independent_points, judge
 from .moves.population_moves import GuideMove, RandomWalkMove, describe, with_fast_sweeps, without_unfitted
-from .output import Output
-from .record import EvaluatedBatch, Incomplete, RunStart, open_record
+from .record import BudgetExhausted, EvaluatedBatch, Incomplete, RunStart, as_limit
 from .reporting.progress import Progress
 from .reports import AnnealingResult, Report, Stage, warn
 from .results import RunResults
@@ -140,7 +139,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
     ):
         check_names(type(self).__name__, self.setting_names, settings, ARGUMENTS)
         nwalkers, ndim = as_whole_number("nwalkers", nwalkers), as_whole_number("ndim", ndim)
-        check_arguments(pool, backend, seed, ndim, vectorize, parameter_names)
+        check_arguments(pool, backend, seed)
         functions = log_prob_fn, log_likelihood_fn, log_prior_fn
         self._target = target = Target(*functions, ndim, args, kwargs, vectorize, blobs_dtype)
         self.log_prior_fn = target.log_prior_fn
@@ -152,16 +151,21 @@ class TemperedSampler(RunResults, EnsembleSampler):
             check_guide(guide, target.function, vectorize)
 
         self._record = open_record(backend, nwalkers, ndim, target.slow_parameters)
-        self._budget = Budget(self._record, as_limit(max_simulations))
-        # whether the annealing of the record must be repeated, and whether another sampler wrote the record
-        self._must_repeat = self._reopened = self._record.start is not None
+        self._record.limit = as_limit(max_simulations)
+        self._must_repeat = reopened = self._record.start is not None  # the annealing, from the record
         self.seconds = 0.0
         self._previous_state = None
         same = pool, copy.deepcopy(moves), args, kwargs, backend, vectorize, blobs_dtype, parameter_names
-        super().__init__(nwalkers, ndim, target.function, *same)
-        self._output = Output(self.backend)
-        self._result, self._verdict = self._output.result, self._output.verdict
-        self._is_compared = not self._reopened and self.backend.iteration == 0
+        try:
+            super().__init__(nwalkers, ndim, target.function, *same)
+        except AssertionError as error:  # emcee's test of the names
+            raise ValueError(
+                f"parameter_names must be a list of {ndim} different names, or a dict of names with their indices, "
+                f"with vectorize=False; got {parameter_names!r}: {error}"
+            ) from error
+        self._chain = Chain(self.backend)
+        self._result, self._verdict = self._chain.result, self._chain.verdict
+        self._must_compare = reopened or self.backend.iteration > 0
         check_moves(self._moves, given.chains)
         self._fast = target.fast_parameters if pool is None or vectorize else ()
         followed = with_fast_sweeps(self._moves, self._fast, ndim, given.fast_sweeps)
@@ -171,7 +175,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         if given.ess_floor >= nwalkers:
             raise ValueError(f"ess_floor={given.ess_floor} must be below nwalkers={nwalkers}")
         target.parameter_names = self.parameter_names if self.params_are_named else None
-        common = target, self._record, self._budget, nwalkers, given.max_failure_share
+        common = target, self._record, nwalkers, given.max_failure_share
         if given.asynchronous:
             check_asynchronous(target, pool, guide is not None or bool(given.recycle))
             queue = None if guide is None else guide.evaluation_queue
@@ -179,13 +183,13 @@ class TemperedSampler(RunResults, EnsembleSampler):
         else:
             self._evaluator = Evaluator(*common)
         self._failed_before = target.failure_count or 0
-        known = self._record.latest(self._record.count) if self._reopened else None
+        known = self._record.latest(self._record.count) if reopened else None
         if known and self._record.start.header["log_prob_fn"] == getattr(target.function, "fingerprint", None):
             target.recall(known)
         self._seed = None if seed is None else np.ravel(seed).tolist()
         # also drawn where it is not used, so that a script draws the same numbers after a restart
         stream = np.random.randint(2**32, size=8, dtype=np.uint32) if seed is None else seed  # noqa: NPY002
-        if self._reopened and self._seed not in (None, stored := self._record.start.header["seed"]):
+        if reopened and self._seed not in (None, stored := self._record.start.header["seed"]):
             logger.warning(
                 "%s contains a run with seed=%s: seed=%s has no effect", self.backend.filename, stored, self._seed
             )
@@ -197,28 +201,18 @@ class TemperedSampler(RunResults, EnsembleSampler):
         """The given settings, with the settings that this sampler chooses, and the moves."""
         return {"recycle": False} | settings, RandomWalkMove() if moves is None else moves
 
-    def __deepcopy__(self, memo):
-        memo[id(self)] = copied = type(self).__new__(type(self))
-        memo[id(self._evaluator)] = evaluator = copy.copy(self._evaluator)  # which copies of moves share
-        vars(evaluator).update(copy.deepcopy(self._evaluator.__getstate__(), memo))
-        vars(copied).update(copy.deepcopy(self.__getstate__(), memo))
-        return copied
-
     def __getstate__(self):
         # emcee removes the pool from the living sampler here; remove it from the copy only
         return {**self.__dict__, "pool": None}
 
     def reset(self):
-        """Clear the chain, as in emcee: burn in, reset, and continue with None or the last State.
-
-        Other draws of the prior begin another annealing, whose evaluations are counted with the earlier ones.
-        """
-        if hasattr(self, "_output"):
+        """Clear the chain, as in emcee: burn in, reset, and continue with None or the last State."""
+        if hasattr(self, "_chain"):
             if not self._must_repeat:
                 state = self._previous_state
             else:  # the annealing of a file, whose chain may end with an estimate that is replaced
-                state = None if self._output.provisional else self._output.last_state()
-            self._output.clear_chain(state)
+                state = None if self._chain.provisional else self._chain.last_state()
+            self._chain.clear_chain(state)
         else:  # emcee initialises a new backend
             super().reset()
 
@@ -237,9 +231,9 @@ class TemperedSampler(RunResults, EnsembleSampler):
         initial_state : (nwalkers, ndim) float, State or None
             Draws of the prior. None: continue from the last state if there is one, else draw
             ``log_prob_fn.sample_prior(nwalkers, random)``. After annealing, a State of this sampler (or the coordinates
-            of its last State) is continued, and so is a run that began with the same draws. Other draws start a new
-            annealing: call `reset` before, or use a new sampler. Points that cannot be draws of the prior, such as a
-            ball near the posterior, are refused with a ValueError (`samplers.evaluation.starts`).
+            of its last State) is continued, and so is a run that began with the same draws. Other draws need a new
+            sampler. Points that cannot be draws of the prior, such as a ball near the posterior, are refused with a
+            ValueError (`samplers.evaluation.starts`).
         nsteps : int
             Number of steps stored in the chain; 0 for the annealing only.
         **kwargs
@@ -311,14 +305,14 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._evaluator.pool = self.pool
         arguments = {"tune": tune, "thin_by": thin_by, "thin": thin, "store": store, "iterations": iterations}
         bar = {"progress": progress, "progress_kwargs": progress_kwargs}
-        start, provisional, evaluations = time.perf_counter(), self._output.provisional, self.evaluations
+        start, provisional, evaluations = time.perf_counter(), self._chain.provisional, self.evaluations
         random_state = self._random.get_state()
-        with self._output.whole():
+        with self._chain.whole():
             try:
                 state = self._first_state(state, skip_initial_state_check)
                 failures, skip = self.failure_count, skip_initial_state_check
                 if isinstance(state, RunStart):
-                    start_of_run, stored, skip = state, self._output.last_state(), True
+                    start_of_run, stored, skip = state, self._chain.last_state(), True
                     try:
                         with self._annealing(start_of_run, stored, bar) as (steps, guidance, take):
                             answer = None
@@ -332,17 +326,16 @@ class TemperedSampler(RunResults, EnsembleSampler):
                         state = self._annealed(population, guidance, stored)
                     except Incomplete:
                         state = self._go_on_without_annealing(stored)
-                if store and provisional and not self._output.provisional:
+                if store and provisional and not self._chain.provisional:
                     arguments["iterations"] = iterations = iterations + 1  # in place of the provisional step
                 with deferred_interrupts():
                     self._previous_state = State(state, copy=True)  # where the next call goes on after an interrupt
                     self._must_repeat = self._must_repeat and bool(self._result.ended)
                 self.seconds += time.perf_counter() - start
                 self._moves = without_unfitted(self._moves)
-                state.blobs = self._evaluator.typed(state.blobs)
+                self._evaluator.typed(EvaluatedBatch(state.coords, state.log_prob, state.blobs, {}))
                 if store:
-                    self._output.trim()
-                    self._output.check_blobs(state.blobs)
+                    self._chain.trim()
                 ended, advanced, stored, new = self._must_repeat, None, State(state, copy=True), 0
                 steps = (
                     () if ended else super().sample(state, skip_initial_state_check=skip, **arguments, progress=False)
@@ -359,7 +352,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
                             with deferred_interrupts():
                                 self._previous_state = stored = State(advanced, copy=True)
                                 if store:
-                                    self._output.step_stored()
+                                    self._chain.step_stored()
                             self._record.drop_old_points(KEPT_POINTS)
                             self.seconds += time.perf_counter() - start
                             yield advanced
@@ -396,7 +389,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
 
     def _undo(self, random_state: tuple) -> None:
         """Remove incomplete results: a part of a step, and the draws of a run that has not begun."""
-        self._output.undo_half_a_step()
+        self._chain.undo_half_a_step()
         if self._record.start is None:  # the next call makes the same draws
             self._random.set_state(random_state)
 
@@ -407,8 +400,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
                 setattr(advanced, name, getattr(stored, name))
         self.random_state = stored.random_state
         if store and missing > 0 and self.backend.iteration == 0:
-            self._output.store_provisional_step(stored)
-        text = describe_early_stop(self.verdict, self._budget.limit, self._result, new, missing)
+            self._chain.store_provisional_step(stored)
+        text = describe_early_stop(self.verdict, self._record.limit, self._result, new, missing)
         # only steps at beta = 1 are missing in a converged run: nothing to be warned of
         logger.info(text) if self.verdict.status == CONVERGED else warn(text)
         if new == 0 and missing > 0:
@@ -423,12 +416,12 @@ class TemperedSampler(RunResults, EnsembleSampler):
             latest = self._record.latest(KEPT_POINTS)
             self._near = None if latest is None else judged_failures(latest, coords, self._target)
             numbers = self.nwalkers, self.ndim, self.simulations
-            others = self._budget.of_guides, self._near, tuple(self._target.names)
+            others = self._record.of_guides, self._near, tuple(self._target.names)
             self._verdict = judge(self._result, *numbers, missing, failed, *others)
         elif self._record.start is not None:  # an annealing that could not be made again
             self._verdict = self._verdict._replace(simulations=self.simulations)
-        self._output.result, self._output.verdict = self._result, self._verdict
-        self._output.write()
+        self._chain.result, self._chain.verdict = self._result, self._verdict
+        self._chain.write()
 
     def compute_log_prob(self, coords):
         """Log-probability and blobs of points (n, ndim), as in emcee; -inf for NaN and outside the prior's support."""
@@ -439,40 +432,35 @@ class TemperedSampler(RunResults, EnsembleSampler):
 
     def _first_state(self, given: State | None, skip_check: bool) -> State | RunStart:
         """The state at beta = 1 from which a call continues, or the start of the annealing that comes first."""
-        if self._record.start is not None and self._output.was_reset:
+        if self._record.start is not None and self._chain.was_reset:
             self.reset()
         self._open_record()
-        if self._record.start is not None:
-            self._output.drop_provisional_step()
+        if self._chain.provisional:
+            self._chain.clear_chain()
         start, previous = self._record.start, self._previous_state
         if start is not None and self._must_repeat:
             known = [each.coords for each in (start, previous) if each is not None]
-            if given is None or any(np.array_equal(given.coords, coords) for coords in known):
-                if self._record.path is not None:  # a user who waits sees that the time spent is not lost
-                    said = "Going on with %s: %d evaluations and %d steps are stored"
-                    logger.warning(said, self.backend.filename, self.evaluations, self.iteration)
-                return start
-            if self._reopened:
+            if given is not None and not any(np.array_equal(given.coords, coords) for coords in known):
                 raise ValueError(
                     f"{self._place} contains a run from other draws of the prior: pass None as initial_state to go on "
                     "with it, or use another file; backend.reset(nwalkers, ndim) discards it"
                 )
-        if given is None and previous is not None:
-            given = previous
-        elif given is None:
-            draws = self._target.sample_prior(self.nwalkers, self._random)
-            return self._new_start(State(draws), skip_check, True)
-        elif previous is not None and given.log_prob is None:
-            if np.array_equal(given.coords, previous.coords):
-                given.log_prob, given.blobs = copy.deepcopy((previous.log_prob, previous.blobs))
-            elif start is not None and np.array_equal(given.coords, start.coords):  # a cell, or a script, that is
-                given = previous  # started again with the same draws goes on
+            if self._record.path is not None:  # a user who waits sees that the time spent is not lost
+                said = "Going on with %s: %d evaluations and %d steps are stored"
+                logger.warning(said, self.backend.filename, self.evaluations, self.iteration)
+            return start
+        if given is None or (start is not None and np.array_equal(given.coords, start.coords)):
+            given = previous  # a cell, or a script, that is started again with the same draws goes on
+        if given is None:
+            return self._new_start(State(self._target.sample_prior(self.nwalkers, self._random)), skip_check, True)
+        if previous is not None and given.log_prob is None and np.array_equal(given.coords, previous.coords):
+            given.log_prob, given.blobs = copy.deepcopy((previous.log_prob, previous.blobs))
         if given.log_prob is not None and self._result.finished:
             return given
-        if self.backend.iteration > 0:
+        if start is not None or self.backend.iteration > 0:
             raise ValueError(
                 f"the chain has {self.iteration} steps that were not annealed from these points: pass None to add to "
-                "them, call reset before other draws of the prior, or use another file for a chain of emcee's sampler"
+                "them, make a new sampler for other draws of the prior, or use another file for a chain of emcee"
             )
         return self._new_start(given, skip_check)
 
@@ -480,18 +468,18 @@ class TemperedSampler(RunResults, EnsembleSampler):
         """Lock the record of a file; once, a ValueError if another posterior or other settings made the stored run."""
         if self._record.start is not None:
             self._record.open()
-        if not self._is_compared and (found := self._differences()):
+        if self._must_compare and (found := self._differences(self._record.start)):
             raise ValueError(
                 f"{self._place} contains another run: {'; '.join(found)}. Use another file or backend, or "
                 "backend.reset(nwalkers, ndim)"
             )
-        self._is_compared = True
+        self._must_compare = False
 
-    def _differences(self) -> list[str]:
+    def _differences(self, start: RunStart | None) -> list[str]:
         """How the stored run differs from a run of this sampler, as text: in its settings, or in values of a function
         without a fingerprint at the best known point.
         """
-        start, last, close = self._record.start, self._previous_state, {"rtol": 1e-9, "atol": 1e-9}
+        close = {"rtol": 1e-9, "atol": 1e-9}
         if start is not None:
             stored, ours = start.header, self._header()
             if stored["sampler"] != ours["sampler"]:  # most settings then differ as well
@@ -501,27 +489,20 @@ class TemperedSampler(RunResults, EnsembleSampler):
                 if changed[0] == "log_prob_fn":  # a guide has the same fingerprint
                     found[0] += ": its model, data, noise or prior differ, or another line of the module with the model"
                 return found
-            log_prior = float(np.sum(self._target.log_prior(start.coords)))
-            if not np.isclose(log_prior, stored["log_prior"], **close):
+            if not np.isclose(float(np.sum(self._target.log_prior(start.coords))), stored["log_prior"], **close):
                 return ["the log-prior of the draws that it started from differs"]
-        elif self._record.path is not None and self._result.finished:
-            logger.warning(
-                "%s has no record: the chain goes on from its last step, and other settings cannot be noticed",
-                self.backend.filename,
-            )
-        known = self._record.latest(max(self._record.count, 1))
-        if known is None and last is not None:
-            known = EvaluatedBatch(last.coords, last.log_prob, last.blobs, {})
+        else:
+            said = "%s has no record: the chain goes on from its last step, and other settings cannot be noticed"
+            logger.warning(said, self._place)
+        known = self._record.latest(self._record.count) or self._previous_state
         if getattr(self._target.function, "fingerprint", None) is not None or known is None:
             return []
-        finite = np.where(np.isfinite(known.log_prob), known.log_prob, -np.inf)
-        if np.max(finite) == -np.inf:
+        best = int(np.argmax(np.where(np.isfinite(known.log_prob), known.log_prob, -np.inf)))
+        coords, log_prob = known.coords[best], known.log_prob[best]
+        found = self._evaluator.compute(coords[None]).log_prob[0] if np.isfinite(log_prob) else log_prob
+        if np.isclose(log_prob, found, equal_nan=True, **close):
             return []
-        known = known.rows([int(np.argmax(finite))])
-        found, (coords,) = self._evaluator.compute(known.coords), known.coords
-        if np.isclose(known.log_prob, found.log_prob, **close).all():
-            return []
-        return [f"log_prob_fn was {known.log_prob[0]:.10g} at {coords}, is {found.log_prob[0]:.10g}"]
+        return [f"log_prob_fn was {log_prob:.10g} at {coords}, is {found:.10g}"]
 
     @property
     def _place(self) -> str:
@@ -539,6 +520,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
             "log_prob_fn": getattr(self._target.function, "fingerprint", None),
             "sampler": type(self).__name__,
             "log_likelihood_fn": "used" if self._target.is_likelihood else None,
+            "blobs_dtype": None if self._target.blobs_dtype is None else str(np.dtype(self._target.blobs_dtype)),
             **asdict(self.settings),
             "moves": [describe(move) for move in moves],
             "probabilities": [float(probability) for probability in probabilities],
@@ -551,14 +533,14 @@ class TemperedSampler(RunResults, EnsembleSampler):
         coords = np.asarray(state.coords, dtype=float)
         log_prior = self._target.check_start(coords, self.nwalkers, skip_check, is_drawn)
         self.random_state = state.random_state
-        run = {"run": uuid.uuid4().hex, "seed": self._seed, "of_earlier_guides": self._budget.of_guides}
-        run["log_prior"] = float(np.sum(log_prior))
+        run = {"run": uuid.uuid4().hex, "seed": self._seed, "log_prior": float(np.sum(log_prior))}
         start = RunStart(self._header() | run, coords, self.random_state)
         self._record.begin(start)
         self._failed_before = self._target.failure_count or 0
-        self._output.begin(run["run"])
+        self._chain.begin(run["run"])
         if state.log_prob is not None:
-            self._record.evaluated(EvaluatedBatch(coords, np.asarray(state.log_prob, dtype=float), state.blobs, {}))
+            known = EvaluatedBatch(coords, np.asarray(state.log_prob, dtype=float), state.blobs, {})
+            self._record.evaluated(self._evaluator.typed(known))
         return start
 
     # ------------------------------------------------------------------ annealing
@@ -571,13 +553,13 @@ class TemperedSampler(RunResults, EnsembleSampler):
         """
         self._result, self._verdict, self._must_repeat = AnnealingResult(), None, True
         self.random_state = start.random_state
-        self._budget.restart(start.header["of_earlier_guides"])
+        self._record.use(None)
         schedule, guidance = MoveSchedule(*copy.deepcopy(self._first_moves)), None
         self._moves, self._weights = schedule
         self._evaluator.remember = remember = self._record.remembering()
         if self._given_guide is not None:
             self._guide = self._given_guide.fresh()
-            guidance = lend(self._guide, self._random, remember, self._budget, self.settings.asynchronous)
+            guidance = lend(self._guide, self._random, remember, self._record, self.settings.asynchronous)
         self._record.is_complete = stored is not None
         population = Population(0.0, start.coords, None, float(self.nwalkers))
         since = time.perf_counter(), self._evaluator.evaluations
@@ -605,37 +587,36 @@ class TemperedSampler(RunResults, EnsembleSampler):
 
     def _annealed(self, population: Population, guidance: Guidance | None, stored: State | None) -> State:
         """The state at beta = 1 that an annealing has led to, or the last `stored` state of a run made again."""
-        self._result = self._finished(self._result, population, guidance)
-        ended, weighted = bool(self._result.ended), self._result.weighted
+        result, weighted = self._result, self._result.weighted
+        first = self._record.latest(self._record.count)
+        coords, log_prob = first.coords[: self.nwalkers], first.log_prob[: self.nwalkers]  # of the prior, or of a guide
+        log_prior = self._target.log_prior(coords)
+        said = check_end(result, population.coords) + check_likelihood(log_prob, log_prior)
+        said += check_prior(coords, log_prior) if guidance is None else list(guidance.guide.findings)
+        for finding in said:
+            warn(finding.message)
+        self._result = result._replace(
+            findings=(*result.findings, *said),
+            basis="" if guidance is None else guidance.guide.basis,
+            independent_points=independent_points(result, population.coords),
+        )
+        ended = bool(result.ended)
         if weighted is not None and weighted.guided and not ended:
             moves = with_fast_sweeps([GuideMove(self._guide)], self._fast, self.ndim, self.settings.fast_sweeps)
             schedule = MoveSchedule(moves, np.ones(1))
             schedule.calibrate(population.coords, np.full(self.nwalkers, 1.0 / self.nwalkers))
             self._moves, self._weights = schedule
         self._judge(0, population.coords)
-        self._reopened = False
+        if not ended:
+            self._record.forget_arrays()
         if stored is not None and not ended:
             self.random_state = stored.random_state
             return stored
         log_prob, blobs = unpack(population.records)
         state = State(population.coords, log_prob=log_prob, blobs=blobs, random_state=self.random_state)
         if not ended:
-            self._output.write(state)
+            self._chain.write(state)
         return state
-
-    def _finished(self, result: AnnealingResult, population: Population, guidance: Guidance | None) -> AnnealingResult:
-        """The result of an annealing, with what is known of it as a whole."""
-        coords, log_prob = self._record.first(self.nwalkers)  # draws of the prior, or of a guide
-        log_prior = self._target.log_prior(coords)
-        said = check_end(result, population.coords) + check_likelihood(log_prob, log_prior)
-        said += check_prior(coords, log_prior) if guidance is None else list(guidance.guide.findings)
-        for finding in said:
-            warn(finding.message)
-        return result._replace(
-            findings=(*result.findings, *said),
-            basis="" if guidance is None else guidance.guide.basis,
-            independent_points=independent_points(result, population.coords),
-        )
 
     def _go_on_without_annealing(self, stored: State) -> State:
         """The last stored state of a run whose annealing cannot be made again, with the results that are stored."""
@@ -644,9 +625,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
             "SciPy, computes other bits, or its record has lost points. The chain goes on from its last stored state, "
             "with its stored results, by differential evolution instead of moves that were fitted to the annealing"
         )
-        self._result, self._verdict, self._near = self._output.result, self._output.verdict, None
-        self._budget.take_from_record()
-        self._reopened = False
+        self._result, self._verdict, self._near = self._chain.result, self._chain.verdict, None
+        self._record.use(None)
         self.random_state = stored.random_state
         self._moves, self._weights = copy.deepcopy(self._first_moves)
         return stored

@@ -28,9 +28,9 @@ class TMCMCSampler(TemperedSampler):
     nwalkers, ndim, log_prob_fn, ..., log_prior_fn, log_likelihood_fn, guide, max_simulations, seed
         As in `samplers.tempered.TemperedSampler`, in the same order. By default `moves` is
         `samplers.moves.population_moves.MixtureMove`.
-    coefficient_of_variation : float, optional
-        Coefficient of variation of the incremental weights, which determines the next exponent. By default 1, which is
-        an effective sample size of half the walkers.
+    ess_ratio : float, default 0.5
+        Wanted effective sample size of each stage, relative to the walkers: 1 / (1 + c²) for a coefficient of variation
+        c of the weights.
     chains : {"leaders", "equal"}
         With "leaders", the default, a chain grows from each distinct resampled point, one step per copy of it. With
         "equal", every resampled point is moved equally often, in one batch, which keeps a pool busy. It is the default
@@ -64,7 +64,7 @@ class TMCMCSampler(TemperedSampler):
     (3, 100, 4)
     """
 
-    setting_names = (*MOVES, "coefficient_of_variation", "chains", "burn_in")
+    setting_names = (*MOVES, "ess_ratio", "chains", "burn_in")
 
     @classmethod
     def _chosen(cls, settings: dict[str, Any], moves: Any, nwalkers: int) -> tuple[dict[str, Any], Any]:

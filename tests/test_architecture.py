@@ -38,12 +38,11 @@ ORDER = {
         ("results",),
         ("reporting",),
         ("evaluation",),
-        ("output", "tempering"),
+        ("chain", "tempering"),
         ("judgement",),
         ("presets", "reports"),
-        ("budget", "estimates", "moves"),
+        ("estimates", "moves"),
         ("proposals", "record", "settings"),
-        ("output_file",),
         ("blobs", "emcee_names", "finding", "interrupts", "locks", "resampling"),
     ),
 }
@@ -178,7 +177,7 @@ def judged_by_limits(tree: ast.Module) -> list[str]:
 def test_findings_are_made_in_checks_and_judgement_alone():
     """Other modules return numbers; they may ask the checks, keep findings, show them and warn of them."""
     makers = {name(path) for path, tree in TREES.items() if "Finding" in called(tree)}
-    makers.remove("samplers/output.py")  # reads stored findings
+    makers.remove("samplers/chain.py")  # reads stored findings
     assert not [path for path in makers if not path.startswith(CHECKS)]
     assert len(makers) > 8  # control
 

@@ -5,7 +5,7 @@ which points had arrived before it, so that an interrupted run, when repeated, m
 were running when the process ended are submitted again.
 
 A queue (``posterior.evaluation_queue()``, or made for a pool) is a `samplers.evaluation.point_queue.PointQueue` or has
-its methods ``submit(coords)``, ``collect()``, ``close()``, perhaps ``ended()``, and its attribute ``workers``.
+its methods ``submit(coords)``, ``collect()`` and ``close()``, and its attribute ``workers``.
 """
 
 import hashlib
@@ -19,7 +19,7 @@ from ..interrupts import deferred_interrupts
 from ..record import merge_batches
 from ..tempering.pending_points import PendingPoints
 from .evaluator import Evaluator
-from .point_queue import pool_queue
+from .point_queue import PointQueue, pool_queue
 from .user_target import Target
 
 __all__ = ["AsynchronousEvaluator", "check_asynchronous"]
@@ -88,7 +88,7 @@ class AsynchronousEvaluator(Evaluator):
         n = len(coords)
         coords = coords[: self._allowed(coords)]
         log_prior, asked, known, _ = self._look_up(coords)
-        self.budget.submitted(coords[asked])
+        self.record.submitted(coords[asked])
         self.evaluations += len(asked)
         pending = PendingPoints(coords, log_prior, refused=len(coords) < n)
         outside = np.flatnonzero(log_prior == -np.inf)
@@ -153,12 +153,12 @@ class AsynchronousEvaluator(Evaluator):
         """End the evaluation of running points; points that have ended are entered in the record."""
         queue, self._queue = self._queue, None
         try:
-            if hasattr(queue, "ended"):
-                self._take(queue.ended())
+            if isinstance(queue, PointQueue):
+                self._take(queue.collect(wait=False))
         except Exception as error:  # another error or Ctrl-C is the reason why the run ends
             logger.warning("evaluations that have ended are not stored: %s", error)
         finally:
             self._forget_running()
-            self.budget.closed()
+            self.record.submitted(())
             if queue is not None:
                 queue.close()

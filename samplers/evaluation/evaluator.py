@@ -11,16 +11,16 @@ from typing import Any
 
 import numpy as np
 
-from ..blobs import converted
-from ..budget import Budget, BudgetExhausted
+from ..chain import check_storable
 from ..interrupts import interrupts_end_the_run
-from ..record import EvaluatedBatch, Incomplete, Record, Remember, merge_batches
+from ..record import BudgetExhausted, EvaluatedBatch, Incomplete, Record, Remember, merge_batches
 from ..tempering.pending_points import PendingPoints
 from .user_target import Target, map_in
 
 __all__ = ["Evaluator", "unpack"]
 
 SECONDS_BETWEEN_NOTES = 0.05
+FIELDS = (("log_prob", np.float64), ("log_prior", np.float64))
 
 
 class Evaluator:
@@ -34,20 +34,16 @@ class Evaluator:
     asynchronous = False
     workers = 0  # `submit` waits for its points
 
-    def __init__(self, target: Target, record: Record, budget: Budget, nwalkers: int, failure_share: float):
-        self.target, self.record, self.budget = target, record, budget
+    def __init__(self, target: Target, record: Record, nwalkers: int, failure_share: float):
+        self.target, self.record = target, record
         self._nwalkers, self._failure_share = nwalkers, failure_share
-        self._fields: list[tuple] = [("log_prob", np.float64), ("log_prior", np.float64)]
-        self._has_blobs: bool | None = None  # whether the function returns blobs; None while this is not known
+        self._blobs: tuple | None = None  # their field in the records, empty without blobs; None while not known
         self.pool = self.observer = None
         self.remember: Remember | None = None  # of the present annealing (`Record.remembering`)
         self.evaluations = self.done = self.running = 0
 
     def __getstate__(self):
         return {**self.__dict__, "pool": None, "observer": None, "remember": None}
-
-    def __deepcopy__(self, memo):
-        return self  # moves that are copied go on with the same density
 
     def count(self, begun: int, ended: int = 0) -> None:
         """Count points that begin to be evaluated, and points that have been evaluated."""
@@ -123,10 +119,10 @@ class Evaluator:
 
     def _allowed(self, coords: np.ndarray) -> int:
         """Number of the first points among (n, ndim) that the limit of simulations allows."""
-        if self.budget.limit is None:
+        if self.record.limit is None:
             return len(coords)
         inside = np.flatnonzero(self.inside(coords))
-        return int([*inside, len(coords)][self.budget.fitting(coords[inside])])
+        return int([*inside, len(coords)][self.record.fitting(coords[inside])])
 
     def _look_up(self, coords: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[EvaluatedBatch]]:
         """Log-prior (n,) of points (n, ndim), rows (m,) of those inside, which of these are known, and their values."""
@@ -137,8 +133,7 @@ class Evaluator:
         known, batches = self.record.find(coords[asked])
         if not known.all() and self.record.is_complete:
             raise Incomplete
-        for batch in batches:
-            self._check_blobs(batch)
+        batches = [self.typed(batch) for batch in batches]
         self.count(int(sum(known)), int(sum(known)))
         return log_prior, asked, known, batches
 
@@ -186,51 +181,47 @@ class Evaluator:
             )
 
     def as_batch(self, coords: np.ndarray, results: Any) -> EvaluatedBatch:
-        batch = self.target.evaluated(coords, results)
-        self._check_blobs(batch)
-        return batch
+        return self.typed(self.target.evaluated(coords, results))
 
-    def _check_blobs(self, batch: EvaluatedBatch) -> None:
-        """Raise ValueError if points that have not failed have blobs and others have none."""
+    def typed(self, batch: EvaluatedBatch) -> EvaluatedBatch:
+        """A batch with blobs of the type that the first evaluations had; ValueError for another type, or some without.
+
+        ValueError also for a type that the file of the record cannot hold.
+        """
         if batch.failed.all():
-            return
-        has_blobs = batch.blobs is not None
-        self._has_blobs = has_blobs if self._has_blobs is None else self._has_blobs
-        if has_blobs != self._has_blobs:
-            this, before = ("blobs", "none") if has_blobs else ("no blobs", "some")
-            name = self.target.name
+            return batch._replace(blobs=None)
+        name, blobs = self.target.name, batch.blobs
+        found = () if blobs is None else (("blobs", blobs.dtype, blobs.shape[1:]),)
+        if self._blobs is None:
+            if blobs is not None and self.record.path is not None:
+                check_storable(blobs.dtype)
+            self._blobs = found
+        if bool(found) != bool(self._blobs):
+            this, before = ("blobs", "none") if found else ("no blobs", "some")
             raise ValueError(f"{name} must return blobs with every point or with none; got {this} after {before}")
+        if found != self._blobs:
+            (_, one, shape), (_, first, shape_of_first) = found[0], self._blobs[0]
+            raise ValueError(
+                f"{name} must return blobs of one type and shape; got {one} of shape {shape} after {first} of shape "
+                f"{shape_of_first}: return numbers, as many for each point (numpy.nan for None), or pass blobs_dtype="
+            )
+        return batch
 
     def _pack(self, log_prior: np.ndarray, rows: np.ndarray, batches: Sequence[EvaluatedBatch]) -> np.ndarray:
         """Records of points with log-prior (n,), of which these `rows` were evaluated, in the order of `batches`."""
-        batch = merge_batches(batches) if batches else None
-        blobs = None if batch is None else self.typed(batch.blobs)
-        records = np.zeros(len(log_prior), dtype=self._fields)
+        records = np.zeros(len(log_prior), dtype=[*FIELDS, *(self._blobs or ())])
         records["log_prob"], records["log_prior"] = -np.inf, log_prior
-        if batch is not None:
-            records["log_prob"][rows] = np.where(np.isnan(batch.log_prob), -np.inf, batch.log_prob)
-        if blobs is not None:
-            records["blobs"][rows] = blobs
+        if batches:
+            batch = merge_batches(batches)
+            records["log_prob"][rows] = np.where(batch.failed, -np.inf, batch.log_prob)
+            if batch.blobs is not None:
+                records["blobs"][rows] = batch.blobs
         return records
-
-    def typed(self, blobs: np.ndarray | None) -> np.ndarray | None:
-        """Blobs (n, ...) in the type of all blobs of the run, which the first evaluations have, or which is declared.
-
-        Raises ValueError if this type cannot hold one of them.
-        """
-        if blobs is None:
-            return None
-        declared = self.target.blobs_dtype
-        if len(self._fields) == 2:
-            dtype = blobs.dtype if declared is None or np.dtype(declared).itemsize == 0 else np.dtype(declared)
-            self.record.check_blobs(dtype)
-            self._fields.append(("blobs", dtype, blobs.shape[1:]))
-        return converted(blobs, *self._fields[2][1:], declared is not None)
 
     def compute(self, coords: np.ndarray) -> EvaluatedBatch:
         """Call the function for points (n, ndim), without counting or storing."""
         answers = list(self.target.answers(coords, self.pool))
-        return self.as_batch(coords, answers[0] if self.target.vectorize else answers)
+        return self.target.evaluated(coords, answers[0] if self.target.vectorize else answers)
 
 
 def unpack(records: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:

@@ -30,8 +30,7 @@ class PointQueue:
     ):
         self._start, self._size, self._give_up = start, size, give_up or _cancel
         self._futures: dict[int, Any] = {}  # of points that were not collected, by ticket
-        self._handed: list[int] = []  # what the last `collect` returned: the caller may not have received it
-        self._arrived, self._submitted, self._closed = threading.Event(), 0, False
+        self._arrived, self._submitted = threading.Event(), 0
 
     def __enter__(self) -> "PointQueue":
         return self
@@ -47,79 +46,57 @@ class PointQueue:
     def submit(self, coords: Any) -> list[int]:
         """Begin to evaluate points (n, ndim); returns n tickets, each of which `collect` returns once.
 
-        RuntimeError if the queue is closed, ValueError for points that cannot be evaluated.
+        ValueError for points that cannot be evaluated.
         """
-        self._require_open()
-        tickets = []
-        for future in self._start(coords):
-            tickets.append(self._submitted)
-            self._futures[self._submitted] = future
-            self._submitted += 1
+        futures = self._start(coords)
+        tickets = list(range(self._submitted, self._submitted + len(futures)))
+        self._submitted += len(futures)
+        self._futures.update(zip(tickets, futures, strict=True))
+        for future in futures:
             future.add_done_callback(lambda _: self._arrived.set())
         return tickets
 
     @interrupts_end_the_run()
-    def collect(self) -> list[tuple[int, Any]]:
-        """Wait until a point is finished; tickets and values of all finished points.
+    def collect(self, wait: bool = True) -> list[tuple[int, Any]]:
+        """Tickets and values of all finished points, after a `wait` for one.
 
-        RuntimeError if no point is pending, or the queue is closed. What ends the run, as KeyboardInterrupt of a worker
-        or a pool that cannot go on, is raised after the points that were finished before have been returned.
+        RuntimeError if no point is pending. What ends the run, as KeyboardInterrupt of a worker or a pool that cannot
+        go on, is raised after the points that were finished before have been returned.
         """
-        self._require_open()
-        if len(self._futures) == len(self._handed):
+        if wait and not self._futures:
             raise RuntimeError("no point is pending: submit points before collect()")
-        while self._handed:
-            self._futures.pop(self._handed.pop(), None)
-        while not any(future.done() for future in self._futures.values()):
+        while wait and not any(future.done() for future in self._futures.values()):
             self._arrived.wait()
             self._arrived.clear()
-        collected, error = self._fetch()
-        if not collected and isinstance(error, CancelledError):
-            raise RuntimeError("the pool has cancelled a point: run again with a new pool") from error
-        if not collected:
-            raise error
-        self._handed = [ticket for ticket, _ in collected]
-        return collected
-
-    def ended(self) -> list[tuple[int, Any]]:
-        """Tickets and values of points that have ended, including the last collected ones, without waiting.
-
-        For a run that Ctrl-C ends, before `close`, so that finished points are kept. Errors are raised by `collect`.
-        """
-        return self._fetch(SECONDS_TO_FETCH)[0]
-
-    def _fetch(self, seconds: float | None = None) -> tuple[list[tuple[int, Any]], BaseException | None]:
-        """Tickets and values of the points that have ended, and an error that no point has caused, if any."""
-        fetched, fault = [], None
-        for ticket, future in list(self._futures.items()):
-            if not future.done():
-                continue
-            value = None
+        collected, fault, seconds = [], None, None if wait else SECONDS_TO_FETCH
+        for ticket, future in [each for each in self._futures.items() if each[1].done()]:
             try:  # `exception` does not raise what the function raised, which may be KeyboardInterrupt
                 error = future.exception(seconds)
                 value = future.result(seconds) if error is None else None
             except (Exception, CancelledError) as raised:
-                error = raised
-                if seconds is not None and isinstance(raised, TimeoutError):
+                error, value = raised, None
+                if not wait and isinstance(raised, TimeoutError):
                     break  # nothing can be fetched from this pool any more
             if type(error).__name__ == "KilledWorker":
                 error, value = None, Failed("every process that evaluated this point died")
             if isinstance(value, Ended):
                 error = value.error
             if error is None:
-                fetched.append((ticket, value))
+                collected.append((ticket, value))
             else:
                 fault = fault or error
-        return fetched, fault
+        if wait and not collected and isinstance(fault, CancelledError):
+            raise RuntimeError("the pool has cancelled a point: run again with a new pool") from fault
+        if wait and not collected:
+            raise fault
+        for ticket, _ in collected:
+            del self._futures[ticket]
+        return collected
 
     def close(self) -> None:
         """Give up the points that have not begun. May be called twice."""
-        self._closed, futures, self._futures = True, list(self._futures.values()), {}
+        futures, self._futures = list(self._futures.values()), {}
         self._give_up(futures)
-
-    def _require_open(self) -> None:
-        if self._closed:
-            raise RuntimeError("the queue is closed: open another one")
 
 
 def pool_queue(function: Callable, pool: Any, as_items: Callable[[Any], Sequence]) -> PointQueue:

@@ -1,7 +1,6 @@
 """The target of a run: the user's functions, however they are to be called, as functions of arrays."""
 
 import logging
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from numbers import Integral
 from typing import Any
@@ -9,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..emcee_names import ndarray_to_list_of_dicts, walkers_independent
-from ..interrupts import Ended, SentFunction, interrupts_end_the_run, raise_if_it_ends_the_run
+from ..interrupts import Ended, SentFunction, interrupts_end_the_run
 from ..record import EvaluatedBatch
 from .starts import not_of_the_prior
 from .values import Caught, log_densities, most_common_reasons, outcomes
@@ -123,18 +122,9 @@ class Target:
 
         It knows this without a simulation; True if unknown.
         """
-        possible, before = getattr(self.function, "possible", None), sys.exception()
-        if callable(possible) and len(coords) > 0:
-            try:
-                found = np.asarray(possible(coords.copy()))
-                if found.shape == (len(coords),) and found.dtype == bool:
-                    return found
-                error: Any = f"it must return bool of shape {(len(coords),)}"
-            except Exception as raised:
-                raise_if_it_ends_the_run(raised, before)
-                error = repr(raised)
-            logger.warning("the method possible failed, so the verdict takes all points as possible: %s", error)
-        return np.ones(len(coords), dtype=bool)
+        possible = getattr(self.function, "possible", None)
+        unknown = np.ones(len(coords), dtype=bool)
+        return unknown if possible is None or len(coords) == 0 else unknown & np.asarray(possible(coords.copy()))
 
     def recall(self, batch: EvaluatedBatch) -> None:
         """Tell a function that counts failures itself what an earlier process has evaluated, by `recall_failures`."""

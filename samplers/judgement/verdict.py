@@ -70,7 +70,7 @@ class Verdict(_Stored):
     reasons : tuple of str
         The reasons for the judgement.
     simulations : float
-        Simulations made (`samplers.budget`).
+        Simulations made (`samplers.record`).
     effective_sample_size : float
         Effective sample size of the points that `sample` names, when beta = 1 was reached.
     sample : str

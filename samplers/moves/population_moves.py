@@ -60,20 +60,16 @@ Inside = Callable[[np.ndarray], np.ndarray]
 
 
 def describe(move: Move) -> dict:
-    """A move as plain data: ``{"class": name, setting: value, ...}``, with nested moves in the same form.
+    """A move as plain data: its class, and its public attributes that are plain, moves or lists of moves."""
 
-    Its settings are its public attributes that are None, bool, int, float, str, moves or lists of moves.
-    """
-    settings = {}
-    for name, value in sorted(vars(move).items()):
-        if not name.startswith("_") and name != "is_fitted":
-            if isinstance(value, Move):
-                settings[name] = describe(value)
-            elif value is None or isinstance(value, bool | int | float | str):
-                settings[name] = value
-            elif isinstance(value, list | tuple) and all(isinstance(item, Move) for item in value):
-                settings[name] = [describe(item) for item in value]
-    return {"class": type(move).__name__, **settings}
+    def plain(value: Any) -> Any:
+        if isinstance(value, Move):
+            return describe(value)
+        return [plain(each) for each in value] if isinstance(value, list | tuple) else value
+
+    found = {name: plain(value) for name, value in sorted(vars(move).items()) if name[0] != "_" and name != "is_fitted"}
+    kinds = type(None) | bool | int | float | str | dict | list
+    return {"class": type(move).__name__} | {name: value for name, value in found.items() if isinstance(value, kinds)}
 
 
 class _FittedMove(MHMove):
@@ -84,11 +80,8 @@ class _FittedMove(MHMove):
     def __init__(self):
         super().__init__(self._draw_if_fitted)
 
-    def _draw(self, coords: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
-        """Proposed points and log-ratios of proposal densities for points (n, ndim)."""
-        raise NotImplementedError
-
     def _draw_if_fitted(self, coords: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+        """Proposed points and log-ratios of proposal densities for points (n, ndim)."""
         if not self.is_fitted:
             raise ValueError(
                 f"{type(self).__name__} is fitted to the stages of an annealing: use it in SMCSampler or TMCMCSampler, "
@@ -103,7 +96,8 @@ def without_unfitted(moves: Sequence[Move]) -> list[Move]:
     They belong to an annealing that is not made again. A fit to the points that it moves would make tails too light:
     heavy tails kept 0.94 of their variance; differential evolution takes its steps from the other half of the walkers.
     """
-    return [move if getattr(move, "is_fitted", True) else DEMove() for move in moves]
+    inner = (getattr(move, "move", move) for move in moves)
+    return [move if getattr(each, "is_fitted", True) else DEMove() for move, each in zip(moves, inner, strict=True)]
 
 
 class RandomWalkMove(_FittedMove):
@@ -351,66 +345,52 @@ class GuideMove(MHMove):
 # log-evidences by 10.8 (0.4); 250 walkers, which recycle, show no difference.
 
 
-class _FastWalk(RandomWalkMove):
-    """Random walk in the parameters with some indices, whose covariance is conditional on the others."""
+class WithFastSweeps(MHMove):
+    """A move, followed by random-walk steps (`sweeps`) of the whole ensemble in the fast parameters (`indices`).
+
+    The covariance of the walk is conditional on the other parameters. The reported acceptance is that of the move
+    alone. ``tune`` adapts the scale of the walk.
+    """
 
     # optimal in two dimensions; it is 0.44 in one dimension and 0.23 in many: Gelman, Roberts & Gilks (1996), Efficient
     # Metropolis jumping rules, Bayesian Statistics 5, 599-608
     target = 0.35
 
-    def __init__(self, indices: Sequence[int]):
-        super().__init__(adapt=True)
-        self.indices = tuple(indices)
+    def __init__(self, move: Move, indices: Sequence[int], sweeps: int = 2):
+        super().__init__(self._draw)
+        self.move, self.indices, self.sweeps = move, tuple(indices), sweeps
+        self._root, self._log_factor, self._share = np.zeros((len(indices), len(indices))), 0.0, 0.0
 
     def calibrate(self, coords: np.ndarray, weights: np.ndarray, *others: Any) -> None:
-        """Fit the walk to points (n, ndim) with normalised weights (n,)."""
-        slow = np.setdiff1d(np.arange(coords.shape[1]), self.indices)
-        super().calibrate(coords[:, np.concatenate([slow, self.indices])], weights)
-        # The last diagonal block of a lower-triangular root of the covariance is a root of the covariance of the last
-        # coordinates, conditional on the others.
-        self._root = self._root[len(slow) :, len(slow) :]
-
-    def _draw(self, coords, random):
-        proposed = coords.copy()
-        proposed[:, self.indices], factors = super()._draw(coords[:, self.indices], random)
-        return proposed, factors
-
-
-class WithFastSweeps(Move):
-    """A move, followed by random-walk steps (`sweeps`) of the whole ensemble in the fast parameters (`indices`).
-
-    The reported acceptance is that of the move alone. ``tune`` adapts the scale of the walk.
-    """
-
-    def __init__(self, move: Move, indices: Sequence[int], sweeps: int = 2):
-        self.move, self.sweeps = move, sweeps
-        self._walk, self._accepted = _FastWalk(indices), np.empty(0)
-
-    @property
-    def is_fitted(self) -> bool:
-        """Whether walk and move were calibrated."""
-        return self._walk.is_fitted and getattr(self.move, "is_fitted", True)
-
-    def calibrate(self, *arguments: Any) -> None:
         """Fit the walk, and the move if it can be fitted (`samplers.moves.population_moves`)."""
         if hasattr(self.move, "calibrate"):
-            self.move.calibrate(*arguments)
-        self._walk.calibrate(*arguments)
+            self.move.calibrate(coords, weights, *others)
+        slow = np.setdiff1d(np.arange(coords.shape[1]), self.indices)
+        # The last diagonal block of a lower-triangular root of the covariance is a root of the covariance of the last
+        # coordinates, conditional on the others.
+        root = location_and_root(coords[:, np.concatenate([slow, self.indices])], weights)[1]
+        self._root = root[len(slow) :, len(slow) :]
+
+    def _draw(self, coords: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+        proposed, scale = coords.copy(), 2.38 / math.sqrt(len(self.indices)) * math.exp(self._log_factor)
+        normal = random.standard_normal((len(coords), len(self.indices)))
+        proposed[:, self.indices] += scale * normal @ self._root.T
+        return proposed, np.zeros(len(coords))
 
     def propose(self, model: Model, state: State) -> tuple[State, np.ndarray]:
         """Make the move, then the fast sweeps; the accepted proposals (nwalkers,) belong to the move."""
         state, accepted = self.move.propose(model, state)
-        acceptances = []
+        shares = []
         for _ in range(self.sweeps):
-            state, accepted_fast = self._walk.propose(model, state)
-            acceptances.append(np.mean(accepted_fast))
-        self._accepted = np.array(acceptances)
+            state, accepted_fast = super().propose(model, state)
+            shares.append(np.mean(accepted_fast))
+        self._share = float(np.mean(shares))
         return state, accepted
 
     def tune(self, state: State, accepted: np.ndarray) -> None:
         """Tune the move, and the scale of the fast sweeps that followed it."""
         self.move.tune(state, accepted)
-        self._walk.tune(state, self._accepted)
+        self._log_factor += self._share - self.target
 
 
 def with_fast_sweeps(moves: Sequence[Move], indices: Sequence[int], ndim: int, sweeps: int) -> list[Move]:

@@ -17,7 +17,6 @@ from collections.abc import Generator, Iterator, Sequence
 
 import numpy as np
 
-from ..budget import BudgetExhausted
 from ..estimates.importance import EvidenceCheck, draw_inside, evidence_from_weights
 from ..estimates.pareto import pareto_shape
 from ..estimates.weights import WHERE_TO_LOOK, coarse_weights, effective_sample_size, normalised_weights
@@ -26,6 +25,7 @@ from ..judgement.checks import check_shares
 from ..proposals.basins import find_basins, with_components
 from ..proposals.mixture import fit_mixture, log_density
 from ..proposals.transforms import find_support_bounds
+from ..record import BudgetExhausted
 from ..reports import LIMIT, Report, Restart, Stage, Weighted
 from ..resampling import systematic
 from ..settings import Settings

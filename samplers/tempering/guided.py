@@ -21,7 +21,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..budget import Budget
 from ..estimates.control_variates import SignedSample, signed_sample, unreached_share
 from ..estimates.importance import (
     KnownDensity,
@@ -49,6 +48,7 @@ from ..judgement.rounds import (
     is_even,
     is_reliable,
 )
+from ..record import Record
 from ..reports import GuidedRound, GuideTick, Report
 from .guide import Guide, GuideSession, checked_density, checked_draws
 from .pending_points import PendingPoints
@@ -72,24 +72,16 @@ class Guidance(NamedTuple):
 
     guide: Guide
     session: GuideSession
-    budget: Budget
+    budget: Record
 
 
 def lend(
-    guide: Guide, random: np.random.RandomState, remember: Callable, budget: Budget, asynchronous: bool
+    guide: Guide, random: np.random.RandomState, remember: Callable, budget: Record, asynchronous: bool
 ) -> Guidance:
     """A fresh guide with its session; its simulations count from now on."""
-    budget.begin(guide)
-
-    def remember_with_count(key: str, compute: Callable | None = None) -> list[np.ndarray] | None:
-        arrays = remember(key)
-        if arrays is None and compute is not None:
-            arrays = remember(key, compute)
-            budget.note()
-        return arrays
-
-    session = GuideSession(random, remember_with_count, budget.fits, lambda: budget.remaining, asynchronous)
-    return Guidance(guide, session, budget)
+    budget.use(guide)
+    fits = partial(budget.fits, remember=remember)
+    return Guidance(guide, GuideSession(random, remember, fits, lambda: budget.remaining, asynchronous), budget)
 
 
 class RoundsOfGuide(NamedTuple):

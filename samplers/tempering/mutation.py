@@ -16,11 +16,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..budget import BudgetExhausted
 from ..emcee_names import DESnookerMove, Model, Move, RedBlueMove, State
 from ..estimates.weights import LOWEST
 from ..judgement.checks import ROUNDING
 from ..moves.population_moves import MixtureMove
+from ..record import BudgetExhausted
 from ..reports import Sweep
 from ..settings import Settings
 from .population import Density, Population

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import h5py
 
+import samplers.chain
 import samplers.evaluation.evaluator
 import samplers.record
 from tests.faults.resumable_run import BURN_IN, KINDS, STEPS, N, calls, go_on, make, outcome
@@ -76,7 +77,7 @@ class Events:
                 super().__init__(name, mode, **kwargs)
 
         h5py.File = CountedFile
-        samplers.record.open = lambda *args, **kwargs: Counted(plain_open(*args, **kwargs))
+        samplers.record.open = samplers.chain.open = lambda *args, **kwargs: Counted(plain_open(*args, **kwargs))
         os.replace = lambda *args: self(lambda: replace(*args))
 
 

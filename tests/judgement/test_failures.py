@@ -5,8 +5,7 @@ import pytest
 from scipy import stats
 
 from samplers import SMCSampler, TMCMCSampler
-from samplers.evaluation.user_target import Target
-from samplers.judgement.failures import NearFailures, failures_near, judged_failures
+from samplers.judgement.failures import NearFailures, failures_near
 from tests.contract.targets import Box, Gaussian
 
 N = 250
@@ -103,25 +102,6 @@ def test_what_is_known_to_be_impossible_is_no_failure(Posterior):
     # failures beside it still count
     near = run(Posterior(0.7, "inf")).verdict.near_failures
     assert (near.place == "border") == (Posterior is CountingRulesOut)
-
-
-@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
-@pytest.mark.parametrize("answer", [None, np.array([True]), "error"])
-def test_an_answer_that_cannot_be_used_rules_nothing_out(answer, caplog):
-    def possible(x):
-        if answer == "error":
-            raise RuntimeError("no answer")
-        return answer
-
-    posterior = CountingRulesOut(5.0, "inf")
-    sampler = run(posterior)
-    posterior.possible = possible
-    known = sampler._record.latest(10_000)
-    target, final = Target(posterior, None, None, posterior.ndim), sampler.get_chain(flat=True)
-    found = judged_failures(known, final, target)
-    posterior.possible = lambda x: np.ones(len(x), dtype=bool)
-    expected = judged_failures(known, final, target)
-    assert found == expected and found.failed > 50 and "takes all points as possible" in caplog.text
 
 
 def test_the_region_is_that_of_the_samples_in_any_units(rng):

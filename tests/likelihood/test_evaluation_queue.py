@@ -121,7 +121,6 @@ def test_points_come_back_while_others_are_submitted(tmp_path, shared_pool):
             for row in SHORT[:3]:
                 (ticket,) = queue.submit(row[None])
                 assert [done for done, _ in queue.collect()] == [ticket]
-                assert [done for done, _ in queue.ended()] == [ticket]  # the caller may not have received it
             other = LONG[:1] * [1.0, 1.0, 1.1]  # another noise
             same = queue.submit(np.concatenate([LONG[:1], other]))
             (tmp_path / "go").touch()
@@ -193,9 +192,8 @@ def test_a_closed_queue_cancels_what_waits_and_caches_what_runs(tmp_path, shared
         wait_until(lambda: (tmp_path / f"started {LONG[0, 0]!r}").exists())
         queue.close()
         queue.close()
-        for call in (queue.collect, lambda: queue.submit(SHORT)):
-            with pytest.raises(RuntimeError, match="the queue is closed"):
-                call()
+        with pytest.raises(RuntimeError, match="no point is pending"):
+            queue.collect()
         (tmp_path / "go").touch()
         stored, key = SimulationCache(path), posterior.likelihood.simulator.simulation_key
         wait_until(lambda: look_up(stored, key, LONG[:1, :2], 1)[0] is not None)

@@ -214,21 +214,6 @@ def test_a_smaller_limit_keeps_what_was_made(path, first, tmp_path):
     assert np.array_equal(sampler.get_chain(), whole.get_chain()) and sampler.simulations == whole.simulations
 
 
-def test_a_second_annealing_counts_the_search_of_the_first(tmp_path):
-    file = tmp_path / "run.h5"
-    sampler = make("searching guide", None, file)
-    sampler.run_mcmc(None, 1)
-    first, searched = sampler.simulations, sampler.guide.simulations
-    sampler.reset()
-    sampler.run_mcmc(sampler.log_prob_fn.f.sample_prior(N, np.random.default_rng(3)), 1)
-    made = sampler.simulations
-    assert made == sampler.log_prob_fn.f.calls and made > first + searched
-    sampler._record.close()
-    sampler = make("searching guide", None, file)
-    sampler.run_mcmc(None, 2)
-    assert sampler.simulations == made + 2 * N
-
-
 def test_nothing_known_is_an_error_that_keeps_what_was_made():
     sampler = make("searching guide", 20)
     with pytest.raises(ValueError, match="there is nothing to report"):
