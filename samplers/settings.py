@@ -67,9 +67,9 @@ class Settings:
         (a returned -inf is not a failure); 0 stops at the first failure.
     asynchronous : bool
         Whether points are evaluated without waiting for the slowest of each batch, for long runs of unequal length on
-        many workers. Recycling, or a guide, then proposes the next points while the last ones run. The choice of the
+        many workers. Recycling then proposes the next points while the last ones run. The choice of the
         proposals, and thus the result, depends on the order of arrival; every estimate is made from complete batches.
-        Moves wait for all points.
+        Moves and guides wait for all points.
 
     Examples
     --------

@@ -31,7 +31,7 @@ class SMCSampler(TemperedSampler):
         trusted. Default: True with 150 walkers or more, unless `moves` or a setting of annealing by moves is given
         (`ess_ratio` to `max_correlation`). With fewer walkers, a mode can be lost unnoticed, and recycling often fails.
     asynchronous
-        As in `samplers.settings.Settings`; it needs recycling or a guide.
+        As in `samplers.settings.Settings`; it needs recycling.
     ess_ratio, ess_rule, ess_floor, resampling, min_moves, max_moves, max_correlation
         Settings of annealing by moves, as in `samplers.settings.Settings`.
     fast_sweeps, check_draws, max_failure_share
@@ -40,7 +40,7 @@ class SMCSampler(TemperedSampler):
     Raises
     ------
     ValueError
-        For an impossible value, or for `asynchronous` without recycling or a guide.
+        For an impossible value, or for `asynchronous` without recycling.
     TypeError
         For a keyword that is not a setting of this sampler.
 

@@ -177,9 +177,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
         target.parameter_names = self.parameter_names if self.params_are_named else None
         common = target, self._record, nwalkers, given.max_failure_share
         if given.asynchronous:
-            check_asynchronous(target, pool, guide is not None or bool(given.recycle))
-            queue = None if guide is None else guide.evaluation_queue
-            self._evaluator: Evaluator = AsynchronousEvaluator(*common, queue=queue)
+            check_asynchronous(target, pool, guide is None and bool(given.recycle))
+            self._evaluator: Evaluator = AsynchronousEvaluator(*common)
         else:
             self._evaluator = Evaluator(*common)
         self._failed_before = target.failure_count or 0
@@ -559,7 +558,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._evaluator.remember = remember = self._record.remembering()
         if self._given_guide is not None:
             self._guide = self._given_guide.fresh()
-            guidance = lend(self._guide, self._random, remember, self._record, self.settings.asynchronous)
+            guidance = lend(self._guide, self._random, remember, self._record)
         self._record.is_complete = stored is not None
         population = Population(0.0, start.coords, None, float(self.nwalkers))
         since = time.perf_counter(), self._evaluator.evaluations

@@ -4,15 +4,9 @@ A point starts when a worker is free, in the order of submission. What the paren
 """
 
 import heapq
-import threading
-import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from functools import partial
+from collections.abc import Callable
 
 import numpy as np
-
-from fe_likelihoods.simulation.executors import PoolExecutor
 
 
 class SimulatedCluster:
@@ -65,24 +59,3 @@ class SimulatedCluster:
     def close(self) -> None:
         """Drop what has not ended."""
         self._running = []
-
-
-class DelayedPool(PoolExecutor):
-    """Threads whose simulations take a millisecond on average, and are counted; parts of `n_steps` are fractions."""
-
-    def __init__(self, workers: int, seed: int, n_steps: int):
-        super().__init__(ThreadPoolExecutor(workers))
-        self._random, self._n_steps, self._lock = np.random.default_rng(seed), n_steps, threading.Lock()
-        self.simulations = 0.0
-
-    def submit_all(self, function: Callable, items: Sequence[np.ndarray]) -> list[Future]:
-        """As `PoolExecutor.submit_all`."""
-        with self._lock:
-            self.simulations += len(items) * function.function.args[-1].n_steps / self._n_steps
-        return super().submit_all(partial(self._later, function), items)
-
-    def _later(self, function: Callable, item: np.ndarray) -> object:
-        with self._lock:
-            seconds = self._random.exponential(1e-3)
-        time.sleep(seconds)
-        return function(item)

@@ -186,10 +186,6 @@ class ResponseGuide(Guide):
             )
         self._emulate(session.random)
 
-    def evaluation_queue(self) -> Any:
-        """The queue of the posterior, which keeps the responses for `observe`."""
-        return self._posterior.evaluation_queue(responses=True)
-
     def draw(self, n: int, random: np.random.RandomState) -> np.ndarray:
         """Independent draws (n, ndim) of the parameters, inside the support of the prior."""
         parts = self._parts()

@@ -23,17 +23,16 @@ __all__ = ["evaluation_queue"]
 _MOST_THREADS = 200  # for a pool that does not say how many simulations run at once
 
 
-def evaluation_queue(posterior: Any, responses: bool = False) -> PointQueue:
+def evaluation_queue(posterior: Any) -> PointQueue:
     """Queue of points at which a posterior is evaluated, see `Posterior.evaluation_queue`.
 
     Duplicates are simulated once. If a data set has no pool, or one that has ``map`` only, `submit` waits for the
-    simulations. With `responses`, the likelihood caches these as well, for its `simulate`. Simulations that run when
-    the queue is closed are cached when they end.
+    simulations. Simulations that run when the queue is closed are cached when they end.
     """
     parts, names = [part for part, _ in posterior.likelihood.parts()], posterior.prior.names
     pools = {id(part.simulator.pool): part.simulator.pool for part in parts if part.simulator.pool is not None}
     streams = all(part.simulator.streams for part in parts)  # no model runs in threads of this process
-    evaluate = partial(_evaluate, posterior, responses)
+    evaluate = partial(_evaluate, posterior)
 
     def size() -> int | None:
         if not pools:
@@ -54,12 +53,7 @@ def evaluation_queue(posterior: Any, responses: bool = False) -> PointQueue:
     return PointQueue(start, size)
 
 
-def _evaluate(posterior: Any, responses: bool, rows: np.ndarray) -> Any:
+def _evaluate(posterior: Any, rows: np.ndarray) -> Any:
     """Log-probability of a point (1, ndim), or those of points (n, ndim)."""
-    if responses:
-        left = rows[posterior.possible(rows)]
-        for part, columns in posterior.likelihood.parts():
-            failed = part.simulate(left[:, columns[: part.simulator.n_structural]]).reasons if len(left) else []
-            left = left[[not reason for reason in failed]]
     values = posterior.log_prob(rows)
     return values if len(values) > 1 else float(values[0])

@@ -420,17 +420,11 @@ class Posterior:
         self._check_models("a prediction")
         return predictive_draws(self.likelihood, as_points(samples, self.prior.names), seed)
 
-    def evaluation_queue(self, responses: bool = False) -> PointQueue:
+    def evaluation_queue(self) -> PointQueue:
         """A queue of points whose log-probabilities are returned in the order in which their simulations end.
 
         Samplers that propose points while others still run keep all workers of a pool busy with it. The values are the
         same as from `log_prob`.
-
-        Parameters
-        ----------
-        responses : bool
-            Whether the likelihood caches the responses as well, so that its method `simulate` returns them without
-            another simulation.
 
         Returns
         -------
@@ -446,7 +440,7 @@ class Posterior:
         True
         """
         self._check_models("asynchronous work")
-        return evaluation_queue(self, responses)
+        return evaluation_queue(self)
 
     def when_simulated(self, callback: Callable[[float], None] | None) -> None:
         """Call a function with the number of points whose simulations have ended, for the progress of samplers.

@@ -10,7 +10,6 @@ its methods ``submit(coords)``, ``collect()`` and ``close()``, and its attribute
 
 import hashlib
 import logging
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -33,10 +32,11 @@ def _has_queue(target: Target, pool: Any) -> bool:
 
 
 def check_asynchronous(target: Target, pool: Any, draws: bool) -> None:
-    """Raise ValueError if points cannot be submitted one by one, or are not made by `draws` of recycling or a guide."""
+    """Raise ValueError if points cannot be submitted one by one, or are not made by the `draws` of recycling."""
     if not draws:
         raise ValueError(
-            "asynchronous=True cannot act here: moves wait for all points that they propose: pass recycle=True"
+            "asynchronous=True cannot act here: moves and guides wait for all points that they propose: pass "
+            "recycle=True, or leave it out"
         )
     can_submit = callable(getattr(pool, "submit", None))
     if not (target.vectorize if _has_queue(target, pool) else can_submit and not target.vectorize):
@@ -49,12 +49,11 @@ def check_asynchronous(target: Target, pool: Any, draws: bool) -> None:
 
 
 class AsynchronousEvaluator(Evaluator):
-    """An evaluator whose `submit` returns without waiting; `queue` opens the queue of a guide, if it has one."""
+    """An evaluator whose `submit` returns without waiting."""
 
     asynchronous = True
 
-    def __init__(self, *args: Any, queue: Callable[[], Any] | None = None):
-        self._open_queue = queue
+    def __init__(self, *args: Any):
         super().__init__(*args)
         self._forget_running()
 
@@ -69,7 +68,7 @@ class AsynchronousEvaluator(Evaluator):
 
     def _opened(self) -> Any:
         if self._queue is None and _has_queue(self.target, self.pool):
-            self._queue = (self._open_queue or self.target.function.evaluation_queue)()
+            self._queue = self.target.function.evaluation_queue()
         elif self._queue is None:
             if self.pool is None:
                 raise ValueError(

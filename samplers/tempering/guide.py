@@ -36,8 +36,6 @@ class GuideSession(NamedTuple):
     remaining : callable
         ``remaining()``: simulations left, inf without a limit. Decisions that depend on it, except to stop, are to be
         stored with `remember`: otherwise a run that is continued with a larger limit cannot repeat its first part.
-    asynchronous : bool
-        Whether draws arrive in any order, and new draws are made while earlier draws are still running.
     weighted : callable
         ``weighted()``: all draws (n, ndim) of complete rounds, and their log-weights (n,); None before the first.
     """
@@ -46,7 +44,6 @@ class GuideSession(NamedTuple):
     remember: Callable[..., list[np.ndarray] | None]
     fits: Callable[[float], bool]
     remaining: Callable[[], float]
-    asynchronous: bool
     weighted: Callable[[], tuple[np.ndarray, np.ndarray] | None] = lambda: None
 
 
@@ -70,11 +67,7 @@ class Guide(ABC):
         (`samplers.estimates.control_variates`).
     observe : callable, optional
         ``observe(coords, session)`` is called with points (n, ndim) directly before they are evaluated, so that a guide
-        can simulate and keep what `log_prob_fn` does not return. Requires ``vectorize=True``. In an asynchronous run it
-        is called when they have been evaluated, a few at a time.
-    evaluation_queue : callable, optional
-        ``evaluation_queue()`` returns the queue for points in an asynchronous run, which replaces the queue of
-        `log_prob_fn`, for a guide that keeps more than the value of an evaluation.
+        can simulate and keep what `log_prob_fn` does not return. Requires ``vectorize=True``.
     fingerprint : str
         Identity of the guide: a run is resumed only with the same fingerprint.
 
@@ -101,7 +94,6 @@ class Guide(ABC):
     simulations = 0.0
     known_density: KnownDensity | None = None
     observe: Callable | None = None
-    evaluation_queue: Callable | None = None
 
     @abstractmethod
     def draw(self, n: int, random: np.random.RandomState, /) -> np.ndarray:
@@ -122,8 +114,7 @@ class Guide(ABC):
     def refine(self, coords: np.ndarray, log_prob: np.ndarray, session: GuideSession, /) -> Iterator[None] | None:
         """Learn from the latest draws (n, ndim) and their log-probabilities (n,), -inf where an evaluation failed.
 
-        May be a generator, as `prepare`. In an asynchronous run, the draws may be from an
-        earlier density, and the next draws may have been made already.
+        May be a generator, as `prepare`.
         """
         return None
 

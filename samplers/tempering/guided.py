@@ -5,10 +5,6 @@ The density of a round is fixed before its draws are made, and each draw is weig
 Pareto shape. All rounds together must then have an effective sample size as large as the number of walkers, and their
 draws must reach all of the posterior that the guide knows by then.
 
-Draws that are submitted together are a `Batch`; they may arrive in any order. A batch becomes a round when all its
-draws have arrived. Until then, its draws influence no weight, no share of a round and no decision: the first arrivals
-have short evaluations, and are not a fair sample.
-
 A part of the posterior that a guide never proposes is not seen by its draws. Guides with a share of the prior in their
 density can find it; other guides depend on their search (`findings`). Constants without a reference were chosen by
 trials on posteriors with known answers.
@@ -23,7 +19,6 @@ import numpy as np
 
 from ..estimates.control_variates import SignedSample, signed_sample, unreached_share
 from ..estimates.importance import (
-    KnownDensity,
     PooledRounds,
     Round,
     add_round,
@@ -51,9 +46,7 @@ from ..judgement.rounds import (
 from ..record import Record
 from ..reports import GuidedRound, GuideTick, Report
 from .guide import Guide, GuideSession, checked_density, checked_draws
-from .pending_points import PendingPoints
 from .population import Density, Population
-from .recycling import most_running
 
 __all__ = ["Guidance", "RoundsOfGuide", "draw_rounds", "lend"]
 
@@ -75,13 +68,11 @@ class Guidance(NamedTuple):
     budget: Record
 
 
-def lend(
-    guide: Guide, random: np.random.RandomState, remember: Callable, budget: Record, asynchronous: bool
-) -> Guidance:
+def lend(guide: Guide, random: np.random.RandomState, remember: Callable, budget: Record) -> Guidance:
     """A fresh guide with its session; its simulations count from now on."""
     budget.use(guide)
     fits = partial(budget.fits, remember=remember)
-    return Guidance(guide, GuideSession(random, remember, fits, lambda: budget.remaining, asynchronous), budget)
+    return Guidance(guide, GuideSession(random, remember, fits, lambda: budget.remaining), budget)
 
 
 class RoundsOfGuide(NamedTuple):
@@ -108,31 +99,8 @@ class RoundsOfGuide(NamedTuple):
         return found.log_evidence, float(np.hypot(found.log_evidence_error, self.unreached))
 
 
-class Batch:
-    """Draws of a guide, with the log-density (n,) that they were drawn from, as a function too, and what it knew."""
-
-    def __init__(self, pending: PendingPoints, log_density: np.ndarray, function: Callable, known: KnownDensity | None):
-        self.pending, self._log_density, self._function, self._known = pending, log_density, function, known
-        self._observed = pending.arrived.copy()
-
-    def as_round(self) -> Round:
-        """The draws as a round; all must have arrived."""
-        coords, records = self.pending.arrived_part()
-        log_prob = records["log_prob"]
-        alive = log_prob > -np.inf
-        log_weights = np.where(alive, np.where(alive, log_prob, 0.0) - self._log_density, -np.inf)
-        known = None if self._known is None else self._known.log_density(coords) - self._log_density
-        return Round(coords, records, log_weights, self._known, known, self._function, self._log_density[:, None])
-
-    def take_observable(self) -> np.ndarray:
-        """Draws (m, ndim) that have arrived since the last call or the submission."""
-        new = self.pending.arrived & ~self._observed
-        self._observed |= new
-        return self.pending.coords[new]
-
-
-def submit_batch(coords: np.ndarray, density: Density, guide: Guide, session: GuideSession) -> Batch:
-    """Begin to evaluate draws (n, ndim) of the guide; a limit of simulations may allow only the first draws.
+def _evaluated(coords: np.ndarray, density: Density, guide: Guide, session: GuideSession) -> tuple[Round | None, bool]:
+    """Draws (n, ndim) of the guide as a round; None without one, and whether the limit of simulations refused some.
 
     Raises ValueError if the density of the guide is zero at one of its own draws.
     """
@@ -142,27 +110,17 @@ def submit_batch(coords: np.ndarray, density: Density, guide: Guide, session: Gu
             f"guide.log_density is -inf at {int(np.sum(log_density == -np.inf))} of {len(coords)} draws of the guide: "
             "it must return the logarithm of the density that guide.draw draws from"
         )
-    if guide.observe is None or session.asynchronous:
-        pending = density.submit(coords)
-    else:
-        pending = density.submit(coords, lambda points: guide.observe(points, session))
-    return Batch(pending, log_density[: len(pending.coords)], guide.frozen(), guide.known_density)
-
-
-def let_arrive(batches: Sequence[Batch], most: int, density: Density, guide: Guide, session: GuideSession) -> None:
-    """Wait until at most this number of draws in the latest batch is running, and none in earlier batches.
-
-    The guide observes draws as they arrive, a few at a time, so that a killed run has kept nearly all draws.
-    """
-    while batches:
-        running = [batch.pending.running for batch in batches]
-        if sum(running[:-1]) == 0 and running[-1] <= most:
-            return
-        density.wait(max(sum(running) - 1, 0))
-        for batch in batches if guide.observe is not None else ():
-            arrived = batch.take_observable()
-            if len(arrived) > 0:
-                guide.observe(arrived, session)
+    function, known = guide.frozen(), guide.known_density
+    observe = () if guide.observe is None else (lambda points: guide.observe(points, session),)
+    pending = density.submit(coords, *observe)
+    coords, records = pending.arrived_part()
+    if len(coords) == 0:
+        return None, pending.refused
+    log_density, log_prob = log_density[: len(coords)], records["log_prob"]
+    alive = log_prob > -np.inf
+    log_weights = np.where(alive, np.where(alive, log_prob, 0.0) - log_density, -np.inf)
+    log_known = None if known is None else known.log_density(coords) - log_density
+    return Round(coords, records, log_weights, known, log_known, function, log_density[:, None]), pending.refused
 
 
 def draw_rounds(
@@ -178,8 +136,7 @@ def draw_rounds(
     session = session._replace(weighted=lambda: None if pooled is None else (pooled.coords, pooled.log_weights))
     size, population = len(population.coords), population._replace(effective_sample_size=0.0)
     rounds: list[Round] = []
-    batches: list[Batch] = []  # of which draws are running
-    refused, pooled, learned = False, None, 0
+    pooled = None
 
     def tick(phase: str, finished: bool) -> tuple[Population, GuideTick]:
         return population, GuideTick(phase, budget.simulations, size, finished)
@@ -191,57 +148,43 @@ def draw_rounds(
                 item = next(steps) if answer is None else steps.send(answer)
                 answer = yield (population, item) if callable(item) else tick(phase, True)
 
-    def judge(most: int) -> Generator[tuple[Population, Report], None, RoundsOfGuide | None]:
-        """Let draws arrive; returns how the rounds end, or None if another round follows."""
-        nonlocal population, pooled, rounds
-        while True:
-            let_arrive(batches, most, density, guide, session)
-            outcome = None
-            while batches and batches[0].pending.complete:
-                rounds = add_round(rounds, batches.pop(0).as_round())
-                pooled = pool_rounds(rounds)
-                population = population._replace(effective_sample_size=pooled.effective_sample_size)
-                yield population, _report(rounds[-1], pooled)
-                yield tick(f"round {len(rounds)}", True)
-                outcome = _outcome(rounds, pooled, size)
-            if refused or budget.refused:  # a search that was cut short goes on first, if the limit is raised
-                unreached = unreached_share(partial(log_mixture, rounds), guide.known_density) if rounds else 0.0
-                found = () if unreached <= LARGEST_UNREACHED else (find_unreached_part(UNSETTLED, WRONG),)
-                outcome = RoundsOfGuide("", found, pooled, rounds, True, None, unreached)
-            # more draws while some are running, if those will not be enough
-            if not batches or (outcome is None and len(rounds) + len(batches) < MOST_ROUNDS and few()):
-                return outcome and _with_signed(outcome)
-            most = 0  # submitted draws are part of the result
-
-    def few() -> bool:
-        return bool(rounds) and is_reliable(rounds) and _missing(rounds, batches, size) > 0.0
-
     yield tick("search", False)
     yield from asked(guide.prepare(session), "search")
     while True:
-        yield tick(f"round {len(rounds) + len(batches) + 1}", False)
-        coords = checked_draws(guide, _next_size(rounds, batches, size), random, population.coords.shape[1])
-        batch = submit_batch(coords, density, guide, session)
-        refused = batch.pending.refused
-        if len(batch.pending.coords) > 0:
-            batches.append(batch)
-        outcome = yield from judge(0 if refused or budget.refused else most_running(density, len(coords)))
+        yield tick(f"round {len(rounds) + 1}", False)
+        coords = checked_draws(guide, _next_size(rounds, size), random, population.coords.shape[1])
+        latest, refused = _evaluated(coords, density, guide, session)
+        outcome = None
+        if latest is not None:
+            rounds = add_round(rounds, latest)
+            pooled = pool_rounds(rounds)
+            population = population._replace(effective_sample_size=pooled.effective_sample_size)
+            yield population, _report(latest, pooled)
+            yield tick(f"round {len(rounds)}", True)
+            outcome = _outcome(rounds, pooled, size)
+        if refused or budget.refused:  # a search that was cut short goes on first, if the limit is raised
+            return _stopped(rounds, pooled, guide)
         # with the last round as well, a guide with a known density may learn that the posterior is larger
-        if outcome is not None and (outcome.stopped or outcome.reason or guide.known_density is None):
-            return outcome
-        if new := rounds[learned:]:
-            learned = len(rounds)
-            lesson = np.concatenate([r.coords for r in new]), np.concatenate([r.records["log_prob"] for r in new])
-            yield from asked(guide.refine(*lesson, session), f"after round {len(rounds)}")
+        if outcome is not None and (outcome.reason or guide.known_density is None):
+            return _with_signed(outcome)
+        yield from asked(guide.refine(latest.coords, latest.records["log_prob"], session), f"after round {len(rounds)}")
         if outcome is not None:
-            outcome = _with_signed(outcome)
             unreached = unreached_share(partial(log_mixture, rounds), guide.known_density)
-            if max(unreached, grown(outcome.pooled, rounds[-1].known, guide.known_density)) <= LARGEST_UNREACHED:
-                return outcome._replace(unreached=unreached)
+            if max(unreached, grown(pooled, latest.known, guide.known_density)) <= LARGEST_UNREACHED:
+                return _with_signed(outcome._replace(unreached=unreached))
             if len(rounds) == MOST_ROUNDS:
-                return outcome._replace(findings=(find_unreached_part(UNSETTLED, WRONG),))
+                return _with_signed(outcome._replace(findings=(find_unreached_part(UNSETTLED, WRONG),)))
         if budget.refused:
-            return (yield from judge(0))
+            return _stopped(rounds, pooled, guide)
+
+
+def _stopped(rounds: Sequence[Round], pooled: PooledRounds | None, guide: Guide) -> RoundsOfGuide:
+    """The rounds that the limit of simulations has ended."""
+    if pooled is None:
+        return RoundsOfGuide("", (), None, rounds, True)
+    unreached = unreached_share(partial(log_mixture, rounds), guide.known_density)
+    found = () if unreached <= LARGEST_UNREACHED else (find_unreached_part(UNSETTLED, WRONG),)
+    return _with_signed(RoundsOfGuide("", found, pooled, rounds, True, None, unreached))
 
 
 def _with_signed(outcome: RoundsOfGuide) -> RoundsOfGuide:
@@ -278,20 +221,14 @@ def _outcome(rounds: Sequence[Round], pooled: PooledRounds, size: int) -> Rounds
     return RoundsOfGuide(shortfall, (), pooled, rounds)
 
 
-def _missing(rounds: Sequence[Round], batches: Sequence[Batch], size: int) -> float:
-    """Missing effective draws, if the running draws have the effective share of the last round."""
-    expected = rounds[-1].effective_share * sum(len(batch.pending.coords) for batch in batches)
-    return size - pool_rounds(rounds).effective_sample_size - expected
-
-
-def _next_size(rounds: Sequence[Round], batches: Sequence[Batch], size: int) -> int:
-    """Number of draws in the next batch; only the number of draws in the running `batches` matters."""
+def _next_size(rounds: Sequence[Round], size: int) -> int:
+    """Number of draws in the next round."""
     first = max(FEWEST_DRAWS, int(np.ceil(FIRST_ROUND_SHARE * size)))
-    if not rounds and not batches:
+    if not rounds:
         return first
-    if rounds and all_impossible(rounds):  # perhaps all simulations fail: find out with few more
+    if all_impossible(rounds):  # perhaps all simulations fail: find out with few more
         return FEWEST_DRAWS
-    if rounds and is_reliable(rounds):
-        missing = _missing(rounds, batches, size)
+    if is_reliable(rounds):
+        missing = size - pool_rounds(rounds).effective_sample_size
         return int(np.clip(np.ceil(missing / rounds[-1].effective_share), first, max(size, first)))
     return max(FEWEST_DRAWS, int(np.ceil(ROUND_SHARE * size)))

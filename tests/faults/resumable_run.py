@@ -29,7 +29,6 @@ KINDS = {
     "guided": (SMCSampler, {"guide": SearchingGuide}),
     "map": (SMCSampler, {"recycle": True}),
     "asynchronous": (SMCSampler, {"recycle": True, "asynchronous": True, "pool": InOrder}),
-    "asynchronous, guided": (SMCSampler, {"guide": SearchingGuide, "asynchronous": True}),
     "limit": (SMCSampler, {"recycle": True}),
     "reset": (SMCSampler, {"recycle": False}),
     "thin": (SMCSampler, {"recycle": False}),

@@ -1,7 +1,6 @@
 """Asynchronous runs: killed anywhere, they go on; the record repeats them to the last bit without an evaluation."""
 
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
 
 import emcee
 import numpy as np
@@ -9,15 +8,14 @@ import pytest
 
 from samplers import SMCSampler, TMCMCSampler
 from tests.contract.targets import Gaussian, WithBlobs
-from tests.emulation.problems import symmetric
 from tests.faults.records import blocks, cut, points_of
 from tests.faults.resumable_run import outcome
-from tests.simulated_cluster import DelayedPool, SimulatedCluster
+from tests.simulated_cluster import SimulatedCluster
 from tests.tempering.guides import FixedGuide
 
 N, NDIM = 40, 2
 COMPARED = 2  # evaluations by which a new sampler compares the posterior with that of the file
-STEPS = {"recycling": 2, "guide": 1}
+STEPS = 2
 
 pytestmark = pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
 
@@ -31,72 +29,59 @@ class Fragile(WithBlobs):
         return values
 
 
-def finished(kind, path, order=0, **settings):
-    """A run on a file, and what it has evaluated; `order` is the seed of the run lengths, and so of the arrivals.
-
-    "recycling" is of points with blobs, of which some fail; "guide" of two modes, with searches on parts of the record.
-    """
+def finished(path, order=0, **settings):
+    """A run on a file, and what it has evaluated; `order` is the seed of the run lengths, and so of the arrivals."""
     settings = {"seed": 5, "asynchronous": True, "backend": emcee.backends.HDFBackend(str(path)), **settings}
-    if kind == "recycling":
-        lengths = np.random.default_rng(order)
-        posterior = SimulatedCluster(Fragile(ndim=NDIM, sd=0.05), 5, lambda x: lengths.exponential(size=len(x)))
-        settings["recycle"], context = True, nullcontext()
-    else:
-        posterior = symmetric()
-        likelihood = posterior.likelihood
-        likelihood.simulator.pool = pool = DelayedPool(12, order, likelihood.model.n_steps)
-        settings["guide"], context = posterior.guide(4), pool.pool
-    sampler = SMCSampler(N, NDIM, posterior, vectorize=True, **settings)
-    with context:
-        sampler.run_mcmc(None, STEPS[kind] - sampler.iteration)
+    lengths = np.random.default_rng(order)
+    posterior = SimulatedCluster(Fragile(ndim=NDIM, sd=0.05), 5, lambda x: lengths.exponential(size=len(x)))
+    sampler = SMCSampler(N, NDIM, posterior, vectorize=True, recycle=True, **settings)
+    sampler.run_mcmc(None, STEPS - sampler.iteration)
     sampler._record.close()
-    return sampler, posterior.evaluations if kind == "recycling" else pool.simulations
+    return sampler, posterior.evaluations
 
 
-def repeated(kind, path, folder, order=99):
+def repeated(path, folder, order=99):
     """The run of a record without its HDF5 file."""
     cut(path, None, folder / "repeated.h5")
-    return finished(kind, folder / "repeated.h5", order)
+    return finished(folder / "repeated.h5", order)
 
 
-@pytest.fixture(scope="module", params=["recycling", pytest.param("guide", marks=pytest.mark.slow)])
-def whole(request, tmp_path_factory):
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
     path = tmp_path_factory.mktemp("whole") / "run.h5"
-    return request.param, path, *finished(request.param, path, order=1)
+    return path, *finished(path, order=1)
 
 
 def test_the_order_of_arrival_decides_and_the_record_repeats_it_without_an_evaluation(whole, tmp_path):
     """The control: other lengths give another run, so that a replay that ignored the order would be noticed."""
-    kind, path, sampler, made = whole
-    assert made == pytest.approx(sampler.simulations) and (sampler.failures or kind == "guide")
-    assert outcome(finished(kind, tmp_path / "other.h5", order=2)[0]) != outcome(sampler)
-    again, nothing = repeated(kind, path, tmp_path)
-    assert outcome(again) == outcome(sampler) and nothing <= (COMPARED if kind == "recycling" else 0)
+    path, sampler, made = whole
+    assert made == pytest.approx(sampler.simulations) and sampler.failures
+    assert outcome(finished(tmp_path / "other.h5", order=2)[0]) != outcome(sampler)
+    again, nothing = repeated(path, tmp_path)
+    assert outcome(again) == outcome(sampler) and nothing <= COMPARED
 
 
 @pytest.mark.parametrize(
     "share", [0.5, *(pytest.param(share, marks=pytest.mark.slow) for share in (0.04, 0.25, 0.7, 0.97))]
 )
 def test_killed_anywhere_a_run_goes_on_and_its_record_repeats_it(whole, tmp_path, share):
-    """In the search and in the rounds; continued with other lengths, of which a later replay takes no account."""
-    kind, path, sampler, made = whole
+    """Continued with other lengths, of which a later replay takes no account."""
+    path, *_ = whole
     places = [place for _, place in blocks(path)]
     cut(path, places[int(share * len(places))], tmp_path / "killed.h5")
     known = len(points_of(tmp_path / "killed.h5"))
-    resumed, rest = finished(kind, tmp_path / "killed.h5", order=4)
-    assert rest <= (resumed.evaluations - known + COMPARED if kind == "recycling" else (1.4 - share) * made + 12)
-    again, nothing = repeated(kind, tmp_path / "killed.h5", tmp_path)
-    assert outcome(again) == outcome(resumed) and nothing <= (COMPARED if kind == "recycling" else 0)
+    resumed, rest = finished(tmp_path / "killed.h5", order=4)
+    assert rest <= resumed.evaluations - known + COMPARED
+    again, nothing = repeated(tmp_path / "killed.h5", tmp_path)
+    assert outcome(again) == outcome(resumed) and nothing <= COMPARED
 
 
-@pytest.mark.parametrize(("kind", "limit"), [("recycling", 150), ("guide", 75)])
-def test_a_limit_counts_what_is_running(kind, limit, tmp_path):
+def test_a_limit_counts_what_is_running(tmp_path):
     """No more than the limit is submitted, all of that is used, and a larger limit goes on."""
-    sampler, made = finished(kind, tmp_path / "run.h5", order=1, max_simulations=limit)
-    assert limit - 1.0 < sampler.simulations <= limit and made == pytest.approx(sampler.simulations)
-    if kind == "recycling":
-        more, further = finished(kind, tmp_path / "run.h5", order=3, max_simulations=5000)
-        assert more.verdict.status != "not usable" and further <= COMPARED + more.evaluations - limit
+    sampler, made = finished(tmp_path / "run.h5", order=1, max_simulations=150)
+    assert 149.0 < sampler.simulations <= 150 and made == pytest.approx(sampler.simulations)
+    more, further = finished(tmp_path / "run.h5", order=3, max_simulations=5000)
+    assert more.verdict.status != "not usable" and further <= COMPARED + more.evaluations - 150
 
 
 class Ends(Gaussian):
@@ -148,8 +133,8 @@ GUIDE = FixedGuide(POSTERIOR, POSTERIOR.mean, [np.diag(POSTERIOR.sd**2)])
     ("Sampler", "settings", "error", "word"),
     [
         (SMCSampler, {"vectorize": True}, ValueError, "evaluation_queue"),
-        (SMCSampler, {"vectorize": True, "guide": GUIDE}, ValueError, "evaluation_queue"),
-        (SMCSampler, {"pool": 1, "recycle": False}, ValueError, "moves wait"),
+        (SMCSampler, {"pool": 1, "guide": GUIDE}, ValueError, "guides wait"),
+        (SMCSampler, {"pool": 1, "recycle": False}, ValueError, "moves and guides wait"),
         (SMCSampler, {"vectorize": True, "asynchronous": 1}, ValueError, "True or False"),
         (TMCMCSampler, {"pool": 1, "guide": GUIDE}, TypeError, "asynchronous"),
     ],

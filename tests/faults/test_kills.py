@@ -6,7 +6,7 @@ from tests.faults.kills import kill
 
 pytestmark = pytest.mark.skipif("not hasattr(__import__('os'), 'fork')", reason="needs os.fork")
 
-QUICK, SLOW = ("smc", "asynchronous, guided"), ("guided", "limit", "reset")
+QUICK, SLOW = ("smc", "guided"), ("asynchronous", "limit", "reset")
 
 
 @pytest.mark.parametrize("kind", [*QUICK, *(pytest.param(kind, marks=pytest.mark.slow) for kind in SLOW)])

@@ -265,11 +265,10 @@ def test_wrong_shapes_are_refused():
     assert queue.submit(np.empty((0, 3))) == []
 
 
-@pytest.mark.parametrize("responses", [True, False])
-def test_without_a_pool_points_that_are_submitted_twice_are_simulated_once(responses):
+def test_without_a_pool_points_that_are_submitted_twice_are_simulated_once():
     posterior = posterior_of(Treacherous())
     x = posterior.sample_prior(6, np.random.default_rng(3))
-    with posterior.evaluation_queue(responses=responses) as queue:
+    with posterior.evaluation_queue() as queue:
         values = collect(queue, queue.submit(x) + queue.submit(x[:4]))
     assert posterior.report()["simulations"] == 6
     expected = posterior.log_prob(x)

@@ -1,4 +1,4 @@
-"""Asynchronous recycling, and rounds of a guide, where the time of an evaluation depends on what is to be found."""
+"""Asynchronous recycling, where the time of an evaluation depends on what is to be found."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,6 @@ from samplers import SMCSampler
 from tests.contract.targets import Gaussian
 from tests.simulated_cluster import SimulatedCluster
 from tests.statistics import analytic_posteriors as analytic
-from tests.tempering.guides import LearningGuide
 
 SEEDS = range(4)
 
@@ -54,31 +53,3 @@ def test_a_run_of_failures_is_stopped():
     sampler = SMCSampler(250, 3, cluster, vectorize=True, seed=1, asynchronous=True)
     with pytest.raises(RuntimeError, match="max_failure_share"):
         sampler.run_mcmc(None, 0)
-
-
-def deviations_with_a_guide(seeds=30):
-    """Deviations (3,) of log-evidence, mean and variance of a parameter, in standard errors of the mean over the seeds.
-
-    Half of the posterior, where the first parameter is large, takes about 100 times as long.
-    """
-
-    def length(x):
-        return np.where(x[:, 0] > target.mean[0], random.uniform(50.0, 150.0, len(x)), 1.0)
-
-    numbers = []
-    for seed in range(seeds):
-        target, random = Gaussian(2, sd=0.05), np.random.default_rng(seed)
-        cluster = SimulatedCluster(target, 32, length)
-        guide = LearningGuide(target, target.mean, [np.diag((2.0 * target.sd) ** 2)])
-        sampler = SMCSampler(80, 2, cluster, vectorize=True, seed=seed, guide=guide, asynchronous=True)
-        z = (sampler.run_mcmc(None, 0).coords[:, 0] - target.mean[0]) / target.sd[0]
-        evidence = (sampler.log_evidence - target.log_evidence) / sampler.log_evidence_error
-        numbers.append((evidence, z.mean(), z.var() - 1.0))
-    numbers = np.array(numbers)
-    return numbers.mean(axis=0) / (numbers.std(axis=0, ddof=1) / np.sqrt(seeds))
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
-def test_rounds_of_a_guide_do_not_prefer_short_runs():
-    assert np.all(np.abs(deviations_with_a_guide()) < 3.0)
