@@ -65,7 +65,6 @@ from .signals.error_measures import rrmse
 from .signals.events import Events
 from .signals.read import read_columns, read_record
 from .signals.records import DisplacementHistory, Record
-from .simulation.executors import DaskExecutor
 from .simulation.model import SimulationFailed
 from .units import from_si, to_si
 
@@ -76,7 +75,6 @@ __all__ = [
     "Channel",
     "ColumnAnalysis",
     "Concrete",
-    "DaskExecutor",
     "DisplacementHistory",
     "EventRatios",
     "Events",

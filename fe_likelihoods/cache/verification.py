@@ -38,7 +38,7 @@ from ..noise.statistics import Statistic, needs_response, statistic_width
 from ..signals.comparison import Comparison
 from ..simulation.by_value import is_arriving
 from ..simulation.faults import ChangedModel, TransientReason
-from ..simulation.files import Opened, observing
+from ..simulation.files import digests_by_name, observing, read_again
 from ..simulation.label import ModelLabel
 from ..simulation.model import (
     MisfitBatch,
@@ -251,7 +251,7 @@ class VerifiedModel:
             return
         with observing() as observer:
             yield
-        self.label.add(observer.result(self.label.opened) if self.pool is None else Opened(observer.noted))
+        self.label.add(observer.result(self.label.opened) if self.pool is None else observer.noted)
 
     def _simulate_again(self, thetas: np.ndarray) -> list[Simulated]:
         start, rows, size = time.perf_counter(), [], most_responses(self.model)
@@ -324,7 +324,7 @@ class VerifiedModel:
 
     def _changes(self) -> set[str]:
         """Names of what has changed; a file counts from when a simulation opened it."""
-        known = self.label.opened.items() | self._known
+        known = digests_by_name(self.label.opened) | self._known
         now = self.label.present(self.model) | {FINGERPRINT: self.model.fingerprint}
         return {name for name in known.keys() | now.keys() if known.get(name) != now.get(name)}
 
@@ -459,23 +459,23 @@ class VerifiedModel:
         rows = self.cache.file.select(f"SELECT {LABEL_COLUMNS} FROM labels WHERE source = ? ORDER BY rowid", (source,))
         rows = list(filter(is_undamaged_label, rows))
         for row in rows:
-            label.add(Opened(json.loads(row[2])).read_again())
+            label.add(read_again(json.loads(row[2])))
         for row in rows:
             files = json.loads(row[2])
-            if row[1] == label.code.encode() and Opened(files).read_again().files == files:
+            if row[1] == label.code.encode() and read_again(files) == files:
                 self._trust.labels[source], known = row, row[3]
         return known
 
     def _new_generation(self, used: Iterable[int]) -> int:
         """The generation that another process has begun under the same label, unless its rows differ."""
-        text = f"{self.label.code} {sorted(self.label.opened.items().items())}".encode()
+        text = f"{self.label.code} {sorted(digests_by_name(self.label.opened).items())}".encode()
         generation = int.from_bytes(blake2b(text, digest_size=8).digest()) >> 2 | 1
         return secrets.randbits(62) | 1 if generation in used else generation
 
     def _use(self, source: int, generation: int) -> int:
         """Store to which generation the label belongs, with the files that simulations have opened by now."""
         label, trust = self.label, self._trust
-        row = pack_label(source, label.code, label.opened.files, generation)
+        row = pack_label(source, label.code, label.opened, generation)
         before, trust.labels[source] = trust.labels.get(source), row
         if before != row:
             delete = "DELETE FROM labels WHERE source = ? AND code = ? AND files = ?"

@@ -5,7 +5,7 @@ of the simulations are. Each point is evaluated in a thread, which waits for its
 """
 
 import os
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -47,9 +47,13 @@ def evaluation_queue(posterior: Any) -> PointQueue:
         if not streams and len(rows):
             with suppress(Exception):  # raised by `collect`
                 evaluate(rows)  # together, which is faster; their simulations are known then
-        return list(threads.submit_all(evaluate, [row[None] for row in rows]))
+        futures, items = [Future() for _ in rows], [row[None] for row in rows]
+        threads.submit_all(futures, items, (size() or _MOST_THREADS) if streams else 1)
+        if not streams:
+            wait(futures)
+        return futures
 
-    threads = Threads(lambda: (size() or _MOST_THREADS) if streams else 0)
+    threads = Threads(lambda: evaluate)
     return PointQueue(start, size)
 
 

@@ -30,8 +30,8 @@ from ..priors.points import as_rows
 from ..signals.channels import Measurements
 from ..signals.comparison import Comparison, compare_with
 from ..simulation.executors import as_executor
-from ..simulation.folder import Observed, unpack
-from ..simulation.local_pool import value_of
+from ..simulation.folder import Observed
+from ..simulation.local_pool import result_of
 from ..simulation.model import (
     Model,
     SimulationBatch,
@@ -41,6 +41,7 @@ from ..simulation.model import (
     run_each,
     sent_simulation,
     simulate_batch,
+    unpack,
 )
 from .failure_log import FailureLog
 from .inputs import check_statistic, name_of_statistic
@@ -343,7 +344,7 @@ class Simulator(VerifiedModel):
                 if not running.keys:
                     running.counted_until = time.perf_counter()
                 measured = () if self._returns_responses(full) else (self.measured, self.statistic)
-                function = Observed(sent_simulation(self.model, *measured))
+                function = Observed(sent_simulation(self.model, *measured), self.pool.n_workers == 1)
                 left = dict(zip(self.pool.submit_all(function, list(self._thetas(new))), new, strict=True))
                 running.keys |= set(new)
         for future in list(left):
@@ -374,7 +375,7 @@ class Simulator(VerifiedModel):
                 key = left.pop(future)
                 self._running.keys.discard(key)
                 try:
-                    done[key], opened = unpack(value_of(future.result()), self.pool)
+                    done[key], opened = unpack(result_of(future))
                     self.label.add(opened)
                 except CancelledError:
                     error = error or RuntimeError("the pool was closed before a simulation had finished")

@@ -11,7 +11,6 @@ import re
 import shutil
 import string
 import tempfile
-import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -22,7 +21,6 @@ import numpy as np
 from ..signals.channels import Channel
 from ..signals.records import Record
 from ..simulation.faults import SimulationFailed, TransientReason, reason_of
-from ..simulation.folder import KEEP, keep_folder
 from ..simulation.programs import run_program
 from ..simulation.worker import describe_exit, last_lines
 from ..units import find_unit
@@ -43,8 +41,8 @@ class ExecutableModel(UserModel):
     parameter, with all its digits; ``$$`` is a dollar sign (`string.Template`). The program is started in the folder of
     the run, without a shell and standard input, with the environment variables of this process: name those that matter
     in `depends_on`. Afterwards all processes in its process group are killed (not daemons, containers and queued jobs).
-    A run that writes more than 256 MiB is stopped; ``FE_LIKELIHOODS_KEEP_FAILURES`` says where folders of failed runs
-    are kept. The label contains the program, and files that an argument names by an absolute path.
+    A run that writes more than 256 MiB is stopped. The label contains the program, and files that an argument names by
+    an absolute path.
 
     Parameters
     ----------
@@ -221,14 +219,12 @@ class ExecutableModel(UserModel):
             place = Path(name)
             folder = place / "run"
             folder.mkdir()
-            start = time.monotonic()
             try:
                 self._write(folder, values)
                 self._execute(place, [string.Template(part).substitute(values) for part in self.command[1:]])
                 return self._check_response(self._read(folder))
             except Exception as error:
-                reason, seconds = reason_of(error), time.monotonic() - start
-                self._keep(place, values, reason, seconds)
+                reason = reason_of(error)
                 if not isinstance(reason, TransientReason) and shutil.disk_usage(place).free < _FREE_BYTES:
                     text = f"{reason} (the disk of the temporary folder {place.parent} is full)"
                     raise SimulationFailed(TransientReason(text)) from error
@@ -288,12 +284,6 @@ class ExecutableModel(UserModel):
             wanted = f"{len(self.columns)} columns" if self._no_other_columns else listed
             raise SimulationFailed(f"{self.output} has {table.shape[1]} columns, expected {wanted}")
         return self._factors * table[:, self.columns].T
-
-    def _keep(self, place: Path, values: dict[str, str], reason: str, seconds: float) -> None:
-        """Keep the folder of a failed run, if that is asked for."""
-        if os.environ.get(KEEP):
-            lines = [reason, f"after {seconds:.3g} s", *(f"{name} = {value}" for name, value in values.items())]
-            keep_folder(place, os.environ[KEEP], "\n".join(lines) + "\n")
 
 
 def read_table(folder: Path, name: str) -> np.ndarray:

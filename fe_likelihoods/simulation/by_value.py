@@ -10,11 +10,9 @@ notebook functions work. The worker imports this library, installed packages and
 * A worker refuses everything if its version of this library has different source code.
 """
 
-import contextlib
 import dis
 import functools
 import importlib.machinery
-import importlib.util
 import inspect
 import io
 import os
@@ -39,9 +37,9 @@ __all__ = [
     "Arrived",
     "CannotLoad",
     "Pickled",
-    "Recent",
     "dumps",
     "is_arriving",
+    "loaded_function",
     "names_in",
     "without_addresses",
 ]
@@ -51,7 +49,9 @@ _CACHED = type(functools.cache(len))
 _CODE = (types.FunctionType, type, _CACHED)
 _OF_THE_IMPORT = {"__builtins__", "__loader__", "__spec__", "__cached__"}
 _COMPILED = tuple(importlib.machinery.EXTENSION_SUFFIXES)
+_MOST_LOADED = 8
 _lock = threading.RLock()
+loaded_functions: "OrderedDict[bytes, Arrived]" = OrderedDict()  # in a worker, by key, the last used last
 _arriving: dict[str, types.ModuleType] | None = None  # modules of the function that is being loaded
 _present: dict[str, types.ModuleType] = {}  # modules of the function that ran last in this process
 
@@ -76,28 +76,12 @@ def is_arriving() -> bool:
     return _arriving is not None
 
 
-class Recent(OrderedDict):
-    """The most recently used values, by key: at most 8, with a total of 256 MiB (or one larger value)."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._sizes: dict[Any, int] = {}
-
-    def use(self, key: Any) -> Any:
-        """The value of a key, which becomes the most recently used value; None if it is not kept."""
-        if key in self:
-            self.move_to_end(key)
-        return self.get(key)
-
-    def keep(self, key: Any, value: Any, size: int) -> None:
-        """Keep a value; `size` is in bytes."""
-        self[key], self._sizes[key] = value, size
-        self.move_to_end(key)
-        while len(self) > 8 or (len(self) > 1 and sum(self._sizes[key] for key in self) > 2**28):
-            del self._sizes[self.popitem(last=False)[0]]
-
-
-loaded_functions = Recent()  # `Arrived` by key, in a worker of a pool
+def loaded_function(key: bytes) -> "Arrived | None":
+    """The function with a key, if it is one of the last that this process has loaded."""
+    with _lock:
+        if key in loaded_functions:
+            loaded_functions.move_to_end(key)
+        return loaded_functions.get(key)
 
 
 class CannotLoad(ValueError):
@@ -128,12 +112,15 @@ class Pickled(NamedTuple):
 
     def __call__(self, item: Any) -> Any:
         """The result for an item in another process, which loads the function once."""
+        return self.loaded()(item)
+
+    def loaded(self) -> "Arrived":
+        """The function, loaded unless it is one of the last that this process has loaded; see `load`."""
         with _lock:
-            function = loaded_functions.use(self.key)
-            if function is None:
-                function = self.load()
-                loaded_functions.keep(self.key, function, len(self.payload))
-        return function(item)
+            function = loaded_functions[self.key] = loaded_function(self.key) or self.load()
+            if len(loaded_functions) > _MOST_LOADED:
+                loaded_functions.popitem(last=False)
+        return function
 
     def load(self) -> "Arrived":
         """The function, in a worker.
@@ -169,15 +156,11 @@ class Arrived:
     def __init__(self, function: Any, modules: dict[str, types.ModuleType]) -> None:
         self._function, self._modules = function, modules
 
-    def prepare(self) -> None:
-        """Put the modules into `sys.modules`, for functions that import them while they run."""
+    def __call__(self, item: Any) -> Any:
         global _present
-        if _present is not self._modules:
+        if _present is not self._modules:  # for functions that import them while they run
             sys.modules.update(self._modules)
             _present = self._modules
-
-    def __call__(self, item: Any) -> Any:
-        self.prepare()
         return self._function(item)
 
 
@@ -279,43 +262,34 @@ class _Pickler(cloudpickle.Pickler):
         # where cloudpickle keeps the future globals of the functions of a module
         self.globals_ref.setdefault(id(function.__globals__), _Namespace(module))
         reduced = self._dynamic_function_reduce(function)
-        imported = _resolved(names_in(function.__code__).imported, module.__dict__.get("__package__") or "")
-        reduced[2][1]["_cloudpickle_submodules"].extend(filter(None, map(self._module, imported)))
+        used = _possible_modules(function.__code__, module.__dict__.get("__package__") or "")
+        reduced[2][1]["_cloudpickle_submodules"].extend(filter(None, map(self._module, used)))
         return *reduced[:-1], functools.partial(_fill_function, reduced[-1])
 
 
-class _Names(NamedTuple):
-    """Names in code, and what it imports."""
-
-    all: frozenset[str]
-    imported: frozenset[str]  # modules (with a dot per level of a relative import) and names imported from them
+@functools.lru_cache(maxsize=4096)
+def names_in(code: types.CodeType) -> frozenset[str]:
+    """Names in a code object and in the code objects inside it."""
+    return frozenset(code.co_names).union(*map(names_in, _inner(code)))
 
 
 @functools.lru_cache(maxsize=4096)
-def names_in(code: types.CodeType) -> _Names:
-    """Names in a code object and in the code objects inside it."""
-    imported: set[str] = set()
-    before: list[Any] = [0, None]
-    for step in dis.get_instructions(code):
-        if step.opname == "IMPORT_NAME":
-            level, items = before[-2:]
-            module = "." * level + step.argval
-            imported |= {module, *(f"{module}{'.' if step.argval else ''}{item}" for item in items or ())}
-        before.append(step.argval)
-    inner = [names_in(constant) for constant in code.co_consts if isinstance(constant, types.CodeType)]
-    return _Names(
-        frozenset(code.co_names).union(*(names.all for names in inner)),
-        frozenset(imported).union(*(names.imported for names in inner)),
-    )
+def _imported_in(code: types.CodeType) -> frozenset[str]:
+    """Modules of import statements in the code, without the dots of relative ones."""
+    own = {step.argval for step in dis.get_instructions(code) if step.opname == "IMPORT_NAME"}
+    return frozenset(own).union(*map(_imported_in, _inner(code)))
 
 
-def _resolved(imported: frozenset[str], package: str) -> set[str]:
-    """Full names of modules."""
-    found = set()
-    for name in imported:
-        with contextlib.suppress(ImportError):
-            found.add(importlib.util.resolve_name(name, package))
-    return found
+def _inner(code: types.CodeType) -> list[types.CodeType]:
+    return [constant for constant in code.co_consts if isinstance(constant, types.CodeType)]
+
+
+def _possible_modules(code: types.CodeType, package: str) -> list[str]:
+    """Full names of modules that the code of a package may import."""
+    imported, parts = _imported_in(code), package.split(".")
+    packages = [".".join(parts[:n]) for n in range(1, len(parts) + 1)] if imported else []
+    found = imported | {f"{each}.{name}".rstrip(".") for each in packages for name in imported}
+    return sorted(found | {f"{each}.{name}" for each in found & sys.modules.keys() for name in names_in(code)})
 
 
 class _Namespace(NamedTuple):

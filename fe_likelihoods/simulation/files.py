@@ -23,19 +23,20 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from .faults import UnusableModel
 
 __all__ = [
     "Opened",
     "RunningSimulation",
+    "digests_by_name",
     "file_digest",
     "mapped",
     "note",
     "observing",
     "of_this_library",
-    "refuse_shared",
+    "read_again",
     "running_simulation",
 ]
 
@@ -55,25 +56,21 @@ _digests: dict[str, tuple[tuple, float, str]] = {}
 _fresh: set[str] = set()  # files that simulations have read and that were written while they ran
 
 
-class Opened(NamedTuple):
-    """What simulations opened: digests of the contents of files, by path."""
+Opened = dict[str, str]
+"""What simulations opened: digests of the contents of files, by path."""
 
-    files: dict[str, str]
-    shared: str = ""  # a file that other simulations may write too
 
-    def items(self) -> dict[str, str]:
-        """Digests by file name, so that the folder does not matter."""
-        found: dict[str, list[str]] = {}
-        for path, digest in self.files.items():
-            found.setdefault(f"opened {os.path.basename(path)}", []).append(digest)
-        return {name: " ".join(sorted(digests)) for name, digests in found.items()}
+def digests_by_name(opened: Opened) -> dict[str, str]:
+    """Digests by file name, so that the folder does not matter."""
+    found: dict[str, list[str]] = {}
+    for path, digest in opened.items():
+        found.setdefault(f"opened {os.path.basename(path)}", []).append(digest)
+    return {name: " ".join(sorted(digests)) for name, digests in found.items()}
 
-    def __or__(self, other: "Opened") -> "Opened":
-        return Opened(self.files | other.files, self.shared or other.shared)
 
-    def read_again(self) -> "Opened":
-        """The same files with their present digests; files that are not found, as on other machines, keep theirs."""
-        return Opened({path: _digest_or(path, digest) for path, digest in self.files.items()})
+def read_again(opened: Opened) -> Opened:
+    """The same files with their present digests; files that are not found, as on other machines, keep theirs."""
+    return {path: _digest_or(path, digest) for path, digest in opened.items()}
 
 
 class _Observer:
@@ -82,20 +79,17 @@ class _Observer:
     def __init__(self) -> None:
         self.read: set[str] = set()
         self.written: set[str] = set()
-        self.noted: dict[str, str] = {}
-        self.shared = ""
+        self.noted: Opened = {}
         self.modules = set(sys.modules)
 
-    def result(self, known: Opened | None = None) -> Opened | None:
-        """Files that were read and not written, including new modules and shared libraries; None if all are known."""
+    def result(self, known: Opened) -> Opened:
+        """The files that are `known`, and those read and not written, with new modules and shared libraries."""
         new = sys.modules.keys() - self.modules if len(sys.modules) != len(self.modules) else ()
         read = {file for name in new if isinstance(file := getattr(sys.modules[name], "__file__", None), str)}
         read |= self.read - self.written
-        if known is not None and self.noted.keys() <= known.files.keys() and (known.shared or not self.shared):
-            if not new and not any(path not in known.files and _counts(path) for path in read):
-                return None
-        files = {path: digest for path, digest in mapped(read).files.items() if path not in self.written}
-        return Opened(files | self.noted, self.shared)
+        if not new and not any(path not in known and _counts(path) for path in read):
+            return known if self.noted.keys() <= known.keys() else known | self.noted
+        return known | {path: each for path, each in mapped(read).items() if path not in self.written} | self.noted
 
     def see(self, path: Any, writes: bool = False) -> None:
         """Note a path, or the file that it shows if it is a link in the own folder of a simulation."""
@@ -119,47 +113,47 @@ def observing() -> Iterator[_Observer]:
             _observers.remove(observer)
 
 
-def note(opened: Opened | None) -> None:
+def note(opened: Opened) -> None:
     """Tell the observers of this process what another process has opened for it."""
-    if opened is not None:
-        for observer in list(_observers):
-            observer.noted.update(opened.files)
-            observer.shared = observer.shared or opened.shared
+    for observer in list(_observers):
+        observer.noted.update(opened)
 
 
 class RunningSimulation:
-    """A simulation that runs now, in its own folder `place` ("" if it has none).
+    """A simulation that runs now, `alone` or beside others, in its own folder `place` ("" if it has none).
 
-    Links there show the folder `base` by way of `hop`. `thread` runs the simulation, 0 if all threads of this process
-    belong to it. `shared` is the first file that other simulations may write too, else ""; `has_programs` if it
-    started processes.
+    Links there show the folder `base`. `thread` runs the simulation, 0 if all threads of this process belong to it.
+    `has_programs` says whether it started processes.
     """
 
-    def __init__(self, thread: int, place: str = "", hop: str = "", base: str = "") -> None:
-        self.place, self.base, self._hop, self._thread = place, base, hop, thread
-        self.shared, self.has_programs = "", False
+    def __init__(self, alone: bool, thread: int, place: str = "", base: str = "") -> None:
+        self.alone, self.place, self.base, self._thread = alone, place, base, thread
+        self.has_programs, self._shared = False, ""  # the first file that other simulations may write too
         self._made: list[str] = []  # files and folders
-        self._databases: list[str] = []  # that may only be read
         self._start = time.time_ns()
 
     def run(self, function: Callable[[Any], Any], item: Any) -> Any:
-        """Result of the function for an item."""
+        """Result of the function for an item; `UnusableModel` for a file that simulations share."""
         _add_hook()
         _running[self._thread] = self
         try:
-            return function(item)
+            result = function(item)
         finally:
             del _running[self._thread]
-            for path in self._databases:
-                self._reads(path)
+        if self._shared and not self.alone:
+            raise UnusableModel(
+                f"The simulations write to {self._shared}, or read there what is written while they run, and "
+                "simulations in other workers may do the same at that moment, so that results would be mixed up. Use a "
+                "pool of processes (dask: workers with one thread) and a relative file name, which is private to each "
+                "simulation, or a folder from tempfile (docs/parallel.rst); or use one worker, pool=1"
+            )
+        return result
 
     def shown(self, path: str) -> str | None:
         """The file that a link in the own folder shows; None for the simulation's own file, else `path`."""
         if not self._is_own(path):
             return path
-        with contextlib.suppress(OSError):
-            return os.readlink(path).replace(self._hop, self.base, 1)
-        path = os.path.realpath(path)  # a link among its folders
+        path = os.path.realpath(path)
         return None if self._is_own(path) else path
 
     # events of the audit hook ---------------------------------------------------------------------------------------
@@ -190,18 +184,13 @@ class RunningSimulation:
         with contextlib.suppress(OSError):
             status = os.stat(path)
             if self._start <= status.st_mtime_ns <= time.time_ns() and stat.S_ISREG(status.st_mode):
-                self.shared = self.shared or (path if path in _fresh else "")
+                self._shared = self._shared or (path if path in _fresh else "")
                 _fresh.add(path)
 
     def makes(self, path: Any) -> None:
         """A file or folder that is new belongs to this simulation."""
         if (path := _full(path)) is not None and not os.path.lexists(path):
             self._made.append(path)
-
-    def connects(self, path: Any) -> None:
-        """A database is looked at when the simulation has ended."""
-        if path not in ("", ":memory:") and (path := _full(path)) is not None:
-            self._databases.append(path)
 
     def removes(self, path: Any, folder: int | None) -> None:
         if folder in (None, -1):  # else within a folder, whose removal has an event of its own
@@ -215,7 +204,7 @@ class RunningSimulation:
 
     def writes(self, path: Any) -> None:
         """Note a file that does not belong to this simulation alone."""
-        if self.shared or (path := _full(path)) is None:
+        if self._shared or (path := _full(path)) is None:
             return
         if self._is_own(path) or _is_cache(path) or self._has_made(path):
             return
@@ -223,7 +212,7 @@ class RunningSimulation:
             mode = os.stat(path).st_mode
             if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):  # a terminal, a pipe, /dev/null
                 return
-        self.shared = os.path.dirname(path) if path.endswith("/*") else path
+        self._shared = os.path.dirname(path) if path.endswith("/*") else path
 
     def _has_made(self, path: str) -> bool:
         return any(path == made or path.startswith(made + os.sep) for made in self._made)
@@ -247,17 +236,6 @@ def of_this_library() -> Iterator[None]:
         _own.is_quiet = before
 
 
-def refuse_shared(path: str, n_workers: int | None) -> None:
-    """`UnusableModel` for a file that simulations share, unless it is "", or there is one worker only."""
-    if path and n_workers != 1:
-        raise UnusableModel(
-            f"The simulations write to {path}, or read there what is written while they run, and simulations in other "
-            "workers may do the same at that moment, so that results would be mixed up. Use a pool of processes (dask: "
-            "workers with one thread) and a relative file name, which is private to each simulation, or a folder from "
-            "tempfile (docs/parallel.rst); or use one worker, pool=1"
-        )
-
-
 _EVENTS: dict[str, Callable[[RunningSimulation, tuple], Any]] = {
     "open": lambda simulation, arguments: simulation.opens(*arguments),
     "os.fork": lambda simulation, _: simulation.starts(),
@@ -265,7 +243,7 @@ _EVENTS: dict[str, Callable[[RunningSimulation, tuple], Any]] = {
     "os.system": lambda simulation, _: simulation.starts("."),
     "subprocess.Popen": lambda simulation, arguments: simulation.starts(arguments[2] or "."),
     "tempfile.mkdtemp": lambda simulation, arguments: simulation.makes(arguments[0]),
-    "sqlite3.connect": lambda simulation, arguments: simulation.connects(arguments[0]),
+    "sqlite3.connect": lambda simulation, _: None,
     "ctypes.dlopen": lambda simulation, _: None,
 }
 for _event in ("os.mkdir", "os.truncate", "shutil.rmtree"):
@@ -338,7 +316,7 @@ def mapped(read: Iterable[str] = ()) -> Opened:
         lines = [line.split(None, 5)[5:] for line in Path("/proc/self/maps").read_text().splitlines()]
         paths |= {path for (path,) in filter(None, lines) if path.startswith("/") and not path.endswith("(deleted)")}
     files = {path: _digest_or(path, "") for path in paths if _counts(path)}
-    return Opened({path: digest for path, digest in files.items() if digest})
+    return {path: digest for path, digest in files.items() if digest}
 
 
 def _counts(path: str) -> bool:

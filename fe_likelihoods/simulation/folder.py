@@ -15,33 +15,21 @@ import functools
 import itertools
 import os
 import shutil
-import subprocess
 import sys
 import tempfile
 import threading
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from samplers.interrupts import process_name
 
 from .faults import SimulationFailed, TransientReason
-from .files import Opened, RunningSimulation, observing, of_this_library, refuse_shared, running_simulation
+from .files import Opened, RunningSimulation, observing, of_this_library, running_simulation
+from .programs import removed_at_end
 
-__all__ = [
-    "KEEP",
-    "Observed",
-    "Sender",
-    "discard",
-    "keep_folder",
-    "run_in_folder",
-    "unpack",
-    "working_folder",
-]
+__all__ = ["Observed", "Sender", "discard", "run_in_folder", "working_folder"]
 
-KEEP = "FE_LIKELIHOODS_KEEP_FAILURES"  # environment variable: where the folders of failed programs are kept
-_MOST_KEPT = 20
 _MOST_LINKS = 500  # in subfolders; other subfolders are links. A link takes 10 us, 1 ms on slow file systems
 _MOST_BESIDE = 3000  # entries beside the working folder, which ``..`` shows
 _CLOCK_TICK = 20_000_000  # [ns]; a file changed more recently may change again with the same modification time
@@ -76,64 +64,61 @@ def working_folder() -> str:
 class Observed:
     """A function of one item, whose results include what it opened; other processes call it in a folder of its own.
 
-    A call returns the result, and an `Opened` with all files that calls in this process have opened, since earlier
-    results may have been lost.
+    A call returns the result, and all files that calls in this process have opened, since earlier results may have been
+    lost. It raises `UnusableModel` if it writes a file that other simulations may write too, unless it runs `alone`; by
+    default, what holds where it is sent.
     """
 
-    def __init__(self, function: Callable[[Any], Any], sender: Sender | None = None) -> None:
-        self.function, self._sender = function, sender
+    def __init__(self, function: Callable[[Any], Any], alone: bool | None = None, sender: Sender | None = None) -> None:
+        self.function, self._alone, self._sender = function, alone, sender
         self.__qualname__ = getattr(function, "__qualname__", type(function).__qualname__)  # for messages
-        self._known: Opened | None = None
+        self._known: Opened = {}
 
     def __repr__(self) -> str:
         return repr(self.function)
 
     def __reduce__(self) -> tuple:
-        return Observed, (self.function, self._sender or Sender.here())
+        alone, simulation = self._alone, running_simulation()
+        if alone is None:
+            alone = _is_main() if simulation is None else simulation.alone
+        return Observed, (self.function, alone, self._sender or Sender.here())
 
-    def __call__(self, item: Any) -> tuple[Any, Opened | None]:
+    def __call__(self, item: Any) -> tuple[Any, Opened]:
         """The result for an item, and what was opened."""
         with observing() as observer:
-            result, shared = run_in_folder(self.function, item, self._sender)
-            observer.shared = observer.shared or shared
-        new = observer.result(self._known)
-        if new is not None:
-            self._known = new if self._known is None else new | self._known
+            result = run_in_folder(self.function, item, self._sender, bool(self._alone))
+        self._known = observer.result(self._known)
         return result, self._known
 
 
-def unpack(outcome: tuple, pool: Any) -> tuple[Any, Opened | None]:
-    """Simulation result from a pool, and what it opened; for a lost worker, the pool reports a result only.
+def run_in_folder(function: Callable[[Any], Any], item: Any, sender: Sender | None, alone: bool) -> Any:
+    """Result of a function for one item; `sender` is the process that has sent the function, None if it was not sent.
 
-    `UnusableModel` if simulations write files that other simulations of the pool may write too.
-    """
-    if isinstance(outcome[1], str):
-        return outcome, None
-    if outcome[1] is not None:
-        refuse_shared(outcome[1].shared, getattr(pool, "n_workers", None))
-    return outcome
-
-
-def run_in_folder(function: Callable[[Any], Any], item: Any, sender: Sender | None) -> tuple[Any, str]:
-    """Result of a function for one item, and the first file that the simulation shares with others, or "".
-
-    `sender` is the process that has sent the function; None if it was not sent.
+    `UnusableModel` if a file that it writes is not its own, unless it runs `alone`.
     """
     is_home = sender is None or sender.process == process_name()
     if running_simulation() is not None or (is_home and _is_main()):  # one after the other
-        return function(item), ""
-    thread = 0 if _is_main() else threading.get_ident()
+        return function(item)
     if is_home or not (_is_main() or _is_only_thread_of_dask()):
-        simulation = RunningSimulation(thread)
-        return simulation.run(function, item), simulation.shared
-    try:
-        result, error, shared = _run_in_mirror(_mirror_for(sender), function, item, thread)
-    except OSError as failure:
-        text = f"the working folder of a simulation could not be made: {failure}"
-        raise SimulationFailed(TransientReason(text)) from failure
+        return RunningSimulation(alone, threading.get_ident()).run(function, item)
+    is_wanted = True
+    while is_wanted:
+        mirror, before, result, error = _mirror_for(sender), working_folder(), None, None
+        simulation = RunningSimulation(alone, 0 if _is_main() else threading.get_ident(), mirror.path, mirror.base)
+        os.chdir(mirror.path)
+        try:
+            result = simulation.run(function, copy.deepcopy(item))
+        except BaseException as raised:
+            error = raised
+        finally:
+            with contextlib.suppress(FileNotFoundError):
+                os.chdir(before)
+        if mirror.owner != os.getpid():  # the simulation has forked, and its copy has returned as well
+            break
+        is_wanted = mirror.was_written_through(simulation.has_programs) and not isinstance(error, KeyboardInterrupt)
     if error is not None:
         raise error
-    return result, shared
+    return result
 
 
 def _is_main() -> bool:
@@ -151,50 +136,17 @@ def _is_only_thread_of_dask() -> bool:
 
 
 def _mirror_for(sender: Sender) -> "_Mirror":
+    """The folder of this process, which shows what the sender's working folder contains now."""
     global _mirror
-    if _mirror is None or _mirror.base != sender.folder or _mirror.owner != os.getpid():
-        sys.path[:] = map(os.path.abspath, sys.path)
-        _mirror = _Mirror(sender)
+    try:
+        if _mirror is None or _mirror.base != sender.folder or _mirror.owner != os.getpid():
+            sys.path[:] = map(os.path.abspath, sys.path)
+            _mirror = _Mirror(sender)
+        _mirror.show()
+    except OSError as failure:
+        text = f"the working folder of a simulation could not be made: {failure}"
+        raise SimulationFailed(TransientReason(text)) from failure
     return _mirror
-
-
-def _run_in_mirror(
-    mirror: "_Mirror", function: Callable[[Any], Any], item: Any, thread: int
-) -> tuple[Any, BaseException | None, str]:
-    """Result or exception of a simulation, and the first file that it shares with others."""
-    is_wanted = True
-    while is_wanted:
-        mirror.show()
-        simulation = RunningSimulation(thread, mirror.path, mirror.hop, mirror.base)
-        argument, result, error, before = copy.deepcopy(item), None, None, working_folder()
-        os.chdir(mirror.path)
-        try:
-            result = simulation.run(function, argument)
-        except BaseException as raised:
-            error = raised
-        finally:
-            with contextlib.suppress(FileNotFoundError):
-                os.chdir(before)
-        if mirror.owner != os.getpid():  # the simulation has forked, and its copy has returned as well
-            return result, error, ""
-        is_wanted = mirror.was_written_through() and not isinstance(error, KeyboardInterrupt)
-    mirror.is_new = not simulation.has_programs  # which may still write
-    return result, error, simulation.shared
-
-
-def keep_folder(place: Path, folder: str, reason: str) -> None:
-    """Move what a failed program has left in `place` into a new folder in `folder`, with a file ``reason.txt``.
-
-    Not if 20 folders are there already, or it fails: a full disk must not hide the reason of the failure.
-    """
-    folder = Path(working_folder(), folder)
-    with contextlib.suppress(OSError), of_this_library():
-        folder.mkdir(parents=True, exist_ok=True)
-        if len(list(folder.glob("failure_*"))) < _MOST_KEPT:
-            kept = Path(tempfile.mkdtemp(prefix="failure_", dir=folder))
-            for path in place.iterdir():
-                shutil.move(path, kept)
-            (kept / "reason.txt").write_text(reason)
 
 
 # places -------------------------------------------------------------------------------------------------------------
@@ -205,25 +157,10 @@ def _place(pid: int) -> str:
     """A temporary folder for the workers of this process, removed when this process ends, even if it is killed."""
     with of_this_library():
         place = os.path.realpath(tempfile.mkdtemp(prefix="fe_likelihoods_"))
-        # standard input closes when this process ends, and workers end a little later
-        remove = 'cat; for i in 1 2 3 4 5 6 7 8 9; do rm -rf "$0"; [ -e "$0" ] || exit; sleep 1; done'
-        process = subprocess.Popen(
-            ["/bin/sh", "-c", remove, place],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            cwd="/",
-            start_new_session=True,
-        )
-    atexit.register(_remove, process, pid)
+        watcher = removed_at_end(place)
+    atexit.register(lambda: pid == os.getpid() and watcher.communicate())  # waits until it is removed
     _places.add(place)
     return place
-
-
-def _remove(process: subprocess.Popen, owner: int) -> None:
-    process.stdin.close()
-    if owner == os.getpid():
-        process.wait()
 
 
 def discard(process: int) -> None:
@@ -236,138 +173,95 @@ def discard(process: int) -> None:
 class _Mirror:
     """A folder `path` that shows another folder, `base`, to one simulation after the other.
 
-    Links go through one link, `hop`, whose time of access tells whether any of them was used. A time of modification
-    of 0 says that nothing was added or removed in a folder. If not `is_new`, the next simulation gets another folder.
+    It is made again if anything was added or removed in a folder, here or there. The time of access of a link tells
+    whether it was used; a time of modification of 0 says that nothing was added or removed in a folder.
     """
 
     def __init__(self, sender: Sender) -> None:
-        self.base, self.owner = sender.folder, os.getpid()
+        self.base, self.owner, self.path = sender.folder, os.getpid(), ""
         place = sender.place if os.path.isdir(sender.place) else _place(os.getpid())  # on another machine
         _places.add(place)
         self._place = os.path.join(place, str(os.getpid()))
         shutil.rmtree(self._place, ignore_errors=True)  # of a mirror of another folder
         os.mkdir(self._place)
-        self.hop = os.path.join(self._place, ".from")
-        os.symlink(self.base or "/", self.hop)
-        _mark(self.hop)
-        with contextlib.suppress(FileNotFoundError):
-            os.stat(self.hop)
-        self._has_access_times = os.lstat(self.hop).st_atime_ns != 0  # not on every file system
-        self._private: set[str] = set()  # files that were written through their links
         for entry in _scan(os.path.dirname(self.base), _MOST_BESIDE) if self.base else ():
-            with contextlib.suppress(FileExistsError):
-                os.symlink(entry.path, os.path.join(self._place, entry.name))
-        self.path, self.is_new = "", False
-        self.show()
+            _link(entry.path, os.path.join(self._place, entry.name))
+        trial = os.path.join(self._place, ".trial")
+        _link("/", trial)
+        os.stat(trial)
+        self._has_access_times = _was_used(trial)  # not on every file system
+        self._private: set[str] = set()  # files that were written through their links
+        self._folders: dict[str, Stamp | None] = {}
+        self._files: dict[str, Stamp | None] = {}  # that are linked
 
     def show(self) -> None:
         """Show what `base` contains now, and nothing that another simulation has left."""
-        if not self.is_new:
-            shutil.rmtree(self.path, ignore_errors=True)
-            self.path, self.is_new = tempfile.mkdtemp(prefix="run_", dir=self._place), True
-            self._shown: dict[str, tuple[Stamp | None, dict[str, bool]]] = {}  # folders; whether entries are folders
-            self._files: dict[str, Stamp | None] = {}  # that are linked
-            self._left = _MOST_LINKS
-        folders = [""]
-        for folder in folders:
-            folders += self._show_folder(folder)
-        for name in self._private:
-            with contextlib.suppress(FileNotFoundError):
-                shutil.copy2(os.path.join(self.base, name), os.path.join(self.path, name))
-                os.utime(os.path.join(self.path, os.path.dirname(name)), ns=(0, 0))
-        _mark(self.hop)
-
-    def _show_folder(self, folder: str) -> list[str]:
-        """Show the entries of a folder of `base`; returns those that are shown as folders."""
-        place, source = os.path.join(self.path, folder), os.path.join(self.base, folder)
-        before, names = self._shown.get(folder, (None, {}))
-        if before is None or _status(source) != before or not self._is_untouched(folder):
-            stamp, entries = _stamp(source), _scan(source)
-            for each in names.keys() - {entry.name for entry in entries}:
-                self._drop(os.path.join(folder, each))
-            names = {entry.name: names.get(entry.name) or self._is_folder(entry) for entry in entries}
-            self._shown[folder] = stamp, names
-            missing = dict(names)
-            for entry in _scan(place):
+        if self._folders and not self._private and all(map(self._is_as_made, self._folders)):
+            return
+        shutil.rmtree(self.path, ignore_errors=True)
+        self.path = tempfile.mkdtemp(prefix="run_", dir=self._place)
+        self._folders, self._files, left = {}, {}, _MOST_LINKS
+        for folder in (folders := [""]):
+            self._folders[folder] = _stamp(os.path.join(self.base, folder))
+            for entry in _scan(os.path.join(self.base, folder)):
                 name = os.path.join(folder, entry.name)
-                is_link, is_folder = entry.is_symlink(), entry.is_dir(follow_symlinks=False)
-                if entry.name in names and (
-                    is_folder if names[entry.name] else is_link and os.readlink(entry.path) == self._target(name)
-                ):
-                    del missing[entry.name]
-                elif is_folder:
-                    shutil.rmtree(entry.path, ignore_errors=True)
-                else:
-                    os.unlink(entry.path)
-            for name, is_folder in ((os.path.join(folder, each), shown) for each, shown in missing.items()):
-                if is_folder:
+                if self._is_shown_as_folder(entry) and (below := len(_scan(entry.path, left + 1))) <= left:
+                    left -= below
+                    folders.append(name)
                     os.mkdir(os.path.join(self.path, name))
-                elif name not in self._private:
-                    os.symlink(self._target(name), os.path.join(self.path, name))
-                    _mark(os.path.join(self.path, name))
-                    self._files[name] = _stamp(os.path.join(self.base, name))
-            os.utime(place, ns=(0, 0))
-        return [os.path.join(folder, name) for name, is_folder in names.items() if is_folder]
+                elif name in self._private:
+                    with contextlib.suppress(FileNotFoundError):
+                        shutil.copy2(entry.path, os.path.join(self.path, name))
+                else:
+                    _link(entry.path, os.path.join(self.path, name))
+                    self._files[name] = _stamp(entry.path)
+        for folder in folders:
+            os.utime(os.path.join(self.path, folder), ns=(0, 0))
 
-    def _is_folder(self, entry: os.DirEntry) -> bool:
-        """Whether an entry of `base` is shown as a folder, not as a link.
-
-        Hidden folders are not, many files, and folders that contain the mirror, which would be within itself.
-        """
-        if not entry.is_dir() or entry.name.startswith("."):
+    def _is_shown_as_folder(self, entry: os.DirEntry) -> bool:
+        """Hidden folders are links, and folders that contain the mirror, which would be within itself."""
+        if entry.name.startswith(".") or not entry.is_dir():
             return False
         above = os.path.realpath(entry.path) + os.sep
-        if any(os.path.join(each, "").startswith(above) for each in (os.path.realpath(self.base), self._place)):
-            return False
-        below = len(_scan(entry.path, self._left + 1))
-        if below <= self._left:
-            self._left -= below
-            return True
-        return False
+        return not any(os.path.join(os.path.realpath(each), "").startswith(above) for each in (self.base, self._place))
 
-    def _drop(self, name: str) -> None:
-        """Forget a file or folder that is not in `base` any more."""
-        for known in (self._shown, self._files):
-            for each in [each for each in known if each == name or each.startswith(name + os.sep)]:
-                del known[each]
+    def _is_as_made(self, folder: str) -> bool:
+        """Whether nothing was added or removed in a folder."""
+        before, own = self._folders[folder], _status(os.path.join(self.path, folder))
+        return before is not None and before == _status(os.path.join(self.base, folder)) and own and own[0] == 0
 
-    def _target(self, name: str) -> str:
-        return os.path.join(self.hop, name)
+    def was_written_through(self, has_programs: bool) -> bool:
+        """Whether files of `base` have changed whose links were used; they are private from now on.
 
-    def was_written_through(self) -> bool:
-        """Whether files of `base` have changed whose links were used; they are private from now on."""
-        if self._has_access_times and os.lstat(self.hop).st_atime_ns == 0:
-            return False
+        The next simulation gets another folder if this one has started programs, which may still write.
+        """
         paths = {name: os.path.join(self.base, name) for name in self._files}
         changed = [name for name, stamp in self._files.items() if stamp is None or _status(paths[name]) != stamp]
         self._files |= {name: _stamp(paths[name]) for name in changed}
-        written = {n for n in changed if not self._has_access_times or _access(os.path.join(self.path, n))}
-        written = {name for name in written if not os.path.isdir(paths[name])}
+        used = [n for n in changed if not self._has_access_times or _was_used(os.path.join(self.path, n))]
+        written = {name for name in used if not os.path.isdir(paths[name])}
         self._private |= written
-        self.is_new = self.is_new and not written
+        if has_programs:
+            self._folders = {}
         return bool(written)
-
-    def _is_untouched(self, folder: str) -> bool:
-        """Whether a simulation has added and removed nothing in a folder."""
-        with contextlib.suppress(OSError):
-            return os.lstat(os.path.join(self.path, folder)).st_mtime_ns == 0
-        return False
 
 
 Stamp = tuple[int, int, int]
 """Time of modification [ns], size and inode of a file."""
 
 
-def _mark(link: str) -> None:
-    """Set the time of access of a link to 0."""
-    os.utime(link, ns=(0, 0), follow_symlinks=False)
+def _link(target: str, link: str) -> None:
+    """Make a link that was not used, unless there is one."""
+    with contextlib.suppress(FileExistsError):
+        os.symlink(target, link)
+        os.utime(link, ns=(0, 0), follow_symlinks=False)
 
 
-def _access(link: str) -> int:
-    """Time of access of a link; 1 if it is not there any more."""
+def _was_used(link: str) -> bool:
+    """Whether a link was followed, or is not there any more."""
     with contextlib.suppress(FileNotFoundError):
-        return os.lstat(link).st_atime_ns
-    return 1
+        return os.lstat(link).st_atime_ns != 0
+    return True
 
 
 def _scan(folder: str, most: int | None = None) -> list[os.DirEntry]:

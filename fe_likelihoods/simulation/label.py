@@ -33,7 +33,7 @@ from typing import Any
 import numpy as np
 
 from .by_value import names_in
-from .files import Opened, file_digest, mapped
+from .files import Opened, digests_by_name, file_digest, mapped, read_again
 from .user_code import LIBRARY, SCRIPTS, is_of_user, package_version, sources_digest
 
 __all__ = [
@@ -89,7 +89,7 @@ class ModelLabel:
         self.items |= {name: _first[name][1] for name in self.changing}
         is_users = hasattr(model, "code_parts") or is_of_user(type(model).__module__)
         self.observes = is_users or (statistic is not None and _defined_by_user(statistic))
-        self.opened = mapped() if self.observes else Opened({})
+        self.opened = mapped() if self.observes else {}
 
     @property
     def code(self) -> str:
@@ -104,14 +104,14 @@ class ModelLabel:
         items = {name: digest for name, digest in self.items.items() if name not in ("python", "library")}
         return _joined(items or {"kernels": KERNEL_HASH})
 
-    def add(self, opened: Opened | None) -> None:
+    def add(self, opened: Opened) -> None:
         """Add what simulations opened."""
-        if opened is not None and not opened.files.keys() <= self.opened.files.keys():
+        if not opened.keys() <= self.opened.keys():
             self.opened = opened | self.opened
 
     def present(self, model: Any) -> dict[str, str]:
         """The items of a model in its present state, and of the files that simulations opened."""
-        return self._present(model) | self.opened.read_again().items()
+        return self._present(model) | digests_by_name(read_again(self.opened))
 
     def has_changed_itself(self, names: Iterable[str]) -> None:
         """Record that simulations change some items; later labels of the same import keep their first digests."""
@@ -284,7 +284,7 @@ class _Walk:
         name = f"{_name_of(module)}.{function.__qualname__}"
         if not self._is_of_user(module):
             return name, []
-        for each in sorted(names_in(code).all & function.__globals__.keys()):
+        for each in sorted(names_in(code) & function.__globals__.keys()):
             self._waiting.setdefault(f"{_name_of(module)}.{each}", function.__globals__[each])
         attributes = [pair for pair in vars(function).items() if pair[0] != "__wrapped__"]
         values = function.__defaults__, function.__kwdefaults__, function.__closure__

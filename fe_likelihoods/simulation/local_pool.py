@@ -7,24 +7,24 @@ known. Only this item is run again, and it is given up after the third death.
 
 import os
 import threading
-from collections import deque
+import weakref
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import FIRST_EXCEPTION, CancelledError, Future
+from concurrent.futures import CancelledError, Future
 from concurrent.futures import wait as wait_for
-from itertools import repeat
+from functools import partial
 from numbers import Integral
+from queue import SimpleQueue
 from typing import Any
 
 from samplers.interrupts import Ended
 
 from .by_value import Pickled
-from .faults import SimulationFailed
-from .worker import LoadingFailed, Worker, Workers
+from .faults import SimulationFailed, TransientReason
+from .worker import LoadingFailed, Worker
 
-__all__ = ["LocalPool", "Outcome", "Submitting", "Threads", "value_of"]
+__all__ = ["LocalPool", "Outcome", "Submitting", "Threads", "result_of", "value_of"]
 
 MAX_ATTEMPTS = 3
-_LINGER = 0.1  # [s] that a thread waits for another item before it ends; a new thread costs as much as a short item
 _THREADS = ("OMP", "OPENBLAS", "MKL", "BLIS", "VECLIB_MAXIMUM", "NUMBA")
 
 Outcome = tuple[Any, str]
@@ -38,15 +38,12 @@ class Submitting:
         """Results of a function for every item, in order; ``(None, reason)`` for one that kills all its processes.
 
         ValueError if the function or an item cannot be sent or loaded, RuntimeError if three processes of a `LocalPool`
-        in succession die before they are given an item, or the first exception of the function: no further items are
-        started then.
+        in succession die before they are given an item, or the first exception of the function: the other items are
+        given up then.
         """
         futures = self.submit_all(function, list(items))
         try:
-            done, left = wait_for(futures, return_when=FIRST_EXCEPTION)
-            for future in done if left else ():
-                future.result()
-            return [value_of(future.result()) for future in futures]
+            return [result_of(future) for future in futures]
         except BaseException:
             self.give_up(futures)
             raise
@@ -66,97 +63,106 @@ def value_of(result: Any) -> Any:
     return result
 
 
-class Threads:
-    """Daemon threads that call functions, at most ``most()`` at once; Python does not wait for them at its end.
+def result_of(future: Any) -> Any:
+    """The result of an item, see `value_of`; one that dask has given up is run once more, apart from the others.
 
-    With 0 threads, functions are called at once.
+    Whichever item kills a worker, those beside it are given up as well. If it is lost again, it is the cause.
+    """
+    for is_last in (False, True):
+        try:
+            return value_of(future.result())
+        except Exception as error:
+            if type(error).__name__ != "KilledWorker":
+                raise
+            if not is_last:
+                future.retry()
+    return None, TransientReason("the worker process died in every attempt of dask")
+
+
+class Threads:
+    """Daemon threads, for which Python does not wait at its end; each has a function of one item from ``make()``.
+
+    They end with `close`, or when this object is garbage-collected.
     """
 
-    def __init__(self, most: Callable[[], int]) -> None:
-        self._most, self._changed = most, threading.Condition()
-        self._waiting: deque[tuple[Future, Callable, Any]] = deque()
-        self._running: set[Future] = set()
-        self._threads: set[threading.Thread] = set()
-        self._n_idle = 0
+    def __init__(self, make: Callable[[], Callable[[Any], Any]]) -> None:
+        self._make, self._calls, self._lock = make, SimpleQueue(), threading.Lock()
+        self._threads: list[threading.Thread] = []
+        self.pending: list[Future] = []  # and some that have ended
+        weakref.finalize(self, self._calls.put, None)
 
-    @property
-    def pending(self) -> list[Future]:
-        """Futures of calls that have not ended."""
-        with self._changed:
-            return [*self._running, *(future for future, *_ in self._waiting)]
-
-    def submit_all(
-        self,
-        function: Callable[[Any], Any],
-        items: Sequence[Any],
-        futures: Sequence[Future] | None = None,
-    ) -> Sequence[Future]:
-        """A future for each item, which `cancel` prevents until a thread takes it."""
-        futures, most = [Future() for _ in items] if futures is None else futures, self._most()
-        calls = list(zip(futures, repeat(function), items))  # noqa: B905
-        with self._changed:
-            self._waiting.extend(calls)
-            self._changed.notify(len(calls))
-            for _ in range(min(most - len(self._threads), len(self._waiting) - self._n_idle)):
-                thread = threading.Thread(target=self._work, args=(_LINGER,), name="fe_likelihoods", daemon=True)
-                self._threads.add(thread)
+    def submit_all(self, futures: Sequence[Future], items: Sequence[Any], most: int) -> None:
+        """Call a function for each item, in at most `most` threads; `cancel` of its future prevents it before."""
+        with self._lock:
+            self.pending = [each for each in self.pending if not each.done()] + list(futures)
+            while len(self._threads) < min(most, len(self.pending)):
+                thread = threading.Thread(target=_work, args=(self._calls, self._make()), daemon=True)
                 thread.start()
-        if not most:
-            self._work(0.0)
-        return futures
+                self._threads.append(thread)
+        for call in zip(futures, items, strict=True):
+            self._calls.put(call)
 
-    def has_this_one(self) -> bool:
-        """Whether the present thread is one of them."""
-        return threading.current_thread() in self._threads
+    def close(self) -> None:
+        """End the threads after the calls that wait."""
+        self._calls.put(None)
+        for thread in self._threads:
+            thread.join()
 
-    def _work(self, linger: float) -> None:
-        """Call functions one after the other, until none has been waiting for a time [s]."""
-        future = None
-        while True:
-            with self._changed:
-                self._running.discard(future)
-                if not self._waiting:
-                    future = None
-                    self._n_idle += 1
-                    self._changed.wait_for(lambda: self._waiting, linger)
-                    self._n_idle -= 1
-                if not self._waiting:
-                    self._threads.discard(threading.current_thread())
-                    return
-                future, function, item = self._waiting.popleft()
-                self._running.add(future)
-            if future.set_running_or_notify_cancel():
-                try:
-                    result = function(item)
-                except BaseException as error:
-                    future.set_exception(error)
-                else:
-                    future.set_result(result)
+
+def _work(calls: SimpleQueue, function: Callable[[Any], Any]) -> None:
+    while (call := calls.get()) is not None:
+        future, item = call
+        if future.set_running_or_notify_cancel():
+            try:
+                result = function(item)
+            except BaseException as error:
+                future.set_exception(error)
+            else:
+                future.set_result(result)
+        call = future = item = result = None  # which must not be kept while this thread waits
+    calls.put(None)  # for the other threads
 
 
 class _Job(Future):
-    """An item with its function; the future of its result. `worker` is the process that has it."""
+    """An item with its function; the future of its result. `worker` is the one that has it."""
 
     def __init__(self, function: Pickled, item: Any) -> None:
         super().__init__()
-        self.function, self.item = function, item
-        self.worker: Worker | None = None
-        self.given_up = False
+        self.function, self.item, self.worker, self.given_up = function, item, None, False
 
-    def held_by(self, worker: Worker | None) -> None:
-        """A process has the item; CancelledError if it was given up."""
-        self.worker = worker
-        if self.given_up:
-            raise CancelledError
+
+def _result(worker: Worker, job: _Job) -> Any:
+    """Result of an item, from another process if its process dies."""
+    deaths = loads = 0
+    job.worker = worker
+    try:
+        while not job.given_up:
+            try:
+                answer = worker.run(job.function, job.item, given_up=lambda: job.given_up)
+            except LoadingFailed as error:
+                loads += 1
+                if loads == MAX_ATTEMPTS:
+                    raise RuntimeError(f"{error.reason} while loading the model; see its output on stderr") from None
+            except SimulationFailed as error:
+                deaths, loads = deaths + 1, 0
+                if deaths == MAX_ATTEMPTS:
+                    return None, error.reason
+            else:
+                if answer.error is not None:
+                    raise answer.error
+                return answer.value
+        raise CancelledError
+    finally:
+        job.worker = None
 
 
 class LocalPool(Submitting):
     """Pool of local processes.
 
-    The processes start with the first item. They end with `close`, when this object is garbage-collected, or when this
-    process ends, even if it is killed (on macOS within a second, unless compiled code keeps the process busy). A
-    process that dies is replaced and its item run again; the other items are not affected. Linear algebra and numba use
-    one thread per process, unless environment variables such as OMP_NUM_THREADS are set.
+    The processes start with the first items. They end with `close`, when this object is garbage-collected, or when this
+    process ends, even if it is killed (on macOS with their items then). A process that dies is replaced and its item
+    run again; the other items are not affected. Linear algebra and numba use one thread per process, unless environment
+    variables such as OMP_NUM_THREADS are set.
 
     Functions are sent by value, with the present values of their modules (`fe_likelihoods.simulation.by_value`), so
     lambdas and functions of a script or notebook can be used.
@@ -180,15 +186,13 @@ class LocalPool(Submitting):
                 f"got {workers!r}"
             )
         self.workers = int(workers)
-        self._environment = {
-            f"{library}_NUM_THREADS": "1" for library in _THREADS if f"{library}_NUM_THREADS" not in os.environ
-        }
+        names = [f"{library}_NUM_THREADS" for library in _THREADS]
+        self._environment = {name: "1" for name in names if name not in os.environ}
         self._set_up()
 
     def _set_up(self) -> None:
-        self._owner = os.getpid()
-        self._threads = Threads(lambda most=self.workers: most)
-        self._workers = Workers(environment=self._environment)
+        environment = self._environment
+        self._owner, self._threads = os.getpid(), Threads(lambda: partial(_result, Worker(environment)))
 
     def __enter__(self) -> "LocalPool":
         return self
@@ -206,49 +210,28 @@ class LocalPool(Submitting):
 
     def close(self) -> None:
         """Give up all items and end the processes; a later item starts new processes."""
-        self._notice_fork()
-        self.give_up(self._threads.pending)
-        self._workers.close()
+        self.give_up(self._threads_here().pending)
+        self._threads.close()
+        self._set_up()
 
     def submit_all(self, function: Callable[[Any], Any], items: Sequence[Any]) -> list[Future]:
         """Futures as from `submit`, for several items; ValueError if the function cannot be sent to the processes."""
-        self._notice_fork()
         pickled = Pickled.of(function)  # each time: the values that it uses may have changed
         jobs = [_Job(pickled, item) for item in items]
-        return list(self._threads.submit_all(self._result, jobs, jobs))
+        self._threads_here().submit_all(jobs, jobs, self.workers)
+        return jobs
 
     def give_up(self, futures: Sequence[Future], running: bool = True) -> None:
         """Cancel items; with `running`, also kill the processes that run them. Items with results keep them."""
-        self._notice_fork()
         started = [job for job in futures if not job.cancel() and running and not job.done()]
         for job in started:
             job.given_up = True  # before the question for its process: one of the two threads sees what the other did
             if (worker := job.worker) is not None:
                 worker.kill()
-        if not self._threads.has_this_one():
-            wait_for(started)
+        wait_for(started)
 
-    def _notice_fork(self) -> None:
-        """In a forked process: forget the parent's workers and threads."""
+    def _threads_here(self) -> Threads:
+        """The threads of this process, not those of the process that has forked it."""
         if self._owner != os.getpid():
             self._set_up()
-
-    def _result(self, job: _Job) -> Any:
-        """Result of an item, from another process if its process dies."""
-        deaths = loads = 0
-        while not job.given_up:
-            try:
-                answer = self._workers.run(job.function, job.item, watch=job.held_by)
-            except LoadingFailed as error:
-                loads += 1
-                if loads == MAX_ATTEMPTS:
-                    raise RuntimeError(f"{error.reason} while loading the model; see its output on stderr") from None
-            except SimulationFailed as error:
-                deaths, loads = deaths + 1, 0
-                if deaths == MAX_ATTEMPTS:
-                    return None, error.reason
-            else:
-                if answer.error is not None:
-                    raise answer.error
-                return answer.value
-        raise CancelledError
+        return self._threads

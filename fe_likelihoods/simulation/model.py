@@ -29,8 +29,8 @@ from ..noise.statistics import Statistic, reduce_response, statistic_width, sums
 from ..signals.channels import Channel
 from ..signals.comparison import Comparison
 from .faults import MisfitReason, SimulationFailed, is_transient, reason_of, shortened
-from .files import note, refuse_shared
-from .folder import Observed, Sender, run_in_folder, unpack
+from .files import Opened, note
+from .folder import Observed, Sender, run_in_folder
 
 __all__ = [
     "MisfitBatch",
@@ -49,6 +49,7 @@ __all__ = [
     "run_each",
     "sent_simulation",
     "simulate_batch",
+    "unpack",
 ]
 
 logger = logging.getLogger(__name__)
@@ -328,12 +329,12 @@ def run_each(
     """
     if pool is None:
         if is_worker():  # of the pool of a sampler
-            run = partial(_in_folder, run, Sender.here()._replace(process=b""))
+            run = partial(run_in_folder, run, sender=Sender.here()._replace(process=b""), alone=False)
         outcomes = [run(theta) for theta in thetas]
     else:
         outcomes = []
-        for outcome in pool.map(Observed(run), list(thetas)):
-            result, opened = unpack(outcome, pool)
+        for outcome in pool.map(Observed(run, pool.n_workers == 1), list(thetas)):
+            result, opened = unpack(outcome)
             outcomes.append(result)
             note(opened)
     values = np.full((len(thetas), *shape), np.nan)
@@ -343,10 +344,9 @@ def run_each(
     return values, [reason for _, reason in outcomes]
 
 
-def _in_folder(run: Callable[[np.ndarray], tuple], sender: Sender, theta: np.ndarray) -> tuple:
-    result, shared = run_in_folder(run, theta, sender)
-    refuse_shared(shared, None)
-    return result
+def unpack(outcome: tuple) -> tuple[tuple, Opened]:
+    """Simulation result from a pool, and what it opened; for a lost worker, the pool reports a result only."""
+    return (outcome, {}) if isinstance(outcome[1], str) else outcome
 
 
 @contextmanager

@@ -15,9 +15,19 @@ from pathlib import Path
 
 from .files import of_this_library
 
-__all__ = ["run_program"]
+__all__ = ["removed_at_end", "run_program"]
 
-_WATCH = 'trap "" TERM; read -r _; kill -TERM 0; rm -rf "$0"; kill -KILL 0'
+_WATCH = 'trap "" TERM; read -r _; kill -TERM 0; rm -rf "$0" || { sleep 1; rm -rf "$0"; }; kill -KILL 0'
+
+
+def removed_at_end(place: str | Path) -> subprocess.Popen:
+    """A shell that leads a group of processes: it removes a folder and kills its group when its standard input closes.
+
+    Workers and programs may still write in the folder then, so it is removed twice.
+    """
+    nothing = subprocess.DEVNULL
+    command = ["/bin/sh", "-c", _WATCH, place]
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=nothing, stderr=nothing, process_group=0)
 
 
 def run_program(
@@ -35,15 +45,11 @@ def run_program(
     the start [s] and returns the time until the next call [s], or raises an exception, which stops the program and is
     passed on. OSError if the program cannot be started.
     """
-    nothing = subprocess.DEVNULL
     with of_this_library():
-        watcher = subprocess.Popen(
-            ["/bin/sh", "-c", _WATCH, place], stdin=subprocess.PIPE, stdout=nothing, stderr=nothing, process_group=0
-        )
-        program = None
+        watcher, program = removed_at_end(place), None
         try:
             with open(stdout, "wb") as out, open(stderr, "wb") as error:
-                options = {"stdin": nothing, "stdout": out, "stderr": error, "process_group": watcher.pid}
+                options = {"stdin": subprocess.DEVNULL, "stdout": out, "stderr": error, "process_group": watcher.pid}
                 program = subprocess.Popen(command, cwd=folder, **options)
             start = time.monotonic()
             waiter = threading.Thread(target=program.wait, daemon=True)  # without the pauses of a wait with a limit

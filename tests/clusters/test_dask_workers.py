@@ -40,13 +40,12 @@ def cluster():
             each.close()
 
 
-def test_simulations_wait_for_workers_that_are_still_starting(cluster, caplog):
+def test_simulations_wait_for_workers_that_are_still_starting(cluster):
     client = cluster(1.0)
     posterior = posterior_of(Treacherous(), pool=client)
     points = posterior.sample_prior(4, 1)
     client.cluster.scale(2)
     np.testing.assert_array_equal(posterior(points), posterior_of(Treacherous())(points))
-    assert "has no worker; 4 simulations wait" in caplog.text
 
 
 def test_an_adaptive_cluster_replaces_its_workers(cluster, tmp_path):

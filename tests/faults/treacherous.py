@@ -190,12 +190,6 @@ def process_id(theta: np.ndarray) -> np.ndarray:
     return np.full((1, N_STEPS), os.getpid())
 
 
-def speaks(theta: np.ndarray) -> np.ndarray:
-    """Ends its process after writing to stderr."""
-    os.write(2, b"solver 7.1\nout of licences\n\n")
-    os._exit(1)
-
-
 def eats(theta: np.ndarray) -> np.ndarray:
     """Allocates more memory than there is."""
     return np.ones((1, 10**11))

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import ExecutableModel, SimulationFailed
-from fe_likelihoods.simulation import folder as folder_of_simulation
 from fe_likelihoods.simulation.label import ModelLabel
 from tests.faults.treacherous import CHANNELS, DT, N_STEPS, gone, line
 
@@ -143,23 +142,6 @@ def test_processes_left_by_a_program_are_killed(tmp_path, monkeypatch):
     pids = family(tmp_path / "pids")
     assert len(pids) == 4
     assert gone(pids)
-
-
-def test_folders_of_failed_runs_are_kept_up_to_a_limit(tmp_path, monkeypatch):
-    monkeypatch.setattr(folder_of_simulation, "_MOST_KEPT", 2)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv(folder_of_simulation.KEEP, "kept")
-    model_of().simulate(THETA)
-    assert not (tmp_path / "kept").exists()
-    for _ in range(3):
-        failure(model_of("fail"))
-    kept = list((tmp_path / "kept").iterdir())
-    assert len(kept) == 2
-    for folder in kept:
-        assert (folder / "run" / "in.txt").read_text().split()[:2] == [repr(float(value)) for value in THETA]
-        assert "matrix is singular" in (folder / "stderr.txt").read_text()
-        assert "matrix is singular" in (folder / "reason.txt").read_text()
-        assert f"slope = {float(THETA[1])!r}" in (folder / "reason.txt").read_text()
 
 
 # settings and fingerprint -------------------------------------------------------------------------------------------
