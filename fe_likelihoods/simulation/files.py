@@ -92,7 +92,7 @@ class _Observer:
         return known | {path: each for path, each in mapped(read).items() if path not in self.written} | self.noted
 
     def see(self, path: Any, writes: bool = False) -> None:
-        """Note a path, or the file that it shows if it is a link in the own folder of a simulation."""
+        """Note a path, or the file that it shows if it is in the own folder of a simulation."""
         if isinstance(path, str | bytes | os.PathLike):
             path, simulation = os.path.abspath(os.fsdecode(path)), running_simulation()
             if simulation is None or (path := simulation.shown(path)) is not None:
@@ -150,11 +150,11 @@ class RunningSimulation:
         return result
 
     def shown(self, path: str) -> str | None:
-        """The file that a link in the own folder shows; None for the simulation's own file, else `path`."""
-        if not self._is_own(path):
-            return path
-        path = os.path.realpath(path)
-        return None if self._is_own(path) else path
+        """The file of `base` that a file in the own folder shows; None if there is none, else `path` without links."""
+        if self._is_own(path):
+            path = os.path.join(self.base, os.path.relpath(path, self.place))
+            return path if os.path.exists(path) else None
+        return os.path.realpath(path)
 
     # events of the audit hook ---------------------------------------------------------------------------------------
 
@@ -179,6 +179,7 @@ class RunningSimulation:
 
     def _reads(self, path: str) -> None:
         """Note a file that was written twice while a simulation ran, but not by Python code of this simulation."""
+        path = os.path.realpath(path)
         if self._is_own(path) or path.startswith(_SYSTEM) or _is_cache(path) or self._has_made(path):
             return
         with contextlib.suppress(OSError):

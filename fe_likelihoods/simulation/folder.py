@@ -2,15 +2,13 @@
 
 User code often writes files of fixed names and reads them back: input of a program, output of an OpenSees recorder. So
 a worker process changes into a temporary folder for each simulation, which shows the sender's working folder: files as
-links, subfolders as folders with links. If Python code opens a link for writing, a private file takes its place first
-(`fe_likelihoods.simulation.files`). If compiled code or a program has written through a link, this name is a private
-copy from then on, and the simulation is run again. Threads of one process share its working folder: there, simulations
+copies, large ones as links, subfolders as folders. If Python code opens a link for writing, a private file takes its
+place first (`fe_likelihoods.simulation.files`). Threads of one process share its working folder: there, simulations
 that write are refused.
 """
 
 import atexit
 import contextlib
-import copy
 import functools
 import itertools
 import os
@@ -30,7 +28,8 @@ from .programs import removed_at_end
 
 __all__ = ["Observed", "Sender", "discard", "run_in_folder", "working_folder"]
 
-_MOST_LINKS = 500  # in subfolders; other subfolders are links. A link takes 10 us, 1 ms on slow file systems
+_MOST_ENTRIES = 500  # of folders with copies; other subfolders are links. A copy takes 60 us, a link 10 us
+_MOST_BYTES = 2**20  # of a copy
 _MOST_BESIDE = 3000  # entries beside the working folder, which ``..`` shows
 _CLOCK_TICK = 20_000_000  # [ns]; a file changed more recently may change again with the same modification time
 
@@ -85,10 +84,14 @@ class Observed:
 
     def __call__(self, item: Any) -> tuple[Any, Opened]:
         """The result for an item, and what was opened."""
+        return run_in_folder(self._observe, item, self._sender, bool(self._alone)), self._known
+
+    def _observe(self, item: Any) -> Any:
         with observing() as observer:
-            result = run_in_folder(self.function, item, self._sender, bool(self._alone))
-        self._known = observer.result(self._known)
-        return result, self._known
+            result = self.function(item)
+        with of_this_library():
+            self._known = observer.result(self._known)
+        return result
 
 
 def run_in_folder(function: Callable[[Any], Any], item: Any, sender: Sender | None, alone: bool) -> Any:
@@ -101,24 +104,15 @@ def run_in_folder(function: Callable[[Any], Any], item: Any, sender: Sender | No
         return function(item)
     if is_home or not (_is_main() or _is_only_thread_of_dask()):
         return RunningSimulation(alone, threading.get_ident()).run(function, item)
-    is_wanted = True
-    while is_wanted:
-        mirror, before, result, error = _mirror_for(sender), working_folder(), None, None
-        simulation = RunningSimulation(alone, 0 if _is_main() else threading.get_ident(), mirror.path, mirror.base)
-        os.chdir(mirror.path)
-        try:
-            result = simulation.run(function, copy.deepcopy(item))
-        except BaseException as raised:
-            error = raised
-        finally:
-            with contextlib.suppress(FileNotFoundError):
-                os.chdir(before)
-        if mirror.owner != os.getpid():  # the simulation has forked, and its copy has returned as well
-            break
-        is_wanted = mirror.was_written_through(simulation.has_programs) and not isinstance(error, KeyboardInterrupt)
-    if error is not None:
-        raise error
-    return result
+    mirror, before = _mirror_for(sender), working_folder()
+    simulation = RunningSimulation(alone, 0 if _is_main() else threading.get_ident(), mirror.path, mirror.base)
+    os.chdir(mirror.path)
+    try:
+        return simulation.run(function, item)
+    finally:
+        mirror.is_new = not simulation.has_programs  # which may still write
+        with contextlib.suppress(FileNotFoundError):
+            os.chdir(before)
 
 
 def _is_main() -> bool:
@@ -173,95 +167,79 @@ def discard(process: int) -> None:
 class _Mirror:
     """A folder `path` that shows another folder, `base`, to one simulation after the other.
 
-    It is made again if anything was added or removed in a folder, here or there. The time of access of a link tells
-    whether it was used; a time of modification of 0 says that nothing was added or removed in a folder.
+    A time of modification of 0 says that nothing was added or removed in one of its folders. If not `is_new`, the next
+    simulation gets another folder.
     """
 
     def __init__(self, sender: Sender) -> None:
-        self.base, self.owner, self.path = sender.folder, os.getpid(), ""
+        self.base, self.owner, self.path, self.is_new = sender.folder, os.getpid(), "", False
         place = sender.place if os.path.isdir(sender.place) else _place(os.getpid())  # on another machine
         _places.add(place)
         self._place = os.path.join(place, str(os.getpid()))
         shutil.rmtree(self._place, ignore_errors=True)  # of a mirror of another folder
         os.mkdir(self._place)
         for entry in _scan(os.path.dirname(self.base), _MOST_BESIDE) if self.base else ():
-            _link(entry.path, os.path.join(self._place, entry.name))
-        trial = os.path.join(self._place, ".trial")
-        _link("/", trial)
-        os.stat(trial)
-        self._has_access_times = _was_used(trial)  # not on every file system
-        self._private: set[str] = set()  # files that were written through their links
-        self._folders: dict[str, Stamp | None] = {}
-        self._files: dict[str, Stamp | None] = {}  # that are linked
+            with contextlib.suppress(FileExistsError):
+                os.symlink(entry.path, os.path.join(self._place, entry.name))
 
     def show(self) -> None:
         """Show what `base` contains now, and nothing that another simulation has left."""
-        if self._folders and not self._private and all(map(self._is_as_made, self._folders)):
-            return
+        if not (self.is_new and all(self._is_shown(*each) for each in self._folders.items())):
+            self._make()
+        for name, stamp in self._copies.items():
+            if not self._is_shown(name, stamp):
+                self._copy(name)
+
+    def _make(self) -> None:
         shutil.rmtree(self.path, ignore_errors=True)
-        self.path = tempfile.mkdtemp(prefix="run_", dir=self._place)
-        self._folders, self._files, left = {}, {}, _MOST_LINKS
+        self.path, self.is_new = tempfile.mkdtemp(prefix="run_", dir=self._place), True
+        self._folders: dict[str, Stamp | None] = {}
+        self._copies: dict[str, Stamp | None] = {}
+        left = _MOST_ENTRIES
         for folder in (folders := [""]):
             self._folders[folder] = _stamp(os.path.join(self.base, folder))
             for entry in _scan(os.path.join(self.base, folder)):
                 name = os.path.join(folder, entry.name)
-                if self._is_shown_as_folder(entry) and (below := len(_scan(entry.path, left + 1))) <= left:
+                below = len(_scan(entry.path, left + 1)) if self._is_folder(entry) else None
+                if below is not None and below <= left:
                     left -= below
                     folders.append(name)
                     os.mkdir(os.path.join(self.path, name))
-                elif name in self._private:
-                    with contextlib.suppress(FileNotFoundError):
-                        shutil.copy2(entry.path, os.path.join(self.path, name))
+                elif entry.is_file() and entry.stat().st_size <= _MOST_BYTES and len(self._copies) < _MOST_ENTRIES:
+                    self._copy(name)
                 else:
-                    _link(entry.path, os.path.join(self.path, name))
-                    self._files[name] = _stamp(entry.path)
+                    os.symlink(entry.path, os.path.join(self.path, name))
         for folder in folders:
             os.utime(os.path.join(self.path, folder), ns=(0, 0))
 
-    def _is_shown_as_folder(self, entry: os.DirEntry) -> bool:
-        """Hidden folders are links, and folders that contain the mirror, which would be within itself."""
+    def _copy(self, name: str) -> None:
+        source, copy = os.path.join(self.base, name), os.path.join(self.path, name)
+        self._copies[name] = _stamp(source)
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(copy)
+        try:
+            shutil.copy2(source, copy)
+        except OSError:  # the user may not read it, or it is not there any more
+            os.symlink(source, copy)
+        os.utime(os.path.dirname(copy), ns=(0, 0))
+
+    def _is_folder(self, entry: os.DirEntry) -> bool:
+        """Whether an entry is shown as a folder: not if it is hidden, or contains the mirror."""
         if entry.name.startswith(".") or not entry.is_dir():
             return False
         above = os.path.realpath(entry.path) + os.sep
         return not any(os.path.join(os.path.realpath(each), "").startswith(above) for each in (self.base, self._place))
 
-    def _is_as_made(self, folder: str) -> bool:
-        """Whether nothing was added or removed in a folder."""
-        before, own = self._folders[folder], _status(os.path.join(self.path, folder))
-        return before is not None and before == _status(os.path.join(self.base, folder)) and own and own[0] == 0
-
-    def was_written_through(self, has_programs: bool) -> bool:
-        """Whether files of `base` have changed whose links were used; they are private from now on.
-
-        The next simulation gets another folder if this one has started programs, which may still write.
-        """
-        paths = {name: os.path.join(self.base, name) for name in self._files}
-        changed = [name for name, stamp in self._files.items() if stamp is None or _status(paths[name]) != stamp]
-        self._files |= {name: _stamp(paths[name]) for name in changed}
-        used = [n for n in changed if not self._has_access_times or _was_used(os.path.join(self.path, n))]
-        written = {name for name in used if not os.path.isdir(paths[name])}
-        self._private |= written
-        if has_programs:
-            self._folders = {}
-        return bool(written)
+    def _is_shown(self, name: str, stamp: "Stamp | None") -> bool:
+        """Whether a folder or file is as it was when it was shown, both there and here."""
+        shown = _status(os.path.join(self.path, name))
+        if stamp is None or shown is None or stamp != _status(os.path.join(self.base, name)):
+            return False
+        return shown[:2] == stamp[:2] if name in self._copies else shown[0] == 0
 
 
 Stamp = tuple[int, int, int]
 """Time of modification [ns], size and inode of a file."""
-
-
-def _link(target: str, link: str) -> None:
-    """Make a link that was not used, unless there is one."""
-    with contextlib.suppress(FileExistsError):
-        os.symlink(target, link)
-        os.utime(link, ns=(0, 0), follow_symlinks=False)
-
-
-def _was_used(link: str) -> bool:
-    """Whether a link was followed, or is not there any more."""
-    with contextlib.suppress(FileNotFoundError):
-        return os.lstat(link).st_atime_ns != 0
-    return True
 
 
 def _scan(folder: str, most: int | None = None) -> list[os.DirEntry]:
