@@ -10,9 +10,7 @@ import contextlib
 import logging
 import math
 import os
-import shutil
 import sqlite3
-import tempfile
 import threading
 import time
 import weakref
@@ -208,7 +206,8 @@ class CacheFile:
                     os.rename(f"{self.path}{suffix}", f"{aside}{suffix}")
             os.rename(self.path, aside)
             self._aside = aside
-            logger.warning("%s is damaged (%s): set aside as %s, and a new cache created", self.path, why, aside.name)
+            text = "%s is damaged (%s): set aside as %s, and a new cache created"
+            logger.warning(text, self.path, why, aside.name)
 
     @property
     def identity(self) -> tuple[int, int] | None:
@@ -272,16 +271,14 @@ class CacheFile:
         """ValueError if a damaged file may be a user's file, such as a table, and not a cache.
 
         The first page identifies a cache: it has SQLite's header with the application id, or the beginning of this
-        header in a truncated file. A first page of zeros, in a file of whole pages, was never written, and a file whose
-        rows have right checksums is a cache with a damaged first page.
+        header in a truncated file. A first page of zeros, in a file of whole pages, was never written.
         """
-        size = self.path.stat().st_size
         with open(self.path, "rb") as file:
             page = file.read(PAGE_SIZE)
         identity = page[ID_START : ID_START + 4]
         if page.startswith(SQLITE_SIGNATURE) and APPLICATION_ID.to_bytes(4).startswith(identity):
             return
-        if size % PAGE_SIZE == 0 and (not any(page) or _has_rows(self.path)):
+        if self.path.stat().st_size % PAGE_SIZE == 0 and not any(page):
             return
         raise ValueError(
             f"{self.path} is not a cache of simulations, and is not changed; give another path, such as "
@@ -295,62 +292,16 @@ def _salvage(damaged: Path, connection: sqlite3.Connection) -> int:
     They are read from the first on and from the last on, until a damaged page. Each has a checksum, so nothing wrong is
     copied.
     """
-
-    def copied(source: Path) -> int:
-        with contextlib.suppress(sqlite3.Error), transaction(connection):
-            rows = _readable(source, "rows", f"id, {COLUMNS}", COLUMNS)
-            connection.executemany(STORE, filter(is_undamaged, rows))
-            labels = _readable(source, "labels", LABEL_COLUMNS, LABEL_COLUMNS)
-            connection.executemany(STORE_LABEL, filter(is_undamaged_label, labels))
-        return connection.execute("SELECT count(*) FROM rows").fetchone()[0]
-
-    if count := copied(damaged):
-        return count
-    with contextlib.suppress(OSError), _with_new_first_page(damaged) as repaired:  # no room for a copy
-        count = copied(repaired)
-    return count
+    with contextlib.suppress(sqlite3.Error), transaction(connection):
+        connection.executemany(STORE, filter(is_undamaged, _readable(damaged, "rows", COLUMNS)))
+        connection.executemany(STORE_LABEL, filter(is_undamaged_label, _readable(damaged, "labels", LABEL_COLUMNS)))
+    return connection.execute("SELECT count(*) FROM rows").fetchone()[0]
 
 
-def _has_rows(path: Path) -> bool:
-    """Whether a file with a damaged first page has undamaged rows."""
-    with open(path, "rb") as file:
-        file.seek(PAGE_SIZE)
-        if file.read(1) not in (b"\x05", b"\x0d"):  # where the table begins, in all caches
-            return False
-    with _with_new_first_page(path) as repaired:
-        return any(map(is_undamaged, _readable(repaired, "rows", f"id, {COLUMNS}", COLUMNS)))
-
-
-@contextlib.contextmanager
-def _with_new_first_page(damaged: Path) -> Iterator[Path]:
-    """A copy of a damaged file with the first page of a new cache: it says where the tables begin, which is alike."""
-    with contextlib.closing(sqlite3.connect(":memory:")) as new:
-        for statement in LAYOUT:
-            new.execute(statement)
-        page = new.serialize()[:PAGE_SIZE]
-    with tempfile.TemporaryDirectory(prefix=f"{damaged.name}.", dir=damaged.parent) as folder:
-        copy = Path(folder) / damaged.name
-        for suffix in ("", "-wal"):
-            if os.path.exists(f"{damaged}{suffix}"):
-                shutil.copyfile(f"{damaged}{suffix}", f"{copy}{suffix}")
-        is_logged = bytes([1 + os.path.exists(f"{copy}-wal")]) * 2
-        n_pages = (copy.stat().st_size // PAGE_SIZE).to_bytes(4)
-        with open(copy, "r+b") as file:
-            file.write(page[:18] + is_logged + page[20:28] + n_pages + page[32:])
-        yield copy
-
-
-def _readable(damaged: Path, table: str, names: str, columns: str) -> Iterator[tuple]:
-    # a file without a log is not in use, and gets no log
-    options = "mode=ro" if damaged.with_name(f"{damaged.name}-wal").exists() else "mode=ro&immutable=1"
+def _readable(damaged: Path, table: str, columns: str) -> Iterator[tuple]:
     for order in ("ASC", "DESC"):
         with contextlib.suppress(sqlite3.Error, OSError, ValueError, MemoryError):
-            with contextlib.closing(sqlite3.connect(f"{damaged.as_uri()}?{options}", uri=True)) as source:
+            with contextlib.closing(sqlite3.connect(f"{damaged.as_uri()}?mode=ro", uri=True)) as source:
                 source.text_factory = bytes
-                source.execute("PRAGMA writable_schema = ON")  # so that a truncated file can be read
-                # by places and `rowid`, because names in the layout may be damaged as well
-                query = (
-                    f"WITH readable (number, {names}) AS (SELECT rowid, * FROM {table}) SELECT {columns} FROM readable"
-                )
-                yield from source.execute(f"{query} ORDER BY number {order}")
+                yield from source.execute(f"SELECT {columns} FROM {table} ORDER BY rowid {order}")
                 return

@@ -38,7 +38,6 @@ logger = logging.getLogger(__name__)
 
 MAX_WAITING_ROWS = 100_000  # rows kept in memory while the file cannot be written
 KEYS_PER_QUERY = 500  # keys in one SELECT
-MAX_CANDIDATES = 5000  # rows from which the rows to compare are chosen
 TOLERANCE = 1e-9
 
 
@@ -184,15 +183,13 @@ class SimulationCache:
         query = "SELECT generation FROM rows WHERE source = ? AND generation GROUP BY generation ORDER BY max(id) DESC"
         return [generation for (generation,) in self.file.select(query, (source_number(fingerprint),))]
 
-    def candidates(self, fingerprint: str, generation: int, width: int) -> list[tuple[bytes, bytes]]:
-        """Keys and parameters of rows of one identity and generation, random ones if there are many.
-
-        Other values of these rows are read by `rows_of`.
-        """
+    def any_rows(self, fingerprint: str, generation: int, width: int, n: int) -> list[Row]:
+        """Random undamaged rows of one identity and generation, at most n."""
         where = "WHERE source = ? AND generation = ? AND (length(value) = ? OR length(reason) > 0)"
-        query = f"SELECT key, theta FROM rows WHERE id IN (SELECT id FROM rows {where} ORDER BY random() LIMIT ?)"
-        values = source_number(fingerprint), generation, 8 * width, MAX_CANDIDATES
-        return self.file.select(query, values)
+        chosen = f"SELECT id FROM rows {where} ORDER BY random() LIMIT ?"
+        query = f"SELECT {COLUMNS} FROM rows WHERE id IN ({chosen}) ORDER BY random()"
+        rows = self.file.select(query, (source_number(fingerprint), generation, 8 * width, n))
+        return [Row._make(row) for row in rows if is_undamaged(row)]
 
     def latest_success(self, fingerprint: str, generation: int, width: int) -> Row | None:
         """The success that was stored last, if it is undamaged."""
@@ -200,11 +197,6 @@ class SimulationCache:
         query = f"SELECT {COLUMNS} FROM rows {where} ORDER BY id DESC LIMIT 1"
         rows = self.file.select(query, (source_number(fingerprint), generation, 8 * width))
         return Row._make(rows[0]) if rows and is_undamaged(rows[0]) else None
-
-    def rows_of(self, keys: list[bytes]) -> list[Row]:
-        """Undamaged rows with given keys, in their order."""
-        rows = {row[0]: Row._make(row) for row in self._rows(keys) if is_undamaged(row)}
-        return [rows[key] for key in keys if key in rows]
 
     # the file -----------------------------------------------------------------------------------------------------
 

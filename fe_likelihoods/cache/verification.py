@@ -7,11 +7,12 @@ which generation a label belongs.
 
 * The label is known: the row stored last and a random one before the first row is used in a process, and a random one
   of every 100 rows used. A difference is an error, `StaleCache`.
-* The label is unknown: `ROWS` rows that cover the parameter space. If all agree, the label is added to their generation
+* The label is unknown: `ROWS` random rows. If all agree, the label is added to their generation
   (adoption). If one differs, or there are fewer rows, so that repeating them would save nothing, a new generation
   begins: the earlier rows stay in the file and are not used.
 
 Failures are compared only if there is no successful simulation, since a changed model often fails at the same points.
+Rows are used without verification, with a warning, if the new simulations do not end, for example without a licence.
 
 Results from two states of a model must not be mixed either, as when a value is set between two batches. So fingerprint,
 code, values and opened files are compared after simulations, in about 1 % of the time. User code may change values
@@ -36,7 +37,6 @@ import numpy as np
 
 from ..noise.statistics import Statistic, needs_response, statistic_width
 from ..signals.comparison import Comparison
-from ..simulation.by_value import is_arriving
 from ..simulation.faults import ChangedModel, TransientReason
 from ..simulation.files import digests_by_name, observing, read_again
 from ..simulation.label import ModelLabel
@@ -61,7 +61,7 @@ from .rows import (
 )
 from .simulation_cache import TOLERANCE, SimulationCache
 
-__all__ = ["ROWS", "StaleCache", "Trust", "VerifiedModel", "choose_rows"]
+__all__ = ["ROWS", "StaleCache", "Trust", "VerifiedModel"]
 
 logger = logging.getLogger(__name__)
 
@@ -76,7 +76,7 @@ SHARE_OF_TIME = 0.01  # for comparisons of the model
 NO_TIME = 5e-5  # [s]; a comparison that takes less is always made, since storing a row takes longer
 ROWS_PER_REPETITION = 100  # simulations between two repetitions if only items have changed that simulations change
 FINGERPRINT = "its fingerprint"
-OF_A_PROCESS = ("environment ", "library", "package ", "python")  # label items that may differ between processes
+OF_A_PROCESS = ("environment ", "library", "package ", "python", "source of ")  # items that differ between processes
 DIFFER = "stored simulations of this %s differ from new ones; they stay in the file and are not used"
 CHANGED = (
     "Something has changed that neither its declared identity nor its label contains, or the model does not repeat its "
@@ -108,8 +108,7 @@ class Trust:
 
     `labels` has the rows of the file (see `pack_label`) by the source number of the model; `left` has the rows that may
     be used until the next verification, by identity and whether any row is a success; `used` counts rows. Rows with the
-    number of the `session` were stored here and need no verification. `stale` is the error of a row that differed;
-    `is_blocked` says that rows could not be compared, since no simulation ended.
+    number of the `session` were stored here and need no verification. `stale` is the error of a row that differed.
     """
 
     _known: "OrderedDict[str, Trust]" = OrderedDict()  # of this process, the most recently used last
@@ -117,9 +116,10 @@ class Trust:
     def __init__(self, label: ModelLabel, key: str) -> None:
         self.label, self.key = label, key
         self.labels: dict[int, tuple] = {}
-        self.is_blocked = False
-        self._lock, self._owner = threading.RLock(), os.getpid()
-        self.start_again()
+        self.left: dict[tuple[str, bool], int] = {}
+        self.used = 0
+        self.stale: StaleCache | None = None
+        self._owner = 0
 
     @classmethod
     def of(cls, label: ModelLabel, key: str) -> "Trust":
@@ -138,17 +138,6 @@ class Trust:
         if self._owner != os.getpid():
             self._lock, self._owner, self.session = threading.RLock(), os.getpid(), secrets.randbits(62)
         return self._lock
-
-    def generation(self, source: int) -> int | None:
-        """Generation to which the label of a model belongs; None if it is not known yet."""
-        return self.labels[source][3] if source in self.labels else None
-
-    def start_again(self) -> None:
-        """Verify all rows again, including rows that this process has stored."""
-        self.left: dict[tuple[str, bool], int] = {}
-        self.used = 0
-        self.stale: StaleCache | None = None
-        self.session = secrets.randbits(62)
 
     def due(self, kind: tuple[str, bool], n: int) -> int:
         """Number of rows to verify when n rows are used."""
@@ -207,7 +196,7 @@ class VerifiedModel:
         self._begin()
 
     def _begin(self) -> None:
-        self.has_results = self._was_sent = False  # from another process, by a pool whose workers import the code
+        self.has_results = self._was_sent = False  # from another process
         self._points: list[tuple[np.ndarray, np.ndarray]] = []  # first and latest success: parameters, statistics
         self._unchecked: list[np.ndarray] = []  # parameters (n, n_structural) simulated since the last comparison
         self._not_before = 0.0  # time of the next comparison [s]
@@ -225,7 +214,7 @@ class VerifiedModel:
     def __setstate__(self, state: dict) -> None:
         vars(self).update(state)
         self._begin()
-        self._was_sent = state["_was_sent"] != os.getpid() and not is_arriving()  # by value
+        self._was_sent = state["_was_sent"] != os.getpid()
 
     @property
     def label(self) -> ModelLabel:
@@ -233,8 +222,9 @@ class VerifiedModel:
         return self._trust.label
 
     def share_trust(self, other: "VerifiedModel") -> None:
-        """Trust rows that another object has verified or stored, if its model has the same code."""
-        if self.cache is not None and other.cache is not None and other.label.code == self.label.code:
+        """Trust rows that another object has verified or stored, if its model is the same, or has the same code."""
+        is_same = self.model is other.model or other.label.code == self.label.code
+        if self.cache is not None and other.cache is not None and is_same:
             self._trust = other._trust
 
     def statistics_of(self, responses: np.ndarray, reasons: list[str]) -> MisfitBatch:
@@ -345,7 +335,6 @@ class VerifiedModel:
                 )
             self.label.has_changed_itself(changed)
             now = self.label.present(self.model)
-            # the same objects where nothing has changed, so that pickles stay small
             self._known |= {name: now.get(name) for name in changed}
         self._unchecked.clear()
 
@@ -375,11 +364,11 @@ class VerifiedModel:
     ) -> None:
         """Store simulations under the model's label: statistics and responses, if given, and failures of the model."""
         trust, source = self._trust, source_number(fingerprint)
+        if all(isinstance(reason, TransientReason) for reason in reasons):
+            return
         with trust.lock:
-            is_blocked = trust.is_blocked
-            trust.is_blocked = is_blocked and all(isinstance(reason, TransientReason) for reason in reasons)
-            generation = trust.generation(source) or self._known_generation(source)
-            if generation is None and is_blocked:  # it is not known which rows agree
+            generation = self._find_generation(source, self._key, self.n_numbers)
+            if generation == 0:  # it is not known which rows agree
                 return
             generation = self._use(source, generation or self._new_generation([]))
         rows = []
@@ -399,14 +388,14 @@ class VerifiedModel:
         The `identity` is that of statistics, or the model's `fingerprint` for responses.
         """
         trust, source = self._trust, source_number(fingerprint)
-        while True:
-            with trust.lock:
-                generation = trust.generation(source) or self._find_generation(source, identity, width)
-            if generation is None:
-                return [None] * len(thetas)
-            rows = self.cache.look_up(identity, thetas, width, generation)
-            if not self.cache.verify or self._verify(identity, rows, generation, source, width):
-                return rows
+        with trust.lock:
+            generation = self._find_generation(source, identity, width)
+        if not generation:
+            return [None] * len(thetas)
+        rows = self.cache.look_up(identity, thetas, width, generation)
+        if self.cache.verify:
+            self._verify(identity, rows, generation, width)
+        return rows
 
     def _stored_responses(self, thetas: np.ndarray, fingerprint: str) -> list[np.ndarray | str | None]:
         """Responses (n_channels, n_steps) [SI], or reasons of failures for any measurements; None if not stored."""
@@ -418,18 +407,20 @@ class VerifiedModel:
     # generations --------------------------------------------------------------------------------------------------
 
     def _find_generation(self, source: int, identity: str, width: int) -> int | None:
-        """The generation of a known label, or one that new simulations agree with, or a new one; None: cannot tell."""
-        trust, cache = self._trust, self.cache
-        generation = self._known_generation(source) or next((row[3] for row in trust.labels.values()), None)
-        if generation is None and not trust.is_blocked and (stored := cache.generations_of(identity)):
+        """The generation of a known label, or see `_adopted`; None if nothing is stored."""
+        cache, labels = self.cache, self._trust.labels
+        if source in labels:
+            return labels[source][3]
+        generation = self._known_generation(source) or next((row[3] for row in labels.values()), None)
+        if generation is None and (stored := cache.generations_of(identity)):
             generation = self._adopted(stored, identity, width) if cache.verify else stored[0]
         return generation and self._use(source, generation)
 
     def _adopted(self, stored: list[int], identity: str, width: int) -> int | None:
-        """The generation that new simulations agree with, else a new one; None if no simulation ends."""
+        """The generation that new simulations agree with, else a new one; 0 if no simulation ends."""
         cache, name = self.cache, type(self.model).__name__
-        candidates = {generation: cache.candidates(identity, generation, width) for generation in stored}
-        candidates = {generation: rows for generation, rows in candidates.items() if len(rows) >= ROWS}
+        candidates = {generation: cache.any_rows(identity, generation, width, ROWS) for generation in stored}
+        candidates = {generation: rows for generation, rows in candidates.items() if len(rows) == ROWS}
         what = "%d of them are simulated again, to see whether they can be used"
         self._say(
             "the code, a file, a package or the machine of this %s is not that of its stored simulations; "
@@ -437,12 +428,11 @@ class VerifiedModel:
             *(name, ROWS),
         )
         for generation, rows in candidates.items():
-            found = self._compare(cache.rows_of(choose_rows(rows, ROWS, self._random)), ROWS)
+            found = self._compare(rows, ROWS)
             if found.row is not None:
                 continue
             if found.compared < ROWS / 2:
-                self._trust.is_blocked = True
-                return None
+                return 0
             self._trust.left[identity, True] = ROWS_PER_VERIFICATION * found.compared
             self._say("%d stored simulations of this %s agree with new ones: all are used", found.compared, name)
             return generation
@@ -487,35 +477,28 @@ class VerifiedModel:
 
     # comparisons of rows ------------------------------------------------------------------------------------------
 
-    def _verify(self, identity: str, rows: list[Row | None], generation: int, source: int, width: int) -> bool:
-        """Verify some of the rows that were found; False if the look-up must be repeated in a new generation."""
+    def _verify(self, identity: str, rows: list[Row | None], generation: int, width: int) -> None:
+        """Verify some of the rows that were found; `StaleCache` if one differs."""
         trust = self._trust
         with trust.lock:
             others = [row for row in rows if row is not None and row.session != trust.session]
             if not others:
-                return True
+                return
             if trust.stale is not None:
                 raise StaleCache(str(trust.stale), trust.stale.theta)
-            if trust.is_blocked:
-                return True
-            succeeded, latest = [row for row in others if not row.reason], None
+            succeeded, latest = any(not row.reason for row in others), None
             if (identity, True) not in trust.left or not succeeded:
                 latest = self.cache.latest_success(identity, generation, width)
                 latest = None if latest is None or latest.session == trust.session else latest
             # failures alone do not verify successful rows, which may be used later
-            used, kind = trust.used, (identity, bool(latest or succeeded))
+            used, kind = trust.used, (identity, latest is not None or succeeded)
             found = self._compare(self._in_order(latest, others), trust.due(kind, len(others)))
             if found.row is not None:
-                return self._use_no_rows(found.row, found.new, used, generation, source)
+                self._refuse(found.row, found.new, used)
             if found.stopped:
-                if not found.compared:
-                    trust.is_blocked = True
-                    del trust.left[kind]
                 n, total = len(found.stopped), len(found.stopped) + found.compared
                 text = "%d of %d stored simulations could not be verified, because the new simulation was stopped (%s)"
-                text += ". Rows are used without verification until one ends" if trust.is_blocked else ""
                 self._say(text, n, total, found.stopped[0])
-            return True
 
     def _in_order(self, latest: Row | None, rows: list[Row]) -> Iterator[Row]:
         """The row that was stored last, and the others in random order, failures last."""
@@ -551,19 +534,10 @@ class VerifiedModel:
             (misfit,), (reason,) = self.statistics_of(misfit.reshape(1, len(self.model.channels), -1), [""])
         return self._difference(misfit, reason, new)
 
-    def _use_no_rows(self, row: Row, new: Simulated, used: int, generation: int, source: int) -> bool:
-        """Begin a new generation, if the label was adopted and no row was used; False. `StaleCache` otherwise."""
+    def _refuse(self, row: Row, new: Simulated, used: int) -> None:
+        """Raise `StaleCache`, now and for all rows until they are deleted."""
         trust, theta = self._trust, np.frombuffer(row.theta, dtype="<f8")
-        trust.start_again()
-        query = "SELECT count(*) FROM labels WHERE source = ? AND generation = ?"
-        if self.cache.file.select(query, (source, generation)) > [(1,)]:
-            # the model has changed in a part of the space where no row was compared, or by what no label contains
-            new_generation = self._new_generation([generation])
-            for each in {source, *trust.labels}:
-                self._use(each, new_generation)
-            self._say(DIFFER, type(self.model).__name__)
-            if not used:
-                return False
+        trust.left, trust.used, trust.session = {}, 0, secrets.randbits(62)
         difference, change = self._row_difference(row, new)
         point = ", ".join(f"{n} = {value:.17g}" for n, value in zip(self.model.parameter_names, theta, strict=True))
         text = f"{self.cache.path}: a stored simulation is not that of this {type(self.model).__name__}. At {point}: "
@@ -579,32 +553,3 @@ class VerifiedModel:
             )
         trust.stale = StaleCache(text, theta)
         raise trust.stale
-
-
-# coverage of the space ------------------------------------------------------------------------------------------------
-
-
-def choose_rows(rows: list[tuple[bytes, bytes]], n: int, rng: np.random.Generator) -> list[bytes]:
-    """Choose n of the rows, given by keys and parameters, that would show a change of the model in a part of the space.
-
-    The space is divided into n cells with about equal numbers of rows, and a random row of each cell is chosen. A
-    change that concerns a share p of the rows is then missed with a probability of at most (1 - p)^n, as with n random
-    rows, and less if the changed part is connected. Returns keys in random order.
-    """
-    thetas = np.frombuffer(b"".join([theta for _, theta in rows]), dtype="<f8").reshape(len(rows), -1)
-    scale = np.ptp(thetas, axis=0)
-    thetas = (thetas - thetas.min(axis=0)) / np.where(scale > 0.0, scale, 1.0)
-    chosen = [rows[rng.choice(cell)][0] for cell in _cells(np.arange(len(rows)), thetas, n, rng)]
-    return [chosen[place] for place in rng.permutation(n)]
-
-
-def _cells(rows: np.ndarray, thetas: np.ndarray, n: int, rng: np.random.Generator) -> list[np.ndarray]:
-    """Divide rows into n parts, each time along the widest parameter (a random one of equally wide parameters)."""
-    if n == 1:
-        return [rows]
-    width = np.ptp(thetas[rows], axis=0)
-    axis = int(rng.choice(np.flatnonzero(width >= width.max())))
-    ordered = rows[np.argsort(thetas[rows, axis], kind="stable")]
-    left = n // 2
-    cut = min(max(round(len(rows) * left / n), left), len(rows) - (n - left))
-    return [*_cells(ordered[:cut], thetas, left, rng), *_cells(ordered[cut:], thetas, n - left, rng)]

@@ -28,7 +28,7 @@ from .programs import removed_at_end
 
 __all__ = ["Observed", "Sender", "discard", "run_in_folder", "working_folder"]
 
-_MOST_ENTRIES = 500  # of folders with copies; other subfolders are links. A copy takes 60 us, a link 10 us
+_MOST_ENTRIES = 100  # in subfolders that are shown as folders; other subfolders are links. A copy takes 60 us
 _MOST_BYTES = 2**20  # of a copy
 _MOST_BESIDE = 3000  # entries beside the working folder, which ``..`` shows
 _CLOCK_TICK = 20_000_000  # [ns]; a file changed more recently may change again with the same modification time
@@ -173,6 +173,8 @@ class _Mirror:
 
     def __init__(self, sender: Sender) -> None:
         self.base, self.owner, self.path, self.is_new = sender.folder, os.getpid(), "", False
+        # by path here: path and stamp there, and time of modification here
+        self._shown: dict[str, tuple[str, Stamp | None, int]] = {}
         place = sender.place if os.path.isdir(sender.place) else _place(os.getpid())  # on another machine
         _places.add(place)
         self._place = os.path.join(place, str(os.getpid()))
@@ -184,44 +186,42 @@ class _Mirror:
 
     def show(self) -> None:
         """Show what `base` contains now, and nothing that another simulation has left."""
-        if not (self.is_new and all(self._is_shown(*each) for each in self._folders.items())):
+        changed = [own for own, shown in self._shown.items() if not _is_as_shown(own, *shown)]
+        if not self.is_new or any(self._shown[own][2] == 0 for own in changed):  # a folder
             self._make()
-        for name, stamp in self._copies.items():
-            if not self._is_shown(name, stamp):
-                self._copy(name)
+        else:
+            for own in changed:
+                self._copy(self._shown[own][0], own)
 
     def _make(self) -> None:
         shutil.rmtree(self.path, ignore_errors=True)
         self.path, self.is_new = tempfile.mkdtemp(prefix="run_", dir=self._place), True
-        self._folders: dict[str, Stamp | None] = {}
-        self._copies: dict[str, Stamp | None] = {}
-        left = _MOST_ENTRIES
-        for folder in (folders := [""]):
-            self._folders[folder] = _stamp(os.path.join(self.base, folder))
-            for entry in _scan(os.path.join(self.base, folder)):
-                name = os.path.join(folder, entry.name)
-                below = len(_scan(entry.path, left + 1)) if self._is_folder(entry) else None
-                if below is not None and below <= left:
+        self._shown, left = {}, _MOST_ENTRIES
+        for base, place in (folders := [(self.base, self.path)]):
+            self._shown[place] = base, _stamp(base), 0
+            for entry in _scan(base):
+                own = os.path.join(place, entry.name)
+                if self._is_folder(entry) and (below := len(_scan(entry.path, left + 1))) <= left:
                     left -= below
-                    folders.append(name)
-                    os.mkdir(os.path.join(self.path, name))
-                elif entry.is_file() and entry.stat().st_size <= _MOST_BYTES and len(self._copies) < _MOST_ENTRIES:
-                    self._copy(name)
+                    folders.append((entry.path, own))
+                    os.mkdir(own)
+                elif entry.is_file() and entry.stat().st_size <= _MOST_BYTES:
+                    self._copy(entry.path, own)
                 else:
-                    os.symlink(entry.path, os.path.join(self.path, name))
-        for folder in folders:
-            os.utime(os.path.join(self.path, folder), ns=(0, 0))
+                    os.symlink(entry.path, own)
+        for _, place in folders:
+            os.utime(place, ns=(0, 0))
 
-    def _copy(self, name: str) -> None:
-        source, copy = os.path.join(self.base, name), os.path.join(self.path, name)
-        self._copies[name] = _stamp(source)
+    def _copy(self, base: str, own: str) -> None:
+        stamp = _stamp(base)
+        self._shown[own] = base, stamp, stamp[0] if stamp else 1
         with contextlib.suppress(FileNotFoundError):
-            os.unlink(copy)
+            os.unlink(own)
         try:
-            shutil.copy2(source, copy)
+            shutil.copy2(base, own)
         except OSError:  # the user may not read it, or it is not there any more
-            os.symlink(source, copy)
-        os.utime(os.path.dirname(copy), ns=(0, 0))
+            os.symlink(base, own)
+        os.utime(os.path.dirname(own), ns=(0, 0))
 
     def _is_folder(self, entry: os.DirEntry) -> bool:
         """Whether an entry is shown as a folder: not if it is hidden, or contains the mirror."""
@@ -230,16 +230,15 @@ class _Mirror:
         above = os.path.realpath(entry.path) + os.sep
         return not any(os.path.join(os.path.realpath(each), "").startswith(above) for each in (self.base, self._place))
 
-    def _is_shown(self, name: str, stamp: "Stamp | None") -> bool:
-        """Whether a folder or file is as it was when it was shown, both there and here."""
-        shown = _status(os.path.join(self.path, name))
-        if stamp is None or shown is None or stamp != _status(os.path.join(self.base, name)):
-            return False
-        return shown[:2] == stamp[:2] if name in self._copies else shown[0] == 0
-
 
 Stamp = tuple[int, int, int]
 """Time of modification [ns], size and inode of a file."""
+
+
+def _is_as_shown(own: str, base: str, stamp: Stamp | None, modified: int) -> bool:
+    """Whether a folder or file is as it was when it was shown, both there and here."""
+    shown = _status(own)
+    return stamp is not None and shown is not None and shown[0] == modified and _status(base) == stamp
 
 
 def _scan(folder: str, most: int | None = None) -> list[os.DirEntry]:

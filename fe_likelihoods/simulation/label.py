@@ -8,7 +8,7 @@ known label, many for an unknown label. So a label may be incomplete, and may ch
 * user functions, classes and values by value: the parts of the model, and everything that their code names,
 * the source files of the user modules among them, without comments, and the versions of installed packages,
 * environment variables whose names occur in this code,
-* the source files of this library that simulations depend on,
+* the source files of this library,
 * what simulations of the model opened while they ran (`fe_likelihoods.simulation.files`).
 
 Pickles by cloudpickle are not used, because their bytes differ between processes: they contain random class
@@ -18,13 +18,11 @@ identifiers, sets in varying order, and file names of notebook cells.
 import ast
 import functools
 import itertools
-import logging
 import os
 import platform
 import re
 import sys
 import types
-import weakref
 from collections.abc import Iterable, Mapping
 from hashlib import blake2b
 from pathlib import Path
@@ -36,42 +34,19 @@ from .by_value import names_in
 from .files import Opened, digests_by_name, file_digest, mapped, read_again
 from .user_code import LIBRARY, SCRIPTS, is_of_user, package_version, sources_digest
 
-__all__ = [
-    "ModelLabel",
-    "items_of",
-    "value_digest",
-]
+__all__ = ["ModelLabel", "items_of", "value_digest"]
 
-SOURCES = ("kernels/*.py", "modal/*.py", "models/*.py", "signals/*.py", "simulation/model.py", "noise/*.py", "units.py")
 MOST_OBJECTS = 1_000_000  # in one value; further objects are left out
 _PLAIN = (type(None), bool, int, float, complex, str, bytes, bytearray, type(...), type(NotImplemented))
-_WRAPPED = ("__func__", "__self__", "fget", "fset", "fdel", "func", "args", "keywords", "__wrapped__", "cell_contents")
-_WRAPPERS = (
-    types.MethodType,
-    staticmethod,
-    classmethod,
-    property,
-    functools.partial,
-    functools.partialmethod,
-    functools.cached_property,
-    type(functools.lru_cache(len)),
-    types.CellType,
+_WRAPPERS = (staticmethod, classmethod, property, types.CellType, type(functools.lru_cache(len)))
+_WRAPPED = ("__wrapped__", "fget", "fset", "fdel", "cell_contents")
+_OF_CLASSES = set(
+    "__slotnames__ _abc_impl __dict__ __weakref__ __module__ __qualname__ __firstlineno__ __static_attributes__".split()
 )
-_OF_CLASSES = {
-    "__slotnames__",
-    "_abc_impl",
-    "__dict__",
-    "__weakref__",
-    "__module__",
-    "__qualname__",
-    "__firstlineno__",
-    "__static_attributes__",
-}
 _DATA = (int, float, complex, str, bytes, list, dict, set, np.ndarray)  # class attributes that running code may change
 _OF_SHELLS = {"_", "PWD", "OLDPWD", "SHLVL"}  # changes are irrelevant for simulations
 _PARTS = {"function", "class", "output", "statistic", "library", "python"}
-_first: dict[str, tuple[Any, str]] = {}  # first digests of values that running code changes, and the import they are of
-_sources: dict[str, tuple[types.ModuleType, Any, str, frozenset[str]]] = {}  # by name: module, its spec, digest, words
+_sources: dict[str, tuple] = {}  # by name of a module: the module and its spec, digest of the source, words in it
 
 
 class ModelLabel:
@@ -79,16 +54,16 @@ class ModelLabel:
 
     Its code is the mapping ``code_parts()`` if the model has this method; for other user models, the object itself; and
     the residual statistic that is stored, if the user has defined one. `items` are digests of everything that is known
-    without a simulation, `opened` is what simulations opened; `observes` says whether they are observed, since they may
-    run user code.
+    without a simulation, `changing` names those that simulations of this process have changed; `opened` is what
+    simulations opened; `observes` says whether they are observed, since they may run user code.
     """
 
     def __init__(self, model: Any, statistic: Any = None) -> None:
-        self._statistic = statistic
+        self._statistic = statistic if statistic is not None and _defined_by_user(statistic) else None
         self.items = self._present(model)
-        self.items |= {name: _first[name][1] for name in self.changing}
+        self.changing: set[str] = set()
         is_users = hasattr(model, "code_parts") or is_of_user(type(model).__module__)
-        self.observes = is_users or (statistic is not None and _defined_by_user(statistic))
+        self.observes = is_users or self._statistic is not None
         self.opened = mapped() if self.observes else {}
 
     @property
@@ -114,30 +89,19 @@ class ModelLabel:
         return self._present(model) | digests_by_name(read_again(self.opened))
 
     def has_changed_itself(self, names: Iterable[str]) -> None:
-        """Record that simulations change some items; later labels of the same import keep their first digests."""
-        for name in self.items.keys() & set(names) - _PARTS - self.changing:
-            _first[name] = _import_of(name), self.items[name]
-
-    @property
-    def changing(self) -> set[str]:
-        """Names of items that simulations of this process have changed."""
-        return {name for name in self.items.keys() & _first.keys() if _first[name][0] is _import_of(name)}
+        """Record that simulations change some items."""
+        self.changing |= self.items.keys() & set(names) - _PARTS
 
     def _present(self, model: Any) -> dict[str, str]:
-        parts: dict[str, Any] = model.code_parts() if hasattr(model, "code_parts") else {}
-        if is_of_user(type(model).__module__):
-            parts = parts | _parts_of(model)
-        if self._statistic is not None and _defined_by_user(self._statistic):
-            parts = parts | {"statistic": self._statistic}
-        return (items_of(parts) if parts else {}) | {"library": sources_digest(*SOURCES).hex()}
-
-
-def _parts_of(model: Any) -> dict[str, Any]:
-    """User class and attributes of an object, without the time limit, which changes no response."""
-    kind = type(model)
-    name = f"{_name_of(kind.__module__)}.{kind.__qualname__}()"
-    attributes = {f"{name}.{each}": value for each, value in _state(model) if each != "time_limit"}
-    return {"class": kind} | attributes
+        parts: dict[str, Any] = dict(model.code_parts()) if hasattr(model, "code_parts") else {}
+        kind = type(model)
+        if is_of_user(kind.__module__):  # a time limit changes no response
+            name = f"{_name_of(kind.__module__)}.{kind.__qualname__}()"
+            parts |= {f"{name}.{each}": value for each, value in _state(model) if each != "time_limit"}
+            parts |= {"class": kind}
+        if self._statistic is not None:
+            parts |= {"statistic": self._statistic}
+        return (items_of(parts) if parts else {}) | {"library": sources_digest().hex()}
 
 
 def _defined_by_user(function: Any) -> bool:
@@ -170,7 +134,6 @@ class _Walk:
         self._waiting: dict[str, Any] = {}
         self._modules: dict[str, types.ModuleType] = {}
         self._packages: set[str] = set()
-        self._library: set[str] = set()
         self._words: set[str] = set()
 
     def items(self, parts: Mapping[str, Any]) -> dict[str, str]:
@@ -188,25 +151,19 @@ class _Walk:
                     items[name] = f"deeper than {sys.getrecursionlimit()}"
                 if isinstance(value, str):  # a command or an input file of a program
                     self._words |= set(re.findall(r"\w+", value))
-        for module in self._all_modules():
-            if module.__name__ not in SCRIPTS:  # of a script, only the parts that the model uses count
-                items[f"source of {module.__name__}"], words = _source(module)
-                self._words |= words
-        items |= {f"source of {module}": _source(sys.modules[module])[0] for module in self._library}
+        waiting = list(self._modules)
+        while waiting:  # with the user modules that these modules name
+            name = waiting.pop()
+            if name in SCRIPTS:  # of a script, only the parts that the model uses count
+                continue
+            items[f"source of {name}"], words = _source(self._modules[name])
+            self._words |= words
+            for value in list(vars(self._modules[name]).values()):
+                other = value.__name__ if isinstance(value, types.ModuleType) else _attribute(value, "__module__")
+                if isinstance(other, str) and other not in self._modules and self._is_of_user(other):
+                    waiting += [other] if other in self._modules else []
         items |= {f"package {package}": package_version(package) for package in self._packages}
         return items | {f"environment {n}": os.environ[n] for n in self._words & os.environ.keys() - _OF_SHELLS}
-
-    def _all_modules(self) -> Iterable[types.ModuleType]:
-        """The user modules found so far, and the user modules that they name."""
-        waiting = list(self._modules)
-        while waiting:
-            module = self._modules[waiting.pop()]
-            for value in [] if module.__name__ in SCRIPTS else list(vars(module).values()):
-                name = value.__name__ if isinstance(value, types.ModuleType) else _attribute(value, "__module__")
-                if isinstance(name, str) and name not in self._modules and name in sys.modules:
-                    if name.partition(".")[0] != LIBRARY and self._is_of_user(name):
-                        waiting.append(name)
-        return self._modules.values()
 
     def _digest(self, value: Any) -> bytes:
         """Digest of one value; equal values have equal digests, whether they are one object or several."""
@@ -257,9 +214,6 @@ class _Walk:
             return f"{name} {value.__name__}", []
         if isinstance(value, _WRAPPERS):
             return name, [_attribute(value, each) for each in _WRAPPED]
-        if isinstance(value, types.BuiltinFunctionType | types.BuiltinMethodType | types.WrapperDescriptorType):
-            of = getattr(value, "__self__", None)
-            return f"{name} {value.__qualname__}", [] if isinstance(of, types.ModuleType | None) else [of]
         if kind in (list, tuple):
             return name, value
         if kind in (set, frozenset):
@@ -267,10 +221,6 @@ class _Walk:
         if isinstance(value, dict | types.MappingProxyType):
             state = () if kind in (dict, types.MappingProxyType) else _state(value)
             return name, [*itertools.chain.from_iterable(value.items()), *state]
-        if isinstance(value, weakref.ref):
-            return name, [value()]
-        if isinstance(value, logging.Logger):
-            return f"{name} {value.name}", []
         if kind.__module__.partition(".")[0] == "numba":  # the compiled variants change with use
             return name, [_attribute(value, "py_func") or _attribute(_attribute(value, "_dispatcher"), "py_func")]
         if is_of_user(kind.__module__) or isinstance(value, types.SimpleNamespace):
@@ -305,14 +255,12 @@ class _Walk:
         return name, parts
 
     def _is_of_user(self, module: str) -> bool:
-        """Whether a module is the user's; other modules are noted, and represented by versions or source digests."""
+        """Whether a module is the user's; installed packages are noted, and represented by their versions."""
         top = module.partition(".")[0]
         if is_of_user(module):
             self._modules.update({module: sys.modules[module]} if module in sys.modules else {})
             return True
-        if top == LIBRARY and module in sys.modules:
-            self._library.add(module)
-        elif top and top not in (LIBRARY, *sys.stdlib_module_names):
+        if top and top not in (LIBRARY, *sys.stdlib_module_names):
             self._packages.add(top)
         return False
 
@@ -347,39 +295,22 @@ def _attribute(value: Any, name: str) -> Any:
         return None
 
 
-def _import_of(name: str) -> Any:
-    """What identifies the import of the module with a named item: its ``__spec__``, which a reload replaces."""
-    module = sys.modules.get(name)
-    while module is None and name:
-        name = name.rpartition(".")[0]
-        module = sys.modules.get(name)
-    return getattr(module, "__spec__", None)
-
-
 def _source(module: types.ModuleType) -> tuple[str, frozenset[str]]:
-    """Digest of the source file that a module was imported from, and the words in it.
+    """Digest of the source file that a module was imported from, without comments and blank lines, and words in it.
 
-    The file is read once for each import: a later edit is not what runs. A reload gives the module a new
-    ``__spec__``. The module is kept beside its digest, so that no other object gets its id.
+    The file is read once for each import, which makes a new ``__spec__``: a later edit is not what runs.
     """
     file, spec = getattr(module, "__file__", None), getattr(module, "__spec__", None)
-    if file is None:
-        return "", frozenset()
     known = _sources.get(module.__name__)
     if known is None or known[0] is not module or known[1] is not spec:
-        known = _sources[module.__name__] = (module, spec, *_read_source(file))
+        text = source = ""
+        try:
+            text = Path(file or "").read_text("utf-8", "replace") if str(file).endswith(".py") else ""
+            source = ast.dump(ast.parse(text)) if text else file_digest(file or "")
+        except (SyntaxError, ValueError, RecursionError):
+            source = text
+        except OSError:
+            pass
+        digest = blake2b(source.encode("utf-8", "surrogatepass"), digest_size=16).hexdigest()
+        known = _sources[module.__name__] = module, spec, digest, frozenset(re.findall(r"\w+", text))
     return known[2:]
-
-
-def _read_source(file: str) -> tuple[str, frozenset[str]]:
-    try:
-        content = Path(file).read_bytes()
-        if not file.endswith(".py"):
-            return file_digest(file), frozenset()
-        text = ast.dump(ast.parse(content))  # without comments and blank lines
-    except OSError:
-        return "", frozenset()
-    except (SyntaxError, ValueError, RecursionError):
-        text = content.decode("utf-8", "replace")
-    words = frozenset(re.findall(r"\w+", content.decode("utf-8", "replace")))
-    return blake2b(text.encode("utf-8", "surrogatepass"), digest_size=16).hexdigest(), words

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import Channel, ExecutableModel, FELikelihood, FunctionModel, Measurements, SimulationCache
-from fe_likelihoods.cache.verification import choose_rows
+from fe_likelihoods.cache.verification import StaleCache
 from fe_likelihoods.simulation.faults import ChangedModel
 from tests.covering import covering
 
@@ -116,9 +116,8 @@ def test_an_unchanged_model_has_the_same_label_in_every_process(workshop):
 CHANGES = {
     "everywhere": {"helper": HELPER.replace("2.5", "3.5")},
     "a value": {"model": MODEL.replace("Steel(2.0)", "Steel(2.1)")},
-    "5 % of the space": {"helper": HELPER.replace("return E * a", "return (E if a < 1.9 else 2.6) * a")},
-    "5 % within the space": {"helper": HELPER.replace("return E * a", "return (2.6 if 0.8 < a < 0.9 else E) * a")},
-    "failures": {"helper": HELPER.replace("return", "if a > 1.9: raise ArithmeticError('yield')\n    return")},
+    "30 % of the space": {"helper": HELPER.replace("return E * a", "return (E if a < 1.4 else 2.6) * a")},
+    "failures": {"helper": HELPER.replace("return", "if a > 1.4: raise ArithmeticError('yield')\n    return")},
 }
 
 
@@ -137,7 +136,7 @@ def test_a_new_generation_begins_after_a_change(workshop, texts, caplog):
     np.testing.assert_array_equal(third.simulator.statistics(POINTS), first.simulator.statistics(POINTS))
 
 
-def test_a_hidden_change_of_an_adopted_model_begins_a_generation(workshop, monkeypatch, caplog):
+def test_a_hidden_change_of_an_adopted_model_is_an_error(workshop, monkeypatch):
     model = MODEL.replace("import helper", "import helper, sys").replace(
         "* TIME", "* TIME * getattr(sys, 'hidden', 1.0)"
     )
@@ -146,10 +145,8 @@ def test_a_hidden_change_of_an_adopted_model_begins_a_generation(workshop, monke
     workshop.write(model=model.replace("x = ", "strain = ").replace("law(x)", "law(strain)"))
     assert workshop.run().simulations == 0
     monkeypatch.setattr(sys, "hidden", 2.0, raising=False)
-    changed = workshop.run()
-    assert "differ from new ones" in caplog.text and changed.simulations == 300
-    np.testing.assert_array_equal(changed.simulator.statistics(POINTS), true_values(workshop))
-    assert workshop.run().simulations == 0
+    with pytest.raises(StaleCache, match="simulated again"):
+        workshop.run()
 
 
 OPENED = {
@@ -228,26 +225,6 @@ def test_versions_and_dependencies_are_declared(workshop):
     options = [{}, {"version": "2"}, {"depends_on": [3.0]}]
     assert [workshop.run(**each).simulations for each in options] == [300] * 3
     assert [workshop.run(**each).simulator.verifications for each in options] == [USUAL] * 3
-
-
-# coverage -------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("ndim", [1, pytest.param(3, marks=pytest.mark.slow), pytest.param(6, marks=pytest.mark.slow)])
-def test_changes_of_5_percent_are_found(ndim, rng):
-    thetas = rng.normal(size=(2000, ndim))
-    rows = [(place, theta.tobytes()) for place, theta in enumerate(thetas)]
-    found = trials = 0
-    for _ in range(200):
-        if rng.random() < 0.5:  # a ball around a row
-            distance = np.linalg.norm(thetas - thetas[rng.integers(2000)], axis=1)
-        else:  # rows anywhere
-            distance = rng.random(2000)
-        changed = set(np.argsort(distance)[:100].tolist())
-        chosen = set(choose_rows(rows, 59, rng))
-        assert len(chosen) == 59
-        found, trials = found + bool(chosen & changed), trials + 1
-    assert found / trials > 0.95 - 2 * np.sqrt(0.95 * 0.05 / trials)
 
 
 # during a run ---------------------------------------------------------------------------------------------------------
