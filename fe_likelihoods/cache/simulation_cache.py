@@ -200,17 +200,6 @@ class SimulationCache:
 
     # the file -----------------------------------------------------------------------------------------------------
 
-    def copy(self, path: str | os.PathLike) -> int:
-        """Copy the cache to a new file, for an archive or another machine; returns the number of simulations.
-
-        ValueError if the file exists, or its folder does not; OSError if either file cannot be used.
-        """
-        target = Path(path).resolve()
-        if target.exists() or not target.parent.is_dir():
-            raise ValueError(f"{path}: expected the path of a new file in an existing folder")
-        self.file.insist(lambda connection: connection.execute("VACUUM INTO ?", (str(target),)))
-        return self.info().simulations
-
     def add(self, path: str | os.PathLike) -> int:
         """Add the rows of another cache, which no other process uses; rows that are stored already are not changed.
 

@@ -49,7 +49,7 @@ from ..simulation.model import (
     simulate_batch,
 )
 from .comparison import Simulated, difference_in_words
-from .memory import MemoryCache, ResponseMemory, statistics_in
+from .memory import MemoryCache, ResponseMemory
 from .rows import (
     LABEL_COLUMNS,
     STORE_LABEL,
@@ -289,16 +289,12 @@ class VerifiedModel:
         Raises `ChangedModel`; what was simulated since the last comparison, on either side of the change, is dropped.
         """
         self._unchecked.append(thetas)
-        succeeded = [row for row, reason in enumerate(reasons) if not reason]
+        is_first, succeeded = not self._points, [row for row, reason in enumerate(reasons) if not reason]
         points = [(thetas[row].copy(), misfit[row].copy()) for row in succeeded[:1] + succeeded[-1:]]
-        if not (known := self._points):  # a known simulation, if none was run here
-            earlier = self.memory_cache.successes(thetas.shape[1])[:1]
-            outcomes = self.memory_cache.look_up([theta.tobytes() for theta in earlier])
-            known = list(zip(earlier, statistics_in(outcomes, self.n_numbers), strict=True))
-        self._points = (known or points)[:1] + points[-1:]
+        self._points = (self._points or points)[:1] + points[-1:]
         if self._points and (start := time.monotonic()) >= self._not_before:
             try:
-                self._require_same(is_first=not known and self.pool is None)
+                self._require_same(is_first and self.pool is None)
             except ChangedModel:
                 self._clear()
                 for *_, generation, _ in self._trust.labels.values() if self.cache is not None else ():

@@ -182,19 +182,16 @@ def test_forget_deletes_the_simulations_of_one_model(path, thetas):
     assert again.simulator.disk_hits == 1
 
 
-def test_a_copy_and_the_rows_of_another_file(tmp_path, path, thetas):
+def test_the_rows_of_another_file(tmp_path, path, thetas):
     first = likelihood_of(Line(), path)
     first.misfit(thetas)
     oscillator(path).misfit([[1.0, 1.0]])
-    assert SimulationCache(path).copy(tmp_path / "copy.sqlite") == 301
     other = likelihood_of(Line(), tmp_path / "other.sqlite")
     other.misfit(thetas[:50])
-    assert (other.simulator.cache.add(tmp_path / "copy.sqlite"), other.simulator.cache.add(path)) == (251, 0)
+    assert (other.simulator.cache.add(path), other.simulator.cache.add(path)) == (251, 0)
     again = likelihood_of(Line(), tmp_path / "other.sqlite")
     np.testing.assert_array_equal(again.misfit(thetas), first.misfit(thetas))
     assert (again.simulations, again.simulator.verifications) == (0, 2 + 3)
-    with pytest.raises(ValueError, match="path of a new file"):
-        other.simulator.cache.copy(path)
     with pytest.raises(ValueError, match="the cache itself"):
         other.simulator.cache.add(tmp_path / "other.sqlite")
 
