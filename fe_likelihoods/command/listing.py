@@ -166,10 +166,12 @@ def _table(path: Path) -> _Lines:
     cases = bool(of_cases) and table.time is None and len(names) > 1
     for k in (k for k in value_columns(table) if names.count(names[k]) == 1 and not (cases and k == 0)):
         unit = stated_unit(table, k) or text_unit(table, k, "acceleration")  # as the readers of accelerations take it
+        if unit and dimension_of(unit) is None:
+            said.append(f"column {names[k]!r} has the unknown unit {unit!r}, and is left out")
+            continue
         name = _name_of_channel(names[k] if table.named else f"column {names[k]}", columns)
-        known = bool(unit and dimension_of(unit))
-        columns[name], unstated = names[k], unstated | ({} if known else {name: "?"})
-        units.append(unit if known else "1")
+        columns[name], unstated = names[k], unstated | ({} if unit else {name: "?"})
+        units.append(unit or "1")
     channels = [Channel(name, dimension_of(u) or "", u) for name, u in zip(columns, units, strict=True)]
     given = {"dt": 1.0} if cases else {"zero": clock or 0.0}
     measured, more = _advised(

@@ -61,6 +61,9 @@ def test_what_a_file_does_not_state_must_be_written(path):
     assert lines["record"]["units"] == "?" and lines["record"]["resample"] == lines["measurements"]["resample"] == 0.01
     assert lines["measurements"]["units"] == {"base": "?", "top": "?"}
     assert lines["measurements"]["columns"]["top_2"] == "top [1]" and lines["measurements"]["missing"] == [-9999]
+    path.write_text("time_s,base [g],flow [l/min]\n0.0,1,2\n0.1,2,3\n0.2,1,3\n")
+    output, lines = listed(path)
+    assert lines["measurements"]["columns"] == {"base": "base [g]"} and "unknown unit 'l/min'" in output
     path.write_text("base [g]\n1\n2\n")
     assert listed(path)[1]["record"]["dt"] == "?"
     path.write_text("t,base [g]\n0.00,1\n0.02,2\n0.04,1\n")
