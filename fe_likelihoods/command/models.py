@@ -108,7 +108,7 @@ def _modes(job: Job, cache: SimulationCache | None) -> _DataSet:
     if job.noise is not None:
         raise ValueError(f"{job.where('noise')} modes have no such errors: give frequency_cv and others in [modes]")
     data, held_out = _read_modes(job)
-    unknown, options = job.modes.unknown_errors, job.modes.given("close", "student_t")
+    unknown, options = job.modes.unknown_errors, job.modes.given("student_t")
     channels, n_modes, sensors, make = (), 0, job.model.get("sensors"), None
     if job.kind in USER_MODELS:
         if sensors is None:

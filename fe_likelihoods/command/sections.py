@@ -111,7 +111,6 @@ class Modes(Section):
     n_modes: Any = key(
         "whole number >= 1", "Modes that the model computes (twice as many as were measured, or all of a function)"
     )
-    close: Any = key("number", "Share of a frequency within which modes are compared as a plane of shapes (0.02)")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,6 +15,7 @@ __all__ = ["ModalData", "real_shapes"]
 
 _LARGEST_SHARE = 0.5  # above it, an error was given in percent or in hertz
 _ABOVE_ZERO = np.finfo(float).tiny
+_CLOSE = 0.02  # ratio of frequencies, less 1, below which an identification finds the plane of two shapes only
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -151,14 +152,14 @@ class ModalData:
             return self.frequency_cv
         return np.sqrt(np.diag(self.covariance)) / self.mean_frequencies
 
-    def groups(self, close: float) -> tuple[tuple[int, ...], ...]:
-        """Modes whose frequencies are within a ratio of 1 + `close`, as groups.
+    def groups(self) -> tuple[tuple[int, ...], ...]:
+        """Modes so close to each other that an identification finds the plane of their shapes only, as groups.
 
         Modes without a shape, and groups whose plane would take up all sensors, are single.
         """
         shaped = np.flatnonzero(self.has_shape.any(axis=0))
         groups = [(mode,) for mode in range(self.n_modes) if mode not in shaped]
-        for group in close_groups(self.mean_frequencies[shaped], close) if len(shaped) else ():
+        for group in close_groups(self.mean_frequencies[shaped], _CLOSE) if len(shaped) else ():
             modes = tuple(int(shaped[each]) for each in group)
             groups += [modes] if len(modes) < self.n_sensors else [(mode,) for mode in modes]
         return tuple(groups)

@@ -24,15 +24,15 @@ from .temperature import ModesWithSlope
 __all__ = ["ModalLikelihood", "PredictedModes"]
 
 _PROBABILITIES = (np.arange(32) + 0.5) / 32  # of an error, for each sample
-_CLOSE = 0.02  # ratio of frequencies, less 1, below which an identification finds the plane of two shapes only
 
 
 class ModalLikelihood(FELikelihood):
     """Log-likelihood of structural parameters, given natural frequencies and mode shapes.
 
-    Modes are paired by their shapes at every point. One number per frequency and per shape is cached for a simulation,
-    so that all errors are served without another one. It is an `FELikelihood`: `Posterior`, all samplers, guides and
-    `JointLikelihood` take it. The channels of its ``model`` are the measured modes.
+    Modes are paired by their shapes at every point. Measured frequencies within 2 % of each other are compared by the
+    plane of their shapes, and by their order in the pair. One number per frequency and per shape is cached for a
+    simulation, so that all errors are served without another one. It is an `FELikelihood`: `Posterior`, all samplers,
+    guides and `JointLikelihood` take it. The channels of its ``model`` are the measured modes.
 
     Parameters
     ----------
@@ -48,9 +48,6 @@ class ModalLikelihood(FELikelihood):
     student_t : float, optional
         Degrees of freedom, above 2, of Student-t errors, such as 4, of which errors are the scales: wrong
         identifications move the parameters little. Default: Gaussian errors.
-    close : float
-        Measured frequencies that differ by less than this share are compared by the plane of their shapes, and their
-        frequencies by the order in the pair. Zero compares each shape.
     held_out : ModalData, optional
         Measured modes that are not compared, but that reports show beside the predicted ones.
     pool, **options
@@ -82,16 +79,13 @@ class ModalLikelihood(FELikelihood):
         pool: Any = None,
         *,
         student_t: float | None = None,
-        close: float = _CLOSE,
         held_out: ModalData | None = None,
         **options: Any,
     ) -> None:
         if not isinstance(data, ModalData):
             raise ValueError(f"ModalLikelihood: expected ModalData; got {type(data).__name__}")
-        if not 0.0 <= close < 1.0:
-            raise ValueError(f"ModalLikelihood: close must be a share from 0 to 1, such as {_CLOSE}; got {close!r}")
         model = _with_modes(model)
-        self._paired = PairedModes(model if data.temperatures is None else ModesWithSlope(model), data, close)
+        self._paired = PairedModes(model if data.temperatures is None else ModesWithSlope(model), data)
         noise = modal_noise(self._paired, (frequency_error, shape_error), student_t)
         self.held_out = held_out
         if held_out is not None:
@@ -140,7 +134,7 @@ class ModalLikelihood(FELikelihood):
         >>> print(modal.predict_modes(draws))
         mode  measured [Hz]  computed [Hz] ...
         """
-        paired = self.model if data is None else PairedModes(self.model.model, data, self.model.close)
+        paired = self.model if data is None else PairedModes(self.model.model, data)
         names = paired.parameter_names
         short = isinstance(samples, Mapping) or np.shape(samples)[-1:] == (len(names),)
         rows = np.atleast_2d(as_points(samples, names if short else self.parameter_names))
@@ -213,7 +207,7 @@ class PredictedModes(NamedTuple):
 
     def against(self, data: ModalData) -> "PredictedModes":
         """The same computed modes beside other measured ones; nothing is simulated."""
-        paired = PairedModes(self.paired.model, data, self.paired.close)
+        paired = PairedModes(self.paired.model, data)
         return self.of(paired, self.computed, self.unknown, self.student)
 
     @property

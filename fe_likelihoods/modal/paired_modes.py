@@ -54,8 +54,8 @@ class PairedModes:
     path_dependent = False
     axis = "frequency, then components of the shape"
 
-    def __init__(self, model: Model, data: ModalData, close: float) -> None:
-        self.model, self.data, self.close, self.groups = model, data, close, data.groups(close)
+    def __init__(self, model: Model, data: ModalData) -> None:
+        self.model, self.data, self.groups = model, data, data.groups()
         self._rows, self._there = sensor_rows(model, data), ~np.isnan(data.frequencies)
         # frequencies with a covariance are compared in coordinates in which their errors are independent
         self.frequency_cv, self._whitening = data.frequency_cv, np.eye(data.n_modes)

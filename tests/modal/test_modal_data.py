@@ -108,5 +108,5 @@ def test_bad_options_are_refused(options, text):
 
 def test_close_modes_are_a_group_unless_their_plane_takes_up_all_sensors():
     data = ModalData([2.01, 1.0, 2.0], [*SHAPES, [1.0, 0.0, 0.0]], FLOORS)
-    assert data.groups(0.02) == ((1,), (2, 0)) and data.groups(0.0) == ((1,), (2,), (0,))
-    assert len(replace(data, shapes=data.shapes[..., :2], sensors=FLOORS[:2]).groups(0.02)) == 3
+    assert data.groups() == ((1,), (2, 0))
+    assert len(replace(data, shapes=data.shapes[..., :2], sensors=FLOORS[:2]).groups()) == 3

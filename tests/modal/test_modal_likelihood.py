@@ -205,7 +205,6 @@ def test_frequencies_alone_are_paired_by_number():
             'shape_error must be "common" or "mode"',
         ),
         (lambda data: ModalLikelihood(FRAME, data, shape_error=0.02), "numbers in the mapping of priors"),
-        (lambda data: ModalLikelihood(FRAME, data, close=2), "close must be a share"),
         (lambda data: ModalLikelihood(FRAME, data).predict_modes(np.ones((1, 3))), "shape"),
         (
             lambda data: ModalLikelihood(LinearStructure(FRAME, Record("m", 0.1, np.ones(5))).parts, data).first(1),

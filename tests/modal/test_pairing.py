@@ -13,9 +13,9 @@ def unit(shapes):
     return np.asarray(shapes, dtype=float) / np.linalg.norm(shapes, axis=-1, keepdims=True)
 
 
-def measured(frequencies, shapes, close=0.02):
+def measured(frequencies, shapes):
     data = ModalData(frequencies, shapes, [f"sensor {k}" for k in range(np.shape(shapes)[-1])])
-    return data, data.groups(close)
+    return data, data.groups()
 
 
 def test_pairs_do_not_depend_on_scale_sign_and_order(rng):
@@ -91,7 +91,7 @@ def test_several_identifications_have_one_pairing_and_their_own_scales(rng):
 
 def test_modes_without_shapes_are_paired_by_their_number():
     nothing = ModalData([5.0, 1.0], mode_numbers=[3, 1])
-    pairs = pair_modes(np.array([2.0, 4.0, 8.0]), np.empty((3, 0)), nothing, nothing.groups(0.02))
+    pairs = pair_modes(np.array([2.0, 4.0, 8.0]), np.empty((3, 0)), nothing, nothing.groups())
     assert pairs.columns.tolist() == [2, 0] and np.isnan(pairs.assurance).all() and not pairs.shapes.any()
 
 

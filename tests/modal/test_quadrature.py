@@ -82,7 +82,7 @@ def tower(theta):
     return np.block([[x, np.zeros((2, 2))], [np.zeros((2, 2)), y]]), np.eye(4)
 
 
-def swapped(close):
+def swapped():
     """Close pairs of modes, with a ratio of frequencies of 1.01, whose order changes within the prior."""
     rows = {"x 1": 0, "x 2": 1, "y 1": 2, "y 2": 3}
     model = FunctionModes(tower, ("x", "y"), rows, 4)
@@ -95,7 +95,7 @@ def swapped(close):
         frequency_cv=0.003,
         shape_error=0.03,
     )
-    return Posterior(ModalLikelihood(model, data, close=close), {"x": Uniform(0.9, 1.1), "y": Uniform(0.9, 1.1)})
+    return Posterior(ModalLikelihood(model, data), {"x": Uniform(0.9, 1.1), "y": Uniform(0.9, 1.1)})
 
 
 PROBLEMS = {
@@ -106,8 +106,7 @@ PROBLEMS = {
         [(0.9, 1.15), (0.75, 1.05), (0.0, 0.06)],
         28,
     ),
-    "close modes": (lambda: swapped(0.02), [(0.97, 1.06), (0.97, 1.06)], 50),
-    "close modes, each shape": (lambda: swapped(0.0), [(0.97, 1.06), (0.97, 1.06)], 50),
+    "close modes": (swapped, [(0.97, 1.06), (0.97, 1.06)], 50),
     "one sensor": (lambda: frame_of_two(sensors=("floor 2",)), [(0.7, 1.3), (0.6, 1.2)], 90),
 }
 
@@ -146,12 +145,10 @@ def test_guided_runs_agree_with_quadrature(problem):
     assert spreads == pytest.approx(deviation, rel=0.05)
 
 
-def test_close_modes_whose_order_changes_have_two_modes_in_the_plane_and_one_by_their_shapes():
-    pair, each = swapped(0.02), swapped(0.0)
-    here, there = np.array([1.0, 1.0201]), np.array([1.0201, 1.0])
-    assert pair.likelihood.model.groups == ((0, 1), (2, 3)) and len(each.likelihood.model.groups) == 4
+def test_close_modes_whose_order_changes_have_two_modes_in_the_plane():
+    pair, here, there = swapped(), np.array([1.0, 1.0201]), np.array([1.0201, 1.0])
+    assert pair.likelihood.model.groups == ((0, 1), (2, 3))
     assert pair.log_likelihood(here) == pytest.approx(pair.log_likelihood(there), abs=1e-9)
-    assert each.log_likelihood(here) > each.log_likelihood(there) + 5.0
 
 
 def test_held_out_modes_of_a_measured_frame_are_predicted(shared):
