@@ -36,15 +36,12 @@ def write_summary(folder: Path, run: FinishedRun, judged: JudgedRun, said: Seque
     (folder / "summary.txt").write_text("\n".join([*lines, *filter(None, said), ""]), encoding="utf-8")
 
 
-def write_samples(
-    folder: Path, run: FinishedRun, samplers: Sequence[Any], prediction: Any, draws: int, judgement: str
-) -> str:
-    """Write ``posterior.nc``, the samples with the responses of `draws` of them and the judgement as an attribute.
+def write_samples(folder: Path, run: FinishedRun, samplers: Sequence[Any], prediction: Any, judgement: str) -> str:
+    """Write ``posterior.nc``, the samples with the prediction and the judgement as an attribute.
 
     Independent runs are chains. Returns how the runs agree, empty for one.
     """
-    options = {"draws": max(draws, len(samplers))} if draws else {}
-    data = to_arviz(samplers, run.posterior if draws else None, prediction, discard=run.discard, **options)
+    data = to_arviz(samplers, prediction, discard=run.discard)
     data.posterior.attrs["judgement"] = judgement
     data.to_netcdf(str(folder / "posterior.nc"))
     if len(samplers) == 1:

@@ -114,7 +114,7 @@ def _write(folder: Path, job: Job, again: str, chains: list[Any], problem: Probl
             warnings.simplefilter("ignore", FindingWarning)  # the outcome has its findings
             prediction = job.located("prediction", propagate, problem.posterior, drawn, **options)
     judged = judge_run(run)
-    agreement = write_samples(folder, run, chains, prediction, job.prediction.draws, str(judged.judgement))
+    agreement = write_samples(folder, run, chains, prediction, str(judged.judgement))
     write_page(folder / PAGE, run, prediction, judged, repeat=again)
     said = [each.measurements.description for each, _ in problem.posterior.likelihood.parts()]
     said = [agreement, *(f"Measurements: {each}" for each in said if "CAUTION" in each)]
@@ -126,7 +126,7 @@ def _write(folder: Path, job: Job, again: str, chains: list[Any], problem: Probl
 
 
 def _drawn(sampler: Any, n: int) -> np.ndarray:
-    """Draws of the posterior to predict with, those that `samplers.to_arviz` takes from one chain."""
+    """Draws of the posterior to predict with, evenly spaced among founders, walkers and steps."""
     chain = sampler.get_chain()[:, np.argsort(sampler.founders, kind="stable")]
     samples = chain.swapaxes(0, 1).reshape(-1, sampler.ndim)
     rows = np.unique(np.linspace(0, len(samples) - 1, min(n, len(samples))).round().astype(int))

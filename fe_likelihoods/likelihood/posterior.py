@@ -26,7 +26,6 @@ from .gradient import likelihood_gradient, slopes_along
 from .joint import JointLikelihood
 from .likelihood import FELikelihood
 from .parameters import Parameter
-from .predictive_draws import MeasuredHistory, measured_data, predictive_draws
 
 if TYPE_CHECKING:
     from ..emulation.guide import ResponseGuide
@@ -388,37 +387,6 @@ class Posterior:
         from ..emulation.modes import find_modes  # scipy.special and scipy.optimize are slow to import
 
         return find_modes(self, starts, seed, max_simulations, _TOP)
-
-    def measured_data(self) -> tuple[MeasuredHistory, ...]:
-        """The measurements, without missing samples; nothing is simulated."""
-        return measured_data(self.likelihood)
-
-    def predictive_draws(self, samples: Any, seed: int = 0) -> dict[str, np.ndarray]:
-        """Measurements that samples of the posterior predict: simulated response plus one draw of the noise.
-
-        The responses are cached, like those for a guide; cached ones are not simulated again.
-
-        Parameters
-        ----------
-        samples : (n, ndim) float, or mapping
-            Samples of the posterior.
-        seed : int
-            Seed of the noise.
-
-        Returns
-        -------
-        dict of str to (n, n_samples) float
-            By the names of `measured_data` [SI]; without those whose noise cannot be drawn from.
-
-        Raises
-        ------
-        ValueError
-            For samples of another shape.
-        SimulationFailed
-            If a sample cannot be simulated.
-        """
-        self._check_models("a prediction")
-        return predictive_draws(self.likelihood, as_points(samples, self.prior.names), seed)
 
     def evaluation_queue(self) -> PointQueue:
         """A queue of points whose log-probabilities are returned in the order in which their simulations end.

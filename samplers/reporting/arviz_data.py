@@ -31,12 +31,10 @@ _RUNS = "Each chain is an independent run, so r_hat compares runs."
 
 def to_arviz(
     sampler: Any,
-    posterior: Any = None,
     prediction: Any = None,
     *,
     parameter_names: Sequence[str] | None = None,
     discard: int = 0,
-    draws: int = 400,
     seed: int = 0,
 ) -> Any:
     """Convert one run, or several independent runs, to arviz data.
@@ -45,8 +43,6 @@ def to_arviz(
     ----------
     sampler : sampler or sequence of samplers
         Samplers that have run, with chains of equal length; `emcee.EnsembleSampler` is accepted too.
-    posterior : fe_likelihoods.Posterior, optional
-        Adds the group ``posterior_predictive``, which needs simulations of `draws` samples.
     prediction : fe_likelihoods.prediction.prediction.Prediction, optional
         The result of `fe_likelihoods.propagate`; adds the group ``predictions``.
     parameter_names : sequence of str, optional
@@ -54,17 +50,15 @@ def to_arviz(
         ``name`` with several, name_0, name_1, ...), or else theta_0, theta_1, ...
     discard : int
         Burn-in of each run, in steps. Chains of SMC and TMCMC have none.
-    draws : int
-        Number of samples that are simulated, evenly spaced in the chains.
     seed : int
-        Seed for draws of the prior and the noise.
+        Seed for draws of the prior.
 
     Returns
     -------
     arviz.InferenceData
         A DataTree from arviz 1.0 on; ``to_netcdf(path)`` writes it to a file. It has the groups ``posterior``,
-        ``sample_stats`` and, where they are known, ``prior``, ``observed_data``, ``posterior_predictive`` and
-        ``predictions``; ``docs/arviz`` describes them. A slash in the name of a parameter or channel becomes ``_``.
+        ``sample_stats`` and, where they are known, ``prior`` and ``predictions``; ``docs/arviz`` describes them. A
+        slash in the name of a parameter or channel becomes ``_``.
 
     Examples
     --------
@@ -82,9 +76,6 @@ def to_arviz(
             "different seeds"
         )
     known = log_posterior_of(runs[0])
-    if posterior is not None:
-        _check_posterior(posterior, runs[0])
-        known = posterior
     if parameter_names is None:
         parameter_names = getattr(known, "parameter_names", None) or _names_in_emcee(runs[0])
     names = names_of_parameters(parameter_names, runs[0].ndim)
@@ -106,10 +97,6 @@ def to_arviz(
     }
     if (prior := _prior_group(runs, known, names, described, seed)) is not None:
         groups["prior"] = prior
-    if hasattr(known, "measured_data"):
-        groups["observed_data"] = _measured_group(known.measured_data())
-    if posterior is not None:
-        groups |= _predictive_group(posterior, chains, groups["observed_data"], draws, seed)
     if prediction is not None:
         groups["predictions"] = prediction.to_xarray()
     groups = {group: _without_slashes(dataset) for group, dataset in groups.items()}
@@ -122,17 +109,6 @@ def _without_slashes(dataset: "xarray.Dataset") -> "xarray.Dataset":
     """Data with ``_`` for ``/`` in names, which would be a folder in netCDF."""
     names = {*dataset.variables, *dataset.dims}
     return dataset.rename({name: name.replace("/", "_") for name in names if "/" in name})
-
-
-def _check_posterior(posterior: Any, run: Any) -> None:
-    missing = [name for name in ("measured_data", "predictive_draws") if not hasattr(posterior, name)]
-    if missing:
-        raise ValueError(
-            f"to_arviz asks the posterior for predictions of its measurements, and {type(posterior).__name__} has no "
-            f"{' and no '.join(missing)}: pass a fe_likelihoods.Posterior, or leave out posterior="
-        )
-    if posterior.ndim != run.ndim:
-        raise ValueError(f"the posterior has {posterior.ndim} parameters, but the sampler {run.ndim}")
 
 
 def _ordered(runs: Sequence[Any], discard: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -179,8 +155,8 @@ def _blobs(run: Any, discard: int) -> dict[str, np.ndarray]:
     return {f"blob_{k}" if k in ours else k: each for k, each in named.items() if each.dtype.kind in "fiubcUSmM"}
 
 
-def _coordinates(n_chains: int, draws: int | np.ndarray) -> dict[str, np.ndarray]:
-    return {"chain": np.arange(n_chains), "draw": np.arange(draws) if isinstance(draws, int) else draws}
+def _coordinates(n_chains: int, draws: int) -> dict[str, np.ndarray]:
+    return {"chain": np.arange(n_chains), "draw": np.arange(draws)}
 
 
 def _parameter_group(
@@ -227,45 +203,3 @@ def _statistics_of_runs(runs: Sequence[Any]) -> dict[str, Any]:
     attributes["verdict"] = "\n".join(str(run.verdict) for run in runs)
     failures = (Counter(failure["reason"] for failure in run.failures) for run in runs)
     return attributes | {"failures": "\n".join(map(json.dumps, failures))}
-
-
-def _time_coordinate(times: Mapping[str, np.ndarray]) -> tuple[dict[str, str], dict[str, Any]]:
-    """Dimension of each history, and coordinates: one time if all histories share it, else one per history."""
-    rows = list(times.values())
-    same = all(np.array_equal(row, rows[0]) for row in rows)
-    dimensions = {name: "time" if same else f"time_{name}" for name in times}
-    about = {"units": "s", "long_name": "time [s]"}
-    return dimensions, {dimensions[name]: (dimensions[name], row, about) for name, row in times.items()}
-
-
-def _measured_group(histories: Sequence[Any]) -> "xarray.Dataset":
-    import xarray
-
-    dimensions, coordinates = _time_coordinate({each.name: each.time for each in histories})
-    variables = {each.name: (dimensions[each.name], each.values, _about(each.channel, each.name)) for each in histories}
-    return xarray.Dataset(variables, coordinates)
-
-
-def _about(channel: Any, name: str) -> dict[str, str]:
-    return {"units": channel.si_unit, "long_name": f"{name} [{channel.si_unit}]", "quantity": channel.quantity}
-
-
-def _predictive_group(
-    posterior: Any, chains: np.ndarray, observed: "xarray.Dataset", draws: int, seed: int
-) -> dict[str, "xarray.Dataset"]:
-    """Replicated measurements; none for a noise that cannot be drawn from."""
-    import xarray
-
-    n_chains, n_draws, ndim = chains.shape
-    if not draws >= n_chains:
-        raise ValueError(f"draws must be one or more for each of {n_chains} chains; got {draws!r}")
-    chosen = np.unique(np.linspace(0, n_draws - 1, min(n_draws, -(-int(draws) // n_chains))).round().astype(int))
-    found = posterior.predictive_draws(chains[:, chosen].reshape(-1, ndim), seed)
-    shape, coordinates = (n_chains, len(chosen)), _coordinates(n_chains, chosen)
-    variables = {
-        name: (("chain", "draw", *observed[name].dims), values.reshape(*shape, -1), observed[name].attrs)
-        for name, values in found.items()
-    }
-    note = {"note": "simulated response plus one draw of the noise per sample"}
-    group = xarray.Dataset(variables, {**observed.coords, **coordinates}, note)
-    return {"posterior_predictive": group} if found else {}
