@@ -1,6 +1,5 @@
 from . import problems
 from .cache.simulation_cache import SimulationCache
-from .checks.fit import check_fit
 from .checks.rehearsal import check_model
 from .checks.result import check_result
 from .checks.screening import check_data
@@ -118,7 +117,6 @@ __all__ = [
     "align",
     "average_predictions",
     "check_data",
-    "check_fit",
     "check_model",
     "check_result",
     "damage",

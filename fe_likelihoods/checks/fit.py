@@ -6,23 +6,20 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtrc
 
-from ..likelihood.posterior import Posterior
 from ..noise.residuals import ResidualChecks
 from ..priors.between_events import spread_of
-from ..priors.points import as_points
 from ..signals.channels import Channel
 from ..signals.error_measures import relative_errors
 from ..text_tables import listed
-from .compared import Fit, checks_of, compare, data_sets_of, draws_to_compare
+from .compared import Fit, checks_of
 from .faults import EXPLAINED, MOST_DRAWS, find_faults, finding_of, supports_apart
 from .finding import CARE, CORRELATED, HALF, NOTE, SMALL_PROBABILITY, WRONG, Finding, about, percent
 from .modal import check_modes, squares_of_modes
 from .model import LARGE_SHIFT, motions_to_replace
-from .run import ParameterRow, moments, rows_of
+from .run import ParameterRow
 
 __all__ = [
     "SAME_AS_PRIOR",
-    "check_fit",
     "check_other_events",
     "check_parameters",
     "check_residuals",
@@ -34,42 +31,6 @@ __all__ = [
 
 SAME_AS_PRIOR = 0.9  # ratio of the standard deviations of posterior and prior: a fifth of the variance is gone
 FEWEST = 10  # samples that the tests of correlation and distribution need
-
-
-def check_fit(posterior: Posterior, samples: Any = None) -> tuple[Finding, ...]:
-    """Look for wrong units, signs, clocks and channels, and for a poor fit.
-
-    Parameters
-    ----------
-    posterior : Posterior
-    samples : (n, ndim) array_like or mapping, optional
-        Samples of the posterior, whose mean is the fit. Default: before a run, the data are compared with draws of the
-        prior alone.
-
-    Returns
-    -------
-    tuple of Finding
-        Empty if nothing was found. ``str`` of a finding gives it in words. The mean and up to 100 draws of the prior
-        are simulated where they are not cached; fewer draws if a simulation takes longer than 0.1 s.
-
-    Examples
-    --------
-    >>> wrong_sign = Measurements(measurements.channels, record.dt, -measurements.values)
-    >>> for finding in check_fit(Posterior(FELikelihood(model, wrong_sign), prior)):
-    ...     print(finding.severity, finding)
-    wrong A sign may be wrong: acceleration and displacement: measured values have the opposite sign...
-    """
-    draws, found, fits, mean = draws_to_compare(posterior), list[Finding](), list[Fit](), None
-    if samples is not None:
-        samples = as_points(samples, posterior.prior.names)
-        mean = samples.mean(axis=0)
-        found += check_parameters(rows_of(posterior.parameters, posterior.prior, moments(samples)))
-    for key, likelihood, columns in data_sets_of(posterior):
-        own, point = (None if each is None else each[..., columns] for each in (samples, mean))
-        fits += compare(likelihood, draws[:, columns], key, point, samples=own)
-        found += check_supports(likelihood.model)
-    first = check_responses(fits)
-    return (*first, *(check_stated_errors(fits) if all(each.severity != WRONG for each in first) else ()), *found)
 
 
 def check_responses(fits: Iterable[Fit]) -> list[Finding]:

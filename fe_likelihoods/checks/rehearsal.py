@@ -31,8 +31,9 @@ class ModelCheck(NamedTuple):
 def check_model(posterior: Posterior, *, progress: bool = False) -> ModelCheck:
     """Try the model and the data of a posterior before a run.
 
-    It simulates the mean of the prior twice, under twice the motion, and draws of the prior, which are compared with
-    the measurements as in `fe_likelihoods.check_fit`. `fe_likelihoods.check_data` looks at the data. Whether step and
+    It simulates the mean of the prior twice, under twice the motion, and up to 100 draws of the prior (fewer if a
+    simulation takes longer than 0.1 s), in which it looks for wrong units, signs, clocks and channels of the data.
+    `fe_likelihoods.check_data` looks at the data alone. Whether step and
     mesh are fine enough is judged after a run (`fe_likelihoods.check_result`), where the precision of the parameters
     is known.
 
@@ -53,9 +54,10 @@ def check_model(posterior: Posterior, *, progress: bool = False) -> ModelCheck:
 
     Examples
     --------
-    >>> checked = check_model(posterior)
-    >>> [finding.kind for finding in checked.findings if finding.severity == "wrong"]
-    []
+    >>> wrong_sign = Measurements(measurements.channels, record.dt, -measurements.values)
+    >>> for finding in check_model(Posterior(FELikelihood(model, wrong_sign), prior)).findings:
+    ...     print(finding.severity, finding)
+    wrong A sign may be wrong: acceleration and displacement: measured values have the opposite sign...
     """
     mean, found, fits, seconds, before = posterior.prior.mean(), list[Finding](), list[Fit](), 0.0, _made(posterior)
     made = 0

@@ -4,8 +4,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from samplers.judgement.failures import check_failed_region
-
 from ..signals.events import find_events
 from ..simulation.model import SimulationBatch, simulate_batch
 from .compared import Fits, data_sets_of, fit_data_sets
@@ -56,7 +54,7 @@ def check_result(sampler: Any, posterior: Any = None, *, discard: int = 0) -> Ju
     Returns
     -------
     Judgement
-        The mean, and draws of the prior, are simulated where they are not cached (`check_fit`).
+        The mean, and draws of the prior, are simulated where they are not cached.
 
     Raises
     ------
@@ -83,7 +81,7 @@ def judge_run(run: FinishedRun) -> JudgedRun:
     of_model, tested, made = _check_model(run)
     failed, fits = failures(run), fits._replace(simulations=fits.simulations + made)  # failures of the fits included
     found = check_responses(fits.fits) + of_model  # first, because they explain a sampling that is not good
-    found += _check_sampling(run) + _check_chain(run) + check_failures(run, failed)
+    found += _check_sampling(run) + _check_chain(run) + check_failures(failed)
     parts = [] if run.likelihood is None else [likelihood for likelihood, _ in run.likelihood.parts()]
     for each in parts:
         found += check_supports(each.model)
@@ -188,8 +186,8 @@ def _check_chain(run: FinishedRun) -> list[Finding]:
     return found
 
 
-def check_failures(run: FinishedRun, failed: Failures) -> list[Finding]:
-    """How many simulations failed, and where a sampler has not said it, whether they border on the samples."""
+def check_failures(failed: Failures) -> list[Finding]:
+    """How many simulations failed; the verdict of a sampler says whether they border on the samples."""
     if not failed.count:
         return []
     share = failed.count / max(failed.attempts, 1)
@@ -198,6 +196,4 @@ def check_failures(run: FinishedRun, failed: Failures) -> list[Finding]:
         "as impossible: the posterior has no samples there."
     )
     action = "See the table of failures: mend the model where its parameters are plausible, else narrow the prior."
-    found = [Finding("Simulations failed", CARE if share > TAIL else NOTE, text, action, {"share": share})]
-    said = run.verdict is not None and run.verdict.near_failures is not None
-    return found if said or (run.is_inconclusive and not run.tempered) else found + check_failed_region(failed.near)
+    return [Finding("Simulations failed", CARE if share > TAIL else NOTE, text, action, {"share": share})]

@@ -13,7 +13,6 @@ import numpy as np
 
 from samplers import Verdict
 from samplers.emcee_names import EnsembleSampler
-from samplers.judgement.failures import NearFailures, failures_near
 
 from ..likelihood.failure_log import reason_without_numbers
 from ..likelihood.joint import JointLikelihood
@@ -121,8 +120,8 @@ def read_run(
     tempered, verdict = hasattr(sampler, "ladder") and bool(sampler.ladder), None
     with suppress(ValueError):  # a file may hold no verdict
         verdict = sampler.verdict if tempered else None
-    mean_error, sd_error, size, autocorrelation = _errors(sampler, samples, tempered, discard)
     likelihood, prior = getattr(posterior, "likelihood", None), getattr(posterior, "prior", None)
+    errors = _errors(sampler, samples, tempered, discard)
     return FinishedRun(
         sampler=sampler,
         posterior=posterior,
@@ -131,44 +130,35 @@ def read_run(
         parameters=parameters,
         samples=samples,
         log_prob=sampler.get_log_prob(flat=True, discard=discard),
-        mean_error=mean_error,
-        sd_error=sd_error,
-        effective_sample_size=size,
+        **errors,
         truth=_truth(truth, [each.name for each in parameters]),
         discard=discard,
         tempered=tempered,
         verdict=verdict,
-        autocorrelation_time=autocorrelation,
     )
 
 
 def _truth(truth: Mapping[str, float] | Sequence[float] | None, names: Sequence[str]) -> np.ndarray:
     known = truth if isinstance(truth, Mapping) else {} if truth is None else dict(zip(names, truth, strict=False))
-    if unknown := [name for name in known if name not in names]:
-        raise ValueError(f"truth has the unknown parameters {', '.join(unknown)}; known are {', '.join(names)}")
-    if not isinstance(truth, Mapping | None) and np.shape(truth) != (len(names),):
-        raise ValueError(f"truth must have {len(names)} numbers, of {', '.join(names)}; got {truth!r}")
+    if set(known) - set(names) or (not isinstance(truth, Mapping | None) and np.shape(truth) != (len(names),)):
+        raise ValueError(f"truth must have values of parameters ({', '.join(names)}), or one for each; got {truth!r}")
     return np.array([float(known.get(name, np.nan)) for name in names])
 
 
-def _errors(
-    sampler: EnsembleSampler, samples: np.ndarray, tempered: bool, discard: int
-) -> tuple[np.ndarray, np.ndarray, float, float]:
-    """Errors of means and standard deviations (ndim,), least effective sample size, and autocorrelation time.
-
-    The time [iterations] is NaN where a chain of emcee's own sampler is too short for any estimate.
-    """
-    spread = samples.std(axis=0)
+def _errors(sampler: EnsembleSampler, samples: np.ndarray, tempered: bool, discard: int) -> dict[str, Any]:
+    """Errors of means and deviations, effective sample size, and autocorrelation time, NaN for a chain too short."""
+    spread, names = samples.std(axis=0), ("mean_error", "sd_error", "effective_sample_size", "autocorrelation_time")
     if tempered:
         error = sampler.mean_error(discard=discard)
         size = float(np.min((spread[error > 0.0] / error[error > 0.0]) ** 2, initial=len(samples)))
-        return error, sampler.sd_error(discard=discard), size, np.nan
+        return dict(zip(names, (error, sampler.sd_error(discard=discard), size, np.nan), strict=True))
     with np.errstate(all="ignore"):
         time = float(np.max(sampler.get_autocorr_time(discard=discard, tol=0)))  # NaN if one is
     size = min((sampler.iteration - discard) * sampler.nwalkers / time, float(len(samples)))  # min keeps a first NaN
     of_variance = np.square(samples - samples.mean(axis=0)).std(axis=0)
     sd_error = 0.5 * of_variance / np.where(spread > 0.0, spread, 1.0) / np.sqrt(size)
-    return spread / np.sqrt(size), sd_error, float(size), time if np.isfinite(time) else np.nan
+    time = time if np.isfinite(time) else np.nan
+    return dict(zip(names, (spread / np.sqrt(size), sd_error, float(size), time), strict=True))
 
 
 class Moments(NamedTuple):
@@ -191,12 +181,10 @@ def moments(samples: np.ndarray, mean_error: Any = np.nan, sd_error: Any = np.na
 
 def moments_of(run: FinishedRun) -> Moments:
     """Moments of the chain, or of the signed sample if that has smaller errors and determines all deviations."""
-    signed = getattr(run.sampler, "signed_sample", None)
-    if signed is not None:
+    if (signed := getattr(run.sampler, "signed_sample", None)) is not None:
         mean, sd = signed.expectation(), signed.standard_deviation()
         if np.all(mean.error < run.mean_error) and np.all(sd.value > 0.0):
-            quantiles = (signed.quantile(probability).value for probability in (0.05, 0.5, 0.95))
-            return Moments(*mean, *sd, *quantiles)
+            return Moments(*mean, *sd, *(signed.quantile(probability).value for probability in (0.05, 0.5, 0.95)))
     return moments(run.samples, run.mean_error, run.sd_error)
 
 
@@ -257,13 +245,12 @@ class Failure(NamedTuple):
 
 
 class Failures(NamedTuple):
-    """All failures, with the number of attempts; `near` are those on which a tempered sampler's verdict depends."""
+    """All failures, with the number of attempts."""
 
     rows: tuple[Failure, ...]  # by reason, the most frequent first
     count: int
     attempts: int
     unknown: str = ""  # what is not known about them
-    near: NearFailures = NearFailures(0, 0)  # among the posterior samples, and all evaluated points there
 
     @property
     def sentence(self) -> str:
@@ -273,16 +260,14 @@ class Failures(NamedTuple):
 
 def failures(run: FinishedRun) -> Failures:
     """Failed simulations by reason, counted in likelihoods, also of first parts of the record, or in the sampler."""
-    reasons, known, attempts, near, unknown = Counter(), list[tuple[str, dict]](), 0, [NearFailures(0, 0)], ""
+    reasons, known, attempts, unknown = Counter(), list[tuple[str, dict]](), 0, ""
     for likelihood, columns in [] if run.likelihood is None else run.likelihood.parts():
-        names, logs = likelihood.model.parameter_names, [each.simulator for each in (likelihood, *likelihood.shortened)]
-        records = [(each["reason"], each["parameters"]) for log in logs for each in log.failures.records]
-        failed = np.array([list(point.values()) for _, point in records]).reshape(-1, len(names))
-        samples = run.samples[:, columns[: len(names)]]
-        near.append(failures_near(samples, failed, logs[0].memory_cache.successes(len(names))))
-        known, reasons = known + records, sum((each.failures.reasons for each in logs), reasons)
-        attempts += sum(each.failures.outcomes for each in logs)
-        if logs[0].failures.outcomes < len(np.unique(samples, axis=0)):
+        logs = [each.simulator.failures for each in (likelihood, *likelihood.shortened)]
+        known += [(each["reason"], each["parameters"]) for log in logs for each in log.records]
+        reasons = sum((each.reasons for each in logs), reasons)
+        attempts += sum(each.outcomes for each in logs)
+        samples = run.samples[:, columns[: len(likelihood.model.parameter_names)]]
+        if logs[0].outcomes < len(np.unique(samples, axis=0)):
             unknown = "Not known: simulations of this run were made in another process, or are no longer in memory."
     count = reasons.total()
     if run.likelihood is None and not run.tempered:
@@ -301,6 +286,4 @@ def failures(run: FinishedRun) -> Failures:
     for text, each in reasons.items():
         rows[reason_without_numbers(text)] += each
     table = tuple(Failure(reason, each, examples.get(reason, "")) for reason, each in rows.most_common())
-    judged = None if run.verdict is None else run.verdict.near_failures
-    judged = max(near, key=lambda each: each.failed) if judged is None else judged
-    return Failures(table, count, max(attempts, count), unknown, judged)
+    return Failures(table, count, max(attempts, count), unknown)

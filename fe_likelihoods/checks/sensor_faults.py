@@ -38,7 +38,7 @@ class SensorFault(NamedTuple):
 def find_sensor_faults(values: np.ndarray, dimension: str = "") -> tuple[SensorFault, ...]:
     """Faults of the samples (n,) of a channel, NaN where missing; each without the samples of faults found before it.
 
-    An acceleration returns to zero, and a displacement begins there; forces and strains of dead loads do not.
+    An acceleration returns to zero; forces and strains of dead loads, and displacements after yielding, do not.
     """
     x, found = np.array(values, dtype=float), list[SensorFault]()
     for kind, look in (("spikes", _spikes), ("clipped", _clipped), ("stuck", _stuck), ("", None)):
@@ -50,7 +50,7 @@ def find_sensor_faults(values: np.ndarray, dimension: str = "") -> tuple[SensorF
             for first, last in spans:
                 x[first : last + 1] = np.nan
     whole, correlation = ((0, len(x) - 1),), _correlation(x)
-    if level := _baseline(x, dimension):
+    if level := _baseline(x) if dimension in ("acceleration", "velocity") else ():
         size = float(np.ptp((0.0, *level))) / _peak(x)
         found.append(SensorFault("offset" if len(level) == 1 else "drift", whole, size, level))
     return (*found, SensorFault("noise", whole, correlation)) if correlation < WHITE else tuple(found)
@@ -167,28 +167,18 @@ def _spikes(x: np.ndarray) -> tuple[tuple[int, int], ...]:
     return tuple(sorted(found))
 
 
-def _baseline(x: np.ndarray, dimension: str) -> tuple[float, ...]:
-    """Offset, or values at the ends (and in the middle) of a drift; empty if there is neither.
-
-    A structure that keeps a residual displacement starts from zero, and does not move at the end.
-    """
+def _baseline(x: np.ndarray) -> tuple[float, ...]:
+    """Offset, or values at the ends (and in the middle) of a drift; empty if there is neither."""
     parts = np.array([np.nan if np.isnan(part).all() else np.nanmean(part) for part in np.array_split(x, 10)])
     places, parts = np.linspace(-0.9, 0.9, 10)[np.isfinite(parts)], parts[np.isfinite(parts)]
-    peak, spread, third = _peak(x), np.square(parts - parts.mean()).sum(), len(parts) // 3
-    returns, first = dimension in ("acceleration", "velocity"), float(np.mean(x[np.isfinite(x)][:STILL]))
+    least, spread = LEVEL * _peak(x), np.square(parts - parts.mean()).sum()
     for degree in (1, 2) if len(parts) > 4 else ():
         line = np.polynomial.Polynomial.fit(places, parts, degree, domain=[-1, 1])
-        ends = line(np.linspace(-1.0, 1.0, degree + 1))
         smooth = np.square(parts - line(places)).sum() < (1.0 - SMOOTH) * spread
-        # a structure that yields moves in the strong part of the motion alone: the rate of its ends is zero
-        rates = [np.polyfit(places[part], parts[part], 1)[0] for part in (slice(third + 1), slice(-third - 1, None))]
-        steady = degree == 1 and min(2.0 * rate / (ends[1] - ends[0]) for rate in rates) > HALF
-        if np.ptp(line(places)) > LEVEL * peak and smooth and (returns or steady):
-            return tuple(ends.tolist())
-    level = parts if returns else np.append(parts, first)
-    large = np.abs(level).min() > LEVEL * peak and (np.sign(level) == np.sign(level[0])).all()
-    known = large and (returns or dimension in ("displacement", "rotation"))
-    return (float(np.median(parts)) if returns else first,) if known else ()
+        if smooth and np.ptp(line(places)) > least:
+            return tuple(line(np.linspace(-1.0, 1.0, degree + 1)).tolist())
+    large = np.abs(parts).min() > least and (np.sign(parts) == np.sign(parts[0])).all()
+    return (float(np.median(parts)),) if large else ()
 
 
 def _correlation(x: np.ndarray) -> float:

@@ -290,6 +290,6 @@ def identifiability(
     if not search.modes:
         raise ValueError(
             f"expected a fit to the data; {search.simulations:.0f} simulations found none: allow more "
-            "(max_simulations), check the fit (check_fit), or give samples"
+            "(max_simulations), check the model (check_model), or give samples"
         )
     return of_mode(posterior, search.modes[0])._replace(simulations=search.simulations)

@@ -58,26 +58,36 @@ class _Pair(NamedTuple):
     dt: float  # step of the reference [s]
     reference: np.ndarray
 
-    def at(self, times: np.ndarray) -> np.ndarray:
-        """The reference at times [s], NaN beyond its ends."""
-        n, end = len(self.reference), (len(self.reference) - 1) * self.dt
-        found = interpolate(self.reference, make_interpolation(self.dt, n, np.clip(times, 0.0, end)))
+    def at(self, times: np.ndarray, history: np.ndarray) -> np.ndarray:
+        """A history of the reference at times [s], NaN beyond its ends."""
+        n, end = len(history), (len(history) - 1) * self.dt
+        found = interpolate(history, make_interpolation(self.dt, n, np.clip(times, 0.0, end)))
         return np.where((times >= -1e-9) & (times <= end + 1e-9), found, np.nan)
 
-    def both(self, *lags: float) -> np.ndarray:
-        """Samples and references of these lags (1 + n_lags, n) where all are known, less their means."""
-        times = self.start + self.step * np.arange(len(self.values))
-        rows = np.stack([self.values, *(self.at(times - lag) for lag in lags)])
+    def fit(self, lag: float) -> tuple[float, float, float, float, float]:
+        """Logarithm of the share of energy that is left, gain, correlation, effective samples, information [1/s²].
+
+        With the derivative s of the shifted reference times its gain, and errors with the spectrum P, the variance of
+        the lag by least squares is ``sum(|S|^2 P) / (n sum(s^2))^2``.
+        """
+        from scipy.ndimage import uniform_filter1d  # slow to import
+
+        times = self.start + self.step * np.arange(len(self.values)) - lag
+        histories = (self.reference, np.gradient(self.reference, self.dt))
+        rows = np.stack([self.values, *(self.at(times, each) for each in histories)])
         rows = rows[:, np.isfinite(rows).all(axis=0)]
-        return rows - rows.mean(axis=1, keepdims=True) if rows.shape[1] > 2 else np.zeros((len(rows), 3))
+        y, r, slope = rows - rows.mean(axis=1, keepdims=True) if rows.shape[1] > 2 else np.zeros((3, 3))
+        gain = float(y @ r) / max(float(r @ r), 1e-300)
+        correlation = float(y @ r) / max(math.sqrt(float(y @ y) * float(r @ r)), 1e-300)
+        errors, slopes = (np.abs(np.fft.fft(each)) ** 2 for each in (y - gain * r, gain * slope))
+        spectrum = uniform_filter1d(errors, max(1, round(_SMOOTH * len(errors))), mode="wrap") + 1e-300
+        information = (gain**2 * len(y) * (slope @ slope)) ** 2 / max(slopes @ spectrum, 1e-300)
+        spectrum /= spectrum.max()
+        worth = float(spectrum.sum() ** 2 / (spectrum @ spectrum))
+        return math.log1p(-min(correlation**2, _NEARLY_ONE)), gain, correlation, worth, float(information)
 
-    def losses(self, *lags: float) -> list[float]:
-        """Logarithms of the share of the samples' energy that the reference of each lag leaves."""
-        y, *references = self.both(*lags)
-        return [math.log1p(-min(_correlation(y, each) ** 2, _NEARLY_ONE)) for each in references]
-
-    def on(self, lags: np.ndarray) -> np.ndarray:
-        """The same on a grid of lags (n_lags,); a channel outside of the reference counts against."""
+    def losses(self, lags: np.ndarray) -> np.ndarray:
+        """The same logarithm on a grid of lags (n_lags,); a channel outside of the reference counts against."""
         from scipy.signal import correlate  # slow to import
 
         every = max(1, math.ceil(self.step / self.dt - 1e-9))
@@ -85,32 +95,11 @@ class _Pair(NamedTuple):
         times = np.arange(int((len(self.reference) - 1) * self.dt / step + 1e-9) + 1) * step
         there, values = np.zeros((2, every * (len(self.values) - 1) + 1))
         there[::every], values[::every] = np.isfinite(self.values), np.nan_to_num(self.values)
-        history = np.nan_to_num(self.at(times))
+        history = np.nan_to_num(self.at(times, self.reference))
         power, product = (correlate(*each, method="fft") for each in ((there, history**2), (values, history)))
         squares = product**2 / ((values @ values) * np.maximum(power, _LEAST * power.max()))
         grid = self.start + step * np.arange(1 - len(times), len(there))
         return np.log1p(-np.interp(lags, grid, np.minimum(squares, _NEARLY_ONE), left=0.0, right=0.0))
-
-    def fit(self, lag: float) -> tuple[float, float, float, float]:
-        """Gain, correlation, effective number of samples, and information about the lag [1/s²].
-
-        With the derivative s of the shifted reference times its gain, and errors with the spectrum P, the variance of
-        the lag by least squares is ``sum(|S|^2 P) / (n sum(s^2))^2``.
-        """
-        from scipy.ndimage import uniform_filter1d  # slow to import
-
-        y, r, ahead, behind = self.both(lag, lag + 0.05 * self.dt, lag - 0.05 * self.dt)
-        gain = float(y @ r) / max(float(r @ r), 1e-300)
-        slope = gain * (ahead - behind) / (0.1 * self.dt)
-        errors, slopes = (np.abs(np.fft.fft(each)) ** 2 for each in (y - gain * r, slope))
-        spectrum = uniform_filter1d(errors, max(1, round(_SMOOTH * len(errors))), mode="wrap") + 1e-300
-        scaled = spectrum / spectrum.max()
-        information = (len(y) * (slope @ slope)) ** 2 / max(slopes @ spectrum, 1e-300)
-        return gain, _correlation(y, r), float(scaled.sum() ** 2 / (scaled @ scaled)), float(information)
-
-
-def _correlation(y: np.ndarray, r: np.ndarray) -> float:
-    return float(y @ r) / max(math.sqrt(float(y @ y) * float(r @ r)), 1e-300)
 
 
 def align(
@@ -161,31 +150,30 @@ def align(
         raise ValueError(f"max_lag must be positive and below {longest:g} s, the longer duration, got {max_lag!r}")
     step = min(each.step / max(1, math.ceil(each.step / each.dt - 1e-9)) for each in pairs)
     lags = step * np.arange(-math.floor(max_lag / step), math.floor(max_lag / step) + 1)
-    score = -sum(each.on(lags) for each in pairs)
+    score = -sum(each.losses(lags) for each in pairs)
     if (best := int(np.argmax(score))) in (0, len(lags) - 1):
         raise ValueError(
             f"the correlation is largest at a lag of {lags[best]:g} s, an end of the range; give a larger max_lag, or "
             "other channels"
         )
     peaks = 1 + np.flatnonzero((score[1:-1] >= score[:-2]) & (score[1:-1] > score[2:]) & (score[1:-1] > 0.0))
-    tops = []  # the peaks of a periodic signal differ on the grid of lags more than at their tops
+    tops = list[tuple[float, list]]()  # the peaks of a periodic signal differ on the grid more than at their tops
     for k in peaks[np.argsort(-score[peaks])][:2]:
         near, options = (lags[k] - step, lags[k] + step), {"xatol": 1e-4 * step}
-        found = minimize_scalar(lambda lag: sum(each.losses(lag)[0] for each in pairs), bounds=near, options=options)
-        tops.append(float(found.x))
+        found = minimize_scalar(lambda lag: sum(each.fit(lag)[0] for each in pairs), bounds=near, options=options)
+        tops.append((float(found.x), [each.fit(float(found.x)) for each in pairs]))
     advantage = math.inf
     if len(tops) > 1:
-        losses = [each.losses(*tops) for each in pairs]
-        advantage = sum(0.5 * each.fit(tops[0])[2] * (b - a) for each, (a, b) in zip(pairs, losses, strict=True))
-    lag, *others = tops if advantage >= 0.0 else tops[::-1]
-    fits = {each.name: each.fit(lag) for each in pairs}
+        advantage = sum(0.5 * a[3] * (b[0] - a[0]) for a, b in zip(tops[0][1], tops[1][1], strict=True))
+    (lag, fits), *others = tops if advantage >= 0.0 else tops[::-1]
+    names = [each.name for each in pairs]
     return Alignment(
         lag,
-        1.0 / math.sqrt(sum(fit[3] for fit in fits.values()) or 1e-300),
-        {name: fit[0] for name, fit in fits.items()},
-        {name: fit[1] for name, fit in fits.items()},
+        1.0 / math.sqrt(sum(fit[4] for fit in fits) or 1e-300),
+        dict(zip(names, (fit[1] for fit in fits), strict=True)),
+        dict(zip(names, (fit[2] for fit in fits), strict=True)),
         1.0 / (1.0 + math.exp(-abs(advantage))),
-        others[0] if others else None,
+        others[0][0] if others else None,
     )
 
 

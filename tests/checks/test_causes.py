@@ -11,12 +11,12 @@ from fe_likelihoods import (
     Measurements,
     Posterior,
     check_data,
-    check_fit,
 )
 from fe_likelihoods.checks.finding import judge, labelled
 from fe_likelihoods.emulation.modes import find_modes
 from fe_likelihoods.problems import table_motion
 from fe_likelihoods.units import UNITS
+from tests.checks.fitted import check_fit
 
 MOTION = table_motion().trim(0.0, 10.0).resample(0.02)
 MODEL = LinearOscillator(MOTION, 0.8)

@@ -19,11 +19,10 @@ from fe_likelihoods import (
     Record,
     TruncatedNormal,
     Uniform,
-    check_fit,
 )
 from fe_likelihoods.problems import table_motion
 from samplers import SMCSampler
-from tests.checks.fitted import fitted
+from tests.checks.fitted import check_fit, fitted
 
 MOTION = table_motion().trim(0.0, 8.0).resample(0.02)
 DECK = {"frequency": Uniform(2.0, 7.0), "damping": Uniform(0.01, 0.3), "share": Uniform(0.2, 1.0)}

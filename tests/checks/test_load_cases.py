@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from fe_likelihoods import Channel, FELikelihood, LogNormal, Posterior, check_fit
+from fe_likelihoods import Channel, FELikelihood, LogNormal, Posterior
 from fe_likelihoods.modal.load_cases import LoadTest
+from tests.checks.fitted import check_fit
 
 SPAN, TRUCK, EI, N = 24.0, 200e3, 2e9, 48  # m, N, N m2, integration points
 AT, CASES = (6.0, 12.0, 18.0), (4.0, 8.0, 13.0, 16.0, 20.0)  # m

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fe_likelihoods import FunctionModes, LogNormal, ModalData, ModalLikelihood, Posterior, ShearFrame, check_fit
+from fe_likelihoods import FunctionModes, LogNormal, ModalData, ModalLikelihood, Posterior, ShearFrame
 from fe_likelihoods.checks.rehearsal import check_model
 from fe_likelihoods.modal.mode_models import StructureModes
-from tests.checks.fitted import fitted
+from tests.checks.fitted import check_fit, fitted
 
 FLOORS = {f"floor {i}": i for i in (1, 2, 3, 4)}
 FRAME = ShearFrame(FLOORS, [20e3] * 4, [30e6] * 4)

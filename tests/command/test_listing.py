@@ -199,15 +199,15 @@ def test_the_lines_for_faults_of_sensors_work(tmp_path):
     right = [np.sin(19.0 * times) * times * np.exp(-0.3 * times) + 0.01 * rng.standard_normal(2000) for _ in range(2)]
     stuck, drifting = right[0].copy(), right[1] + 0.1 + 0.03 * times
     stuck[400:450], stuck[700] = stuck[400], 3.0
-    rows = zip(times, motion, stuck, drifting, strict=True)
+    rows = zip(times, motion, drifting, stuck, strict=True)
     path, job = tmp_path / "log.csv", tmp_path / "job.toml"
     path.write_text(
         "time_s,base_m_s2,top_g,top_mm\n" + "".join(f"{t:.2f},{b:.5f},{a:.5f},{u:.5f}\n" for t, b, a, u in rows)
     )
     output, lines = listed(path)
-    assert "CAUTION: A sensor was stuck: top_g stands still at 4.000 to 4.490 s" in output
-    assert "CAUTION: A channel has spikes: top_g has spikes of one to three samples at 7.000 s" in output
-    assert "CAUTION: A channel drifts: top_mm" in output and output.count("CAUTION") == 3
+    assert "CAUTION: A sensor was stuck: top_mm stands still at 4.000 to 4.490 s" in output
+    assert "CAUTION: A channel has spikes: top_mm has spikes of one to three samples at 7.000 s" in output
+    assert "CAUTION: A channel drifts: top_g" in output and output.count("CAUTION") == 3
     head = (
         f'[model]\nkind = "oscillator"\nperiod = "0.4 s"\n[record]\nfile = "{path}"\ncolumn = "base_m_s2"\n[priors]\n'
     )
@@ -217,14 +217,14 @@ def test_the_lines_for_faults_of_sensors_work(tmp_path):
         .replace("top_g =", "acceleration =")
         .replace("top_mm =", "displacement =")
     )
-    named = named.replace('["top_g"', '["acceleration"').replace('base_m_s2 = "base_m_s2", ', "")
+    named = named.replace('["top_mm"', '["displacement"').replace('base_m_s2 = "base_m_s2", ', "")
     job.write_text(head + named)
     measured = make_problem(read_job(job)).posterior.likelihood.measurements
-    assert np.flatnonzero(np.isnan(measured.values[0])).tolist() == [*range(400, 450), 700]
-    np.testing.assert_allclose(measured.values[1], 1e-3 * right[1], atol=4e-5)
+    assert np.flatnonzero(np.isnan(measured.values[1])).tolist() == [*range(400, 450), 700]
+    np.testing.assert_allclose(measured.values[0], 9.80665 * right[1], atol=0.4)
     assert check_data(measured) == ()
     for old, new, message in (
-        ('[["acceleration"', '[["top"', "missing: no channel 'top'"),
+        ('[["displacement"', '[["top"', "missing: no channel 'top'"),
         ("[0.000, ", "[", "baseline: expected a table of points of time and value"),
     ):
         job.write_text(head + named.replace(old, new))

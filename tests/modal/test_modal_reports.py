@@ -15,13 +15,13 @@ from fe_likelihoods import (
     ModalLikelihood,
     Posterior,
     ShearFrame,
-    check_fit,
     check_result,
     propagate,
     report,
 )
 from fe_likelihoods.modal.load_cases import LoadTest
 from fe_likelihoods.modal.mode_models import StructureModes
+from tests.checks.fitted import check_fit
 from tests.emulation.problems import guided
 
 FLOORS = {"floor 1": 1, "roof": 2}

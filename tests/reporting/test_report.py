@@ -158,10 +158,9 @@ def test_the_fit_is_that_of_the_posterior_mean_and_its_simulations_are_counted(v
     assert fit_data_sets(read_run(sampler, posterior)).simulations == 0
 
 
-def test_many_failed_simulations_limit_a_result(vibrating):
-    finished = read_run(*vibrating)
+def test_many_failed_simulations_limit_a_result():
     for count, severity in ((0, []), (4, ["note"]), (30, ["care"])):
-        named = check_failures(finished, Failures((), count, 100))
+        named = check_failures(Failures((), count, 100))
         assert [each.severity for each in named] == severity
         assert all(f"{count} of 100 simulations failed ({count} %)" in each.text for each in named)
 
