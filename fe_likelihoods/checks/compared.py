@@ -174,7 +174,9 @@ def compare(
     except (ChangedModel, StaleCache) as error:  # concerns the next sampling, not this result
         logger.warning("the fit is compared with no draws of the prior: %s", error)
     noise = sampled_noise(likelihood.noise)
-    by_channel = {"assumed": getattr(noise, "effective_samples", None)}
+    by_channel, assumed = dict[str, np.ndarray](), getattr(noise, "effective_samples", None)
+    if assumed is not None:
+        by_channel["assumed"] = np.broadcast_to(assumed, measured.n_channels)
 
     def at(theta: np.ndarray) -> np.ndarray:
         values = dict(zip(likelihood.parameter_names, theta, strict=True))
@@ -188,7 +190,7 @@ def compare(
         by_channel["deviations"] = noise.standard_deviations(at(np.median(draws, axis=0))[None])[0][:, None]
     fits, stated = [], not noise.parameter_names
     for title, part, rows, inside in _events(likelihood, key):
-        cut = {name: each[rows] for name, each in by_channel.items() if each is not None}
+        cut = {name: each[rows] for name, each in by_channel.items()}
         for name, each in found.items():
             cut[name] = np.where(inside, each, np.nan)[..., rows, :][..., inside[rows].any(axis=0)]
         fits.append(Fit(title, part, stated=stated, failed="; ".join(failed), **cut))

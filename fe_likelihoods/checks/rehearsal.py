@@ -5,7 +5,6 @@ from time import perf_counter
 from typing import Any, NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
 from ..likelihood.posterior import Posterior
 from ..simulation.model import SimulationBatch, simulate_batch
@@ -28,7 +27,7 @@ class ModelCheck(NamedTuple):
     fits: tuple[Fit, ...]  # measurements beside the draws of the prior that were simulated
 
 
-def check_model(posterior: Posterior, *, progress: bool = False) -> ModelCheck:
+def check_model(posterior: Posterior) -> ModelCheck:
     """Try the model and the data of a posterior before a run.
 
     It simulates the mean of the prior twice, under twice the motion, and up to 100 draws of the prior (fewer if a
@@ -40,8 +39,6 @@ def check_model(posterior: Posterior, *, progress: bool = False) -> ModelCheck:
     Parameters
     ----------
     posterior : Posterior
-    progress : bool
-        Whether to show a progress bar.
 
     Returns
     -------
@@ -61,40 +58,34 @@ def check_model(posterior: Posterior, *, progress: bool = False) -> ModelCheck:
     """
     mean, found, fits, seconds, before = posterior.prior.mean(), list[Finding](), list[Fit](), 0.0, _made(posterior)
     made = 0
-    with tqdm(disable=not progress, unit="simulation", desc="check") as bar:
-        posterior.when_simulated(bar.update)
 
-        def simulate(model: Any, points: np.ndarray, pool: Any = None) -> SimulationBatch:
-            nonlocal made
-            made += len(points)
-            bar.update(len(points))
-            return simulate_batch(model, points, pool)
+    def simulate(model: Any, points: np.ndarray, pool: Any = None) -> SimulationBatch:
+        nonlocal made
+        made += len(points)
+        return simulate_batch(model, points, pool)
 
-        try:
-            for key, likelihood, columns in data_sets_of(posterior):
-                model, pool = likelihood.model, likelihood.simulator.pool
-                theta = mean[columns][: len(model.parameter_names)]
-                batch = likelihood.simulate(theta[None])
-                if batch.reasons[0]:
-                    raise ValueError(
-                        f"the simulation at the mean of the prior has failed: {batch.reasons[0]}; check model, priors"
-                    )
-                for _ in range(2):  # a first simulation may start a process, which would leave time for few draws
-                    start = perf_counter()
-                    again = simulate(model, theta[None])
-                    if not SECONDS / MOST_DRAWS < (took := perf_counter() - start) < SECONDS:
-                        break
-                seconds += took
-                at_once = 1 if pool is None else pool.n_workers or 1
-                fits += compare(likelihood, draws_to_compare(posterior, took / at_once)[:, columns], key)
-                # generators of workers have moved on meanwhile
-                response, later = batch.response[0], simulate(model, np.tile(theta, (2, 1)), pool)
-                chance = check_chance(response, again) or check_chance(response, later)
-                # where responses differ by chance, other differences say nothing
-                found += chance or check_stronger_motion(model, theta, response, simulate)
-                found += check_supports(model) + list(check_data(likelihood.measurements, motions_to_replace(model)))
-        finally:
-            posterior.when_simulated(None)
+    for key, likelihood, columns in data_sets_of(posterior):
+        model, pool = likelihood.model, likelihood.simulator.pool
+        theta = mean[columns][: len(model.parameter_names)]
+        batch = likelihood.simulate(theta[None])
+        if batch.reasons[0]:
+            raise ValueError(
+                f"the simulation at the mean of the prior has failed: {batch.reasons[0]}; check model, priors"
+            )
+        for _ in range(2):  # a first simulation may start a process, which would leave time for few draws
+            start = perf_counter()
+            again = simulate(model, theta[None])
+            if not SECONDS / MOST_DRAWS < (took := perf_counter() - start) < SECONDS:
+                break
+        seconds += took
+        at_once = 1 if pool is None else pool.n_workers or 1
+        fits += compare(likelihood, draws_to_compare(posterior, took / at_once)[:, columns], key)
+        # generators of workers have moved on meanwhile
+        response, later = batch.response[0], simulate(model, np.tile(theta, (2, 1)), pool)
+        chance = check_chance(response, again) or check_chance(response, later)
+        # where responses differ by chance, other differences say nothing
+        found += chance or check_stronger_motion(model, theta, response, simulate)
+        found += check_supports(model) + list(check_data(likelihood.measurements, motions_to_replace(model)))
     found += check_responses(fits)
     report = posterior.report()
     for reason, count in Counter(report["failure_reasons"]).most_common(1):

@@ -252,11 +252,6 @@ class Failures(NamedTuple):
     attempts: int
     unknown: str = ""  # what is not known about them
 
-    @property
-    def sentence(self) -> str:
-        """The sentence for a report without a table of failures."""
-        return self.unknown or "No simulation failed."
-
 
 def failures(run: FinishedRun) -> Failures:
     """Failed simulations by reason, counted in likelihoods, also of first parts of the record, or in the sampler."""

@@ -20,7 +20,7 @@ from .runs import default_folder, make_sampler
 __all__ = ["check_job"]
 
 
-def check_job(file: Path, picture: Path, say: Callable[[str], None], progress: bool = False) -> None:
+def check_job(file: Path, picture: Path, say: Callable[[str], None]) -> None:
     """Check a TOML file and its data, `say` line by line what a run will do, and draw the prior predictive picture.
 
     ValueError if anything in the file is wrong, or the simulation at the mean of the prior fails.
@@ -29,7 +29,7 @@ def check_job(file: Path, picture: Path, say: Callable[[str], None], progress: b
     problem = make_problem(job)
     job.located("sampler", make_sampler, job, problem)
     _say_data(problem, say)
-    checked = check_model(problem.posterior, progress=progress)
+    checked = check_model(problem.posterior)
     _say_simulation(problem, checked, say)
     if (most := job.budget.max_simulations) is not None:
         say(f"The run stops at {most} simulations (max_simulations)")

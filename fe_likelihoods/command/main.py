@@ -102,17 +102,16 @@ def _show(outcome: Any) -> None:
 
 @main.command()
 @click.argument("file", type=_FILE)
-@click.option("--quiet", is_flag=True, help="Show no progress bars.")
-def check(file: Path, quiet: bool) -> None:
+def check(file: Path) -> None:
     """Read FILE and its data, test with about 100 simulations, and say what was found.
 
     It tries whether the model is repeatable and follows its motion, and whether units, signs, clocks and channels are
-    right. The picture check-NAME.png compares the measurements
-    with simulations at draws of the prior: the measurements should lie within their band.
+    right. The picture check-NAME.png compares the measurements with simulations at draws of the prior: the
+    measurements should lie within their band.
     """
     from .checking import check_job
 
-    check_job(file, Path(f"check-{file.stem}.png"), click.echo, progress=not quiet)
+    check_job(file, Path(f"check-{file.stem}.png"), click.echo)
 
 
 @main.command()

@@ -103,14 +103,14 @@ def test_failures_that_are_not_counted_are_not_known(tmp_path):
     sampler = run(posterior)
     assert failures(read_run(sampler, posterior)).count > 0
     elsewhere = failures(read_run(sampler, posterior_of([1.0, 0.8])))
-    assert elsewhere.count == 0 and elsewhere.sentence.startswith("Not known")
+    assert elsewhere.count == 0 and elsewhere.unknown.startswith("Not known")
     target = Gaussian(ndim=2)
     chain = emcee.EnsembleSampler(20, 2, target, vectorize=True)
     chain.run_mcmc(0.7 + 0.1 * np.random.default_rng(3).standard_normal((20, 2)), 30)
     page = read_page(report(chain, out=tmp_path / "plain.html"))
     assert "Not known: neither the sampler nor the log-density counts failures" in page.text
     assert "No simulation failed" not in page.text
-    assert "-inf" in failures(read_run(run(target), target)).sentence
+    assert "-inf" in failures(read_run(run(target), target)).unknown
 
 
 @pytest.mark.parametrize("what", ["model", "models", "function"])

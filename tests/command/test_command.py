@@ -235,11 +235,11 @@ def test_a_motion_that_is_not_read_and_chance_are_told_by_check(tmp_path, monkey
     monkeypatch.chdir(tmp_path)
     fixed = "    motion = (0.1 * record.acceleration / abs(record.acceleration).max()).tolist()"
     write_function(tmp_path, "unread", "    motion = record.acceleration.tolist()", fixed)
-    output = call("check", "unread.toml", "--quiet")
+    output = call("check", "unread.toml")
     assert re.search("CAUTION.*: The motion changes nothing: The response to twice the motion equals", output)
     chance = "    return response * (1.0 + 1e-4 * np.random.default_rng().standard_normal())"
     write_function(tmp_path, "chance", "    return response", chance)
-    assert re.search("CAUTION.*: The model is not repeatable", call("check", "chance.toml", "--quiet"))
+    assert re.search("CAUTION.*: The model is not repeatable", call("check", "chance.toml"))
     assert "The model is not repeatable" in call("run", "chance.toml", "--quiet", code=1)
 
 

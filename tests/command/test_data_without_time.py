@@ -54,7 +54,7 @@ def changed(folder, kind, *changes):
 def test_from_a_table_of_modes_to_a_report(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     call("new", "modal", "a")
-    said = call("check", "a/modal.toml", "--quiet")
+    said = call("check", "a/modal.toml")
     assert "mode  measured [Hz]  computed [Hz]" in said
     assert "CAUTION" not in said and (tmp_path / "check-modal.png").stat().st_size > 10_000
     said = call("run", "a/modal.toml", "--quiet")
@@ -67,7 +67,7 @@ def test_from_a_table_of_modes_to_a_report(tmp_path, monkeypatch):
 def test_from_a_load_test_to_a_report(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     path = changed(tmp_path, "load-test")
-    said = call("check", str(path), "--quiet")
+    said = call("check", str(path))
     assert "midspan    mm        3 " in said and "CAUTION" not in said
     outcome = run_job(path, progress=False)
     samples = outcome.sampler.get_chain(flat=True)[:, 0]

@@ -98,7 +98,7 @@ def test_three_data_sets_are_one_posterior(settings_of):
 
 @pytest.mark.slow
 def test_a_check_and_a_run_have_one_report(settings_of, tmp_path):
-    said = call("check", "frame.toml", "--quiet")
+    said = call("check", "frame.toml")
     assert "mode  measured [Hz]" in said and " 300 " in said
     assert all((tmp_path / f"check-frame-{name}.png").exists() for name in ("measurements", "modes", "load_test"))
     outcome = run_job(settings_of(), progress=False)
