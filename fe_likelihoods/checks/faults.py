@@ -124,8 +124,8 @@ def _named(names: Sequence[str], gain: float, lag: float, step: float, *more: An
     """A sign, a factor, and a lag of more than a step, which is a convention of files; `more` are fields of `Fault`."""
     found = [Fault("sign", tuple(names), math.nan, *more)] if gain < 0.0 else []
     large = abs(math.log(max(abs(gain), 1e-300))) > math.log(FACTOR)
-    found += [Fault("factor", tuple(names), abs(gain), *more)] if large else []
-    return found + ([Fault("lag", tuple(names), lag, *more)] if abs(lag) > 1.5 * step else [])
+    found += [Fault("factor", tuple(names), float(abs(gain)), *more)] if large else []
+    return found + ([Fault("lag", tuple(names), float(lag), *more)] if abs(lag) > 1.5 * step else [])
 
 
 def _log_errors(y: np.ndarray, r: np.ndarray) -> np.ndarray:

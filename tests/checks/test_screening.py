@@ -27,7 +27,7 @@ def test_plausible_data_are_left_alone():
 
 def test_data_without_time_are_not_screened_for_faults_of_sensors():
     values = np.full((2, 500), np.nan)
-    values[0], values[1] = VALUES[0] + 10.0, VALUES[1]
+    values[0], values[1] = VALUES[0], VALUES[1] + 10.0
     assert len(screen(Measurements([TOP, DECK], 0.02, values))) == 1
     assert screen(Measurements([TOP, DECK], 0.02, values, axis="position")) == []
 

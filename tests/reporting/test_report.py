@@ -231,7 +231,7 @@ def test_what_does_not_fit_is_refused_before_anything_is_written(vibrating, tmp_
     for arguments, options, message in (
         ((posterior, sampler), {}, "needs a sampler that has run"),
         ((SMCSampler(20, 3, posterior), posterior), {}, "call run_mcmc|Call run_mcmc"),
-        ((sampler, posterior), {"truth": {"mass": 1.0}}, "unknown parameters mass"),
+        ((sampler, posterior), {"truth": {"mass": 1.0}}, "truth must have values of parameters"),
         ((sampler, Gaussian(ndim=2)), {}, "the chain has 3 parameters"),
         ((sampler, posterior, "bands"), {}, "result of propagate"),
     ):
