@@ -256,10 +256,11 @@ def parse_prior(text: str, dimension: str | None = None) -> Distribution:
     try:
         found = [_parse(argument, dimension) for argument in match[2].split(",") if argument.strip()]
         numbers = [number for number, _ in found]
-        if name == "log-normal" and found[-1][1]:
+        if name == "log-normal" and any(unit for _, unit in found[1:]):
             raise ValueError("a logarithm has no unit")
-        if name == "normal" and len(numbers) == 2 and numbers[0] <= 0.0:
-            raise ValueError("a mean of zero or less needs bounds")
+        if name == "normal" and (len(numbers) == 3 or (len(numbers) == 2 and numbers[0] <= 0.0)):
+            raise ValueError("give both bounds")
         return make(*numbers)
-    except (ValueError, TypeError) as error:  # also of another number of arguments
-        raise ValueError(f"expected {form}; got {text!r}: {error}") from None
+    except (ValueError, TypeError) as error:
+        why = f": {error}" if isinstance(error, ValueError) else ""  # else another number of arguments
+        raise ValueError(f"expected {form}; got {text!r}{why}") from None

@@ -365,7 +365,7 @@ def load_function(job: Job, text: str) -> Callable:
         module = importlib.import_module(path.stem)
     except Exception as error:
         raise ValueError(f"{where} {path.name} cannot be imported: {type(error).__name__}: {error}") from error
-    if Path(module.__file__ or "").resolve() != path:
+    if Path(getattr(module, "__file__", None) or "").resolve() != path:
         raise ValueError(f"{where} {path.name} cannot be imported by its name; rename it, for example to my_model.py")
     function = vars(module).get(name)
     if not callable(function):

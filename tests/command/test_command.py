@@ -471,6 +471,9 @@ def test_quantities_and_priors_as_text():
     assert parse_prior("normal(1, 0.5, 0.2, inf)").bounds == (0.2, float("inf"))
     wrong = (
         "uniform(1)",
+        "uniform(0, 1, 2)",
+        "log-normal()",
+        "normal(1, 0.3, 0)",
         "normal",
         "gamma(1, 2)",
         "normal(1, a)",
