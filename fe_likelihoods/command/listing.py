@@ -123,10 +123,7 @@ def _screened(measured: Measurements | None, marks: Sequence[Any] = (), unstated
         return [], []
     faults = [each._replace(unit="") if each.name in unstated else each for each in screen(measured)]
     cautions = [f"CAUTION: {each.kind}: {each.text}" for each in check_sensors(faults)]
-    repairs = repair_lines(faults, marks)
-    if marks and not any(each.startswith("missing") for each in repairs):
-        repairs.append(f"missing = {_toml(marks)}")
-    return [*describe(measured, unstated), *cautions], repairs
+    return [*describe(measured, unstated), *cautions], repair_lines(faults, marks)
 
 
 def _motions(path: Path, form: str) -> _Lines:
