@@ -30,7 +30,6 @@ from fe_likelihoods import (
     problems,
     stiffness_loss,
 )
-from fe_likelihoods.emulation.modes import find_modes
 
 plt.style.use("fe_likelihoods.plots.tutorials")
 
@@ -70,7 +69,7 @@ def measure(name: str) -> Measurements:
 # ------------
 #
 # The parameters are one stiffness factor per storey and one damping ratio for all modes. Errors of a wrong model are
-# correlated in time; under white noise the posterior would be much too narrow. `find_modes` searches the mode and
+# correlated in time; under white noise the posterior would be much too narrow. `Posterior.mode` searches the mode and
 # returns its Laplace approximation, from which `StoredPosterior.from_search` draws, with findings where something
 # speaks against it.
 
@@ -83,7 +82,7 @@ for name, record in records.items():
     for channel, level in zip(model.channels, data.values.std(axis=1).tolist(), strict=True):
         prior |= {f"sigma_{channel.name}": HalfNormal(level), f"rho_{channel.name}": Uniform(0.0, 0.999)}
     posterior = Posterior(FELikelihood(model, data, AutoregressiveNoise(model.channels)), prior)
-    search = find_modes(posterior, starts=4, seed=1)
+    search = posterior.mode(starts=4, seed=1)
     calibrated[name] = StoredPosterior.from_search(search, posterior)
     findings = "; ".join(map(str, calibrated[name].findings)) or "none"
     print(f"{name}: {search.simulations:.0f} simulations; findings: {findings}")

@@ -57,9 +57,7 @@ class Archive:
 
     def __init__(self, statistic: Callable[[np.ndarray], np.ndarray], shape: tuple[int, int]) -> None:
         self._statistic, self._shape = statistic, shape
-        self._numbers: list[int] = []
-        self._coords: list[np.ndarray] = []
-        self._statistics: list[np.ndarray] = []
+        self.numbers, self.coords, self.statistics = np.empty(0, int), np.empty((0, 0)), np.empty((0, 0))
         self._forms: list[np.ndarray] = []  # (i + 1, n_numbers) of history i with those up to itself
         self._open(b"")
 
@@ -79,27 +77,12 @@ class Archive:
     def __len__(self) -> int:
         return len(self._forms)
 
-    @property
-    def numbers(self) -> np.ndarray:
-        """Numbers (m,) of the runs among all histories."""
-        return np.array(self._numbers, dtype=int)
-
-    @property
-    def coords(self) -> np.ndarray:
-        """Structural coordinates (m, n_structural) of the runs."""
-        return np.array(self._coords)
-
-    @property
-    def statistics(self) -> np.ndarray:
-        """Statistics (m, n_numbers) of the residuals of the runs."""
-        return np.array(self._statistics)
-
     def add(self, coords: np.ndarray, residuals: np.ndarray, statistics: np.ndarray) -> np.ndarray:
         """Add runs at coordinates (m, n_structural); returns their numbers (m,)."""
         numbers = self.add_histories(residuals)
-        self._numbers += list(numbers)
-        self._coords += list(coords)
-        self._statistics += list(statistics)
+        both = (self.coords, coords), (self.statistics, statistics)
+        self.coords, self.statistics = (np.concatenate(each[not len(self.numbers) :]) for each in both)
+        self.numbers = np.append(self.numbers, numbers)
         return numbers
 
     def add_histories(self, histories: np.ndarray) -> np.ndarray:

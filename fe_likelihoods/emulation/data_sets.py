@@ -30,21 +30,9 @@ class _DataSet(NamedTuple):
     likelihood: Any
     structural: list[int]  # places of its parameters among all structural parameters
     noise: list[int]  # places of its parameters among all noise parameters
-    channels: slice  # its rows among all channels
-    samples: slice
+    rows: tuple[slice, slice]  # its channels and samples among all
     numbers: slice  # its rows among all statistics
     statistic: Callable[[np.ndarray], np.ndarray]  # of its residuals
-
-    def residuals(self, responses: np.ndarray) -> np.ndarray:
-        """Measured minus simulated responses (n, n_channels, n_samples); zero where a sample is missing."""
-        measured = self.likelihood.measured
-        if not isinstance(measured, Comparison):
-            return measured - responses
-        residuals = np.full((len(responses), *measured.values.shape), np.nan)
-        for row, response in zip(residuals, responses, strict=True):
-            if np.isfinite(response).all():
-                row[:] = -measured.known_residuals(response)
-        return residuals
 
     def slopes(self, thetas: np.ndarray) -> np.ndarray:
         """Derivatives (n, d, n_channels, n_samples) of the residuals by the parameters, by the model's ``jacobian``."""
@@ -70,35 +58,31 @@ class DataSets:
         self._parts: list[_DataSet] = []
         channels = numbers = 0
         for part, columns in likelihood.parts():
-            statistic, values = _statistic_of(part), measured_values(part.measured)
+            statistic, values, own = _statistic_of(part), measured_values(part.measured), part.simulator.n_structural
             check_quadratic(statistic, values)
-            own, width = part.simulator.n_structural, part.simulator.n_numbers
             places = list(columns[:own]), [place - n_structural for place in columns[own:]]
-            rows, sums = slice(channels, channels + len(values)), slice(numbers, numbers + width)
-            self._parts.append(_DataSet(part, *places, rows, slice(values.shape[1]), sums, statistic))
-            channels, numbers = rows.stop, sums.stop
-        self.measured = np.zeros((channels, max(part.samples.stop for part in self._parts)))
+            rows = slice(channels, channels + len(values)), slice(values.shape[1])
+            sums = slice(numbers, numbers + part.simulator.n_numbers)
+            self._parts.append(_DataSet(part, *places, rows, sums, statistic))
+            channels, numbers = rows[0].stop, sums.stop
+        self.measured = np.zeros((channels, max(part.rows[1].stop for part in self._parts)))
         for part in self._parts:
-            self.measured[part.channels, part.samples] = measured_values(part.likelihood.measured)
+            self.measured[part.rows] = measured_values(part.likelihood.measured)
         # white noise keeps its fast way: zeros add nothing to a sum of squares
         white = all(part.statistic is sums_of_squares for part in self._parts)
         self.statistic = sums_of_squares if white else self._statistic
         models = [part.likelihood.model for part in self._parts]
         self.differentiable = all(map(has_jacobian, models))
         self.kinds = " or ".join(dict.fromkeys(type(model).__name__ for model in models))
-        gaps = [part.likelihood for part in self._parts if isinstance(part.likelihood.measured, Comparison)]
         self.identity = json.dumps(
-            [
-                [[part.likelihood.model.fingerprint, part.structural] for part in self._parts],
-                [each.measurements.fingerprint for each in gaps],
-            ]
+            [[each.model.fingerprint, each.measurements.fingerprint, at] for each, at, *_ in self._parts]
         )
         pools = [part.likelihood.simulator.pool for part in self._parts]
         workers = [1 if pool is None else getattr(pool, "n_workers", None) or _MANY for pool in pools]
         self.together = max(*workers, *map(most_responses, models))
 
     def _statistic(self, residuals: np.ndarray) -> np.ndarray:
-        return np.concatenate([part.statistic(residuals[part.channels, part.samples]) for part in self._parts])
+        return np.concatenate([part.statistic(residuals[part.rows]) for part in self._parts])
 
     def log_likelihood(self, statistics: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         """Log-likelihood (n,) of statistics (n, n_numbers) at noise parameters (n, n_noise)."""
@@ -120,22 +104,22 @@ class DataSets:
         statistics = np.full((len(thetas), self._parts[-1].numbers.stop), np.nan)
         left = np.arange(len(thetas))
         for part in self._parts:
-            residuals[:, part.channels, part.samples] = np.nan
-            if len(left) > 0:
-                own = thetas[np.ix_(left, part.structural)]
-                statistics[left, part.numbers], batch = part.likelihood.run(own)
-                with np.errstate(over="ignore"):
-                    residuals[left, part.channels, part.samples] = part.residuals(batch.response)
-                for row, reason in zip(left, batch.reasons, strict=True):
-                    reasons[row] = reason
-                left = left[[not reason for reason in batch.reasons]]
+            residuals[:, *part.rows] = np.nan
+            own = thetas[np.ix_(left, part.structural)]
+            statistics[left, part.numbers], batch = part.likelihood.run(own)
+            for row, response, reason in zip(left, *batch, strict=True):
+                reasons[row] = reason
+                if not reason:
+                    with np.errstate(over="ignore"):
+                        residuals[row, *part.rows] = np.nan_to_num(part.likelihood.residuals_of(response))
+            left = left[[not reason for reason in batch.reasons]]
         return [residuals, statistics, np.frombuffer(json.dumps(reasons).encode(), dtype=np.uint8)]
 
     def derivatives(self, thetas: np.ndarray) -> list[np.ndarray]:
         """Derivatives (n, n_structural, n_channels, n_samples) of the residuals, in single precision as these."""
         found = np.zeros((*thetas.shape, *self.measured.shape), np.float32)
         for part in self._parts:
-            found[:, part.structural, part.channels, part.samples] = part.slopes(thetas)
+            found[:, part.structural, *part.rows] = part.slopes(thetas)
         return [found]
 
     def recall(self, thetas: np.ndarray, statistics: np.ndarray, reasons: Sequence[str]) -> None:

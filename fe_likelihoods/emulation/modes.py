@@ -206,14 +206,15 @@ class Search:
             half = (starts + 1) // 2
             enough = starts if not search.grown else half if begin == 0 else 0
             missing = max(enough - search.ended, half if search.unseen_share > DOUBTED_SHARE else 0)
-            if not finished or missing <= 0 or following == len(self._starts) or not self._allowed():
+            if not finished or missing <= 0 or following == len(self._starts):
+                return search
+            # a search is worth nothing without draws after it
+            (allowed,) = self._session.remember(
+                "starts", lambda: [np.array(self._session.remaining() > 2 * self.spent)]
+            )
+            if not allowed:
                 return search
             begin, following = following, min(following + missing, len(self._starts))
-
-    def _allowed(self) -> bool:
-        """Whether further starts may begin: a search is worth nothing without draws after it."""
-        affordable = self._session.remember("starts", lambda: [np.array(self._session.remaining() > 2.0 * self.spent)])
-        return bool(affordable[0])
 
     def _pay(self, simulations: float) -> None:
         """Count simulations that are made next, if they fit."""
@@ -331,43 +332,7 @@ def find_modes(
     max_simulations: float | None = None,
     tolerance: float = TOLERANCE,
 ) -> ModeSearch:
-    """Find the modes of a posterior from the responses of its model.
-
-    Parameters
-    ----------
-    posterior : Posterior
-        Any noise whose statistics are quadratic in the residuals, as all noises of this package are.
-    starts : int
-        Number of starts that shall lead to a mode: the median of the prior, and a Latin hypercube of its quantiles. At
-        most twice as many begin.
-    seed : int, optional
-        Seed of the draws.
-    max_simulations : float, optional
-        Largest number of simulations; parts of a record count as fractions.
-    tolerance : float
-        Log-density that an ascent may leave to gain: the default is enough for draws around the modes.
-
-    Returns
-    -------
-    ModeSearch
-
-    Raises
-    ------
-    ValueError
-        If `starts` is not a whole number of at least one, or the noise is of another kind.
-
-    Notes
-    -----
-    A mode that no start leads to is not found. The more starts, the better: a mode to which a third of the starts
-    lead is missed by six starts in 9 of 100 cases, and by twelve in fewer than one.
-
-    Examples
-    --------
-    >>> from fe_likelihoods.emulation.modes import find_modes
-    >>> found = find_modes(posterior, seed=1)
-    >>> len(found.modes)
-    1
-    """
+    """The modes of a posterior, see `Posterior.mode`; ascents leave less than a `tolerance` of log-density to gain."""
     starts = check_starts(starts)
     target = ResponseTarget(posterior)
     limit = np.inf if max_simulations is None else float(max_simulations)

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..signals.comparison import Comparison
 from ..signals.durations import growing_durations
 from .archive import Archive
 from .data_sets import DataSets
@@ -96,23 +97,18 @@ class ResponseTarget:
 
         The shares are of the Arias intensity, at which the parts end.
         """
-        likelihood = self.posterior.likelihood
-        if not hasattr(getattr(likelihood, "model", None), "first"):
+        likelihood, parts = self.posterior.likelihood, []
+        if not hasattr(getattr(likelihood, "model", None), "first") or not likelihood.measurements.simultaneous:
             return []
-        measurements, missing = likelihood.measurements, getattr(likelihood.measured, "missing", None)
         # differences, because a residual displacement is not motion
-        steps = np.diff(self.data.measured, axis=1)
-        if missing is not None:
-            if not measurements.simultaneous:
-                return []
-            steps[missing[:, 1:] | missing[:, :-1]] = 0.0
-        parts = []
+        measurements = likelihood.measurements
+        steps = np.nan_to_num(np.diff(measurements.values, axis=1))
         for seconds in growing_durations(steps, measurements.dt, shares)[:-1] if steps.any() else ():
             try:
                 part = likelihood.first(measurements.start + seconds)
                 parts.append(ResponseTarget(type(self.posterior)(part, self._prior)))
             except ValueError:
-                if missing is None:
+                if not isinstance(likelihood.measured, Comparison):
                     raise  # else a channel has no sample in this part
         for part in parts:
             part.unchecked = self.unchecked
@@ -126,15 +122,13 @@ class ResponseTarget:
 
     def structural_parameters(self, coords: np.ndarray) -> np.ndarray:
         """Structural parameters (n, n_structural) at coordinates (n, n_structural)."""
-        full = np.zeros((len(coords), self.ndim))
-        full[:, : self.n_structural] = coords
-        return self._prior.from_normal(full)[:, : self.n_structural]
+        return self.parameters(np.pad(coords, ((0, 0), (0, self.n_noise))))[:, : self.n_structural]
 
     def _noise_parameters(self, coords: np.ndarray) -> np.ndarray:
         """Noise parameters (n, n_noise) at coordinates (n, n_noise)."""
-        full = np.zeros((len(coords), self.ndim))
-        full[:, self.n_structural :] = coords
-        return self._prior.from_normal(full)[:, self.n_structural :] if self.n_noise else coords
+        if not self.n_noise:
+            return coords
+        return self.parameters(np.pad(coords, ((0, 0), (self.n_structural, 0))))[:, self.n_structural :]
 
     def coordinates(self, parameters: np.ndarray) -> np.ndarray:
         """Coordinates (n, ndim) of parameters (n, ndim), finite also where these were rounded to a bound."""

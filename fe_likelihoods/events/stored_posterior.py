@@ -138,7 +138,7 @@ class StoredPosterior:
         Parameters
         ----------
         search : ModeSearch
-            Result of `fe_likelihoods.emulation.modes.find_modes`. What it says against one mode is a finding.
+            Result of `Posterior.mode`. What it says against one mode is a finding.
         posterior : Posterior
             The posterior that was searched.
         n, seed : int

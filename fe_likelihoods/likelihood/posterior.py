@@ -375,7 +375,9 @@ class Posterior:
         Notes
         -----
         Density and Laplace approximation are those of standard normal coordinates of the prior, in which it has no
-        bounds. On a posterior that is curved or cut by a bound they are rough: sample with a guide.
+        bounds. On a posterior that is curved or cut by a bound they are rough: sample with a guide. A mode that no
+        start leads to is not found: one to which a third of the starts lead is missed by six starts in 9 of 100 cases,
+        and by twelve in fewer than one.
 
         Examples
         --------
