@@ -26,7 +26,6 @@ _FLATTEST = 0.2  # smallest curvature of the Laplace approximation: five times t
 _APART = 0.25  # prior standard deviations in one coordinate that part ends on a part of the record
 _FEW = 6  # parameters whose differences cost about as much as two steps
 _MOST_STARTS, _DRAWN = 2, 4  # times the number asked for: that begin, and of which the highest begin
-_HOPELESS = 1.6  # log-density per measured number below the best end of a part: residuals five times as large
 _STEP = 1e-4  # of the derivatives of parameters by coordinates
 _SHARES = 0.03, 0.1, 0.3, 0.6  # of the Arias intensity, at which the parts of the record end
 
@@ -254,15 +253,12 @@ class Search:
                     least = self._tolerance if whole else min(TOLERANCE / part.share, _LOOSEST)
                     ascents[k] = climb.run(start, steps, least)
                 yield from self._side_by_side(part, ascents)
-            # a model that is not exact may fit a part of the record best where it does not fit the whole one
-            heights = {k: end.value for k, end in part.ends.items()}
-            least = max(heights.values(), default=0.0) - _HOPELESS * part.target.data.measured.size
-            good = [k for k in sorted(fronts, key=lambda k: -heights.get(k, -np.inf)) if heights.get(k, least) > least]
-            for k in (fronts.keys() & heights.keys()) - set(good):
-                self._standing_for[k] = -1
             wide = place == len(self._parts) - 2
-            steps = {k: axes_of(part.ends[k], FIRST_DIFFERENCE) if wide else small for k in good}
-            fronts = {k: (part.ends[k].coords, steps[k]) for k in good}
+            ends = {k: part.ends[k] for k in fronts if k in part.ends}
+            fronts = {
+                k: (end.coords, axes_of(end, FIRST_DIFFERENCE) if wide else small)
+                for k, end in sorted(ends.items(), key=lambda each: -each[1].value)
+            }
 
     def _side_by_side(self, part: _Part, ascents: dict[int, Any]) -> Steps:
         """Run ascents, by their numbers, to their ends: all their requests together are one batch."""
