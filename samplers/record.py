@@ -197,7 +197,7 @@ class Record:
     def use(self, guide: Any) -> None:
         """An annealing begins, with a new guide or without one."""
         self.guide, self.refused = guide, False
-        self._running.clear()
+        self.given_up()
 
     @property
     def of_guides(self) -> float:
@@ -228,8 +228,12 @@ class Record:
         return not self.refused
 
     def submitted(self, coords: np.ndarray) -> None:
-        """Points (n, ndim) begin to be evaluated, and count from now on; none: those that were running are given up."""
-        self._running = (self._running - self.simulated) | set(self.keys(coords)) if len(coords) > 0 else set()
+        """Points (n, ndim) begin to be evaluated, and count from now on."""
+        self._running = (self._running - self.simulated) | set(self.keys(coords))
+
+    def given_up(self) -> None:
+        """Points that were running and are not known have been given up."""
+        self._running.clear()
 
     def fitting(self, coords: np.ndarray) -> int:
         """Number of leading points among (n, ndim) that fit into the limit."""

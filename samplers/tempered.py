@@ -64,8 +64,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
         walk by default. If `log_prob_fn` has ``fast_parameters``, each move is followed by `fast_sweeps` sweeps over
         them (not with a `pool` and ``vectorize=False``, since workers do not cache simulations). A point for which
         `log_prob_fn` raises an exception or returns NaN counts as -inf and is recorded (`failures`). Points outside the
-        support of the prior are not evaluated. Blobs are stored exactly: without `blobs_dtype`, in a type that holds
-        the blobs of the first evaluations, and later blobs that this type cannot hold are refused. With an emcee
+        support of the prior are not evaluated. Blobs that are numbers are stored as floats, others as objects, or as
+        `blobs_dtype` says; blobs that this type cannot hold exactly are refused. With an emcee
         `HDFBackend`, a record of all evaluations is kept beside the file, and a killed run continues without repeating
         an evaluation (`run_mcmc`). The file is replaced as a whole, about every second and at the end of a call.
     log_prior_fn : callable, optional

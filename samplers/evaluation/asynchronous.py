@@ -16,7 +16,7 @@ import numpy as np
 
 from ..interrupts import deferred_interrupts
 from ..record import merge_batches
-from ..tempering.pending_points import PendingPoints
+from ..tempering.population import PendingPoints
 from .evaluator import Evaluator
 from .point_queue import PointQueue, pool_queue
 from .user_target import Target
@@ -90,9 +90,6 @@ class AsynchronousEvaluator(Evaluator):
         self.record.submitted(coords[asked])
         self.evaluations += len(asked)
         pending = PendingPoints(coords, log_prior, refused=len(coords) < n)
-        outside = np.flatnonzero(log_prior == -np.inf)
-        if len(outside) > 0:
-            pending.arrive(outside, pending.base[outside])
         numbers = range(self._submitted, self._submitted + len(asked))
         self._submitted += len(asked)
         self._running.update((number, (pending, int(row))) for number, row in zip(numbers, asked, strict=True))
@@ -142,11 +139,9 @@ class AsynchronousEvaluator(Evaluator):
         _, batches = self.record.find(self._points(numbers))
         pending = self._running[numbers[0]][0]
         rows = np.array([self._running.pop(number)[1] for number in numbers])
-        failed, whole = sum(np.count_nonzero(batch.failed) for batch in batches), len(numbers) == len(pending.coords)
-        counts = self.record.count - len(numbers), len(self.record.failed) - failed
-        self.check_failures(merge_batches(batches), *counts, len(self._running), whole)
-        log_prior = pending.base["log_prior"][rows]
-        pending.arrive(rows, self._pack(log_prior, np.arange(len(rows)), batches))
+        counts = len(self.record.failed), self.record.count + len(self._running)
+        self.check_failures(merge_batches(batches), *counts, len(numbers) == len(pending.coords))
+        pending.arrive(rows, self._pack(pending.log_prior[rows], np.arange(len(rows)), batches))
 
     def close(self) -> None:
         """End the evaluation of running points; points that have ended are entered in the record."""
@@ -158,6 +153,6 @@ class AsynchronousEvaluator(Evaluator):
             logger.warning("evaluations that have ended are not stored: %s", error)
         finally:
             self._forget_running()
-            self.record.submitted(())
+            self.record.given_up()
             if queue is not None:
                 queue.close()

@@ -14,13 +14,12 @@ import numpy as np
 from ..chain import check_storable
 from ..interrupts import interrupts_end_the_run
 from ..record import BudgetExhausted, EvaluatedBatch, Incomplete, Record, Remember, merge_batches
-from ..tempering.pending_points import PendingPoints
+from ..tempering.population import RECORD, PendingPoints
 from .user_target import Target, map_in
 
 __all__ = ["Evaluator", "unpack"]
 
 SECONDS_BETWEEN_NOTES = 0.05
-FIELDS = (("log_prob", np.float64), ("log_prior", np.float64))
 
 
 class Evaluator:
@@ -68,7 +67,8 @@ class Evaluator:
         `observe` is called with points directly before they are evaluated.
         """
         allowed = coords[: self._allowed(coords)]
-        return PendingPoints.known(allowed, self.evaluate(allowed, observe=observe), len(allowed) < len(coords))
+        records = self.evaluate(allowed, observe=observe)
+        return PendingPoints(allowed, records["log_prior"], len(allowed) < len(coords), records)
 
     def wait(self, most: int) -> None:
         """Nothing runs after `submit`."""
@@ -152,31 +152,29 @@ class Evaluator:
         """Enter what is left of a `whole` batch, or of a part of it, and return it; RuntimeError for many failures."""
         batch = self.as_batch(coords, results)
         new = batch.rows([*failed, *range(stored, len(coords))])
+        counts = len(self.record.failed) + np.count_nonzero(new.failed), self.record.count + len(new.coords)
         try:
-            self.check_failures(new, self.record.count, len(self.record.failed), whole=whole and stored == 0)
+            self.check_failures(new, *counts, whole and stored == 0)
         except RuntimeError:
             self.record.evaluated(new.rows(np.flatnonzero(~new.failed)))
             raise
         self.record.evaluated(new)
         return batch
 
-    def check_failures(
-        self, batch: EvaluatedBatch, evaluations: int, failures: int, running: int = 0, whole: bool = True
-    ) -> None:
-        """Raise RuntimeError if too many evaluations have failed with a batch that comes after the given numbers.
+    def check_failures(self, batch: EvaluatedBatch, count: int, total: int, whole: bool) -> None:
+        """Raise RuntimeError if `count` of `total` evaluations with the latest `batch` have failed, and these are many.
 
-        Failures may be quicker than successes, so running points count as successes, and only a `whole` batch may not
+        Failures may be quicker than successes, so running points count in the total, and only a `whole` batch may not
         fail as a whole.
         """
-        n, failed = len(batch.coords), np.flatnonzero(batch.failed)
-        count = failures + len(failed)
-        total = evaluations + n + running
+        failed, n = np.flatnonzero(batch.failed), len(batch.coords)
         all_failed = whole and len(failed) == n >= self.target.ndim + 2
         if all_failed or (total >= self._nwalkers and count > self._failure_share * total):
             what = f"all {n} evaluations of a batch" if all_failed else f"{count} of {total} evaluations"
+            latest = [(batch.coords[row], batch.reasons[row]) for row in failed[:1]] or self.record.failed[-1:]
             raise RuntimeError(
                 f"{what} failed, where max_failure_share={self._failure_share:g} of the run is allowed: "
-                f"{batch.reasons[failed[0]]} at {batch.coords[failed[0]]}. Earlier evaluations are kept (see "
+                f"{latest[0][1]} at {latest[0][0]}. Earlier evaluations are kept (see "
                 "failures), and a run with a backend in a file goes on from there after the cause is fixed"
             )
 
@@ -209,7 +207,7 @@ class Evaluator:
 
     def _pack(self, log_prior: np.ndarray, rows: np.ndarray, batches: Sequence[EvaluatedBatch]) -> np.ndarray:
         """Records of points with log-prior (n,), of which these `rows` were evaluated, in the order of `batches`."""
-        records = np.zeros(len(log_prior), dtype=[*FIELDS, *(self._blobs or ())])
+        records = np.zeros(len(log_prior), dtype=[*RECORD, *(self._blobs or ())])
         records["log_prob"], records["log_prior"] = -np.inf, log_prior
         if batches:
             batch = merge_batches(batches)

@@ -1,25 +1,28 @@
 """Arrays of log-densities and blobs from what a user's function returns, or an error that says what is wrong.
 
-emcee's conventions hold: one number per point, or a sequence of the number and blobs; blobs of several points are
-stacked; text and blobs of different lengths become objects. Unlike in emcee, a point fails by NaN, and anything that is
-not a number is refused with an explanation.
+emcee's conventions hold: one number per point, or a sequence of the number and blobs. Unlike in emcee, a point fails by
+NaN, and anything that is not a number is refused with an explanation. Blobs that are numbers are stored as floats, and
+all others as Python objects, unless the user declares another type: so the type does not depend on the values of the
+first points. A value that the type cannot hold is refused: text is never cut, and a number never cut or rounded. The
+exception is a float that the user declares with fewer digits, such as ``blobs_dtype=numpy.float32``.
 """
 
 import copy
 import logging
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from ..blobs import stacked
 from ..interrupts import interrupts, raise_if_interrupted, raise_if_it_ends_the_run
 
 __all__ = ["Caught", "Failed", "log_densities", "most_common_reasons", "outcomes"]
 
 logger = logging.getLogger(__name__)
+
+LARGEST_EXACT = 2**53  # integers above are rounded in a float, and stay Python's
 
 
 def most_common_reasons(reasons: Iterable[str] | Mapping[str, int], number: int = 3) -> str:
@@ -74,45 +77,9 @@ class Caught:
 def outcomes(results: Any, n: int, blobs_dtype: Any, name: str) -> tuple[np.ndarray, np.ndarray | None, dict[int, str]]:
     """Log-densities (n,), blobs (n, ...) or None, and reasons of failures by row, of what a function has returned.
 
-    A point fails by an exception or a fault (`Caught`), by NaN, or if a pool lost every process that evaluated it. Its
-    log-density is NaN; its blobs are zero or empty. Errors as in `_arrays`.
-    """
-    reasons = {}
-    if isinstance(results, list):
-        lost = (row if not _lost_in_pool(row) else Failed(row[1]) for row in results)
-        reasons = {row: result.reason for row, result in enumerate(lost) if isinstance(result, Failed)}
-    if not reasons:
-        log_prob, blobs = _arrays(results, n, name, blobs_dtype)
-    else:
-        good = [row for row in range(len(results)) if row not in reasons]
-        log_prob, blobs = np.full(n, np.nan), None
-        if good:
-            log_prob[good], found = _arrays([results[row] for row in good], len(good), name, blobs_dtype)
-            if found is not None:
-                blobs = np.zeros((n, *found.shape[1:]), dtype=found.dtype)
-                blobs[good] = found
-    for row in np.flatnonzero(np.isnan(log_prob)):
-        reasons.setdefault(int(row), f"{name} returned NaN")
-    return log_prob, blobs, reasons
-
-
-def log_densities(results: Any, n: int, name: str) -> np.ndarray:
-    """Log-densities (n,) from a function that must return one number per point, without blobs; -inf for NaN."""
-    values, blobs = _arrays(results, n, name, None)
-    if blobs is not None:
-        row = next(row for row in results if _is_row(row) and len(row) > 1)
-        raise ValueError(
-            f"{name} must return one number per point; got {type(row).__name__} of shape {np.shape(row)} for a point. "
-            "If these are the log-densities of the single parameters, return their sum, np.sum(..., axis=-1)"
-        )
-    return np.where(np.isnan(values), -np.inf, values)
-
-
-def _arrays(results: Any, n: int, name: str, blobs_dtype: Any) -> tuple[np.ndarray, np.ndarray | None]:
-    """Log-densities (n,), with NaN, and blobs (n, ...) or None, from what a function called `name` has returned.
-
-    `results` are n numbers, or n sequences (number, blob, ...). Raises ValueError if there are not `n` results, one is
-    not a number or is +inf, or `blobs_dtype` cannot hold a blob.
+    `results` are n numbers, or n sequences (number, blob, ...). A point fails by an exception or a fault (`Caught`), by
+    NaN, or if a pool lost every process that evaluated it. Its log-density is NaN; its blobs are zero or empty.
+    ValueError if there are not `n` results, one is not a number or is +inf, or `blobs_dtype` cannot hold a blob.
     """
     if hasattr(results, "__array__"):
         results = np.asarray(results)
@@ -125,19 +92,43 @@ def _arrays(results: Any, n: int, name: str, blobs_dtype: Any) -> tuple[np.ndarr
         )
     if len(results) != n:
         raise ValueError(f"{name} must return {n} numbers for {n} points; got {len(results)}")
-    blobs = None
+    reasons: dict[int, str] = {}
+    blobs, log_prob = None, np.full(n, np.nan)
     if isinstance(results, np.ndarray) and results.ndim == 1 and results.dtype.kind in "fiu":
-        log_prob = results.astype(float)
+        log_prob[:] = results
     else:
-        log_prob = np.array([_number(row[0] if _is_row(row) else row, name) for row in results])
-        tails = [row[1:] for row in results if _is_row(row) and len(row) > 1]
-        if tails and len(tails) != n:
-            raise ValueError(f"{name} must return blobs with every point or with none; got {len(tails)} of {n}")
+        for row, each in enumerate(results):
+            if isinstance(each, Failed):
+                reasons[row] = each.reason
+            elif isinstance(each, tuple) and len(each) == 2 and each[0] is None and isinstance(each[1], str):
+                reasons[row] = each[1]  # every process of a pool that evaluated the point has died
+            else:
+                log_prob[row] = _number(each[0] if _is_row(each) else each, name)
+        good = [row for row in range(n) if row not in reasons]
+        tails = [results[row][1:] for row in good if _is_row(results[row]) and len(results[row]) > 1]
+        if tails and len(tails) != len(good):
+            raise ValueError(f"{name} must return blobs with every point or with none; got {len(tails)} of {len(good)}")
         if tails:
-            blobs = stacked(tails, blobs_dtype, name)
+            found = _stacked(tails, blobs_dtype, name)
+            blobs = np.zeros((n, *found.shape[1:]), dtype=found.dtype)
+            blobs[good] = found
     if np.any(log_prob == np.inf):
         raise ValueError(f"{name} returned +inf for {np.sum(log_prob == np.inf)} of {n} points: no density is infinite")
-    return log_prob, blobs
+    for row in np.flatnonzero(np.isnan(log_prob)).tolist():
+        reasons.setdefault(row, f"{name} returned NaN")
+    return log_prob, blobs, reasons
+
+
+def log_densities(results: Any, n: int, name: str) -> np.ndarray:
+    """Log-densities (n,) from a function that must return one number per point, without blobs; -inf for NaN."""
+    values, blobs, _ = outcomes(results, n, None, name)
+    if blobs is not None:
+        first = results[0]
+        raise ValueError(
+            f"{name} must return one number per point; got {type(first).__name__} of shape {np.shape(first)} for a "
+            "point. If these are the log-densities of the single parameters, return their sum, np.sum(..., axis=-1)"
+        )
+    return np.where(np.isnan(values), -np.inf, values)
 
 
 def _is_row(value: Any) -> bool:
@@ -160,6 +151,52 @@ def _number(value: Any, name: str) -> float:
         ) from None
 
 
-def _lost_in_pool(result: Any) -> bool:
-    """Whether a pool returned (None, reason) for a point, because every process that evaluated it died."""
-    return isinstance(result, tuple) and len(result) == 2 and result[0] is None and isinstance(result[1], str)
+def _stacked(blobs: list, dtype: Any, name: str) -> np.ndarray:
+    """Blobs of several points, a sequence for each, as one array (n, ...), as emcee stores them.
+
+    ValueError if a declared dtype cannot hold a value.
+    """
+    try:
+        with np.errstate(all="ignore"):
+            if dtype is None:
+                found = np.array(blobs)
+                found = found.astype(np.result_type(found.dtype, float)) if found.dtype.kind in "biufc" else None
+                if found is None or (np.any(np.abs(found) >= LARGEST_EXACT) and _lost(blobs, found)):
+                    found = np.array(blobs, object)
+            else:
+                found = np.array(blobs, dtype)
+    except (TypeError, ValueError, OverflowError) as error:  # no type holds all values, or rows of several lengths
+        if dtype is not None and np.dtype(dtype).kind != "O":
+            raise ValueError(f"{name} must return blobs of the declared type, blobs_dtype={dtype}: {error}") from error
+        found = np.empty(len(blobs), dtype=object)
+        for place, row in enumerate(blobs):
+            found[place] = row
+    if dtype is not None and (value := _lost(blobs, found)):
+        raise ValueError(
+            f"{name} must return blobs of the declared type, blobs_dtype={dtype}; got {value[0]!r}, which this type "
+            "cannot hold. Declare a wider one"
+        )
+    single = tuple(axis for axis in range(1, found.ndim) if found.shape[axis] == 1)
+    return np.squeeze(found, single) if single else found
+
+
+def _leaves(values: Iterable) -> Iterator:
+    """The single values of nested sequences and arrays in order, as values of Python, whose comparisons are exact."""
+    for value in values.reshape(-1) if isinstance(values, np.ndarray) else values:
+        plain = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+        if isinstance(plain, list | tuple):
+            yield from _leaves(plain)
+        else:
+            yield plain
+
+
+def _lost(given: Iterable, found: np.ndarray) -> list:
+    """The first of the values that an array of them has not kept, in a list; a float may have fewer digits."""
+    for value, kept in zip(_leaves(given), _leaves(found), strict=False):
+        both = value.encode() if isinstance(value, str) and isinstance(kept, bytes) else value
+        same = both is kept or both == kept or (kept != kept and (value != value or value is None))
+        if isinstance(value, float | complex) and isinstance(kept, float | complex):
+            same = np.isfinite(kept) or not np.isfinite(value)
+        if not same:
+            return [value]
+    return []

@@ -26,8 +26,7 @@ from ..reports import Report, Stage, Sweep
 from .early_stop import StoppedEarly, stop_at
 from .mutation import tempered_log_prob
 from .next_beta import next_beta
-from .pending_points import PendingPoints
-from .population import Density, Population
+from .population import Density, PendingPoints, Population
 
 __all__ = ["Recycled", "first_draws", "most_running", "recycle", "search_draws", "smallest_target", "submit_start"]
 
@@ -210,13 +209,13 @@ class WeightedPoints:
     def __init__(self, pending: PendingPoints):
         self._batches = [pending]
         self._proposals: list[tuple[float, Mixture]] = []
-        self._log_mixture_of_all = np.log(len(pending.coords)) + pending.base["log_prior"]
+        self._log_mixture_of_all = np.log(len(pending.coords)) + pending.log_prior
         self.update()
 
     def add(self, mixture: Mixture, made: float, pending: PendingPoints) -> None:
         """Add the draws inside the support, of `made` draws from a mixture."""
         coords = pending.coords
-        log_mixture = np.log(len(self._batches[0].coords)) + pending.base["log_prior"]
+        log_mixture = np.log(len(self._batches[0].coords)) + pending.log_prior
         for count, earlier in self._proposals:
             log_mixture = np.logaddexp(log_mixture, np.log(count) + log_density(earlier, coords))
         self._proposals.append((made, mixture))

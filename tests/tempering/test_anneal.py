@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from samplers import SMCSampler
-from samplers.tempering.pending_points import PendingPoints
+from samplers.tempering.population import PendingPoints
 from samplers.tempering.recycling import recycle
 from tests.contract.targets import Box, Gaussian
 
@@ -27,7 +27,8 @@ class CountedDensity:
         return then(coords, records)
 
     def submit(self, coords):
-        return PendingPoints.known(coords, self.evaluate(coords))
+        records = self.evaluate(coords)
+        return PendingPoints(coords, records["log_prior"], records=records)
 
     def wait(self, most):
         pass
