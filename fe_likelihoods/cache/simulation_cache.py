@@ -39,6 +39,7 @@ logger = logging.getLogger(__name__)
 MAX_WAITING_ROWS = 100_000  # rows kept in memory while the file cannot be written
 KEYS_PER_QUERY = 500  # keys in one SELECT
 TOLERANCE = 1e-9
+_ANY = "length(value) = ? OR length(reason) > 0"
 
 
 class CacheInfo(NamedTuple):
@@ -183,20 +184,13 @@ class SimulationCache:
         query = "SELECT generation FROM rows WHERE source = ? AND generation GROUP BY generation ORDER BY max(id) DESC"
         return [generation for (generation,) in self.file.select(query, (source_number(fingerprint),))]
 
-    def any_rows(self, fingerprint: str, generation: int, width: int, n: int) -> list[Row]:
-        """Random undamaged rows of one identity and generation, at most n."""
-        where = "WHERE source = ? AND generation = ? AND (length(value) = ? OR length(reason) > 0)"
-        chosen = f"SELECT id FROM rows {where} ORDER BY random() LIMIT ?"
+    def some_rows(self, fingerprint: str, generation: int, width: int, n: int, latest: bool = False) -> list[Row]:
+        """Undamaged rows of one identity and generation, at most n: random ones, or the latest successes."""
+        kind, order = ("length(reason) = 0 AND length(value) = ?", "id DESC") if latest else (_ANY, "random()")
+        chosen = f"SELECT id FROM rows WHERE source = ? AND generation = ? AND ({kind}) ORDER BY {order} LIMIT ?"
         query = f"SELECT {COLUMNS} FROM rows WHERE id IN ({chosen}) ORDER BY random()"
         rows = self.file.select(query, (source_number(fingerprint), generation, 8 * width, n))
         return [Row._make(row) for row in rows if is_undamaged(row)]
-
-    def latest_success(self, fingerprint: str, generation: int, width: int) -> Row | None:
-        """The success that was stored last, if it is undamaged."""
-        where = "WHERE source = ? AND generation = ? AND length(reason) = 0 AND length(value) = ?"
-        query = f"SELECT {COLUMNS} FROM rows {where} ORDER BY id DESC LIMIT 1"
-        rows = self.file.select(query, (source_number(fingerprint), generation, 8 * width))
-        return Row._make(rows[0]) if rows and is_undamaged(rows[0]) else None
 
     # the file -----------------------------------------------------------------------------------------------------
 

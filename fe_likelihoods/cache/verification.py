@@ -360,7 +360,7 @@ class VerifiedModel:
     ) -> None:
         """Store simulations under the model's label: statistics and responses, if given, and failures of the model."""
         trust, source = self._trust, source_number(fingerprint)
-        if all(isinstance(reason, TransientReason) for reason in reasons):
+        if {TransientReason}.issuperset(map(type, reasons)):
             return
         with trust.lock:
             generation = self._find_generation(source, self._key, self.n_numbers)
@@ -415,7 +415,7 @@ class VerifiedModel:
     def _adopted(self, stored: list[int], identity: str, width: int) -> int | None:
         """The generation that new simulations agree with, else a new one; 0 if no simulation ends."""
         cache, name = self.cache, type(self.model).__name__
-        candidates = {generation: cache.any_rows(identity, generation, width, ROWS) for generation in stored}
+        candidates = {generation: cache.some_rows(identity, generation, width, ROWS) for generation in stored}
         candidates = {generation: rows for generation, rows in candidates.items() if len(rows) == ROWS}
         what = "%d of them are simulated again, to see whether they can be used"
         self._say(
@@ -482,26 +482,22 @@ class VerifiedModel:
                 return
             if trust.stale is not None:
                 raise StaleCache(str(trust.stale), trust.stale.theta)
-            succeeded, latest = any(not row.reason for row in others), None
+            succeeded, latest = any(not row.reason for row in others), []
             if (identity, True) not in trust.left or not succeeded:
-                latest = self.cache.latest_success(identity, generation, width)
-                latest = None if latest is None or latest.session == trust.session else latest
+                latest = self.cache.some_rows(identity, generation, width, 1, latest=True)
+                latest = [row for row in latest if row.session != trust.session]
             # failures alone do not verify successful rows, which may be used later
-            used, kind = trust.used, (identity, latest is not None or succeeded)
-            found = self._compare(self._in_order(latest, others), trust.due(kind, len(others)))
+            used, kind = trust.used, (identity, bool(latest) or succeeded)
+            shuffled = [others[place] for place in self._random.permutation(len(others))]
+            shuffled.sort(key=lambda row: bool(row.reason))  # failures last
+            chosen = latest + [row for row in shuffled if row not in latest]
+            found = self._compare(chosen, trust.due(kind, len(others)))
             if found.row is not None:
                 self._refuse(found.row, found.new, used)
             if found.stopped:
                 n, total = len(found.stopped), len(found.stopped) + found.compared
                 text = "%d of %d stored simulations could not be verified, because the new simulation was stopped (%s)"
                 self._say(text, n, total, found.stopped[0])
-
-    def _in_order(self, latest: Row | None, rows: list[Row]) -> Iterator[Row]:
-        """The row that was stored last, and the others in random order, failures last."""
-        if latest is not None:
-            yield latest
-        shuffled = [rows[place] for place in self._random.permutation(len(rows))]
-        yield from (row for row in sorted(shuffled, key=lambda row: bool(row.reason)) if row != latest)
 
     def _compare(self, rows: Iterable[Row], n: int) -> _Comparison:
         """Simulate rows again, in growing batches, until n are compared, one differs, or too many stop."""

@@ -9,8 +9,7 @@ reason in words and a row of NaN. Ctrl-C and ``sys.exit`` are no failures.
 
 import logging
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import cycle
 from typing import Any, NamedTuple, Protocol
@@ -180,8 +179,15 @@ def simulate_batch(model: Model, thetas: np.ndarray, pool: Any = None) -> Simula
         if getattr(model, "simulate_together", None) is not None:
             return model.simulate_together(thetas, pool)
         if pool is None and has_batch_method(model):
-            with _one_by_one_if_it_fails(model):
-                return SimulationBatch(*_checked_batch(model, model.simulate_batch(thetas), (len(thetas), *shape)))
+            before, known = sys.exception(), interrupts()
+            try:
+                batch = SimulationBatch(*_checked_batch(model, model.simulate_batch(thetas), (len(thetas), *shape)))
+                raise_if_interrupted(known)
+                return batch
+            except BaseException as error:  # which must not make all parameter sets fail
+                raise_if_it_ends_the_run(error, before)
+                text = "A batch method of %s failed; its parameter sets are run one by one: %s: %s"
+                logger.warning(text, type(model).__name__, type(error).__name__, error)
         return SimulationBatch(*run_each(sent_simulation(model), thetas, shape, pool))
 
 
@@ -347,23 +353,6 @@ def run_each(
 def unpack(outcome: tuple) -> tuple[tuple, Opened]:
     """Simulation result from a pool, and what it opened; for a lost worker, the pool reports a result only."""
     return (outcome, {}) if isinstance(outcome[1], str) else outcome
-
-
-@contextmanager
-def _one_by_one_if_it_fails(model: Model) -> Iterator[None]:
-    """Log a failure of the model's own batch method, which must not make all its parameter sets fail."""
-    before, known = sys.exception(), interrupts()
-    try:
-        yield
-        raise_if_interrupted(known)
-    except BaseException as error:
-        raise_if_it_ends_the_run(error, before)
-        logger.warning(
-            "A batch method of %s failed; its parameter sets are run one by one: %s: %s",
-            type(model).__name__,
-            type(error).__name__,
-            error,
-        )
 
 
 def _checked_batch(model: Model, batch: tuple, shape: tuple[int, ...]) -> tuple[np.ndarray, list[str]]:
