@@ -6,10 +6,6 @@ from pathlib import Path
 from ..checks.compared import data_sets_of, draws_to_compare
 from ..checks.finding import labelled
 from ..checks.rehearsal import ModelCheck, check_model
-from ..plots.predictions import plot_bands
-from ..plots.without_time import plot_modes, plot_points
-from ..prediction.propagation import propagate
-from ..reporting.pictures import save_picture
 from ..signals.error_measures import rrmse
 from ..text_tables import text_table
 from .job import read_job
@@ -71,6 +67,11 @@ def _say_simulation(problem: Problem, checked: ModelCheck, say: Callable[[str], 
 
 def _draw(problem: Problem, checked: ModelCheck, picture: Path) -> list[Path]:
     """The draws of the prior that a check has simulated, with the measurements, as a PNG file for each data set."""
+    from ..plots.predictions import plot_bands  # slow to import
+    from ..plots.without_time import plot_modes, plot_points
+    from ..prediction.propagation import propagate
+    from ..reporting.pictures import save_picture
+
     posterior, files = problem.posterior, []
     points, modes = draws_to_compare(posterior, checked.seconds), {fit.title: fit.modal for fit in checked.fits}
     for key, part, columns in data_sets_of(posterior):

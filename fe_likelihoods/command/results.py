@@ -4,12 +4,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import arviz
-import pandas as pd
-
-from samplers import to_arviz
-from samplers.reporting.summary import Summary
-
 from ..checks.result import JudgedRun
 from ..checks.run import FinishedRun
 
@@ -18,6 +12,10 @@ __all__ = ["write_samples", "write_summary"]
 
 def write_summary(folder: Path, run: FinishedRun, judged: JudgedRun, said: Sequence[str]) -> None:
     """Write ``summary.txt`` (judgement, moments of the parameters, fit, what else is `said`) and ``summary.csv``."""
+    import pandas as pd  # slow to import
+
+    from samplers.reporting.summary import Summary
+
     columns = {"label": "parameter", "mean": "mean", "mean_error": "mean_error", "sd": "sd", "sd_error": "sd_error"}
     columns |= {"cv": "cv", "low": "q05", "median": "median", "high": "q95", "nominal": "nominal"}
     rows = pd.DataFrame([{name: getattr(row, key) for key, name in columns.items()} for row in judged.rows])
@@ -41,6 +39,10 @@ def write_samples(folder: Path, run: FinishedRun, samplers: Sequence[Any], predi
 
     Independent runs are chains. Returns how the runs agree, empty for one.
     """
+    import arviz  # slow to import
+
+    from samplers import to_arviz
+
     data = to_arviz(samplers, prediction, discard=run.discard)
     data.posterior.attrs["judgement"] = judgement
     data.to_netcdf(str(folder / "posterior.nc"))

@@ -11,7 +11,6 @@ import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import emcee
 import numpy as np
 
 import samplers
@@ -21,8 +20,6 @@ from ..checks.finding import NOTE, FindingWarning, labelled
 from ..checks.model import refuse_chance
 from ..checks.result import judge_run
 from ..checks.run import read_run
-from ..prediction.propagation import propagate
-from ..reporting.report import write_page
 from .job import Job, parse_job, read_job
 from .models import Problem, make_problem, runs_code_of_user
 from .results import write_samples, write_summary
@@ -88,6 +85,8 @@ def report_run(path: Path, runs_code: bool = False) -> Outcome:
 
 def _go_on(job: Job, folder: Path, file: Path, samples: bool, progress: bool) -> Outcome:
     """Go on with the run in a folder, without new steps if not `samples`, and write its results."""
+    import emcee  # slow to import
+
     problem, chains = make_problem(job, SimulationCache(folder / CACHE)), []
     again = shlex.join(["fe-likelihoods", "run", str(file), "--out", str(folder)])
     for k in range(job.sampler.chains):  # independent runs
@@ -106,6 +105,9 @@ def _go_on(job: Job, folder: Path, file: Path, samples: bool, progress: bool) ->
 
 def _write(folder: Path, job: Job, again: str, chains: list[Any], problem: Problem, progress: bool) -> Outcome:
     """Write tables, prediction, samples and report; `again` is the command that makes the run."""
+    from ..prediction.propagation import propagate  # slow to import
+    from ..reporting.report import write_page
+
     run, drawn, prediction = read_run(chains[0], problem.posterior), _drawn(chains[0], job.prediction.draws), None
     if len(drawn) and not job.modes and not (job.load_test and job.measurements):  # the report has a figure of each fit
         cache = problem.posterior.likelihood.simulator.cache
