@@ -6,7 +6,7 @@ import numpy as np
 
 from ..signals.events import find_events
 from ..simulation.model import SimulationBatch, simulate_batch
-from .compared import Fits, data_sets_of, fit_data_sets
+from .compared import Fits, fit_data_sets
 from .finding import CARE, NOTE, TAIL, WRONG, Finding, Judgement, judge
 from .fit import (
     check_other_events,
@@ -16,7 +16,7 @@ from .fit import (
     check_stated_errors,
     check_supports,
 )
-from .model import STEP, check_stronger_motion, halve_steps, has_steps, motions_to_replace
+from .model import STEP, halve_steps, has_steps, motions_to_replace
 from .run import Failures, FinishedRun, ParameterRow, failures, moments_of, read_run, rows_of
 from .screening import check_data
 
@@ -78,7 +78,7 @@ def judge_run(run: FinishedRun) -> JudgedRun:
     A run that says nothing about the parameters gets no findings that compare its samples with prior, truth or noise.
     """
     rows, fits = rows_of(run.parameters, run.prior, moments_of(run), run.truth), fit_data_sets(run)
-    of_model, tested, made = _check_model(run)
+    of_model, tested, made = _check_steps(run)
     failed, fits = failures(run), fits._replace(simulations=fits.simulations + made)  # failures of the fits included
     found = check_responses(fits.fits) + of_model  # first, because they explain a sampling that is not good
     found += _check_sampling(run) + _check_chain(run) + check_failures(failed)
@@ -110,12 +110,12 @@ def judge_run(run: FinishedRun) -> JudgedRun:
     return JudgedRun(rows, fits, failed, judge(unique, (tests | tested).items()))
 
 
-def _check_model(run: FinishedRun) -> tuple[list[Finding], dict[str, str], int]:
-    """Whether the model reads its motion, the error of step and mesh at the centre of the samples, and simulations.
+def _check_steps(run: FinishedRun) -> tuple[list[Finding], dict[str, str], int]:
+    """The error of step and mesh at the centre of the samples, what was tested, and simulations.
 
     These are one for each parameter and more; where they are many and take long, step and mesh are not tested.
     """
-    if run.likelihood is None or run.prior is None or not has_steps(run.likelihood):
+    if run.likelihood is None or run.prior is None or run.is_inconclusive or not has_steps(run.likelihood):
         return [], {}, 0
     known = {likelihood.model.fingerprint: likelihood for likelihood, _ in run.likelihood.parts()}
     report, others = run.likelihood.report(), 0
@@ -127,23 +127,13 @@ def _check_model(run: FinishedRun) -> tuple[list[Finding], dict[str, str], int]:
         others += len(points)
         return simulate_batch(model, points)
 
-    found, tests = list[Finding](), {"Motion": "not tested: no model has a motion that can be replaced"}
-    for _, likelihood, columns in data_sets_of(run):
-        theta = run.centre[columns][: len(likelihood.model.parameter_names)]
-        batch = likelihood.simulate(theta[None])
-        if not batch.reasons[0] and motions_to_replace(likelihood.model):
-            tests["Motion"] = "twice the motion was simulated"
-            stronger = check_stronger_motion(likelihood.model, theta, batch.response[0], simulate)
-            found += [each for each in stronger if each.severity == WRONG]  # failures are said where they are predicted
     needed = sum(2 + len(likelihood.model.parameter_names) for likelihood, _ in run.likelihood.parts())
     seconds = report["seconds"] / max(report["simulations"], 1)
     if run.n_modes > 1:
-        tests[STEP] = "not tested: the samples have several modes, which have no common standard deviation"
-    elif needed > LARGEST_TEST * report["simulations"] and needed * seconds > TEST_SECONDS:
-        tests[STEP] = f"not tested: the test takes about {needed} simulations of {seconds:.2g} s"
-    elif not found and not run.is_inconclusive:
-        coarse, halved = halve_steps(run.posterior, run.centre, run.samples.std(axis=0), simulate)
-        found, tests = coarse, tests | halved
+        return [], {STEP: "not tested: the samples have several modes, which have no common standard deviation"}, 0
+    if needed > LARGEST_TEST * report["simulations"] and needed * seconds > TEST_SECONDS:
+        return [], {STEP: f"not tested: the test takes about {needed} simulations of {seconds:.2g} s"}, 0
+    found, tests = halve_steps(run.posterior, run.centre, run.samples.std(axis=0), simulate)
     return found, tests, run.likelihood.simulations - report["simulations"] + others
 
 

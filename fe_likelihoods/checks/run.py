@@ -195,7 +195,6 @@ class ParameterRow(NamedTuple):
     label: str  # name with unit
     unit: str
     prior: str  # in words
-    prior_mean: float
     prior_sd: float
     mean: float
     mean_error: float  # Monte Carlo standard error
@@ -207,8 +206,6 @@ class ParameterRow(NamedTuple):
     high: float  # 95 % quantile
     nominal: float
     truth: float
-    lower: float  # bound of the prior; infinite where there is none or it is not known
-    upper: float  # bound of the prior; infinite where there is none or it is not known
 
 
 def rows_of(
@@ -219,19 +216,18 @@ def rows_of(
     for i, parameter in enumerate(parameters):
         family, *of_prior = ("", np.nan, np.nan, -np.inf, np.inf) if prior is None else known[i][1:]
         true = np.nan if truth is None else truth[i]
-        prior_mean, prior_sd, lower, upper = (float(each) for each in parameter.shown(of_prior))
-        numbers = parameter.shown([*(each[i] for each in moments), parameter.nominal, true])
-        mean, mean_error, sd, sd_error, *quantiles, nominal, true = (float(each) for each in numbers)
+        mean, prior_sd, lower, upper = (float(each) for each in parameter.shown(of_prior))
         family = family.split("(")[0]
-        text = f"{family}, mean {prior_mean:.4g}, sd {prior_sd:.3g}" if family else ""
+        text = f"{family}, mean {mean:.4g}, sd {prior_sd:.3g}" if family else ""
         if family == "Uniform":
             text = f"{family}, {lower:.4g} to {upper:.4g}"
         elif family:
             bounds = (("above", lower), ("below", upper))
             text += "".join(f", {side} {bound:.4g}" for side, bound in bounds if np.isfinite(bound))
+        numbers = parameter.shown([*(each[i] for each in moments), parameter.nominal, true])
+        mean, mean_error, sd, sd_error, *others = (float(each) for each in numbers)
         unit, cv = parameter.label.removeprefix(parameter.name).strip(), sd / abs(mean) if mean else np.nan
-        of_posterior = mean, mean_error, sd, sd_error, cv, *quantiles
-        shown = text, prior_mean, prior_sd, *of_posterior, nominal, true, lower, upper
+        shown = text, prior_sd, mean, mean_error, sd, sd_error, cv, *others
         rows.append(ParameterRow(parameter.name, parameter.label, unit, *shown))
     return rows
 

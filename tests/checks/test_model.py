@@ -101,16 +101,6 @@ def test_a_coarse_step_limits_the_result_of_a_run(joint):
     assert not [each for each in fine.findings if "coarse" in each.kind or "tested" in each.kind], str(fine)
 
 
-@pytest.mark.slow
-def test_a_motion_that_is_not_read_is_named_after_a_run_as_well():
-    """The parameters may be right, but every prediction repeats the calibration; the step is not tested then."""
-    posterior = posterior_of(lambda theta, record: central_differences(theta, MOTION, 8)[:, : record.n_steps])
-    sampler = guided(posterior, walkers=40)
-    judgement = check_result(sampler)
-    assert judgement.status == "do not use" and judgement.findings[0].kind == "The motion changes nothing"
-    assert not [each for each in judgement.findings if "finer" in each.kind or "tested" in each.kind]
-
-
 def test_a_random_model_is_named_and_a_run_refuses_it():
     rng = np.random.default_rng(3)
     posterior = posterior_of(lambda theta, record: central_differences(theta, record) * (1.0 + 0.02 * rng.normal()))
