@@ -107,9 +107,7 @@ def find_faults(measurements: Measurements, draws: np.ndarray) -> tuple[Fault, .
                 of = [names[k] for k in group]
                 faults = [Fault("swap", tuple(of), math.nan, before, left)]
                 if gains is not None:
-                    faults = _named(
-                        of, gains[row] if n else np.median(gains), lags[row], max(steps[group]), before, left
-                    )
+                    faults = _named(of, gains[row], lags[row], max(steps[group]), before, left)
                 if faults:
                     most, chosen = gain, (group, faults, corrected)
         if chosen is None:
@@ -139,7 +137,7 @@ def _fitted(y: np.ndarray, r: np.ndarray, steps: np.ndarray, n: int) -> tuple[np
     Spectra (n_channels, n_lines) and (n_draws, n_channels, n_lines) of n samples; n is zero for data without time.
     """
     own = np.square(np.abs(y)).sum(axis=-1)
-    power, lags, turns = np.square(np.abs(r)).sum(axis=-1) / own, np.zeros(1), 0.0
+    power, lags = np.square(np.abs(r)).sum(axis=-1) / own, np.zeros(1)
     products = (y * r.conj()).real.sum(axis=-1)[..., None] / own[:, None]
     if n:
         reach = int(min(LONGEST_LAG, LONGEST_SHARE * n * steps.min()) / steps.max())
@@ -148,12 +146,13 @@ def _fitted(y: np.ndarray, r: np.ndarray, steps: np.ndarray, n: int) -> tuple[np
         products = np.stack([all_lags[:, c, np.rint(lags / step).astype(int)] for c, step in enumerate(steps)], axis=1)
     # least squares of relative errors: no channel outweighs the others
     gains = products.sum(axis=1) / np.maximum(power.sum(axis=1), 1e-300)[:, None]
+    if not n:  # a factor of a single draw is its stiffness as well
+        gains = np.full_like(gains, np.median(gains))
     shares = 1.0 + gains[:, None] ** 2 * power[:, :, None] - 2.0 * gains[:, None] * products
     best = np.log(np.maximum(shares, FLOOR**2)).sum(axis=1).argmin(axis=1)
     gain, lag = gains[np.arange(len(r)), best], lags[best]
-    if n:
-        turns = np.fft.rfftfreq(n) * np.rint(lag[:, None] / steps)[:, :, None]
-    return gain, lag, r * gain[:, None, None] * (np.exp(-2j * np.pi * turns) if n else 1.0)
+    shift = np.exp(-2j * np.pi * np.fft.rfftfreq(n) * np.rint(lag[:, None] / steps)[:, :, None]) if n else 1.0
+    return gain, lag, r * gain[:, None, None] * shift
 
 
 def _exchanged(r: np.ndarray, pair: list[int], channels: Sequence[Channel]) -> np.ndarray:
