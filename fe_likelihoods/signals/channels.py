@@ -7,7 +7,6 @@ import hashlib
 import json
 import math
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -338,37 +337,21 @@ class Measurements:
 
 
 def _values_array(values: Any, names: Sequence[str]) -> NDArray[np.float64]:
-    """Samples as a new array (n_channels, n_steps); rows of different lengths are filled with NaN at their ends."""
-    if isinstance(values, np.ma.MaskedArray):
-        values = _without_masked(values)
-    elif not isinstance(values, np.ndarray):
-        with suppress(TypeError):  # without rows, which is refused below
-            values = [_without_masked(row) for row in values]
-            if all(row.ndim == 1 for row in values):
-                longest = max((row.size for row in values), default=0)
-                values = [np.append(row, np.full(longest - row.size, np.nan)) for row in values]
-    if np.iscomplexobj(values):
-        raise ValueError("values must be real numbers, got complex ones; give the real part if it is the data")
+    """Samples as a new array (n_channels, n_steps), NaN where one is masked and at the ends of shorter rows."""
     try:
-        values = np.array(values, dtype=np.float64)
+        rows = [np.ma.asarray(row) for row in values]
+        if any(map(np.iscomplexobj, rows)):
+            raise TypeError("got complex ones; give the real part if it is the data")
+        rows = [row.astype(np.float64).filled(np.nan) for row in rows]
     except (TypeError, ValueError) as error:
         raise ValueError(
-            f"values must be numbers, one row per channel ({error}); read tables by read_columns"
+            f"values must be real numbers, one row per channel: {error}; read tables by read_columns"
         ) from None
-    if values.ndim != 2 or values.shape[0] != len(names) or values.shape[1] < 1:
-        raise ValueError(
-            f"expected values of shape (n_channels, n_steps) = ({len(names)}, n_steps), got {values.shape}"
-        )
-    return values
-
-
-def _without_masked(row: Any) -> NDArray[Any]:
-    """The samples as an array, with NaN for masked ones: `numpy.asarray` returns the numbers below the mask."""
-    if not isinstance(row, np.ma.MaskedArray):
-        return np.asarray(row)
-    if np.iscomplexobj(row):
-        return row.data
-    return row.astype(np.float64).filled(np.nan)
+    longest = max((row.size for row in rows), default=0)
+    if len(rows) != len(names) or not longest or any(row.ndim != 1 for row in rows):
+        expected = f"values of shape (n_channels, n_steps) = ({len(names)}, n_steps)"
+        raise ValueError(f"expected {expected}, got {(len(rows), *(rows[0].shape if rows else ()))}")
+    return np.array([np.append(row, np.full(longest - row.size, np.nan)) for row in rows])
 
 
 def _per_channel(value: Any, n_channels: int, what: str) -> tuple[Any, ...]:

@@ -9,7 +9,7 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,8 +24,6 @@ DAMAGE = (OSError, KeyError, IndexError, TypeError, AttributeError, RuntimeError
 """Errors that reading a damaged HDF5 file raises, besides ValueError."""
 
 SCHEMA, SCHEMA_VERSION = "fe_likelihoods.dataset", 1
-# deflate compresses zeros to 1/1032 of their size (RFC 1951); data are never smaller
-_LARGEST_RATIO, _SMALL = 1100, 2**20
 
 
 class Dataset(NamedTuple):
@@ -119,7 +117,7 @@ def read_dataset(path: str | Path) -> Dataset:
                 )
             samples, values = file["record/acceleration"], file["measurements/values"]
             text, checksum = file.attrs["attributes"], file.attrs["checksum"]
-            acceleration, responses = _values(samples, path), _values(values, path)
+            acceleration, responses = (np.asarray(each[()], dtype="<f8") for each in (samples, values))
             record = _record(acceleration, samples.attrs)
             columns = [values.attrs[key] for key in ("channel_names", "quantities", "display_units")]
             channels = tuple(Channel(*map(str, each)) for each in zip(*columns, strict=True))
@@ -182,14 +180,3 @@ def _checksum(record: Record, measurements: Measurements, attributes: str) -> st
             json.dumps([window[:3] for window in record.windows])
         )  # name, first sample, the one after the last
     return hashlib.blake2b("\n".join(parts).encode(), digest_size=16).hexdigest()
-
-
-def _values(data: Any, path: str | Path) -> np.ndarray:
-    """The numbers of an h5py data set; ValueError if it declares more numbers than the file can contain."""
-    declared, stored = 8 * int(data.size), int(data.id.get_storage_size())
-    if declared > _SMALL and (declared > _LARGEST_RATIO * stored or stored > os.path.getsize(path)):
-        raise ValueError(
-            f"{path}: {data.name} declares {data.size} numbers, more than the file can contain; it is damaged, make it "
-            "or download it again"
-        )
-    return np.asarray(data[()], dtype="<f8")

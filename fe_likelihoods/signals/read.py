@@ -123,7 +123,18 @@ def read_record(
     options = {"time": time, "time_unit": time_unit, "skip": skip, "missing": missing}
     if form is None:
         try:
-            series = _table_series(path, units, dt, channel, resample, **options)
+            table = read_table(path, along_rows=channel == "rows", **options)
+            rows = channel == "rows" and "rows" not in [each.name for each in table.columns]
+            wanted = (None if rows else channel, "acceleration", units, table.file)
+            ((values, unit, _),) = table_values(table, [wanted], stacklevel=2)
+            absent = np.flatnonzero(np.isnan(values))
+            if absent.size:
+                raise ValueError(
+                    f"{table.file}, line {table.lines[absent[0]]}: expected a number, got an empty cell or NaN; an "
+                    f"excitation needs all samples, {absent.size} are missing: interpolate them, or cut the file"
+                )
+            step, times = (table_step(table, dt), None) if resample is None else (np.nan, row_times(table, dt))
+            series = Series(table.title, step, unit, values, times)
         except ValueError as error:
             if Path(path).suffix.lower() in _TABLES:
                 raise
@@ -153,29 +164,6 @@ def read_record(
             f"{file} states a step of {step:g} s but dt = {dt!r} was given; leave dt out, or correct the file"
         )
     return Record(series.name or Path(path).stem, step, to_si(values, unit, "acceleration"), source)
-
-
-def _table_series(
-    path: str | Path,
-    units: str | None,
-    dt: float | None,
-    column: int | str | None,
-    resample: float | None,
-    **options: Any,
-) -> Series:
-    """One column of a table, checked against what the file states."""
-    table = read_table(path, along_rows=column == "rows", **options)
-    rows = column == "rows" and "rows" not in [each.name for each in table.columns]
-    wanted = (None if rows else column, "acceleration", units, table.file)
-    ((values, unit, _),) = table_values(table, [wanted], stacklevel=3)
-    absent = np.flatnonzero(np.isnan(values))
-    if absent.size:
-        raise ValueError(
-            f"{table.file}, line {table.lines[absent[0]]}: expected a number, got an empty cell or NaN; an excitation "
-            f"needs all samples, {absent.size} are missing: interpolate them, or cut the file"
-        )
-    step, times = (table_step(table, dt), None) if resample is None else (np.nan, row_times(table, dt))
-    return Series(table.title, step, unit, values, times)
 
 
 # measured responses ---------------------------------------------------------------------------------------------------
@@ -241,7 +229,13 @@ def read_columns(
     >>> measured.values  # m
     array([[0.    , 0.0015, 0.002 ]])
     """
-    wanted = _wanted(path, channels, columns, units)
+    given = units_of(channels, units)
+    if isinstance(columns, str) or len(channels) != len(columns):
+        raise ValueError(f"expected one column for each of {len(channels)} channels; got {columns!r}")
+    wanted = [
+        (column, channel.dimension, unit, f"{path}, column {column!r}")
+        for channel, column, unit in zip(channels, columns, given, strict=True)
+    ]
     if recognise(path) is not None:
         options = {
             "resample": resample,
@@ -297,19 +291,3 @@ def units_of(channels: Sequence[Channel], units: str | Sequence[str] | Mapping[s
             f"expected a unit for each of {', '.join(names)}, one for all, or units by name; got {units!r}"
         )
     return given
-
-
-def _wanted(
-    path: str | Path,
-    channels: Sequence[Channel],
-    columns: Sequence[str | int],
-    units: str | Sequence[str] | Mapping[str, str] | None,
-) -> list[tuple[str | int | None, str, str | None, str]]:
-    """Columns as `table_values` takes them."""
-    given = units_of(channels, units)
-    if isinstance(columns, str) or len(channels) != len(columns):
-        raise ValueError(f"expected one column for each of {len(channels)} channels; got {columns!r}")
-    return [
-        (column, channel.dimension, unit, f"{path}, column {column!r}")
-        for channel, column, unit in zip(channels, columns, given, strict=True)
-    ]

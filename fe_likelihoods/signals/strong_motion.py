@@ -40,6 +40,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..units import to_si
+from .sampling import expect
 from .tables import (
     LINE_END,
     NUMBER,
@@ -98,11 +99,9 @@ def read_series(path: str | Path, form: str, channel: int | str | None = None, m
     chosen = [each for each in candidates if channel is None or str(each.channel).lower() == str(channel).lower()]
     if len(chosen) != 1:
         listing = "\n  ".join(f"channel {each.channel}: {each.label} [{each.file}]" for each in chosen or candidates)
-        raise ValueError(
-            f"{path}: expected one channel with channel = {channel}, member = {member!r}, found {len(chosen)}; "
-            "choose with channel= and member=, or in a TOML file with the end of a file name as column, among\n  "
-            f"{listing}"
-        )
+        advice = "choose with channel= and member=, or in a TOML file with the end of a file name as column, among"
+        wanted = f"one channel with channel = {channel}, member = {member!r}, found {len(chosen)}"
+        expect(False, path, wanted, advice=f"{advice}\n  {listing}")
     file, series = chosen[0].file, chosen[0].parse()
     source = file.removeprefix(f"{Path(path).parent}/") if form == "v2" else ""
     return series._replace(name=series.title, file=file, source=source)
@@ -137,10 +136,7 @@ def recognise(path: str | Path) -> str | None:
     lines = LINE_END.sub("\n", text).splitlines()
     name, form = ("", None) if _is_table(lines) else _form_of(lines[:_LOOK], text)
     if name and form is None:
-        article = "an" if name.startswith("HDF5") else "a"
-        raise ValueError(
-            f"{path}: this looks like {article} {name} file, which is not read; take a file of another format"
-        )
+        raise ValueError(f"{path}: this looks like a {name} file, which is not read; take a file of another format")
     return form
 
 
@@ -166,7 +162,6 @@ def _form_of(lines: list[str], text: str) -> tuple[str, str | None]:
         return bool(re.match(pattern, first, re.IGNORECASE))
 
     rules = (
-        ("HDF5", None, text.startswith("\x89HDF")),
         ("K-NET or KiK-net", "knet", first.startswith("Origin Time") and "Scale Factor" in head),
         ("ESM or ITACA", "esm", first.startswith("EVENT_NAME:") and "SAMPLING_INTERVAL_S:" in head),
         ("USGS SMC", "smc", re.match(r"[0-9] +(UN)?CORRECTED ACCELEROGRAM", first)),
@@ -177,8 +172,6 @@ def _form_of(lines: list[str], text: str) -> tuple[str, str | None]:
         ("CSMIP or COSMOS V2", "v2", begins("corrected acc")),
         ("CSMIP V3 (spectra)", None, begins("response and fourier")),
         ("BHRC V1", None, first.startswith("* VOL1DS FILE")),
-        ("LabVIEW TDMS", None, text.startswith("TDSm")),
-        ("MATLAB", None, text.startswith("MATLAB 5.0 MAT-file")),
         ("gzip", None, text.startswith("\x1f\x8b")),
         ("PDF", None, text.startswith("%PDF")),
         ("damaged zip", None, text.startswith("PK")),
@@ -232,20 +225,17 @@ class Block(NamedTuple):
             line = self.lines[k].rstrip() if k < len(self.lines) else ""
             wanted, found = min(per_line, count - len(values)), math.ceil(len(line) / width)
             if found != wanted:
-                raise ValueError(
-                    f"{self.where(k)}: expected {wanted} numbers of {width} columns after {len(values)} of {count} "
-                    f"samples, got {found}; the file is truncated or damaged"
-                )
+                expected = f"{wanted} numbers of {width} columns after {len(values)} of {count} samples"
+                expect(False, self.where(k), expected, found, "the file is truncated or damaged")
             values += [parse_number(line[i * width :][:width].strip(), self.where(k)) for i in range(wanted)]
-        if len(values) < 2:
-            raise ValueError(f"{self.file}: expected two samples or more, the file announces {count}")
-        if len(line) % width and len(self.lines[start].rstrip()) % width == 0:  # the last line ends within a number
-            raise ValueError(
-                f"{self.where(end - 1)}: expected numbers of {width} columns, the last one is cut; it is truncated"
-            )
+        expect(len(values) > 1, self.file, "two samples or more", len(values))
+        cut = len(line) % width and len(self.lines[start].rstrip()) % width == 0  # the last line ends within a number
+        expect(
+            not cut, self.where(end - 1), f"numbers of {width} columns, the last one is cut", advice="it is truncated"
+        )
         following = next((line for line in self.lines[end:] if line.strip()), "")
-        if last and is_number(following[:width].strip()):
-            raise ValueError(f"{self.where(start)}: the file announces {count} samples but has more after them")
+        more = last and is_number(following[:width].strip())
+        expect(not more, self.where(start), f"{count} samples as the file announces, but it has more after them")
         return np.array(values)
 
     def form_at_the_end_of(self, place: int) -> tuple[int, int]:
@@ -253,27 +243,22 @@ class Block(NamedTuple):
         line = self.lines[place].rstrip()
         stated = _FORMAT.search(line[-100:])
         form = (int(stated[1][:9] or 1), int(stated[2][:9])) if stated else (0, 0)
-        if not all(0 < each <= _WIDEST for each in form):
-            raise ValueError(
-                f"{self.where(place)}: expected a Format such as (8F10.5) of 1 to {_WIDEST} numbers and columns, got "
-                f"{line!r}"
-            )
+        known, expected = all(0 < each <= _WIDEST for each in form), f"of 1 to {_WIDEST} numbers and columns"
+        expect(known, self.where(place), f"a Format such as (8F10.5) {expected}", repr(line))
         return form
 
 
 def _check_peak(found: float, stated: float, tolerance: float, where: str) -> None:
     """ValueError if the stated peak is not the peak of the samples."""
-    if not abs(found - stated) <= tolerance:
-        raise ValueError(
-            f"{where}: the header states a peak of {stated:g}, the samples have {found:g}; the file is damaged, or of "
-            "another form than the one that is read here"
-        )
+    advice = "the file is damaged, or of another form than the one that is read here"
+    expect(
+        abs(found - stated) <= tolerance, where, f"the peak of {stated:g} that the header states", f"{found:g}", advice
+    )
 
 
 def _check_step(dt: float, where: str, stated: str | None = None) -> float:
     """The step [s] in a header; ValueError if it is not positive, or the text `stated` another one."""
-    if not dt > 0.0:
-        raise ValueError(f"{where}: expected the time step [s] in the header, got {dt:g}")
+    expect(dt > 0.0, where, "the time step [s] in the header", f"{dt:g}")
     if stated is not None and abs(dt - float(stated)) > 0.51e-3:  # texts have three decimals
         raise ValueError(f"{where}: the step is {stated} s in the text but {dt:g} s in the header; the file is damaged")
     return dt
@@ -281,8 +266,8 @@ def _check_step(dt: float, where: str, stated: str | None = None) -> float:
 
 def _whole(number: float, file: str, what: str) -> int:
     """A number of lines or samples."""
-    if not 0.0 <= number < 1e9 or abs(number - round(number)) > 1e-6:
-        raise ValueError(f"{file}: expected a number of {what}, got {number:g}")
+    whole = 0.0 <= number < 1e9 and abs(number - round(number)) <= 1e-6
+    expect(whole, file, f"a number of {what}", f"{number:g}")
     return round(number)
 
 
@@ -315,22 +300,17 @@ def _parse_at2(text: str, file: str) -> Series:
     """The samples of a PEER AT2 file, in the new or old form of its header."""
     lines = text.splitlines()
     index, stated = next(((i, found) for i, line in enumerate(lines) if (found := _at2_header(line))), (None, None))
-    if index is None:
-        raise ValueError(
-            f"{file}: expected a header line 'NPTS=  4096, DT=  .0100 SEC' or '4096  .0100  NPTS, DT', found none in "
-            f"{len(lines)} lines; is it a table of plain columns?"
-        )
+    expected = "a header line 'NPTS=  4096, DT=  .0100 SEC' or '4096  .0100  NPTS, DT'"
+    expect(stated, file, f"{expected}, found none in {len(lines)} lines", advice="is it a table of plain columns?")
     units = _UNITS_OF.search("\n".join(lines[:index]))
     rows = [(number, row) for number, row in enumerate(lines[index + 1 :], index + 2) if row.strip()]
     while rows and re.search("[A-Za-z]{3}", rows[-1][1]) and not any(map(is_number, rows[-1][1].split())):
         rows.pop()  # a closing remark in any words: the number of samples is stated
     values = [parse_number(cell, f"{file}, line {number}") for number, row in rows for cell in number_cells(row)]
     check_count(len(values), stated[0], f"{file}: NPTS in line {index + 1}")
-    if stated[2].lower() not in _SECONDS:
-        raise ValueError(
-            f"{file}, line {index + 1}: expected DT in seconds, such as 'DT= .0100 SEC', got {stated[1]} {stated[2]}; "
-            "write it in seconds"
-        )
+    step, where = f"{stated[1]} {stated[2]}", f"{file}, line {index + 1}"
+    known = stated[2].lower() in _SECONDS
+    expect(known, where, "DT in seconds, such as 'DT= .0100 SEC'", step, "write it in seconds")
     title = lines[index - 2].strip() if index >= 2 else ""
     return Series(title, float(stated[1]), units[1] if units else None, np.array(values))
 
@@ -362,8 +342,8 @@ _V1_HEADER = _V1_REAL_START + math.ceil(50 / 8)
 _V2_TEXT, _CSMIP_FORM, _CSMIP_REALS = 25, (8, 10), 100
 # positions in headers, from 0: step of V2 files; number, length and peak of V1 files
 _CSMIP_DT, _COSMOS_DT, _V1_COUNT, _V1_LENGTH, _V1_PEAK = 60, 33, 27, 2, 6
-# Limits of a zip archive and its contents: bytes, files, nested archives. Stations have a few MiB.
-_LARGEST_CONTENT, _MOST_FILES, _DEEPEST, _MOST_LINES = 64 * 2**20, 2000, 3, 4_000_000
+# Limits of a zip archive and all within it: bytes and files. Stations have a few MiB.
+_LARGEST_CONTENT, _MOST_FILES = 64 * 2**20, 2000
 _ZIP_DAMAGE = (zipfile.BadZipFile, RuntimeError, NotImplementedError, OSError, EOFError, KeyError, IndexError) + (
     OverflowError,
     MemoryError,
@@ -393,38 +373,28 @@ def find_channels(path: str | Path, form: str, member: str | None = None) -> lis
     elif len(files) > 1:  # corrected acceleration, if there is any
         files = ending(".v2", ".v2c") or ending(".v1", ".v1c")
     channels = [channel for name, data in files for channel in _split_v2(decode_text(data), name)]
-    if not channels:
-        raise ValueError(
-            f"{path}: expected a CSMIP or COSMOS V1 or V2 file with a line 'N POINTS OF ACCEL DATA EQUALLY SPACED AT "
-            f"...', 'N acceleration pts ...' or 'Uncorrected accelerogram', found none in {len(files)} file(s)"
-            + (f" named {member!r}" if member else "")
-        )
+    expected = "'N POINTS OF ACCEL DATA EQUALLY SPACED AT ...', 'N acceleration pts ...' or 'Uncorrected accelerogram'"
+    none = f"found none in {len(files)} file(s)" + (f" named {member!r}" if member else "")
+    expect(channels, path, f"a CSMIP or COSMOS V1 or V2 file with a line {expected}, {none}")
     found = [Found(each.channel, each.label, each.file, partial(_parse_v2, each)) for each in channels]
     return sorted(found, key=lambda each: (each.channel is None, each.channel or 0))
 
 
-def _unzip(content: bytes, name: str, archive: str, left: list[int], depth: int = 1) -> Iterator[tuple[str, bytes]]:
+def _unzip(content: bytes, name: str, archive: str, left: list[int]) -> Iterator[tuple[str, bytes]]:
     """Yield the names and contents of the files in a zip archive, and in the archives that it contains.
 
     `left` is how many files and bytes may still be read, for all nested archives together.
     """
-    if depth > _DEEPEST:
-        raise ValueError(
-            f"{name}: expected at most {_DEEPEST} archives within each other; unpack it and read the files"
-        )
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as opened:
             infos = opened.infolist()
             left[:] = left[0] - len(infos), left[1] - sum(info.file_size for info in infos)
-            if min(left) < 0:
-                raise ValueError(
-                    f"{archive}: expected at most {_MOST_FILES} files with {_LARGEST_CONTENT} bytes in all, got more; "
-                    "unpack the archive and read the files"
-                )
+            expected = f"at most {_MOST_FILES} files with {_LARGEST_CONTENT} bytes in all"
+            expect(min(left) >= 0, archive, expected, "more", "unpack the archive and read the files")
             for info in infos:
                 inner = f"{name}/{info.filename}"
                 if info.filename.lower().endswith(".zip"):
-                    yield from _unzip(opened.read(info), inner, archive, left, depth + 1)
+                    yield from _unzip(opened.read(info), inner, archive, left)
                 elif not info.is_dir():
                     yield inner, opened.read(info)
     except _ZIP_DAMAGE as error:
@@ -433,8 +403,6 @@ def _unzip(content: bytes, name: str, archive: str, left: list[int], depth: int 
 
 def _split_v2(text: str, file: str) -> list[Block]:
     """The channels of a V2 file, without channels of velocity and displacement (in COSMOS files)."""
-    if text.count("\n") > _MOST_LINES:
-        raise ValueError(f"{file}: expected at most {_MOST_LINES} lines, got {text.count(chr(10))}")
     channels, lines, first = [], text.splitlines(), 0
     for index, line in enumerate(lines):
         end = _END.match(line)
@@ -466,15 +434,12 @@ def _parse_v2(block: Block) -> Series:
         return _parse_v1(block)
     index = next(i for i, line in enumerate(lines) if _CSMIP_DATA.match(line) or _COSMOS_DATA.match(line))
     line, where = lines[index], block.where(index)
-    if re.match(r"\s*raw", lines[0], re.IGNORECASE) or _V1_FIRST.match(lines[0]):
-        raise ValueError(
-            f"{block.file}: expected acceleration in the form of V2, got {lines[0].strip()!r}; counts of a recorder "
-            "are not read: take V1 or V2"
-        )
+    counts = re.match(r"\s*raw", lines[0], re.IGNORECASE) or _V1_FIRST.match(lines[0])
+    advice = "counts of a recorder are not read: take V1 or V2"
+    expect(not counts, block.file, "acceleration in the form of V2", repr(lines[0].strip()), advice)
     if csmip := _CSMIP_DATA.match(line):
         units = _CSMIP_UNITS.search(line, csmip.end())
-        if units is None:
-            raise ValueError(f"{where}: expected the unit of acceleration in {line.strip()!r}")
+        expect(units, where, f"the unit of acceleration in {line.strip()!r}")
         unit, form = (
             units[1] or units[2],
             block.form_at_the_end_of(index) if _FORMAT.search(line.rstrip()) else _CSMIP_FORM,
@@ -485,8 +450,8 @@ def _parse_v2(block: Block) -> Series:
     else:
         unit, form = _COSMOS_DATA.match(line)[2], block.form_at_the_end_of(index)
         header = next((i for i in range(index) if _COSMOS_REALS.match(lines[i])), None)
-        if header is None:
-            raise ValueError(f"{where}: expected a line 'N Real-header values follow on N lines, Format= (5F15.6)'")
+        expected = "a line 'N Real-header values follow on N lines, Format= (5F15.6)'"
+        expect(header is not None, where, expected)
         dt = _check_step(float(block.field(header + 1, block.form_at_the_end_of(header), _COSMOS_DT)), where)
     values = block.samples(index + 1, int((csmip or _COSMOS_DATA.match(line))[1]), form)
     if csmip:
@@ -505,15 +470,12 @@ def _parse_v1(block: Block) -> Series:
         dt = _check_step(1.0 / rate if rate else 0.0, block.where(_V1_HEADER))
         form = block.form_at_the_end_of(_V1_HEADER)
         values = block.samples(_V1_HEADER + 1, count, form)
-        if abs(count * dt - float(length)) > 2.0 * dt:
-            raise ValueError(
-                f"{where}: {count} samples at {1 / dt:g} per second are not {length} s; the file is damaged"
-            )
+        there, got = abs(count * dt - float(length)) <= 2.0 * dt, f"{count} samples at {1 / dt:g} per second"
+        expect(there, where, f"{length} s", got, "the file is damaged")
         printed = block.lines[_V1_HEADER + 1][: form[1]]
     else:
         found = _V1_UNITS.search("\n".join(block.lines[:_V1_TEXT]))
-        if found is None:
-            raise ValueError(f"{where}: expected 'Units of uncor data are sec and g' or 'g/10' in {_V1_TEXT} lines")
+        expect(found, where, f"'Units of uncor data are sec and g' or 'g/10' in {_V1_TEXT} lines")
         unit, width = found[1], _V1_PAIRS[1]
         count = _whole(float(block.field(_V1_TEXT, _V1_INTEGERS, _V1_COUNT)), where, "samples")
         pairs = block.samples(_V1_HEADER, 2 * count, _V1_PAIRS)
@@ -536,7 +498,7 @@ def _parse_v1(block: Block) -> Series:
 _SMC_NULL = 1.6e38  # larger reals stand for missing values
 _SMC_TYPES = ("1 UNCORRECTED ACCELEROGRAM", "2 CORRECTED ACCELEROGRAM")
 _SMC_TEXT, _SMC_INTEGERS, _SMC_REALS, _SMC_DATA = 11, (8, 10), (5, 15), (8, 10)
-_GEONET_TEXT, _GEONET_FORM, _MOST_COMPONENTS = 16, (10, 8), 100
+_GEONET_TEXT, _GEONET_FORM = 16, (10, 8)
 _GEONET_PEAK = re.compile(rf"Acceleration:\s*peak\s*({NUMBER})\s*mm/s/s", re.IGNORECASE)
 _GEONET_STEP = re.compile(rf"\bat\s+(?:intervals\s+of\s+)?({NUMBER})\s*s", re.IGNORECASE)
 _GEONET_UNIT = re.compile(rf"in\s+units\s+of\s+({NUMBER})\s*mm/s/s", re.IGNORECASE)
@@ -546,22 +508,19 @@ def _parse_smc(text: str, file: str) -> Series:
     """The samples of a USGS SMC file, uncorrected or corrected."""
     block = Block(file, text.splitlines())
     title = " ".join(block.lines[0].split(maxsplit=1)) if block.lines else ""
-    if title.strip() not in _SMC_TYPES:
-        raise ValueError(
-            f"{file}: expected the first line of an SMC file, {' or '.join(_SMC_TYPES)}; got {title[:80]!r}"
-        )
+    known, expected = title.strip() in _SMC_TYPES, f"the first line of an SMC file, {' or '.join(_SMC_TYPES)}"
+    expect(known, file, expected, repr(title[:80]))
     integers, start = block.header(_SMC_TEXT, 48, _SMC_INTEGERS)
     reals, start = block.header(start, 50, _SMC_REALS)
     comments, count = (_whole(integers[place], file, what) for place, what in ((15, "comment lines"), (16, "samples")))
     rate, highest, lowest = reals[1], reals[29], reals[31]
     uneven = rate >= _SMC_NULL  # pairs of time and acceleration
-    if not rate > 0.0 or (uneven and count % 2):
-        raise ValueError(
-            f"{file}: expected a positive number of samples per second as the second real, or none for an even number "
-            f"of times and accelerations, got {rate:g} and {count} numbers"
-        )
-    if not all(line.startswith("|") for line in block.lines[start : start + comments]):
-        raise ValueError(f"{file}: expected {comments} comment lines that start with '|'; the file is damaged")
+    expected = (
+        "a positive number of samples per second as the second real, or none for an even number of times and values"
+    )
+    expect(rate > 0.0 and not (uneven and count % 2), file, expected, f"{rate:g} and {count} numbers")
+    marked = all(line.startswith("|") for line in block.lines[start : start + comments])
+    expect(marked, file, f"{comments} comment lines that start with '|'", advice="the file is damaged")
     numbers = block.samples(start + comments, count, _SMC_DATA)
     values = numbers[1::2] if uneven else numbers
     for stated, found in ((highest, values.max()), (lowest, values.min())):
@@ -576,8 +535,6 @@ def _parse_geonet(text: str, file: str) -> list[Found]:
     """The components of a GeoNet V1A or V2A file, with directions such as ``"S16W"`` or ``"Up"``."""
     block, place, found = Block(file, text.splitlines()), 0, []
     while any(line.strip() for line in block.lines[place : place + 3]):
-        if len(found) >= _MOST_COMPONENTS:
-            raise ValueError(f"{file}: expected at most {_MOST_COMPONENTS} components")
         component, series, place = _geonet_component(block, place)
         found.append(Found(component, series.title, file, lambda series=series: series))
     return found
@@ -590,12 +547,9 @@ def _geonet_component(block: Block, place: int) -> tuple[str, Series, int]:
     first = re.match(r"\s*(un)?corrected accelerogram", head, re.IGNORECASE)
     peak, component = _GEONET_PEAK.search(head), re.search(r"^Component\s+(\S+)", head, re.MULTILINE)
     step = next((match for line in head.splitlines()[10:12] if (match := _GEONET_STEP.search(line))), None)
-    if first is None or peak is None or component is None or step is None:
-        raise ValueError(
-            f"{where}: expected 'Corrected accelerogram' or 'Uncorrected accelerogram', the first line of a component "
-            f"of a GeoNet file, and component, step and peak acceleration in {_GEONET_TEXT} lines; got "
-            f"{lines[place][:80]!r}"
-        )
+    expected = "'Corrected accelerogram' or 'Uncorrected accelerogram', the first line of a component of a GeoNet file"
+    expected += f", and component, step and peak acceleration in {_GEONET_TEXT} lines"
+    expect(first and peak and component and step, where, expected, repr(lines[place][:80]))
     integers, start = block.header(place + _GEONET_TEXT, 40, _GEONET_FORM)
     reals, start = block.header(start, 60, _GEONET_FORM)
     counts, dt = [_whole(number, block.file, "samples") for number in integers[33:36]], reals[25]
@@ -608,8 +562,8 @@ def _geonet_component(block: Block, place: int) -> tuple[str, Series, int]:
     resolution = 1.01 * scale * 10.0 ** -decimals_of(printed) + 0.505 * 10.0 ** -decimals_of(peak[1])
     _check_peak(_largest(values), abs(float(peak[1])), resolution, where)
     end = start + sum(math.ceil(count / _GEONET_FORM[0]) for count in counts)
-    if end > len(lines):
-        raise ValueError(f"{where}: expected {sum(counts)} numbers up to line {end}; the file is truncated")
+    expected = f"{sum(counts)} numbers up to line {end}"
+    expect(end <= len(lines), where, expected, advice="the file is truncated")
     site = re.search(r"^Site\s+(\S+)", head, re.MULTILINE)
     title = f"{site[1] if site else 'GeoNet'}, component {component[1]}"
     return component[1], Series(title, dt, "mm/s2", values), end
@@ -624,8 +578,8 @@ _ESM_TEXT, _ESM_NAME = 200, re.compile(r"[A-Z][A-Z0-9_/^]*:")  # most lines of t
 
 def _stated(header: dict[str, str], names: tuple[str, ...], file: str, form: str) -> list[str]:
     """The values of names in a header; ValueError if one is missing."""
-    if missing := [name for name in names if name not in header]:
-        raise ValueError(f"{file}: expected the header of {form} file, {', '.join(missing)} are missing")
+    missing = ", ".join(name for name in names if name not in header)
+    expect(not missing, file, f"the header of {form} file, {missing} are missing")
     return [header[name] for name in names]
 
 
@@ -643,11 +597,9 @@ def _parse_knet(text: str, file: str) -> Series:
     station, frequency, duration, direction, factor, peak = _stated(header, names, file, "a K-NET")
     rate = parse_number(re.sub(r"\s*hz$", "", frequency, flags=re.IGNORECASE), f"{file}, Sampling Freq")
     scale = _KNET_SCALE.match(factor)
-    if scale is None or not float(scale[2]) > 0.0 or not rate > 0.0:
-        raise ValueError(
-            f"{file}: expected a positive sampling frequency and a scale factor such as '3920(gal)/6182761', got "
-            f"{rate:g} and {factor!r}"
-        )
+    known = scale is not None and float(scale[2]) > 0.0 and rate > 0.0
+    expected = "a positive sampling frequency and a scale factor such as '3920(gal)/6182761'"
+    expect(known, file, expected, f"{rate:g} and {factor!r}")
     counts = _samples_below(lines, _KNET_TEXT, file)
     expected = _whole(rate * parse_number(duration, f"{file}, Duration Time"), file, "samples")
     check_count(counts.size, expected, f"{file}: frequency times duration")
@@ -668,8 +620,7 @@ def _parse_esm(text: str, file: str) -> Series:
         header[name] = value.strip()
     names = ("SAMPLING_INTERVAL_S", "NDATA", "UNITS", "DATA_TYPE", "STATION_CODE", "STREAM")
     interval, count, unit, kind, station, stream = _stated(header, names, file, "an ESM or ITACA")
-    if kind.upper() != "ACCELERATION":
-        raise ValueError(f"{file}: expected acceleration, got DATA_TYPE {kind!r}; take the ACC file")
+    expect(kind.upper() == "ACCELERATION", file, "acceleration", f"DATA_TYPE {kind!r}", "take the ACC file")
     dt = _check_step(parse_number(interval, f"{file}, SAMPLING_INTERVAL_S"), f"{file}, SAMPLING_INTERVAL_S")
     values, where = _samples_below(lines, len(header), file), f"{file}: NDATA"
     check_count(values.size, _whole(parse_number(count, where), file, "samples"), where)
@@ -702,11 +653,9 @@ def _parse_obspy(path: str | Path, form: str, channel: str | None) -> Series:
         traces = [trace for trace in stream if channel is None or trace.id.endswith(channel)]
     except Exception as error:  # a damaged file may raise anything
         raise ValueError(f"{path}: obspy cannot read the file ({error}); download it again") from error
-    if len(traces) != 1:
-        raise ValueError(
-            f"{path}: expected one trace with channel = {channel!r}, found {len(traces)}; the traces are "
-            f"{', '.join(trace.id for trace in stream)}"
-        )
+    there = ", ".join(trace.id for trace in stream)
+    expected = f"one trace with channel = {channel!r}, found {len(traces)}"
+    expect(len(traces) == 1, path, expected, advice=f"the traces are {there}")
     (trace,) = traces
     if np.ma.is_masked(trace.data):
         raise ValueError(
@@ -719,10 +668,8 @@ def _parse_obspy(path: str | Path, form: str, channel: str | None) -> Series:
             "(trace.remove_response with output='ACC') and make a Record of the samples"
         )
     quantity = _NO_ACCELERATION.get(trace.stats.get("sac", {}).get("idep"))
-    if quantity is not None:
-        raise ValueError(
-            f"{path}: expected acceleration, the SAC header of {trace.id} says {quantity}; differentiate it"
-        )
+    got = f"{quantity} by the SAC header of {trace.id}"
+    expect(quantity is None, path, "acceleration", got, "differentiate it")
     rate = round(1.0 / trace.stats.delta)  # SAC has the step in single precision
     dt = 1.0 / rate if rate and abs(rate * trace.stats.delta - 1.0) < 1e-6 else trace.stats.delta
     return Series(trace.id, float(dt), None, np.asarray(trace.data, dtype=np.float64), name=trace.id)

@@ -40,7 +40,6 @@ __all__ = [
     "check_count",
     "check_peaks",
     "clock_text",
-    "column_unit",
     "column_values",
     "decimals_of",
     "decode_text",
@@ -443,7 +442,6 @@ class Table(NamedTuple):
     title: str  # the first comment
     stated: Statements  # what comments and the text above state
     missing: tuple[float | str, ...] | None  # what stands for missing samples, if the caller says it
-    found: set[str]  # texts of missing samples that rows have
     clock: ClockTime | None = None  # the first clock time
     time: int | None = None  # column of times
     time_unit: str | None = None  # as given by the caller
@@ -477,11 +475,10 @@ def read_table(
     separator = "\t" if is_book else _separator([line for _, line in lines[-_LAST_LINES:]])
     rows = [(number, _split(line, separator, f"{file}, line {number}")) for number, line in lines]
     rows, stated = _logger_table(rows, file)
-    missing, found = _checked_missing(missing), set[str]()
+    missing = _checked_missing(missing)
     marks = [each for each in missing or () if isinstance(each, str)]
     for _, cells in rows if marks else ():  # but names of columns
         if any(map(_known, cells)) or all(cell in marks or _is_missing(cell) for cell in cells):
-            found |= {*cells} & {*marks}
             cells[:] = ["nan" if cell in marks else cell for cell in cells]
     along_rows = along_rows and not any("rows" in row for _, row in rows[:_LAST_LINES])
     announced = None if along_rows or stated else _announced(rows, file)
@@ -495,7 +492,7 @@ def read_table(
     above = [line for number, line in lines if number < rows[0][0]]
     statements = read_statements([*comments, *stated, *above], commas)
     title, numbers = "".join([*comments, *stated][:1]), tuple(number for number, _ in rows)
-    table = Table(file, bool(names), columns, numbers, title, statements, missing, found, clock, None, time_unit)
+    table = Table(file, bool(names), columns, numbers, title, statements, missing, clock, None, time_unit)
     for words, count in statements.counts:
         check_count(len(rows), count, f"{file}: {words!r}", f". {_SKIP}")
     if time is None:
@@ -854,21 +851,6 @@ def text_unit(table: Table, place: int, dimension: str, others: bool = False) ->
     return next((unit for _, unit, _ in table.stated.peaks_of(names, places.index(place)) if unit), None)
 
 
-def column_unit(
-    table: Table, place: int, values: NDArray[np.float64], given: str | None, dimension: str, where: str
-) -> str:
-    """The unit of a column, on which file and caller agree; a stated peak is compared with its `values`."""
-    named = stated_unit(table, place, dimension)
-    text = text_unit(table, place, dimension, others=named is not None or given is not None)
-    stated = agree_on_unit(named, text, dimension, f"{where} (column and text)") if named or text else None
-    unit = agree_on_unit(stated, given, dimension, where)
-    if dimension == "acceleration" and not np.isnan(values).any():
-        places, decimals = value_columns(table), table.columns[place].decimals
-        peaks = table.stated.peaks_of([table.columns[k].name for k in places], places.index(place))
-        check_peaks(peaks, values, decimals, unit, table.file, f". {_SKIP}")
-    return unit
-
-
 def value_columns(table: Table) -> list[int]:
     """The places of the columns with values."""
     return [k for k, column in enumerate(table.columns) if column.kind == "number" and k != table.time]
@@ -938,19 +920,23 @@ def table_values(
 ) -> list[tuple[NDArray[np.float64], str, str]]:
     """Samples of columns (n_rows,), units and dimensions, of columns' names, dimensions, units and words for messages.
 
-    Warns if a number for missing samples is in none of the columns, or a text in no row: the file may write it in
-    another way.
+    Units are those on which file and caller agree; stated peaks are compared. Warns if a number for missing samples is
+    in none of the columns: the file may write it in another way.
     """
     found, places = [], [_value_column(table, name) for name, *_ in columns]
-    for place, (_, dimension, unit, where) in zip(places, columns, strict=True):
-        values = column_values(table, place)
-        found.append((values, column_unit(table, place, values, unit, dimension, where), dimension))
-    absent = []
-    for each in table.missing or ():
-        if isinstance(each, str):
-            absent += [] if each in table.found else [repr(each)]
-        elif not any(each in table.columns[place].values for place in places):
-            absent.append(f"{each:g}")
+    for place, (_, dimension, given, where) in zip(places, columns, strict=True):
+        values, named = column_values(table, place), stated_unit(table, place, dimension)
+        text = text_unit(table, place, dimension, others=named is not None or given is not None)
+        stated = agree_on_unit(named, text, dimension, f"{where} (column and text)") if named or text else None
+        unit = agree_on_unit(stated, given, dimension, where)
+        if dimension == "acceleration" and not np.isnan(values).any():
+            others, decimals = value_columns(table), table.columns[place].decimals
+            peaks = table.stated.peaks_of([table.columns[k].name for k in others], others.index(place))
+            check_peaks(peaks, values, decimals, unit, table.file, f". {_SKIP}")
+        found.append((values, unit, dimension))
+    values = [table.columns[place].values for place in places]
+    listed = [each for each in table.missing or () if not isinstance(each, str)]
+    absent = [f"{each:g}" for each in listed if not any(each in column for column in values)]
     if absent:
         warnings.warn(
             f"{table.file}: missing={', '.join(absent)} is in none of the columns that "
@@ -1000,8 +986,12 @@ def _time_unit(table: Table) -> float:
     return find_unit(agree_on_unit(stated, table.time_unit, "time", f"{table.file} (times)")).factor
 
 
-def _times(table: Table) -> NDArray[np.float64]:
-    """Times of the rows [s]; ValueError if some are missing, or another column has different times."""
+def row_times(table: Table, dt: float | None = None) -> NDArray[np.float64]:
+    """Times of the rows [s]; ValueError if there are none or some are missing, for a `dt`, or if columns differ."""
+    if table.time is None or dt is not None:
+        raise ValueError(
+            f"{table.file}: resample is for uneven times in the file and dt for a file without times; give one of them"
+        )
     unit, own = _time_unit(table), table.columns[table.time]
     times = own.values * unit
     line = table.lines[int(np.argmax(np.isnan(times)))]
@@ -1028,15 +1018,6 @@ def _times(table: Table) -> NDArray[np.float64]:
     return times
 
 
-def row_times(table: Table, dt: float | None = None) -> NDArray[np.float64]:
-    """The times of the rows [s]; ValueError if the table has none, some are missing, or `dt` is given."""
-    if table.time is None or dt is not None:
-        raise ValueError(
-            f"{table.file}: resample is for uneven times in the file and dt for a file without times; give one of them"
-        )
-    return _times(table)
-
-
 def _uniform_step(table: Table) -> tuple[float, float]:
     """The mean step of the times [s], and the largest error in it that rounding can cause.
 
@@ -1046,7 +1027,7 @@ def _uniform_step(table: Table) -> tuple[float, float]:
     may differ by 2e-7 times the largest time, if this is less than a quarter of a step. Other times must be uniform
     within 1e-4 of a step and round-off.
     """
-    times, column = _times(table), table.columns[table.time]
+    times, column = row_times(table), table.columns[table.time]
     advice = "print the times with more digits, or leave the column out and give dt="
     increasing = times.size > 1 and times[-1] > times[0]
     expect(increasing, table.file, "times that increase over 2 rows or more", f"{times.size} row(s)", advice)
@@ -1145,7 +1126,6 @@ def table_start(table: Table, step: float, zero: float | str = 0.0) -> float:
 
 _GAP = 1.5  # usual steps between two samples, from which on samples are missing
 _NEAR = 0.1  # usual steps from a sample, within which a time beside a gap has its value
-_MOST_REPEATED = 0.05  # share of rows that repeat a time; more are the times of packets
 _LARGEST_DIFFERENCE = 0.05  # relative, of the new step from the usual one
 
 
@@ -1158,11 +1138,9 @@ class UniformTimes(NamedTuple):
     usual: float  # mean step without gaps [s]
     gaps: NDArray[np.float64]  # (n_gaps,) lengths [s]
     note: str  # what is done, for the description of the data
-    kept: NDArray[np.bool_]  # (n_rows,) samples that are used: of those with equal times the first
 
     def interpolate(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Values (n_steps,) at the uniform times, linear between known samples, NaN in gaps and beyond the last."""
-        values = values[self.kept]
         known = np.flatnonzero(~np.isnan(values))
         if known.size == 0:
             return np.full(self.uniform.size, np.nan)
@@ -1185,23 +1163,17 @@ class UniformTimes(NamedTuple):
                 UserWarning,
                 stacklevel=stacklevel + 1,
             )
-        return np.interp(self.uniform, self.times, values[self.kept])
+        return np.interp(self.uniform, self.times, values)
 
 
 def uniform_times(times: NDArray[np.float64], step: float | None, where: str) -> UniformTimes:
     """Return times with the uniform `step` [s] from the first to the last of the given times (n_samples,) [s].
 
     The default step is a whole number of samples per second within 5 % of the usual step, else the usual step. Raises
-    ValueError if times decrease or many repeat, more than half of the samples are missing, or the step differs from the
-    usual one by more than 5 %: that would need a filter (`Record.resample`, `Measurements.decimate`). Of samples with
-    equal times the first one is used.
+    ValueError unless times increase, if more than half of the samples are missing, or if the step differs from the
+    usual one by more than 5 %: that would need a filter (`Record.resample`, `Measurements.decimate`).
     """
     step = None if step is None else check_step(step, f"resample of {where}")
-    kept = np.concatenate([[True], np.diff(times) != 0.0])
-    if 0 < (repeated := np.count_nonzero(~kept)) <= _MOST_REPEATED * times.size:
-        first_repeated, times = float(times[~kept][0]), times[kept]
-    else:
-        repeated, kept = 0, np.ones(times.size, dtype=bool)
     increments = np.diff(times)
     if times.size < 2 or not np.all(increments > 0.0):
         place = int(np.argmax(~(increments > 0.0))) if times.size > 1 else 0
@@ -1220,9 +1192,8 @@ def uniform_times(times: NDArray[np.float64], step: float | None, where: str) ->
     gaps, others = (increments[chosen] for chosen in (increments > _GAP * usual, increments <= _GAP * usual))
     note = f"interpolated linearly to a step of {step:g} s from steps of {others.min():.4g} to {others.max():.4g} s"
     note += f", with {gaps.size} gap(s) of up to {gaps.max():.4g} s" if gaps.size else ""
-    note += f", without {repeated} row(s) of a repeated time, the first at {first_repeated:g} s" if repeated else ""
     duration = times[-1] - times[0]
     got = f"{times.size} in {duration:.4g} s with a gap of {gaps.max(initial=0.0):.4g} s"
     expect(duration <= 2 * times.size * step, where, "samples at most times", got, "cut the file at its long gaps")
     uniform = times[0] + step * np.arange(int(duration / step + 1e-6) + 1)
-    return UniformTimes(times, step, uniform, usual, gaps, note, kept)
+    return UniformTimes(times, step, uniform, usual, gaps, note)

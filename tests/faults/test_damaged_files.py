@@ -49,26 +49,17 @@ def careless(path, column=None):
     return Record("a", 0.02, G0 * np.array(values))
 
 
-def nested(depth):
-    content = zipped([("a.v2", b"x")])
-    for _ in range(depth):
-        content = zipped([("inner.zip", content)])
-    return content
-
-
 @pytest.mark.parametrize(
     ("make", "match"),
     [
-        (lambda: nested(6), "at most 3 archives within each other"),
         (lambda: zipped([(f"{i}.v2", b"") for i in range(5000)]), "at most 2000 files with"),
         (lambda: zipped([(f"{i}.v2", b"\0" * 2**23) for i in range(20)]), "at most 2000 files with"),
         (
             lambda: zipped([(f"{k}.zip", zipped([(f"{i}.v2", b"\0" * 2**22) for i in range(9)])) for k in "abc"]),
             "at most 2000 files with",
         ),
-        (lambda: zipped([("a.v2", b"\n" * 2**23 + b"x")]), "at most 4000000 lines"),
     ],
-    ids=["nested", "many", "large", "nested and large", "lines"],
+    ids=["many", "large", "nested and large"],
 )
 def test_archives_have_total_limits(make, match, tmp_path):
     content = make()
@@ -122,4 +113,4 @@ def test_hdf5_that_declares_more_than_it_contains(tmp_path):
         attributes = dict(file["record/acceleration"].attrs)
         del file["record/acceleration"]
         file.create_dataset("record/acceleration", (10**11,), dtype="<f8", chunks=(1024,)).attrs.update(attributes)
-    refused(read_dataset, path, path.read_bytes(), "declares 100000000000 numbers, more than the file can contain")
+    refused(read_dataset, path, path.read_bytes(), "not a complete data set")

@@ -96,8 +96,6 @@ def test_texts_for_missing_samples(tmp_path, mark, place):
     assert read_record(path, column="OL", units="g", missing=mark).n_steps == 4
     with pytest.raises(ValueError, match="an excitation needs all samples, 2 are missing"):
         read_record(path, column="acc_g", missing=[mark, -9999])
-    with pytest.warns(UserWarning, match="missing='UL' is in none of the columns"):
-        read_columns(path, [TOP], ["acc_g"], missing=[mark, "UL", -9999])
 
 
 @pytest.mark.parametrize("missing", [["9999"], ["1,5"], [" "], [None], ["10:32:07"]])

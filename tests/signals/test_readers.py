@@ -292,7 +292,9 @@ class TestV2OnRealZips:
             text.replace(
                 " 1138 POINTS OF ACCEL", " 1130 POINTS OF ACCEL"
             ): r"line 188: expected 2 numbers of 10 columns after .* samples, got 8",
-            text.replace(" 1138 POINTS OF ACCEL", " 1136 POINTS OF ACCEL"): "announces 1136 samples but has more",
+            text.replace(
+                " 1138 POINTS OF ACCEL", " 1136 POINTS OF ACCEL"
+            ): "expected 1136 samples as the file announces, but it has more",
             text.replace(" AT  .020 SEC.  (UNITS", " AT  .010 SEC.  (UNITS"): "step is .010 s in the text but 0.02 s",
             text.replace("(UNITS: CM/SEC/SEC)", ""): "expected the unit of acceleration",
             text.replace("(UNITS: CM/SEC/SEC)", "(UNITS: CM/SEC)"): "a unit of velocity",

@@ -396,7 +396,7 @@ def test_a_scale_factor_without_a_number_is_one_gal(tmp_path):
     expected = read(tmp_path, "a.NS", text(*lines))
     bare = [line.replace("1(gal)/", "(gal)/") for line in lines]
     assert same(read(tmp_path, "a.NS", text(*bare)), expected)
-    with pytest.raises(ValueError, match="states a peak of"):
+    with pytest.raises(ValueError, match="the peak of"):
         read(tmp_path, "a.NS", text(*(line.replace("(gal)/1048.2", "(gal)/1000") for line in bare)))
 
 
