@@ -40,7 +40,6 @@ __all__ = [
     "check_count",
     "check_peaks",
     "clock_text",
-    "column_values",
     "decimals_of",
     "decode_text",
     "dimension_of",
@@ -495,8 +494,13 @@ def read_table(
     table = Table(file, bool(names), columns, numbers, title, statements, missing, clock, None, time_unit)
     for words, count in statements.counts:
         check_count(len(rows), count, f"{file}: {words!r}", f". {_SKIP}")
-    if time is None:
-        return table._replace(time=_time_column(table))
+    if time is None and not table.named and time_unit is not None and len(columns) > 1:
+        return table._replace(time=0)
+    if time is None:  # by the name of the column, else a clock
+        numbers = [k for k, column in enumerate(columns) if column.kind == "number" and table.named]
+        named = [k for form in (_TIME, _STAMP) for k in numbers if form.match(columns[k].name)]
+        clocks = [k for k, column in enumerate(columns) if column.kind == "clock"]
+        return table._replace(time=next(iter(named + clocks), None))
     places = [k for k, column in enumerate(columns) if column.name == str(time) and column.kind != "text"]
     if len(places) != 1:
         raise ValueError(
@@ -879,28 +883,6 @@ def _value_column(table: Table, column: int | str | None = None) -> int:
     return places[0]
 
 
-def column_values(table: Table, place: int) -> NDArray[np.float64]:
-    """The numbers of a column, with NaN for numbers that stand for missing samples.
-
-    ValueError for another number that usually does, unless the caller says that none does, or the number may have been
-    measured: the column has other numbers within 1 % of it, or, for -999 and the limits of integers, other numbers of
-    half its size, like the samples next to a measured peak.
-    """
-    given = table.missing or ()
-    listed = [each for each in given if not isinstance(each, str)]
-    values = np.where(np.isin(table.columns[place].values, listed), np.nan, table.columns[place].values)
-    for sentinel in (*_SENTINELS, *_PLAUSIBLE_SENTINELS) if table.missing != () else ():
-        found, size = np.flatnonzero(values == sentinel), abs(sentinel)
-        close = sentinel in _SENTINELS
-        similar = np.abs(values - sentinel) <= 0.01 * size if close else np.abs(values) >= 0.5 * size
-        if found.size and np.count_nonzero(similar) == found.size:
-            numbers = ", ".join(repr(each) if isinstance(each, str) else f"{each:g}" for each in (*given, sentinel))
-            got = f"{sentinel:g} in {found.size} rows, which usually stands for a missing sample"
-            advice = f"give missing=[{numbers}] to read it as NaN, or missing=[] if it was measured"
-            expect(False, f"{table.file}, line {table.lines[found[0]]}", "a measured number", got, advice)
-    return values
-
-
 def _checked_missing(missing: Sequence[float | str] | None) -> tuple[float | str, ...] | None:
     """Numbers and texts that stand for missing samples; ValueError for other values, and for numbers in quotes."""
     if missing is None:
@@ -924,18 +906,31 @@ def table_values(
     in none of the columns: the file may write it in another way.
     """
     found, places = [], [_value_column(table, name) for name, *_ in columns]
-    for place, (_, dimension, given, where) in zip(places, columns, strict=True):
-        values, named = column_values(table, place), stated_unit(table, place, dimension)
-        text = text_unit(table, place, dimension, others=named is not None or given is not None)
+    given = table.missing or ()
+    listed = [each for each in given if not isinstance(each, str)]
+    for place, (_, dimension, unit, where) in zip(places, columns, strict=True):
+        values, named = table.columns[place].values, stated_unit(table, place, dimension)
+        values = np.where(np.isin(values, listed), np.nan, values)
+        # a sentinel may be measured if the column has other numbers within 1 % of it, or the plausible ones if others
+        # have half its size, like the samples next to a peak
+        for sentinel in (*_SENTINELS, *_PLAUSIBLE_SENTINELS) if table.missing != () else ():
+            there, size = np.flatnonzero(values == sentinel), abs(sentinel)
+            close = sentinel in _SENTINELS
+            similar = np.abs(values - sentinel) <= 0.01 * size if close else np.abs(values) >= 0.5 * size
+            if there.size and np.count_nonzero(similar) == there.size:
+                marks = [repr(each) if isinstance(each, str) else f"{each:g}" for each in (*given, sentinel)]
+                got = f"{sentinel:g} in {there.size} rows, which usually stands for a missing sample"
+                advice = f"give missing=[{', '.join(marks)}] to read it as NaN, or missing=[] if it was measured"
+                expect(False, f"{table.file}, line {table.lines[there[0]]}", "a measured number", got, advice)
+        text = text_unit(table, place, dimension, others=named is not None or unit is not None)
         stated = agree_on_unit(named, text, dimension, f"{where} (column and text)") if named or text else None
-        unit = agree_on_unit(stated, given, dimension, where)
+        unit = agree_on_unit(stated, unit, dimension, where)
         if dimension == "acceleration" and not np.isnan(values).any():
             others, decimals = value_columns(table), table.columns[place].decimals
             peaks = table.stated.peaks_of([table.columns[k].name for k in others], others.index(place))
             check_peaks(peaks, values, decimals, unit, table.file, f". {_SKIP}")
         found.append((values, unit, dimension))
     values = [table.columns[place].values for place in places]
-    listed = [each for each in table.missing or () if not isinstance(each, str)]
     absent = [f"{each:g}" for each in listed if not any(each in column for column in values)]
     if absent:
         warnings.warn(
@@ -952,16 +947,6 @@ def table_values(
 _TIME = re.compile(r"(elapsed |relative )?(t|(time|zeit|temps|tempo|tiempo)\d*)(\b|_)", re.IGNORECASE)
 _STAMP = re.compile(r"(timestamp|unix|epoch)(\b|_)", re.IGNORECASE)  # times if no other column has them
 _UNIX = re.compile(r"unix|epoch", re.IGNORECASE)
-
-
-def _time_column(table: Table) -> int | None:
-    """Place of the times: by the name of the column, else a clock, or the first column of a table without names."""
-    kinds = [column.kind for column in table.columns]
-    if not table.named and table.time_unit is not None and len(kinds) > 1:
-        return 0
-    numbers = [k for k, kind in enumerate(kinds) if kind == "number" and table.named]
-    named = (k for form in (_TIME, _STAMP) for k in numbers if form.match(table.columns[k].name))
-    return next(named, kinds.index("clock") if "clock" in kinds else None)
 
 
 def _is_unix(seconds: float) -> bool:
@@ -999,15 +984,11 @@ def row_times(table: Table, dt: float | None = None) -> NDArray[np.float64]:
     for place, other in enumerate(() if table.chosen or not table.named else table.columns):
         if place == table.time or other.kind != own.kind:
             continue
-        by_name, stated = _TIME.match(other.name), None
-        if own.kind == "number":
-            stated = stated_unit(table, place)  # T may be a temperature
-            if not (by_name or _STAMP.match(other.name)) or (
-                (not by_name or re.match(r"t(\b|_)", other.name, re.IGNORECASE))
-                if stated is None
-                else dimension_of(stated) != "time"
-            ):
-                continue
+        stated = stated_unit(table, place) if own.kind == "number" else None
+        named = _TIME.match(other.name) or (stated and _STAMP.match(other.name))
+        is_t = not stated and re.match(r"t(\b|_)", other.name, re.IGNORECASE)  # T may be a temperature
+        if own.kind == "number" and (not named or is_t or (stated and dimension_of(stated) != "time")):
+            continue
         others_unit = unit if stated is None else find_unit(stated, "time").factor
         ahead = other.values * others_unit - times
         ahead = ahead - ahead[0] if _is_unix(abs(ahead[0])) else ahead  # a Unix time beside an elapsed one

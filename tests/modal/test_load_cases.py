@@ -31,7 +31,7 @@ def test_the_posterior_of_a_flexibility_is_normal():
     [
         ((CHANNELS, CASES[:2], VALUES), "each of 3 samples"),
         ((CHANNELS, ("a", "a", "b"), VALUES), "different names of load cases"),
-        ((CHANNELS, CASES, to_si(1.0, "mm")), "shape"),
+        ((CHANNELS, CASES, to_si(1.0, "mm")), "one row per channel"),
         ((CHANNELS, CASES, VALUES, {"top": 1.0}), "standard deviations .* of midspan, bottom; got .*top"),
         ((CHANNELS, CASES, VALUES, {"midspan": 0.0}), "'midspan': 0.0"),
     ],
