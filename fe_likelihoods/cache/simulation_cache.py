@@ -12,7 +12,6 @@ aside, and while the file cannot be written, rows wait in memory.
 
 import logging
 import os
-import secrets
 import sqlite3
 from collections.abc import Collection
 from pathlib import Path
@@ -123,10 +122,6 @@ class SimulationCache:
         self.file = CacheFile(path)
         self.file.check()
         self.damaged, self._waiting = 0, list[Row]()
-        self._rename()
-
-    def _rename(self) -> None:
-        self.name = secrets.token_hex(8)  # of the object, under which likelihoods share what they have verified
 
     def __getstate__(self) -> dict:
         return vars(self) | {"damaged": 0, "_waiting": []}
@@ -238,7 +233,6 @@ class SimulationCache:
         sources = {source_number(fingerprint) for fingerprint in fingerprints}
         with self.file.lock:
             self._waiting = [row for row in self._waiting if row.source not in sources]
-            self._rename()
             delete, rows = "DELETE FROM rows WHERE source = ?", [(source,) for source in sources]
             return self.file.insist(lambda connection: connection.executemany(delete, rows).rowcount)
 

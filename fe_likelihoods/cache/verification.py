@@ -162,10 +162,9 @@ class VerifiedModel:
 
     `measured` are values (n_channels, n_steps) or a `Comparison`, `_key` is the identity of stored statistics. `label`
     is that of the model when it was first simulated, with the statistic's code. Derived likelihoods and copies share
-    its `Trust`, and so do likelihoods of one cache object with equal models that run no user code. `verifications`
-    counts simulations that were made again, `unverified` rows whose new simulation was stopped (not by the model),
-    `seconds` is the wall time of simulations [s]; `has_results` says whether results are known in this process. Methods
-    take the model's `fingerprint`, which is one for a request.
+    its `Trust`. `verifications` counts simulations that were made again, `unverified` rows whose new simulation was
+    stopped (not by the model), `seconds` is the wall time of simulations [s]; `has_results` says whether results are
+    known in this process. Methods take the model's `fingerprint`, which is one for a request.
     """
 
     _key: str
@@ -188,11 +187,9 @@ class VerifiedModel:
         self._label_model()
 
     def _label_model(self) -> None:
-        label, fingerprint, key = ModelLabel(self.model, self.statistic), self.model.fingerprint, secrets.token_hex(16)
-        if self.cache is not None and not label.observes:  # user code may depend on what no label contains
-            key = f"{self.cache.name} {label.code} {fingerprint}"
-        self._trust = Trust.of(label, key)
-        self._known: dict[str, str | None] = label.items | {FINGERPRINT: fingerprint}
+        label = ModelLabel(self.model, self.statistic)
+        self._trust = Trust.of(label, secrets.token_hex(16))
+        self._known: dict[str, str | None] = label.items | {FINGERPRINT: self.model.fingerprint}
         self._begin()
 
     def _begin(self) -> None:

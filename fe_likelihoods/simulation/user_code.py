@@ -87,9 +87,9 @@ def package_version(top: str) -> str:
 
 
 @functools.cache
-def sources_digest(*patterns: str) -> bytes:
-    """Digest of this library's source files: those that match patterns such as ``"kernels/*.py"``, or all files."""
+def sources_digest() -> bytes:
+    """Digest of this library's source files."""
     root, digest = Path(__file__).resolve().parents[1], blake2b(digest_size=16)
-    for file in sorted({file for pattern in patterns or ("**/*.py",) for file in root.glob(pattern)}):
+    for file in sorted(root.glob("**/*.py")):
         digest.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes())
     return digest.digest()
