@@ -5,7 +5,7 @@ of the simulations are. Each point is evaluated in a thread, which waits for its
 """
 
 import os
-from concurrent.futures import Future, wait
+from concurrent.futures import Future
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -15,7 +15,7 @@ import numpy as np
 from samplers.evaluation.point_queue import PointQueue
 
 from ..priors.points import as_points
-from ..simulation.local_pool import Threads
+from ..simulation.local_pool import Threads, settle
 from ..simulation.model import has_batch_method
 
 __all__ = ["evaluation_queue"]
@@ -48,9 +48,11 @@ def evaluation_queue(posterior: Any) -> PointQueue:
             with suppress(Exception):  # raised by `collect`
                 evaluate(rows)  # together, which is faster; their simulations are known then
         futures, items = [Future() for _ in rows], [row[None] for row in rows]
-        threads.submit_all(futures, items, (size() or _MOST_THREADS) if streams else 1)
-        if not streams:
-            wait(futures)
+        if streams:
+            threads.submit_all(futures, items, size() or _MOST_THREADS)
+        else:
+            for future, item in zip(futures, items, strict=True):
+                settle(future, evaluate, item)
         return futures
 
     threads = Threads(lambda: evaluate)

@@ -22,7 +22,7 @@ from .by_value import Pickled
 from .faults import SimulationFailed, TransientReason
 from .worker import LoadingFailed, Worker
 
-__all__ = ["LocalPool", "Outcome", "Submitting", "Threads", "result_of", "value_of"]
+__all__ = ["LocalPool", "Outcome", "Submitting", "Threads", "result_of", "settle", "value_of"]
 
 MAX_ATTEMPTS = 3
 _THREADS = ("OMP", "OPENBLAS", "MKL", "BLIS", "VECLIB_MAXIMUM", "NUMBA")
@@ -111,16 +111,20 @@ class Threads:
 
 def _work(calls: SimpleQueue, function: Callable[[Any], Any]) -> None:
     while (call := calls.get()) is not None:
-        future, item = call
-        if future.set_running_or_notify_cancel():
-            try:
-                result = function(item)
-            except BaseException as error:
-                future.set_exception(error)
-            else:
-                future.set_result(result)
-        call = future = item = result = None  # which must not be kept while this thread waits
+        settle(call[0], function, call[1])
+        call = None  # which must not be kept while this thread waits
     calls.put(None)  # for the other threads
+
+
+def settle(future: Future, function: Callable[[Any], Any], item: Any) -> None:
+    """Set the result of a function for an item, or its error, unless the future was cancelled."""
+    if future.set_running_or_notify_cancel():
+        try:
+            result = function(item)
+        except BaseException as error:
+            future.set_exception(error)
+        else:
+            future.set_result(result)
 
 
 class _Job(Future):

@@ -167,17 +167,16 @@ class Worker:
             while not _ended(self._process) and time.monotonic() < give_up:  # it may end by itself, with its exit code
                 time.sleep(0.001)
             self.kill()
-            raise failure(TransientReason(describe_exit(self._process.returncode, "the worker process"))) from None
+            raise failure(TransientReason(describe_exit(self._process.wait(), "the worker process"))) from None
         except BaseException:
             self.kill()
             raise
 
     def kill(self) -> None:
         """Kill the process and its session."""
-        if (process := self._process) is not None and self._owner == os.getpid():
+        if self._process is not None and self._owner == os.getpid():
             self._end()
-            process.wait()
-            discard(process.pid)
+            discard(self._process.pid)
 
 
 class Sandbox:
