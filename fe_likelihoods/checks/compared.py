@@ -110,7 +110,6 @@ class Fits(NamedTuple):
     fits: tuple[Fit, ...]
     before: str
     after: str
-    simulations: int  # run for the fits
 
 
 def checks_of(residuals: np.ndarray) -> ResidualChecks | None:
@@ -237,15 +236,13 @@ def _modes(key: str, likelihood: Any, draws: np.ndarray, samples: np.ndarray | N
 def fit_data_sets(run: FinishedRun) -> Fits:
     """Simulate two points of each data set, before and after the update; empty without a likelihood of this package."""
     if run.likelihood is None:
-        return Fits((), "", "", 0)
+        return Fits((), "", "")
     start, start_name = _before(run)
-    made, fits = run.likelihood.simulations, list[Fit]()
-    points = draws_to_compare(run.posterior), run.centre, start, run.samples
+    points, fits = (draws_to_compare(run.posterior), run.centre, start, run.samples), list[Fit]()
     for key, likelihood, columns in data_sets_of(run):
         draws, point, first, samples = (each[..., columns] for each in points)
         fits += compare(likelihood, draws, key, point, first, samples)
-    names = f"before: {start_name}", f"after: {run.centre_name}"
-    return Fits(tuple(fits), *names, run.likelihood.simulations - made)
+    return Fits(tuple(fits), f"before: {start_name}", f"after: {run.centre_name}")
 
 
 def _before(run: FinishedRun) -> tuple[np.ndarray, str]:

@@ -99,11 +99,11 @@ def halve_steps(
     return found, tests
 
 
-def check_stronger_motion(model: Any, theta: np.ndarray, response: np.ndarray, simulate: Simulate) -> list[Finding]:
+def check_stronger_motion(model: Any, theta: np.ndarray, response: np.ndarray) -> list[Finding]:
     """Whether twice the motion, if it can be replaced, fails or does not change the response (n_channels, n_steps)."""
     if not motions_to_replace(model):
         return []
-    batch = simulate(_under(model, lambda each: each.scale(2.0)), theta[None])
+    batch = simulate_batch(_under(model, lambda each: each.scale(2.0)), theta[None])
     if batch.reasons[0]:
         text = f"Under twice the base motion the simulation fails: {batch.reasons[0]}."
         return [Finding("A stronger motion fails", CARE, text, "Predictions of stronger events may fail as well.")]

@@ -78,8 +78,8 @@ def judge_run(run: FinishedRun) -> JudgedRun:
     A run that says nothing about the parameters gets no findings that compare its samples with prior, truth or noise.
     """
     rows, fits = rows_of(run.parameters, run.prior, moments_of(run), run.truth), fit_data_sets(run)
-    of_model, tested, made = _check_steps(run)
-    failed, fits = failures(run), fits._replace(simulations=fits.simulations + made)  # failures of the fits included
+    of_model, tested = _check_steps(run)
+    failed = failures(run)  # those of the fits included
     found = check_responses(fits.fits) + of_model  # first, because they explain a sampling that is not good
     found += _check_sampling(run) + _check_chain(run) + check_failures(failed)
     parts = [] if run.likelihood is None else [likelihood for likelihood, _ in run.likelihood.parts()]
@@ -110,31 +110,27 @@ def judge_run(run: FinishedRun) -> JudgedRun:
     return JudgedRun(rows, fits, failed, judge(unique, (tests | tested).items()))
 
 
-def _check_steps(run: FinishedRun) -> tuple[list[Finding], dict[str, str], int]:
-    """The error of step and mesh at the centre of the samples, what was tested, and simulations.
+def _check_steps(run: FinishedRun) -> tuple[list[Finding], dict[str, str]]:
+    """The error of step and mesh at the centre of the samples, and what was tested.
 
-    These are one for each parameter and more; where they are many and take long, step and mesh are not tested.
+    This takes a simulation for each parameter and more; where they are many and take long, it is not tested.
     """
     if run.likelihood is None or run.prior is None or run.is_inconclusive or not has_steps(run.likelihood):
-        return [], {}, 0
+        return [], {}
     known = {likelihood.model.fingerprint: likelihood for likelihood, _ in run.likelihood.parts()}
-    report, others = run.likelihood.report(), 0
-
-    def simulate(model: Any, points: np.ndarray) -> SimulationBatch:
-        nonlocal others
-        if model.fingerprint in known:
-            return known[model.fingerprint].simulate(points)
-        others += len(points)
-        return simulate_batch(model, points)
-
+    report = run.likelihood.report()
     needed = sum(2 + len(likelihood.model.parameter_names) for likelihood, _ in run.likelihood.parts())
     seconds = report["seconds"] / max(report["simulations"], 1)
     if run.n_modes > 1:
-        return [], {STEP: "not tested: the samples have several modes, which have no common standard deviation"}, 0
+        return [], {STEP: "not tested: the samples have several modes, which have no common standard deviation"}
     if needed > LARGEST_TEST * report["simulations"] and needed * seconds > TEST_SECONDS:
-        return [], {STEP: f"not tested: the test takes about {needed} simulations of {seconds:.2g} s"}, 0
-    found, tests = halve_steps(run.posterior, run.centre, run.samples.std(axis=0), simulate)
-    return found, tests, run.likelihood.simulations - report["simulations"] + others
+        return [], {STEP: f"not tested: the test takes about {needed} simulations of {seconds:.2g} s"}
+
+    def simulate(model: Any, points: np.ndarray) -> SimulationBatch:
+        cached = known.get(model.fingerprint)
+        return simulate_batch(model, points) if cached is None else cached.simulate(points)
+
+    return halve_steps(run.posterior, run.centre, run.samples.std(axis=0), simulate)
 
 
 def _check_sampling(run: FinishedRun) -> list[Finding]:

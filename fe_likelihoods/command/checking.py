@@ -31,7 +31,6 @@ def check_job(file: Path, picture: Path, say: Callable[[str], None]) -> None:
         say(f"The run stops at {most} simulations (max_simulations)")
     names = ", ".join(map(str, _draw(problem, checked, picture)))
     say(f"{names}: the measurements should lie within the band of the simulations at draws of the prior")
-    say(f"This check made {checked.simulations} simulations")
     say(f"Next: fe-likelihoods run {file} (writes to {default_folder(file)}/)")
 
 

@@ -175,7 +175,7 @@ def residual_sentences(fits: Fits) -> list[str]:
     return [f"{fit.where(each.channel.name)}: {describe_residuals(each.checks)[0]}" for fit, each in channels]
 
 
-def cost(run: FinishedRun, fits: Fits) -> list[tuple[str, str]]:
+def cost(run: FinishedRun) -> list[tuple[str, str]]:
     """Numbers of simulations, cache hits and wall times."""
     rows, of_posterior = [], _report_of(run)
     if run.tempered:
@@ -192,7 +192,6 @@ def cost(run: FinishedRun, fits: Fits) -> list[tuple[str, str]]:
         ]
     if of_posterior:
         rows += [
-            ("further simulations for fit and judgement", f"{fits.simulations}"),
             ("simulations in this process, without predictions", f"{of_posterior['simulations']}"),
             ("wall time of these simulations", _duration(of_posterior["seconds"])),
             ("answers from the cache", f"{of_posterior['cache_hits']}, {of_posterior['disk_hits']} of them from disk"),

