@@ -6,7 +6,6 @@ the file or the arguments; ValueError is raised if neither states them or if the
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -237,15 +236,19 @@ def read_columns(
         for channel, column, unit in zip(channels, columns, given, strict=True)
     ]
     if recognise(path) is not None:
-        options = {
-            "resample": resample,
-            "dt": dt,
-            "time": time,
-            "time_unit": time_unit,
-            "skip": skip,
-            "missing": missing,
-        }
-        return _recorded(path, channels, wanted, description, zero, **options)
+        if isinstance(zero, str):
+            raise ValueError(f"{path} has no clock times; give zero in seconds after its first sample, got {zero!r}")
+        if other := next((channel for channel in channels if channel.dimension != "acceleration"), None):
+            raise ValueError(
+                f"{path}: accelerations are read from files of this format, and the channel {other.name!r} is a "
+                f"{other.dimension}; leave it out, or write its samples to a CSV file"
+            )
+        options = {"dt": dt, "time": time, "time_unit": time_unit, "skip": skip, "missing": missing}
+        records = [read_record(path, column, unit, resample=resample, **options) for column, _, unit, _ in wanted]
+        labels = [f"{channel.name} is {record.name}" for channel, record in zip(channels, records, strict=True)]
+        description = ", ".join(filter(None, (description, *labels)))
+        steps, rows = [record.dt for record in records], [record.acceleration for record in records]
+        return Measurements(tuple(channels), steps, rows, description, 0.0 - zero)
     table = read_table(path, skip, time_unit, time, missing=missing)
     values = np.array([to_si(*each) for each in table_values(table, wanted, stacklevel=2)])
     if resample is None:
@@ -255,29 +258,6 @@ def read_columns(
         values = np.array([even.interpolate(row) for row in values])
         description = ", ".join(filter(None, (description, even.note)))
     return Measurements(tuple(channels), step, values, description, table_start(table, step, zero))
-
-
-def _recorded(
-    path: str | Path,
-    channels: Sequence[Channel],
-    wanted: Sequence[tuple],
-    description: str,
-    zero: float | str,
-    **options: Any,
-) -> Measurements:
-    """Measured accelerations in a file of a strong-motion network or a zip archive of such files."""
-    if isinstance(zero, str):
-        raise ValueError(f"{path} has no clock times; give zero in seconds after its first sample, got {zero!r}")
-    if other := next((channel for channel in channels if channel.dimension != "acceleration"), None):
-        raise ValueError(
-            f"{path}: accelerations are read from files of this format, and the channel {other.name!r} is a "
-            f"{other.dimension}; leave it out, or write its samples to a CSV file"
-        )
-    records = [read_record(path, column, unit, **options) for column, _, unit, _ in wanted]
-    labels = [f"{channel.name} is {record.name}" for channel, record in zip(channels, records, strict=True)]
-    text = ", ".join(filter(None, (description, *labels)))
-    steps, rows = [record.dt for record in records], [record.acceleration for record in records]
-    return Measurements(tuple(channels), steps, rows, text, 0.0 - zero)
 
 
 def units_of(channels: Sequence[Channel], units: str | Sequence[str] | Mapping[str, str] | None) -> list[str | None]:

@@ -68,16 +68,11 @@ def response_spectrum(
     if not 0.0 <= damping_ratio < 1.0:
         raise ValueError(f"damping_ratio must be in [0, 1) (0.05 is 5 %); got {damping_ratio!r}")
     frequencies = 2.0 * math.pi / periods
-    displacement = np.array([_peak_displacement(acceleration, dt, omega, damping_ratio) for omega in frequencies])
+    displacement = np.empty(periods.size)
+    for k, (period, omega) in enumerate(zip(2.0 * math.pi / frequencies, frequencies, strict=True)):
+        parts, rest = max(1, math.ceil(_INSTANTS * dt / period)), math.ceil(period / dt) + 1
+        samples = np.concatenate([acceleration, np.zeros(rest)])  # and one period of free vibration
+        finer = np.interp(np.arange((samples.size - 1) * parts + 1) / parts, np.arange(samples.size), samples)
+        displacement[k] = np.abs(respond(finer, dt / parts, omega, damping_ratio).displacement).max()
     velocity = frequencies * displacement
     return ResponseSpectrum(periods, float(damping_ratio), displacement, velocity, frequencies * velocity)
-
-
-def _peak_displacement(acceleration: NDArray[np.float64], dt: float, omega: float, damping_ratio: float) -> float:
-    """Return the largest relative displacement [m] during the motion and one period of free vibration after it."""
-    period = 2.0 * math.pi / omega
-    parts = max(1, math.ceil(_INSTANTS * dt / period))
-    rest = math.ceil(period / dt) + 1
-    samples = np.concatenate([acceleration, np.zeros(rest)])
-    finer = np.interp(np.arange((samples.size - 1) * parts + 1) / parts, np.arange(samples.size), samples)
-    return float(np.abs(respond(finer, dt / parts, omega, damping_ratio).displacement).max())

@@ -464,8 +464,6 @@ def read_table(
     """
     if skip is not None and (isinstance(skip, bool) or not isinstance(skip, int) or skip < 0):
         raise ValueError(f"skip must be a number of lines, zero or more, got {skip!r}")
-    if time_unit is not None:
-        find_unit(time_unit, "time")
     file, is_book = str(path), Path(path).suffix.lower() in WORKBOOKS
     text = _workbook(path) if is_book else decode_text(read_bytes(path)).splitlines()
     lines = [(number, line) for number, line in enumerate(text, 1) if number > (skip or 0) and line.strip()]
