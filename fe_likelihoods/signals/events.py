@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from .channels import Channel, Measurements
 from .records import Record
-from .sampling import rest_samples, same_step
+from .sampling import expect, rest_samples, same_step
 
 __all__ = ["EventWindow", "Events", "events_of", "find_events", "join_measurements", "motions_of"]
 
@@ -90,11 +90,9 @@ class Events(Record):
             raise ValueError(f"Events expects a sequence of one Record or more, got {found}")
         parts, pauses, names = _flatten(given, rest, names)
         for part in parts[1:]:
-            if not same_step(parts[0].dt, part.dt):
-                raise ValueError(
-                    f"events must have the same time step, got {parts[0].dt!r} s ({parts[0].name!r}) and {part.dt!r} s "
-                    f"({part.name!r}); use Record.resample(dt) on one of them"
-                )
+            got = f"{parts[0].dt!r} s ({parts[0].name!r}) and {part.dt!r} s ({part.name!r})"
+            alike = same_step(parts[0].dt, part.dt)
+            expect(alike, "Events", "records of the same time step", got, "use Record.resample(dt) on one of them")
         dt = parts[0].dt
         zeros = [rest_samples(pause, dt) for pause in pauses]
         samples, windows, first = [], [], 0
@@ -147,8 +145,7 @@ class Events(Record):
         {'first': (2, 200), 'second': (2, 200)}
         """
         values = np.asarray(values)
-        if values.shape[-1:] != (self.n_steps,):
-            raise ValueError(f"expected histories of {self.n_steps} samples, got shape {values.shape}")
+        expect(values.shape[-1:] == (self.n_steps,), self.name, f"histories of {self.n_steps} samples", values.shape)
         return {window.name: values[..., window.samples] for window in self.windows}
 
     def join(self, measurements: Mapping[str, Measurements]) -> Measurements:
@@ -173,37 +170,28 @@ class Events(Record):
         first = next(iter(measurements.values()))
         channels: dict[str, Channel] = {}
         for name, each in measurements.items():
-            if not isinstance(each, Measurements) or not each.simultaneous or not same_step(first.dt, each.dt):
-                raise ValueError(
-                    f"measurements of events must have one time step for all channels and events; the steps of "
-                    f"{name!r} differ: use Measurements.decimate, or join channels with different steps by NaN in one "
-                    "Measurements"
-                )
+            alike = isinstance(each, Measurements) and each.simultaneous and same_step(first.dt, each.dt)
+            advice = "use Measurements.decimate, or join channels with different steps by NaN in one Measurements"
+            expect(alike, f"measurements of {name!r}", "one time step for all channels and events", "others", advice)
             for channel in each.channels:
                 known = channels.setdefault(channel.name, channel)
-                if known.quantity != channel.quantity:
-                    raise ValueError(
-                        f"channel {channel.name!r} is {known.quantity!r} in one event and {channel.quantity!r} in "
-                        f"{name!r}; rename one of them"
-                    )
+                got = f"{channel.quantity!r} in {name!r}"
+                alike, what = known.quantity == channel.quantity, f"channel {channel.name!r}"
+                expect(alike, what, f"{known.quantity!r} as in another event", got, "rename one of them")
         dt = first.dt
         values = np.full((len(channels), math.floor(self.duration / dt * (1 + 1e-12)) + 1), np.nan)
         rows = {name: row for row, name in enumerate(channels)}
         for name, each in measurements.items():
             end, duration = each.start + (each.n_steps - 1) * dt, self.records[self.names.index(name)].duration
-            if each.start < -1e-9 * duration or end > duration * (1 + 1e-9):  # in a pause or another event
-                raise ValueError(
-                    f"the measurements of {name!r} are from {each.start:g} to {end:g} s, the event from 0, its first "
-                    f"sample, to {duration:g} s; use Measurements.trim(start, stop)"
-                )
+            within = each.start >= -1e-9 * duration and end <= duration * (1 + 1e-9)  # not in a pause or another event
+            expected = f"samples in the event from 0, its first sample, to {duration:g} s"
+            got = f"measurements from {each.start:g} to {end:g} s"
+            expect(within, repr(name), expected, got, "use Measurements.trim(start, stop)")
             time = windows[name].start + each.start
             start = round(time / dt)
-            if abs(time - start * dt) > 1e-6 * dt:
-                raise ValueError(
-                    f"the first measured sample of {name!r} is at {time:g} s of the joined record, which is no "
-                    f"multiple of the step {dt:g} s of the measurements; choose pauses after which every event begins "
-                    "at such a multiple"
-                )
+            expected = f"a first sample at a multiple of the step {dt:g} s of the measurements in the joined record"
+            advice = "choose pauses after which every event begins at such a multiple"
+            expect(abs(time - start * dt) <= 1e-6 * dt, repr(name), expected, f"{time:g} s", advice)
             for channel, samples in zip(each.channels, each.values, strict=True):
                 values[rows[channel.name], start : start + each.n_steps] = samples
         described = [f"{name}: {each.description}" for name, each in measurements.items() if each.description]
@@ -260,18 +248,12 @@ def motions_of(model: Any) -> tuple[Record, ...]:
 def events_of(model: Any) -> Events:
     """The events that are the excitation of a model; raise ValueError if the excitation is not `Events`."""
     events = find_events(model)
-    if events is None:
-        raise ValueError(
-            f"measurements and noise per event need a model whose excitation is Events([eq1, eq2, ...]), unlike the "
-            f"excitation of this {type(model).__name__}"
-        )
+    got, what = f"{type(model).__name__} with another excitation", "measurements and noise per event"
+    expect(events is not None, what, "a model whose excitation is Events([eq1, eq2, ...])", got)
     missing = events.duration - (model.n_steps - 1) * model.dt
-    if missing > 1.000001 * model.dt:
-        raise ValueError(
-            f"measurements and noise per event need a response to all {events.duration:g} s of the events, and the "
-            f"response of this {type(model).__name__} lacks {missing:g} s; leave out its lead, and put NaN where the "
-            "measurements of the first event are not to be compared"
-        )
+    expected = f"a response to all {events.duration:g} s of the events"
+    advice = "leave out its lead, and put NaN where the measurements of the first event are not to be compared"
+    expect(missing <= 1.000001 * model.dt, what, expected, f"{type(model).__name__} without {missing:g} s", advice)
     return events
 
 

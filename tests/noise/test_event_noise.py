@@ -135,11 +135,11 @@ def test_bad_input_is_refused_before_anything_is_simulated(model, events, measur
     cases = {
         "no event 'EQ3'; the events are EQ1, EQ2": {"EQ3": measured["EQ1"]},
         "expected Measurements for one or more of EQ1, EQ2": {},
-        "the steps of 'EQ2' differ": measured | {"EQ2": measured["EQ2"].decimate(2)},
-        "from 0 to 1.18 s, the event from 0, its first sample, to 0.98 s": {"EQ2": measured["EQ1"]},
-        r"from -0.02 to .*, the event from 0, .*\.trim\(start, stop\)": {"EQ1": measured["EQ1"].shift(-0.02)},
-        "'EQ2' are from -1.2 to": {"EQ2": measured["EQ2"].shift(-1.2)},
-        "is no multiple": {"EQ2": Measurements(channel, 0.04 * 1.5, np.ones((1, 3)))},
+        "measurements of 'EQ2': expected one time step": measured | {"EQ2": measured["EQ2"].decimate(2)},
+        "event from 0, its first sample, to 0.98 s, got measurements from 0 to 1.18 s": {"EQ2": measured["EQ1"]},
+        r"the event from 0, .*from -0.02 to .*\.trim\(start, stop\)": {"EQ1": measured["EQ1"].shift(-0.02)},
+        "'EQ2': .*got measurements from -1.2 to": {"EQ2": measured["EQ2"].shift(-1.2)},
+        "expected a first sample at a multiple": {"EQ2": Measurements(channel, 0.04 * 1.5, np.ones((1, 3)))},
         "rename one of them": measured | {"EQ2": Measurements(channel, 0.02, np.ones((1, 5)))},
     }
     for message, wrong in cases.items():
@@ -156,7 +156,7 @@ def test_bad_input_is_refused_before_anything_is_simulated(model, events, measur
         GaussianNoise(model.channels, groups="all").with_measurements(turned)
     plain = LinearOscillator(events.trim(0.0, 1.0))
     for arguments in ((measured,), (whole, GaussianNoise(plain.channels, groups="event"))):
-        with pytest.raises(ValueError, match="need a model whose excitation is Events"):
+        with pytest.raises(ValueError, match="expected a model whose excitation is Events"):
             FELikelihood(plain, *arguments)
 
 
@@ -165,6 +165,6 @@ def test_response_that_begins_after_a_lead_is_refused(events, rng):
     structure = LinearStructure(frame, events, lead=0.4)
     data = {"EQ2": Measurements(structure.channels, 0.02, rng.normal(size=(2, 50)))}
     for noise in (None, GaussianNoise(structure.channels, groups="event")):
-        with pytest.raises(ValueError, match="this LinearStructure lacks 0.4 s; leave out its lead, and put NaN"):
+        with pytest.raises(ValueError, match="got LinearStructure without 0.4 s; leave out its lead, and put NaN"):
             FELikelihood(structure, data, noise)
     assert FELikelihood(LinearStructure(frame, events), data).n_samples.samples.tolist() == [50, 50]

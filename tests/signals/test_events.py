@@ -80,7 +80,7 @@ class TestEvents:
         parts = events.split(np.stack([events.acceleration, events.time]))
         np.testing.assert_array_equal(parts["EQ2"][0], eq2.acceleration)
         assert parts["EQ1"].shape == (2, 40)
-        with pytest.raises(ValueError, match=r"expected histories of 120 samples, got shape \(2, 5\)"):
+        with pytest.raises(ValueError, match=r"expected histories of 120 samples, got \(2, 5\)"):
             events.split(np.ones((2, 5)))
 
     def test_scaled_and_resampled_events_keep_their_windows(self, eq1, eq2):
@@ -98,7 +98,7 @@ class TestEvents:
             "one Record or more, got ndarray": ([np.ones(5)],),
             "the events would overlap": ([eq1, eq2], -0.1),
             "one for each of the 1 pauses": ([eq1, eq2], [1.0, 2.0]),
-            "events must have the same time step": ([eq1, eq2.resample(0.01)],),
+            "expected records of the same time step": ([eq1, eq2.resample(0.01)],),
             "2 different texts": ([eq1, eq2], 1.0, ["a", "a"]),
         }
         for message, arguments in cases.items():
