@@ -204,13 +204,11 @@ def fit_fragility(intensity: np.ndarray, exceedances: np.ndarray, trials: np.nda
         raise ValueError(
             "the points do not determine the slope: use more intensities between those where none and all exceed"
         )
-
     from scipy.optimize import minimize  # slow to import
 
     logs = np.log(intensity)
     centre, width = logs.mean(), logs.std()
     x = (logs - centre) / width
-    total = trials.sum()
 
     def loss(ab: np.ndarray) -> tuple[float, np.ndarray]:
         z = ab[0] + ab[1] * x
@@ -218,7 +216,7 @@ def fit_fragility(intensity: np.ndarray, exceedances: np.ndarray, trials: np.nda
         density = -0.5 * z**2 - 0.5 * np.log(2.0 * np.pi)
         slope = exceedances * np.exp(density - above) - (trials - exceedances) * np.exp(density - below)
         value = exceedances @ above + (trials - exceedances) @ below
-        return -value / total, -np.array([slope.sum(), slope @ x]) / total
+        return -value / trials.sum(), -np.array([slope.sum(), slope @ x]) / trials.sum()
 
     found = minimize(loss, np.array([0.0, 1.0]), jac=True, method="BFGS", options={"gtol": 1e-8})
     offset, slope = found.x
