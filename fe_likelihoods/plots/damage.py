@@ -96,7 +96,7 @@ def _draw_column(axes: Axes, damage: Damage, state: str, event: int, colours) ->
     whole = damage.presence[state]
     title = f"{state}\n{_per_cent(float(whole.probability[event]))} %"
     if 0.0 < whole.probability[event] < 1.0:
-        title += rf" $\pm$ {100.0 * whole.standard_error[event]:.1f}"
+        title += f" ± {100.0 * whole.standard_error[event]:.1f}"
     axes.set_title(title, fontsize=9, fontweight="bold" if whole.probability[event] >= 0.5 else "normal")
     axes.set(xlim=(-1.75, 1.75), ylim=(-0.06 * height, 1.08 * height))
     axes.set_xticks([-0.5, 0.5], ["\N{MINUS SIGN} side", "+ side"], fontsize=7)

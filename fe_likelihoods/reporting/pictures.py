@@ -48,26 +48,30 @@ class Picture(NamedTuple):
     width: int = 0  # smallest one to read the labels [pixel]; a narrower page scrolls
 
 
-def save_picture(figure: "Figure", path: Path) -> None:
-    """Write a figure to a file and close it: matplotlib keeps figures of pyplot in memory until then."""
+def save_picture(figure: "Figure", file: Path | io.BytesIO, dpi: int = 150) -> None:
+    """Write a figure as a PNG and close it: matplotlib keeps figures of pyplot in memory until then.
+
+    The layout is made here, because `savefig` draws all of a figure for its layout, and then again.
+    """
     import matplotlib.pyplot as plt
 
-    figure.savefig(path, dpi=150)
+    figure.dpi = dpi
+    if (layout := figure.get_layout_engine()) is not None:
+        layout.execute(figure)
+        figure.set_layout_engine(None)
+    figure.savefig(file, format="png", dpi=dpi, facecolor="white")
     plt.close(figure)
 
 
 def _picture(title: str, caption: str, alt: str, draw: Callable[[], "Figure"]) -> Picture:
     """Draw a figure and embed it; a ValueError of the drawing function becomes a sentence of the report."""
-    import matplotlib.pyplot as plt
-
     try:
         figure = draw()
     except ValueError as error:
         return Picture(title, caption, alt, "", f"This figure could not be drawn: {error}")
     file = io.BytesIO()
-    figure.savefig(file, format="png", dpi=RESOLUTION, facecolor="white")
+    save_picture(figure, file, RESOLUTION)
     width = min(round(LEGIBLE * figure.get_figwidth()), WIDEST)
-    plt.close(figure)
     source = f"data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}"
     return Picture(title, caption, alt, source, "", width)
 

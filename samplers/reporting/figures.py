@@ -230,8 +230,6 @@ def _true_values(given: Values | None, known: list[str]) -> np.ndarray:
 
 def _priors(posterior: Any, names: Sequence[str], columns: list[int], factors: np.ndarray) -> tuple[list, Any]:
     """Prior densities of the parameters, from draws if ``prior.distributions`` has none, and draws (n, k)."""
-    from scipy.stats import gaussian_kde
-
     prior = getattr(posterior, "prior", None)
     if not hasattr(prior, "rvs"):
         return [], None
@@ -241,6 +239,8 @@ def _priors(posterior: Any, names: Sequence[str], columns: list[int], factors: n
     def density(i: int) -> Callable[[np.ndarray], np.ndarray]:
         if (distribution := distributions.get(names[i])) is not None:
             return lambda values: np.exp(distribution.logpdf(values * factors[i])) * factors[i]
+        from scipy.stats import gaussian_kde  # slow to import
+
         return gaussian_kde(draws[:, i]) if np.ptp(draws[:, i]) > 0.0 else np.zeros_like
 
     return [density(i) for i in range(len(columns))], draws
@@ -319,7 +319,7 @@ def plot_run(sampler: Any) -> "Figure":
     figure, (*ladder, points, evidence, chain) = plt.subplots(3 + several, 1, **size)
     title = f"{sampler.evaluations} evaluations"
     if stages[-1].beta == 1.0:
-        title += rf", $\log Z$ = {sampler.log_evidence:.2f} $\pm$ {sampler.log_evidence_error:.2g}"
+        title += f", log Z = {sampler.log_evidence:.2f} ± {sampler.log_evidence_error:.2g}"
     if sampler.ended_at is not None:
         title += f", ended by the limit of simulations at beta = {sampler.ended_at:.3g}"
     figure.suptitle(title, fontsize="medium")
@@ -328,7 +328,7 @@ def plot_run(sampler: Any) -> "Figure":
     ends = np.cumsum(made)
     for axes in ladder:
         axes.semilogy(ends, beta, "o-", color=BLUE, markersize=4)
-        axes.set_ylabel(r"exponent $\beta$ [-]", color=BLUE)
+        axes.set_ylabel("exponent β [-]", color=BLUE)
         acceptance = axes.twinx()
         acceptance.plot(ends, share, "s--", color=ORANGE, markersize=4)
         acceptance.set(ylim=(0, 1))
