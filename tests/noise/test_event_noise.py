@@ -119,7 +119,7 @@ def test_first_part_cache_and_guide(model, measured, tmp_path):
     value = likelihood(point)
     again = FELikelihood(model, measured, noise=GaussianNoise(model.channels, groups="event"), cache=cache)
     assert again(point) == value and again.simulator.disk_hits == 1
-    assert FELikelihood(model, measured, cache=cache).fingerprint != again.fingerprint
+    assert FELikelihood(model, measured, cache=cache).density_parts() != again.density_parts()
     part = likelihood.first(0.5)  # within the first event
     only = FELikelihood(first_part(model, 0.5), measured["EQ1"].trim(0.0, 0.5), GaussianNoise(model.channels))
     assert part(point) == pytest.approx(only(point[:4]), rel=1e-12)
