@@ -17,6 +17,7 @@ from ..units import DIMENSIONS
 from .channels import Channel, Measurements
 from .events import Events
 from .records import Record
+from .sampling import expect
 
 __all__ = ["DAMAGE", "Dataset", "read_dataset", "write_dataset"]
 
@@ -110,11 +111,9 @@ def read_dataset(path: str | Path) -> Dataset:
     try:
         with h5py.File(path, "r") as file:
             schema, version = file.attrs.get("schema"), file.attrs.get("schema_version")
-            if schema != SCHEMA or version != SCHEMA_VERSION:
-                raise ValueError(
-                    f"{path}: expected schema {SCHEMA!r} version {SCHEMA_VERSION}, got {schema!r} version {version}; a "
-                    "data set of another release is to be written again with this one"
-                )
+            known, got = (schema, version) == (SCHEMA, SCHEMA_VERSION), f"{schema!r} version {version}"
+            advice = "a data set of another release is to be written again with this one"
+            expect(known, path, f"schema {SCHEMA!r} version {SCHEMA_VERSION}", got, advice)
             samples, values = file["record/acceleration"], file["measurements/values"]
             text, checksum = file.attrs["attributes"], file.attrs["checksum"]
             acceleration, responses = (np.asarray(each[()], dtype="<f8") for each in (samples, values))
@@ -128,10 +127,8 @@ def read_dataset(path: str | Path) -> Dataset:
         found, free = _checksum(record, measurements, text), json.loads(text)
     except (*DAMAGE, RecursionError) as error:
         raise ValueError(f"{path}: not a complete data set ({error}); make it or download it again") from error
-    if units != [DIMENSIONS["acceleration"], *(channel.si_unit for channel in channels)]:
-        raise ValueError(
-            f"{path}: expected SI units, got {units}; the file is damaged or was written by another program"
-        )
+    known = units == [DIMENSIONS["acceleration"], *(channel.si_unit for channel in channels)]
+    expect(known, path, "SI units", units, "the file is damaged or was written by another program")
     if checksum != found:
         raise ValueError(
             f"{path}: the contents do not match their checksum; the file is damaged, make it or download it again"

@@ -12,6 +12,7 @@ import numpy as np
 from ..units import to_si
 from .channels import Channel, Measurements
 from .records import Record
+from .sampling import expect
 from .strong_motion import Series, read_series, recognise
 from .tables import (
     WORKBOOKS,
@@ -127,11 +128,9 @@ def read_record(
             wanted = (None if rows else channel, "acceleration", units, table.file)
             ((values, unit, _),) = table_values(table, [wanted], stacklevel=2)
             absent = np.flatnonzero(np.isnan(values))
-            if absent.size:
-                raise ValueError(
-                    f"{table.file}, line {table.lines[absent[0]]}: expected a number, got an empty cell or NaN; an "
-                    f"excitation needs all samples, {absent.size} are missing: interpolate them, or cut the file"
-                )
+            where = f"{table.file}, line {table.lines[absent[0]]}" if absent.size else table.file
+            advice = f"an excitation needs all samples, {absent.size} are missing: interpolate them, or cut the file"
+            expect(not absent.size, where, "a number", "an empty cell or NaN", advice)
             step, times = (table_step(table, dt), None) if resample is None else (np.nan, row_times(table, dt))
             series = Series(table.title, step, unit, values, times)
         except ValueError as error:

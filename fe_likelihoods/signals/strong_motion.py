@@ -657,11 +657,9 @@ def _parse_obspy(path: str | Path, form: str, channel: str | None) -> Series:
     expected = f"one trace with channel = {channel!r}, found {len(traces)}"
     expect(len(traces) == 1, path, expected, advice=f"the traces are {there}")
     (trace,) = traces
-    if np.ma.is_masked(trace.data):
-        raise ValueError(
-            f"{path}: {trace.id} lacks {np.ma.count_masked(trace.data)} samples; an excitation needs all samples: cut "
-            "the record, or fill the gaps in obspy"
-        )
+    advice = "an excitation needs all samples: cut the record, or fill the gaps in obspy"
+    lacking = np.ma.count_masked(trace.data)
+    expect(not lacking, path, "all samples", f"{trace.id} without {lacking} samples", advice)
     if not np.issubdtype(trace.data.dtype, np.floating):
         raise ValueError(
             f"{path}: the samples of {trace.id} are whole numbers, counts of a recorder; remove its response in obspy "

@@ -500,10 +500,8 @@ def read_table(
         clocks = [k for k, column in enumerate(columns) if column.kind == "clock"]
         return table._replace(time=next(iter(named + clocks), None))
     places = [k for k, column in enumerate(columns) if column.name == str(time) and column.kind != "text"]
-    if len(places) != 1:
-        raise ValueError(
-            f"{file}: expected one column of times with time={time!r}, found {len(places)}; {_listed_columns(table)}"
-        )
+    expected = f"one column of times with time={time!r}, found {len(places)}"
+    expect(len(places) == 1, file, expected, advice=_listed_columns(table))
     return table._replace(time=places[0], chosen=True)
 
 
@@ -875,9 +873,8 @@ def _value_column(table: Table, column: int | str | None = None) -> int:
             "give column=2 and time_unit='s' if the first column has the times, in seconds; else column=1 and the step "
             f"dt=; or column='rows' and dt= if the samples follow each other along the rows. {_POINTS}"
         )
-    if len(places) != 1:
-        which = f" named {column!r}" if column else "; choose it with column="
-        raise ValueError(f"{table.file}: expected one column of values{which}, {_listed_columns(table)}")
+    which = f" named {column!r}" if column else "; choose it with column="
+    expect(len(places) == 1, table.file, f"one column of values{which}, {_listed_columns(table)}")
     return places[0]
 
 

@@ -41,7 +41,7 @@ def test_what_is_refused(tmp_path, trace):
         read_record(tmp_path / "counts.mseed", units="g")
     late.stats.starttime += 2.0
     obspy.Stream([trace, late]).write(str(tmp_path / "gap.mseed"), format="MSEED")
-    with pytest.raises(ValueError, match="XX.SYN..HNZ lacks 200 samples; an excitation needs all samples"):
+    with pytest.raises(ValueError, match="got XX.SYN..HNZ without 200 samples; an excitation needs all samples"):
         read_record(tmp_path / "gap.mseed", units="g")
     late.stats.channel = "HNE"
     obspy.Stream([trace, late]).write(str(tmp_path / "two.mseed"), format="MSEED")
