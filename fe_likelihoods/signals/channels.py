@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..units import DIMENSIONS, find_unit
-from .sampling import as_number, check_step, sample_window
+from .sampling import as_number, check_step, expect, sample_window
 
 __all__ = ["Channel", "Measurements"]
 
@@ -158,11 +158,9 @@ class Measurements:
         object.__setattr__(self, "start", _single(starts))
         object.__setattr__(self, "values", values)
         points = tuple(self.points) or (() if self.is_history else tuple(str(k + 1) for k in range(values.shape[1])))
-        if len(points) not in (0, values.shape[1]) or (points and self.is_history):
-            raise ValueError(
-                f"expected a point for each of {values.shape[1]} samples along an axis other than time; got "
-                f"{len(points)} points along {self.axis!r}"
-            )
+        fits, got = len(points) in (0, values.shape[1]) and not (points and self.is_history), f"along {self.axis!r}"
+        expected = f"a point for each of {values.shape[1]} samples along an axis other than time"
+        expect(fits, "measurements", expected, f"{len(points)} points {got}")
         object.__setattr__(self, "points", points)
 
     @property
@@ -275,11 +273,8 @@ class Measurements:
             window = sample_window("the measurements", self.n_steps, self.dt, start, stop)
             return replace(self, values=self.values[:, window], points=self.points[window])
         stop = self.end if stop is None else stop
-        if not (0.0 <= start < stop <= self.end * (1.0 + 1e-12)):
-            raise ValueError(
-                f"expected 0 <= start < stop <= {self.end:g} s, the end of the measurements, got start = {start}, "
-                f"stop = {stop}"
-            )
+        within, got = 0.0 <= start < stop <= self.end * (1.0 + 1e-12), f"start = {start}, stop = {stop}"
+        expect(within, "the measurements", f"0 <= start < stop <= {self.end:g} s, their end", got)
         rows, starts = [], []
         for channel, values, dt in zip(self.channels, self.values, self.steps, strict=True):
             times = self.times(channel.name)

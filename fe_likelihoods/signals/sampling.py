@@ -34,27 +34,19 @@ def expect(fits: object, where: object, expected: str, got: object = None, advic
 
 def check_samples(values: ArrayLike, what: str, name: str) -> NDArray[np.float64]:
     """Return a read-only float64 copy (n_steps,) of the samples, at least two finite numbers; ValueError otherwise."""
-    if np.iscomplexobj(values):
-        raise ValueError(f"{what} of {name!r} must be real numbers, got complex ones")
-    if np.ma.is_masked(values):
-        raise ValueError(
-            f"{what} of {name!r} must have all samples, {np.ma.count_masked(values)} are masked; interpolate them, "
-            "or cut the data"
-        )
+    where, masked = f"{what} of {name!r}", np.ma.count_masked(values) if np.ma.is_masked(values) else 0
+    expect(not np.iscomplexobj(values), where, "real numbers", "complex ones")
+    expect(not masked, where, "all samples", f"{masked} masked ones", "interpolate them, or cut the data")
     try:
         samples = np.array(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{what} of {name!r} must be an array of numbers: {error}") from None
-    if samples.ndim != 1 or samples.size < 2:
-        raise ValueError(
-            f"{what} of {name!r} must be one-dimensional with 2 samples or more, got shape {samples.shape}"
-        )
+        raise ValueError(f"{where}: expected an array of numbers, got {error}") from None
+    fits = samples.ndim == 1 and samples.size > 1
+    expect(fits, where, "one dimension with 2 samples or more", f"shape {samples.shape}")
     bad = np.flatnonzero(~np.isfinite(samples))
-    if bad.size:
-        raise ValueError(
-            f"{what} of {name!r} must be finite: {bad.size} of {samples.size} samples are not, the first is sample "
-            f"{bad[0]} ({samples[bad[0]]}); repair or cut the data"
-        )
+    first = "".join(f"{k} ({samples[k]})" for k in bad[:1])
+    got = f"{bad.size} of {samples.size} that are not, the first is sample {first}"
+    expect(not bad.size, where, "finite samples", got, "repair or cut the data")
     samples.flags.writeable = False
     return samples
 
@@ -106,11 +98,8 @@ def sample_window(name: str, n_steps: int, dt: float, start: float, stop: float 
     duration = (n_steps - 1) * dt
     stop = duration if stop is None else stop
     slack = _TIME_TOLERANCE * dt
-    if not (-slack <= start < stop <= duration * (1 + 1e-12) + slack):
-        raise ValueError(
-            f"expected 0 <= start < stop <= {duration:g} s, the duration of {name!r}, got start = {start}, "
-            f"stop = {stop}"
-        )
+    within = -slack <= start < stop <= duration * (1 + 1e-12) + slack
+    expect(within, name, f"0 <= start < stop <= {duration:g} s, its duration", f"start = {start}, stop = {stop}")
     first = max(math.ceil(start / dt - _TIME_TOLERANCE), 0)
     last = min(math.floor(stop / dt + _TIME_TOLERANCE), n_steps - 1)
     if last - first < 1:

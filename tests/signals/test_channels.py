@@ -106,5 +106,5 @@ class TestMeasurements:
         values = Measurements((TOP, DRIFT), 0.01, form(rows)).values
         np.testing.assert_array_equal(values[0], [1.0, np.nan, 2.0])
         np.testing.assert_array_equal(values[1, :2], [3.0, 4.0])
-        with pytest.raises(ValueError, match="1 are masked"):
+        with pytest.raises(ValueError, match="got 1 masked"):
             Record("masked", 0.01, rows[0])

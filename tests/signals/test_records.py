@@ -27,9 +27,9 @@ class TestRecord:
         [
             *((dt, [0.0, 1.0], "'r' must be a positive number of seconds") for dt in (0, -0.01, np.nan, "fast", None)),
             *((0.01, bad, "with 2 samples or more, got shape") for bad in ([], [1.0], [[1.0, 2.0]], 3.0)),
-            (0.01, [0, 1, 2, np.inf, np.nan], "2 of 5 samples are not, the first is sample 3"),
-            (0.01, [0.0, 1j], "acceleration of 'r' must be real numbers, got complex ones"),
-            (0.01, ["zero", "one"], "'r' must be an array of numbers"),
+            (0.01, [0, 1, 2, np.inf, np.nan], "2 of 5 that are not, the first is sample 3"),
+            (0.01, [0.0, 1j], "acceleration of 'r': expected real numbers, got complex ones"),
+            (0.01, ["zero", "one"], "'r': expected an array of numbers"),
         ],
     )
     def test_what_is_no_record_is_refused(self, dt, samples, message):
