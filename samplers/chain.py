@@ -188,14 +188,11 @@ def check_storable(dtype: np.dtype) -> None:
     """Raise ValueError for blobs that a file cannot hold."""
     try:
         h5py.h5t.py_create(dtype, logical=True)
-        reason = "Python objects" if dtype.hasobject else ""
     except TypeError as error:
-        reason = str(error)
-    if reason:
         raise ValueError(
-            f"blobs of dtype {dtype} cannot be stored in a file ({reason}): return numbers, as many for each point "
+            f"blobs of dtype {dtype} cannot be stored in a file ({error}): return numbers, as many for each point "
             "(numpy.nan for None), or pass blobs_dtype, as for text blobs_dtype='S20'"
-        )
+        ) from error
 
 
 def open_record(backend: Backend | None, nwalkers: int, ndim: int, slow: Sequence[int]) -> Record:
@@ -291,12 +288,12 @@ class Chain:
         contents = {
             "ladder": result.ladder,
             "check": result.check,
-            "founders": None if result.founders is None else np.asarray(result.founders).tolist(),
-            "parents": None if result.parents is None else np.asarray(result.parents).tolist(),
+            "founders": result.founders,
+            "parents": result.parents,
             "verdict": self.verdict,
             "provisional": self.provisional,
         }
-        data = np.frombuffer(json.dumps(contents).encode(), dtype=np.uint8)
+        data = np.frombuffer(json.dumps(contents, default=np.ndarray.tolist).encode(), dtype=np.uint8)
         with self.whole(), backend.open("a") as file:
             group = file[backend.name]
             group.attrs["run"] = self.run

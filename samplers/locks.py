@@ -1,7 +1,6 @@
 """Locks of files and folders, where the system and the file system have them."""
 
 import contextlib
-import math
 import os
 import time
 from collections.abc import Iterator
@@ -26,7 +25,7 @@ def lock_now(file: Any) -> None:
 
 
 @contextlib.contextmanager
-def locked_folder(folder: Path, seconds: float = math.inf) -> Iterator[None]:
+def locked_folder(folder: Path, seconds: float) -> Iterator[None]:
     """Context that one process at a time enters, or any after a time [s]; any at once where there are no locks."""
     with contextlib.ExitStack() as stack:
         with contextlib.suppress(OSError):  # a folder with search permission only, a file system without locks

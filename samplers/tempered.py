@@ -95,8 +95,6 @@ class TemperedSampler(RunResults, EnsembleSampler):
     ----------
     settings : Settings
         The settings in use.
-    seconds : float
-        Wall time spent by this object in annealing and sweeps [s].
 
     Raises
     ------
@@ -153,7 +151,6 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._record = open_record(backend, nwalkers, ndim, target.slow_parameters)
         self._record.limit = as_limit(max_simulations)
         self._must_repeat = reopened = self._record.start is not None  # the annealing, from the record
-        self.seconds = 0.0
         self._previous_state = None
         same = pool, copy.deepcopy(moves), args, kwargs, backend, vectorize, blobs_dtype, parameter_names
         try:
@@ -304,8 +301,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._evaluator.pool = self.pool
         arguments = {"tune": tune, "thin_by": thin_by, "thin": thin, "store": store, "iterations": iterations}
         bar = {"progress": progress, "progress_kwargs": progress_kwargs}
-        start, provisional, evaluations = time.perf_counter(), self._chain.provisional, self.evaluations
-        random_state = self._random.get_state()
+        provisional, evaluations, random_state = self._chain.provisional, self.evaluations, self._random.get_state()
         with self._chain.whole():
             try:
                 state = self._first_state(state, skip_initial_state_check)
@@ -330,7 +326,6 @@ class TemperedSampler(RunResults, EnsembleSampler):
                 with deferred_interrupts():
                     self._previous_state = State(state, copy=True)  # where the next call goes on after an interrupt
                     self._must_repeat = self._must_repeat and bool(self._result.ended)
-                self.seconds += time.perf_counter() - start
                 self._moves = without_unfitted(self._moves)
                 self._evaluator.typed(EvaluatedBatch(state.coords, state.log_prob, state.blobs, {}))
                 if store:
@@ -342,7 +337,6 @@ class TemperedSampler(RunResults, EnsembleSampler):
                 per_step = 1 if thin else int(thin_by)
                 sweeps = None if iterations is None else iterations * per_step
                 shown = Progress(bar, self._evaluator, self._target.function, "sweeps at beta = 1", "sweeps", sweeps)
-                start = time.perf_counter()
                 try:
                     with shown:
                         for advanced in steps:
@@ -353,9 +347,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
                                 if store:
                                     self._chain.step_stored()
                             self._record.drop_old_points(KEPT_POINTS)
-                            self.seconds += time.perf_counter() - start
                             yield advanced
-                            start = time.perf_counter()
                 except BudgetExhausted:
                     ended = True
                 missing = 0 if iterations is None else iterations - new

@@ -188,7 +188,7 @@ def cost(run: FinishedRun) -> list[tuple[str, str]]:
             ]
         rows += [
             ("evaluations of the log-density, also of known responses", f"{sampler.evaluations}"),
-            ("wall time of the sampler", _duration(sampler.seconds)),
+            ("wall time of the annealing", _duration(sum(stage.seconds for stage in sampler.ladder))),
         ]
     if of_posterior:
         rows += [

@@ -161,7 +161,9 @@ class Target:
         points = self.as_points(coords)
         if self.vectorize:
             return map(self.caught, [points])
-        return map(self.caught, points) if pool is None else _unless_ended(map_in(pool), self.caught, points)
+        if pool is None:
+            return map(self.caught, points)
+        return map(_unless_ended, map_in(pool)(SentFunction(self.caught), points))
 
     def evaluated(self, coords: np.ndarray, results: Any) -> EvaluatedBatch:
         """Log-posterior and blobs of points (n, ndim) from `answers`; ValueError if these are no log-densities."""
@@ -233,9 +235,8 @@ class Target:
         )
 
 
-def _unless_ended(map_of_pool: Callable, caught: Callable, points: Any) -> Iterator:
-    """Answers from the processes of a pool; an error that ends the run is raised here."""
-    for answer in map_of_pool(SentFunction(caught), points):
-        if isinstance(answer, Ended):
-            raise answer.error
-        yield answer
+def _unless_ended(answer: Any) -> Any:
+    """An answer from a process of a pool; an error that ends the run is raised here."""
+    if isinstance(answer, Ended):
+        raise answer.error
+    return answer

@@ -107,9 +107,6 @@ class RandomWalkMove(_FittedMove):
     ----------
     scale : float, optional
         Factor on the covariance root; 2.38 / sqrt(ndim) by default.
-    adapt : bool
-        Whether ``tune`` adapts the scale to reach an acceptance of 0.234, which is optimal in many dimensions. The
-        adapted scale is kept for later stages.
 
     References
     ----------
@@ -118,20 +115,16 @@ class RandomWalkMove(_FittedMove):
 
     Examples
     --------
-    >>> walk = RandomWalkMove(adapt=True)
+    >>> walk = RandomWalkMove(scale=1.0)
     >>> walking = SMCSampler(100, posterior.ndim, posterior, moves=walk, recycle=False, vectorize=True)
     """
 
-    target = 0.234
-
-    def __init__(self, scale: float | None = None, adapt: bool = False):
+    def __init__(self, scale: float | None = None):
         if scale is not None and not scale > 0.0:
             raise ValueError(f"scale multiplies the root of the covariance and must be positive; got {scale}")
         super().__init__()
         self.scale = scale
-        self.adapt = adapt
         self._root: np.ndarray | None = None
-        self._log_factor = 0.0
 
     def calibrate(
         self, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None, mixture: Mixture | None = None
@@ -141,14 +134,8 @@ class RandomWalkMove(_FittedMove):
         self._root = location_and_root(coords, weights)[1]
 
     def _draw(self, coords, random):
-        ndim = coords.shape[1]
-        scale = (2.38 / math.sqrt(ndim) if self.scale is None else self.scale) * math.exp(self._log_factor)
+        scale = 2.38 / math.sqrt(coords.shape[1]) if self.scale is None else self.scale
         return coords + scale * random.standard_normal(coords.shape) @ self._root.T, np.zeros(len(coords))
-
-    def tune(self, state: State, accepted: np.ndarray) -> None:
-        """If `adapt`, increase the scale when the acceptance exceeds the target, and decrease it otherwise."""
-        if self.adapt:
-            self._log_factor += float(np.mean(accepted)) - self.target
 
 
 class MixtureMove(_FittedMove):

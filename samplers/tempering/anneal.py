@@ -29,10 +29,9 @@ from ..record import BudgetExhausted
 from ..reports import LIMIT, Report, Restart, Stage, Weighted
 from ..resampling import systematic
 from ..settings import Settings
-from .early_stop import StoppedEarly
 from .guided import Guidance, draw_rounds
 from .mutation import Kernel, MoveSchedule, Mutated, VisitedPoints, move_together
-from .population import Density, Population
+from .population import Density, Population, StoppedEarly
 from .recycling import Recycled, first_draws, recycle, submit_start
 from .smc_moves import anneal_by_moves
 

@@ -23,10 +23,9 @@ from ..proposals.basins import find_basins, with_components
 from ..proposals.mixture import Mixture, fit_mixture, log_density
 from ..proposals.transforms import find_support_bounds
 from ..reports import Report, Stage, Sweep
-from .early_stop import StoppedEarly, stop_at
 from .mutation import tempered_log_prob
 from .next_beta import next_beta
-from .population import Density, PendingPoints, Population
+from .population import Density, PendingPoints, Population, StoppedEarly, stop_at
 
 __all__ = ["Recycled", "first_draws", "most_running", "recycle", "search_draws", "smallest_target", "submit_start"]
 

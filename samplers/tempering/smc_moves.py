@@ -19,10 +19,9 @@ from ..estimates.weights import (
 from ..finding import Finding
 from ..judgement.checks import check_annealing, check_stages
 from ..reports import Stage, Sweep
-from .early_stop import stop_at
 from .mutation import Kernel, grow_chains, move_together
 from .next_beta import next_beta
-from .population import Population
+from .population import Population, stop_at
 
 __all__ = ["anneal_by_moves"]
 

@@ -61,10 +61,10 @@ class Noisy(Gaussian):
 MODES = {
     "recycling": {},
     "moves": {"recycle": False},
-    "walk": {"moves": RandomWalkMove(adapt=True), "min_moves": 6, "max_moves": 15},
+    "walk": {"moves": RandomWalkMove(), "min_moves": 6, "max_moves": 15},
     "stretch": {"moves": emcee.moves.StretchMove(), "min_moves": 8, "max_moves": 20},
     "tmcmc": {"Sampler": TMCMCSampler},
-    "leaders": {"Sampler": TMCMCSampler, "chains": "leaders", "burn_in": 3, "moves": RandomWalkMove(adapt=True)},
+    "leaders": {"Sampler": TMCMCSampler, "chains": "leaders", "burn_in": 3, "moves": RandomWalkMove()},
 }
 
 
