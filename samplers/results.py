@@ -96,7 +96,7 @@ class RunResults:
 
     @property
     def log_evidence_check(self) -> EvidenceCheck | None:
-        """The evidence by importance sampling after the annealing; None with ``check_draws=0``."""
+        """The evidence by importance sampling after the annealing; None with a guide, or if the limit ended the run."""
         self._result.require_finished()
         return self._result.check
 

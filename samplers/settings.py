@@ -16,7 +16,7 @@ from .resampling import RESAMPLING
 __all__ = ["MOVES", "Settings", "as_whole_number", "check_arguments", "check_names", "most_moves"]
 
 # settings of annealing by moves that every sampler has
-MOVES = ("resampling", "min_moves", "max_moves", "max_correlation", "fast_sweeps", "check_draws", "max_failure_share")
+MOVES = ("resampling", "min_moves", "max_moves", "max_correlation", "fast_sweeps", "max_failure_share")
 
 
 def as_whole_number(name: str, value: Any) -> int:
@@ -59,9 +59,6 @@ class Settings:
     recycle : bool, optional
         Anneal by adaptive importance sampling over all evaluated points (`samplers.tempering.recycling`), and by moves
         only if the result cannot be trusted. None leaves the choice to the sampler.
-    check_draws : int, optional
-        Evaluations for an estimate of the evidence that is independent of the annealing. None: as many as there are
-        walkers; 0: no such estimate.
     max_failure_share : float
         The run stops with an error when more than this share of the evaluations have failed by an exception or by NaN
         (a returned -inf is not a failure); 0 stops at the first failure.
@@ -88,21 +85,18 @@ class Settings:
     burn_in: int = 0
     fast_sweeps: int = 2
     recycle: bool | None = None
-    check_draws: int | None = None
     max_failure_share: float = 0.5
     asynchronous: bool = False
 
     def __post_init__(self):
-        for name in ("min_moves", "max_moves", "burn_in", "fast_sweeps", "check_draws"):
-            if name != "check_draws" or self.check_draws is not None:
-                object.__setattr__(self, name, as_whole_number(name, vars(self)[name]))
+        for name in ("min_moves", "max_moves", "burn_in", "fast_sweeps"):
+            object.__setattr__(self, name, as_whole_number(name, vars(self)[name]))
         for name, allowed in (("asynchronous", "True or False"), ("recycle", "True, False or None")):
             value = vars(self)[name]
             if isinstance(value, np.bool_):
                 object.__setattr__(self, name, bool(value))
             elif not isinstance(value, bool) and (value is not None or name == "asynchronous"):
                 raise ValueError(f"{name} must be {allowed}; got {value!r}")
-        check_draws = self.check_draws
         for name, possible, wanted in (
             ("ess_ratio", 0.0 < self.ess_ratio < 1.0, "between 0 and 1 (both excluded)"),
             ("ess_rule", self.ess_rule in ("constant", "declining"), '"constant" or "declining"'),
@@ -113,7 +107,6 @@ class Settings:
             ("chains", self.chains in ("equal", "leaders"), '"equal" or "leaders"'),
             ("burn_in", self.burn_in >= 0, "non-negative"),
             ("fast_sweeps", self.fast_sweeps >= 0, "a whole number, 0 for none"),
-            ("check_draws", check_draws is None or check_draws >= 0, "non-negative"),
             ("max_failure_share", 0.0 <= self.max_failure_share <= 1.0, "between 0 and 1"),
         ):
             if not possible:

@@ -34,7 +34,7 @@ class SMCSampler(TemperedSampler):
         As in `samplers.settings.Settings`; it needs recycling.
     ess_ratio, ess_rule, ess_floor, resampling, min_moves, max_moves, max_correlation
         Settings of annealing by moves, as in `samplers.settings.Settings`.
-    fast_sweeps, check_draws, max_failure_share
+    fast_sweeps, max_failure_share
         As in `samplers.settings.Settings`.
 
     Raises

@@ -46,7 +46,7 @@ class TMCMCSampler(TemperedSampler):
     max_correlation : float, default 0.15
         Between `min_moves` and `max_moves`, moving stops once the correlation with the resampled points is below this
         value.
-    resampling, fast_sweeps, check_draws, max_failure_share
+    resampling, fast_sweeps, max_failure_share
         As in `samplers.settings.Settings`.
 
     Raises

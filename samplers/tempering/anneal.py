@@ -79,12 +79,9 @@ def anneal(
 
 def _check_moves(population: Population, stages: Sequence[Stage], kernel: Kernel) -> Steps:
     """The evidence check after annealing by moves, and findings."""
-    draws = kernel.settings.check_draws
-    if draws == 0:
-        return
     log_evidence = sum(stage.log_evidence_increment for stage in stages)
     try:
-        check, found = check_population(population, *kernel[:2], kernel.visited, log_evidence, draws)
+        check, found = check_population(population, *kernel[:2], kernel.visited, log_evidence)
     except BudgetExhausted:
         yield population, Weighted(0, population.effective_sample_size, float("-inf"), ended=LIMIT)
         return
@@ -98,19 +95,17 @@ def check_population(
     random: np.random.RandomState,
     visited: VisitedPoints,
     log_evidence: float,
-    draws: int | None = None,
 ) -> tuple[EvidenceCheck, list[Finding]]:
     """Evidence, and findings about the shares of the posterior's parts, by fresh draws of a mixture fitted to the final
     points.
 
-    `visited` are the points of all stages, whose `log_evidence` is given. There are as many draws as final points by
-    default.
+    `visited` are the points of all stages, whose `log_evidence` is given. There are as many draws as final points.
     """
     coords, n = population.coords, len(population.coords)
     mixture = fit_mixture(coords, np.full(n, 1.0 / n), bounds=find_support_bounds(density.inside, coords))
     points, log_target = visited.at(1.0)
     mixture = with_components(mixture, find_basins(mixture, points, log_target - log_evidence))
-    drawn, made = draw_inside(mixture, n if draws is None else draws, random, density.inside)
+    drawn, made = draw_inside(mixture, n, random, density.inside)
     log_weights = density.evaluate(drawn)["log_prob"] - log_density(mixture, drawn)
     findings = check_shares(mixture, coords, population.founders[0], drawn, log_weights)
     return evidence_from_weights(log_weights, made), findings
@@ -130,8 +125,7 @@ def _by_recycling(
     schedule.calibrate(found.coords, coarse_weights(found.log_weights), kernel.density.inside, proposal)
     population, distinct = _resampled(found.coords, found.records, found.log_weights, size, kernel.random)
     effective = population.effective_sample_size
-    if kernel.settings.check_draws != 0:
-        yield population, found.check
+    yield population, found.check
     if found.independent:  # sweeps would cost evaluations and improve nothing
         for move in schedule.mixtures:
             move.expect_independence()

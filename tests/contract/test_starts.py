@@ -35,6 +35,6 @@ def test_control_a_start_that_is_not_of_the_prior_would_be_wrong(monkeypatch):
     """Negative control: why starts are tested."""
     monkeypatch.setattr(user_target, "not_of_the_prior", lambda *args: "")
     posterior = Gaussian(3, sd=0.1)
-    sampler = SMCSampler(100, 3, posterior, vectorize=True, seed=1, check_draws=0)
+    sampler = SMCSampler(100, 3, posterior, vectorize=True, seed=1)
     sampler.run_mcmc(ball(posterior, 100, 0.02), 1)
-    assert sampler.log_evidence - posterior.log_evidence > 10.0 * sampler.log_evidence_error
+    assert sampler.log_evidence_ladder - posterior.log_evidence > 10.0 * sampler.ladder[-1].log_evidence_error

@@ -160,7 +160,7 @@ def test_another_run_is_refused_and_nothing_is_changed(whole, tmp_path):
     kind, path, _ = whole
     path = copied(path, tmp_path)
     before = record_of(path).read_bytes(), path.read_bytes()
-    for change, message in (({"check_draws": 0}, "check_draws was"), ({"sd": 0.02}, "log_prob_fn was")):
+    for change, message in (({"max_failure_share": 0.2}, "max_failure_share was"), ({"sd": 0.02}, "log_prob_fn was")):
         with pytest.raises(ValueError, match=message):
             make(path, kind, **change).run_mcmc(None, 1)
         assert (record_of(path).read_bytes(), path.read_bytes()) == before

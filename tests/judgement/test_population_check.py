@@ -81,7 +81,7 @@ def test_a_mode_that_only_earlier_points_show_is_reported(seen):
         visit(visited, density, MEANS[1] + 4.0 * random.standard_normal((60, NDIM)))
     points = population(1.0, random)
     visit(visited, density, points.coords)
-    check, found = check_population(points, density, random, visited, np.log(0.5) + 1.5 * np.log(2.0 * np.pi), None)
+    check, found = check_population(points, density, random, visited, np.log(0.5) + 1.5 * np.log(2.0 * np.pi))
     assert bool(found) == seen
     truth = 1.5 * np.log(2.0 * np.pi) - (0.0 if seen else np.log(2.0))
     assert check.log_evidence == pytest.approx(truth, abs=0.15)

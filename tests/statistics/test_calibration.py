@@ -58,7 +58,6 @@ def p_values(name, seed, repeats, nwalkers, noise=NOISE):
             posterior,
             vectorize=True,
             seed=rng.integers(2**32, size=4),
-            check_draws=0,
             **settings,
         )
         sampler.run_mcmc(None, 1)

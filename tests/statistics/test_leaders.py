@@ -15,7 +15,7 @@ def test_burn_in_removes_the_bias_of_chains_from_leaders(settings, biased, seed)
     """Negative control: without burn-in, a random walk has a bias that many points do not remove."""
     posterior = Gaussian(1, sd=0.2)
     variance = posterior.sd**2 + (posterior.mean - 0.7) ** 2
-    samplers = runs(posterior, seed, count=40, nwalkers=1000, nsteps=1, Sampler=TMCMCSampler, check_draws=0, **settings)
+    samplers = runs(posterior, seed, count=40, nwalkers=1000, nsteps=1, Sampler=TMCMCSampler, **settings)
     found = within(deviations(samplers, variance, lambda x: (x - 0.7) ** 2), samplers)
     assert found != biased
 

@@ -33,17 +33,16 @@ CHANGES = {
     "burn_in": (3, {"chains": "leaders"}),
     "fast_sweeps": (4, {}),
     "recycle": (None, {}),  # the other value than that of the path
-    "check_draws": (0, {}),
     "max_failure_share": (0.0, {}),
     "asynchronous": (True, {}),
 }
 ACTS = {
-    "recycling": {"fast_sweeps", "recycle", "check_draws", "asynchronous"},
+    "recycling": {"fast_sweeps", "recycle", "asynchronous"},
     "moves": {"ess_ratio", "ess_rule", "ess_floor", "resampling", "min_moves", "max_moves", "max_correlation"}
-    | {"fast_sweeps", "recycle", "check_draws"},
+    | {"fast_sweeps", "recycle"},
     "equal chains": {"ess_ratio", "resampling", "min_moves", "max_moves", "max_correlation", "chains"}
-    | {"burn_in", "fast_sweeps", "check_draws"},
-    "chains from leaders": {"ess_ratio", "resampling", "burn_in", "fast_sweeps", "check_draws"}
+    | {"burn_in", "fast_sweeps"},
+    "chains from leaders": {"ess_ratio", "resampling", "burn_in", "fast_sweeps"}
     | {"min_moves", "max_moves", "max_correlation"},
 }
 
@@ -138,7 +137,7 @@ def test_a_setting_that_cannot_act_is_refused(Sampler, settings, match):
     "settings",
     [
         *({"ess_ratio": value} for value in (0.0, 1.0, np.nan)),
-        *({name: value} for name in ("check_draws", "fast_sweeps") for value in (-1, 1.5, True)),
+        *({name: value} for name in ("fast_sweeps",) for value in (-1, 1.5, True)),
         {"ess_rule": "sometimes"},
         {"ess_floor": -1.0},
         {"resampling": "wheel"},
@@ -177,12 +176,11 @@ def test_numpy_numbers_are_settings(tmp_path):
         vectorize=True,
         min_moves=whole(2),
         max_moves=np.uint8(5),
-        check_draws=whole(30),
         recycle=np.False_,
         backend=emcee.backends.HDFBackend(str(tmp_path / "run.h5")),
     )
     sampler.run_mcmc(None, 1)
-    assert sampler.settings == Settings(max_moves=5, check_draws=30, recycle=False)
+    assert sampler.settings == Settings(max_moves=5, recycle=False)
     assert type(sampler.settings.max_moves) is int and sampler.settings.recycle is False
 
 
