@@ -53,8 +53,6 @@ class RareEvent(NamedTuple):
         The threshold.
     levels, shares : (n_levels,) float
         Thresholds of the stages, and their conditional probabilities, whose product is `probability`.
-    acceptance : (n_levels - 1,) float
-        Share of accepted proposals between the levels. Below a tenth, the points of a stage are nearly copies.
     simulations, failed : int
         Number of points at which the quantity was computed, and how many of them failed.
     coords : (k, ndim) float
@@ -68,7 +66,6 @@ class RareEvent(NamedTuple):
     threshold: float
     levels: np.ndarray
     shares: np.ndarray
-    acceptance: np.ndarray
     simulations: int
     failed: int
     coords: np.ndarray
@@ -159,7 +156,7 @@ def subset_simulation(
         )
     scale = FIRST_SCALE
     error = EvidenceError(n, FEWEST / n)
-    levels, shares, acceptance = [], [], []
+    levels, shares = [], []
     while True:
         above, bound = values > threshold, float(np.partition(values, -kept)[-kept])
         last = above.mean() >= LEVEL_PROBABILITY
@@ -179,7 +176,7 @@ def subset_simulation(
         error.resample(ancestors)
         # chains of Au & Beck (2001): from each of the points that a level keeps, one step per copy
         leaders, place, lengths = np.unique(ancestors, return_index=True, return_counts=True)
-        ends, at_ends, accepted = points[leaders], values[leaders], 0
+        ends, at_ends = points[leaders], values[leaders]
         points, values = np.empty_like(points), np.empty_like(values)
         for step in range(lengths.max()):
             growing = np.flatnonzero(lengths > step)
@@ -190,11 +187,9 @@ def subset_simulation(
             reached = found >= bound
             ends[growing] = points[rows] = np.where(reached[:, None], proposed, ends[growing])
             at_ends[growing] = values[rows] = np.where(reached, found, at_ends[growing])
-            accepted += int(reached.sum())
             scale = min(scale * math.exp(reached.mean() - TARGET_ACCEPTANCE), 1.0)
-        acceptance.append(accepted / n)
     probability = float(np.prod(shares))
     factor = float(np.exp(ndtri(0.975) * np.sqrt(np.log1p(deviation**2))))
     interval = probability / factor, min(probability * factor, 1.0)
-    stages = (np.array(each) for each in (levels, shares, acceptance))
+    stages = np.array(levels), np.array(shares)
     return RareEvent(probability, deviation, *interval, float(threshold), *stages, simulations, failed, points[above])
