@@ -194,7 +194,7 @@ def _statistics_of_runs(runs: Sequence[Any]) -> dict[str, Any]:
     attributes: dict[str, Any] = {"samplers": "\n".join(type(run).__name__ for run in runs)}
     if not all(is_tempered(run) and run.ladder for run in runs):
         return attributes
-    numbers = ("log_evidence", "log_evidence_error", "evaluations", "simulations", "failure_count", "seconds")
+    numbers = ("log_evidence", "log_evidence_error", "evaluations", "simulations", "failure_count")
     attributes |= {name: np.array([float(getattr(run, name)) for run in runs]) for name in numbers}
     attributes["ladder"] = json.dumps([[stage._asdict() for stage in run.ladder] for run in runs])
     if len(runs) == 1:
