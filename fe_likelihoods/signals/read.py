@@ -4,6 +4,7 @@
 the file or the arguments; ValueError is raised if neither states them or if they disagree.
 """
 
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -154,7 +155,14 @@ def read_record(
             raise ValueError(
                 f"{file}: the samples are at uneven times; give their nominal step, resample={even.step:.6g}"
             )
-        source, step, values = f"{source}; {even.note}", resample, even.straight(values, file, stacklevel=2)
+        if even.gaps.size:
+            warnings.warn(
+                f"{file}: {even.note}; an excitation needs all samples, so the gaps are straight lines: compare with "
+                "another record of the motion if a gap is in its strong part",
+                UserWarning,
+                stacklevel=2,
+            )
+        source, step, values = f"{source}; {even.note}", resample, np.interp(even.uniform, series.times, values)
     elif resample is not None:
         raise ValueError(f"{file}: the samples have a uniform step; leave resample out")
     if dt is not None and not abs(dt - step) <= 1e-6 * step:

@@ -440,10 +440,8 @@ def _parse_v2(block: Block) -> Series:
     if csmip := _CSMIP_DATA.match(line):
         units = _CSMIP_UNITS.search(line, csmip.end())
         expect(units, where, f"the unit of acceleration in {line.strip()!r}")
-        unit, form = (
-            units[1] or units[2],
-            block.form_at_the_end_of(index) if _FORMAT.search(line.rstrip()) else _CSMIP_FORM,
-        )
+        unit = units[1] or units[2]
+        form = block.form_at_the_end_of(index) if _FORMAT.search(line.rstrip()) else _CSMIP_FORM
         start = index - math.ceil(_CSMIP_REALS / _CSMIP_FORM[0])
         # the data line has the step with three decimals only, the real header may have more
         dt = _check_step(float(block.field(start, _CSMIP_FORM, _CSMIP_DT)), where, csmip[2])

@@ -1130,17 +1130,6 @@ class UniformTimes(NamedTuple):
         near = np.minimum(np.abs(ahead), np.abs(behind)) <= _NEAR * self.usual
         return np.where(apart, np.where(near, values[known][nearest], np.nan), found)
 
-    def straight(self, values: NDArray[np.float64], where: str, stacklevel: int) -> NDArray[np.float64]:
-        """Values (n_steps,) at the uniform times, with straight lines over gaps and a warning about them."""
-        if self.gaps.size:
-            warnings.warn(
-                f"{where}: {self.note}; an excitation needs all samples, so the gaps are straight lines: compare with "
-                "another record of the motion if a gap is in its strong part",
-                UserWarning,
-                stacklevel=stacklevel + 1,
-            )
-        return np.interp(self.uniform, self.times, values)
-
 
 def uniform_times(times: NDArray[np.float64], step: float | None, where: str) -> UniformTimes:
     """Return times with the uniform `step` [s] from the first to the last of the given times (n_samples,) [s].
