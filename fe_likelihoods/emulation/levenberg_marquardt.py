@@ -203,14 +203,6 @@ class Climb:
         changes = _differences(ends, here.run, max(here.run, *ends) + 1)
         self.jacobians.known.append((here.coords, np.linalg.solve(used, changes)))
 
-    def _derivatives(self) -> Requests:
-        """The model's own derivatives at the present point; the first ones are compared with differences."""
-        numbers = yield self._here.coords
-        if self.target.unchecked:
-            self.target.unchecked.clear()
-            yield from self._check(numbers)
-        self.jacobians.known.append((self._here.coords, self.target.archive.weights(numbers)))
-
     def _check(self, numbers: np.ndarray) -> Requests:
         """ValueError if derivatives, numbers (d,) in the archive, deny the residuals at a step along all coordinates.
 
@@ -262,7 +254,11 @@ class Climb:
         damping, failures, gain = _FIRST_DAMPING, 0, np.inf
         for iteration in range(_MAX_ITERATIONS):
             if self.target.data.differentiable and not self._known_here():
-                yield from self._derivatives()
+                numbers = yield self._here.coords
+                if self.target.unchecked:  # the first derivatives are compared with a difference
+                    self.target.unchecked.clear()
+                    yield from self._check(numbers)
+                self.jacobians.known.append((self._here.coords, self.target.archive.weights(numbers)))
             at = self._quadratic()
             if merging and (joined := self._explained()) is not None:
                 return joined
