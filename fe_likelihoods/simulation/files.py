@@ -193,10 +193,6 @@ class RunningSimulation:
         if (path := _full(path)) is not None and not os.path.lexists(path):
             self._made.append(path)
 
-    def removes(self, path: Any, folder: int | None) -> None:
-        if folder in (None, -1):  # else within a folder, whose removal has an event of its own
-            self.writes(path)
-
     def starts(self, folder: Any = None) -> None:
         """A process, or a program that may write in its folder."""
         self.has_programs = True
@@ -251,8 +247,8 @@ for _event in ("os.mkdir", "os.truncate", "shutil.rmtree"):
     _EVENTS[_event] = lambda simulation, arguments: simulation.writes(arguments[0])
 for _event in ("os.link", "os.rename", "os.symlink"):
     _EVENTS[_event] = lambda simulation, arguments: simulation.writes(arguments[1])
-for _event in ("os.remove", "os.rmdir"):
-    _EVENTS[_event] = lambda simulation, arguments: simulation.removes(*arguments)
+for _event in ("os.remove", "os.rmdir"):  # else within a folder, whose removal has its own event
+    _EVENTS[_event] = lambda simulation, arguments: arguments[1] in (None, -1) and simulation.writes(arguments[0])
 
 
 @functools.cache
