@@ -169,6 +169,8 @@ def _table(path: Path) -> _Lines:
         name = _name_of_channel(names[k] if table.named else f"column {names[k]}", columns)
         columns[name], unstated = names[k], unstated | ({} if unit else {name: "?"})
         units.append(unit or "1")
+    if not columns:
+        return [f"a table of {len(table.lines)} rows without a column of values", *said, *_twice(names)], {}
     channels = [Channel(name, dimension_of(u) or "", u) for name, u in zip(columns, units, strict=True)]
     given = {"dt": 1.0} if cases else {"zero": clock or 0.0}
     measured, more = _advised(
