@@ -54,14 +54,12 @@ class SampleNoise(NamedTuple):
         return self.over_time(self.deviations[sample], n_steps) * errors
 
 
-def sample_noise(
-    noise: Any, parameters: np.ndarray, n_channels: int, dt: float | None = None, at_samples: bool = False
-) -> SampleNoise:
+def sample_noise(noise: Any, parameters: np.ndarray, n_channels: int, dt: float | None = None) -> SampleNoise:
     """Noise of samples with parameters (n, n_noise), with levels for the whole measurements or by the response.
 
     A level that depends on the response needs its time step `dt` [s]; without it, ``noise.standard_deviations`` of the
-    measurements are used. `at_samples`: responses are given at the measured samples, for a noise that knows the sample
-    times. Raises ValueError if the noise cannot be drawn from, or has impossible standard deviations or correlations.
+    measurements are used. Raises ValueError if the noise cannot be drawn from, or has impossible standard deviations or
+    correlations.
     """
     if not hasattr(noise, "standard_deviations"):
         raise ValueError(
@@ -75,7 +73,7 @@ def sample_noise(
             f"channels; got shape {deviations.shape}, smallest {deviations.min(initial=np.inf)}"
         )
     if dt is not None and hasattr(noise, "response_deviations"):
-        deviations_of = partial(noise.response_deviations, dt=None if at_samples else dt)
+        deviations_of = partial(noise.response_deviations, dt=dt)
         return SampleNoise(parameters, None, of_response=deviations_of)
     if not hasattr(noise, "lag_one_correlations"):
         return SampleNoise(deviations, None)
