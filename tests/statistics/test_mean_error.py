@@ -66,7 +66,8 @@ def test_founders_are_followed_while_there_are_enough(rng):
         # by moves, shares of modes have the error of the stages, as if no draw crossed between the modes; here nearly
         # all do, so that the stated errors are 3 times too large
         ("moves", two_modes, 120, 0.2),
-        ("default", two_modes, 250, 0.6),
+        # by recycling, those of the parameters that tell the modes apart: 0.55 to 0.67 of the stated ones, by the seed
+        ("default", two_modes, 250, 0.5),
     ],
     ids=lambda value: getattr(value, "__name__", str(value)),
 )
