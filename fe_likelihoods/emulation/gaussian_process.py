@@ -1,12 +1,13 @@
 """Gaussian process for several outputs that share their inputs and length scales.
 
-Each output is a linear function of the inputs plus a Gaussian process with squared exponential covariance::
+Each output is a linear function of the inputs plus a Gaussian process with rational quadratic covariance::
 
-    y_k(w) = b_k0 + b_k . w + f_k(w) + e_k,    cov f_k = s_k^2 exp(-|(w - w') / l|^2 / 2),    var e_k = s_k^2 g_k,
+    y_k(w) = b_k0 + b_k . w + f_k(w) + e_k,    cov f_k = s_k^2 (1 + |(w - w') / l|^2 / 2a)^-a,    var e_k = s_k^2 g_k,
 
-with one length scale l per input, common to all outputs, and a variance s_k^2 and a nugget g_k per output. The linear
-part is integrated out with a flat prior: restricted maximum likelihood (C. E. Rasmussen, C. K. I. Williams, 2006,
-"Gaussian Processes for Machine Learning", MIT Press, section 2.7). With N an orthonormal basis of the contrasts, which
+with one length scale l per input and a shape a, common to all outputs, and a variance s_k^2 and a nugget g_k per
+output. A small shape is a mixture of many length scales, as of a structure whose bars yield one after the other; for a
+large one the covariance is the squared exponential. The linear part is integrated out with a flat prior: restricted maximum likelihood (C. E. Rasmussen, C. K. I. Williams, 2006,
+"Gaussian Processes for Machine Learning", MIT Press, sections 2.7 and 4.2). With N an orthonormal basis of the contrasts, which
 the linear part cannot explain, N'KN = U D U' is decomposed once per length scale; a nugget and output then costs a sum.
 """
 
@@ -18,7 +19,7 @@ from scipy.linalg import cho_factor, cho_solve, qr, solve_triangular
 __all__ = ["GaussianProcess", "fit_process", "left_out_errors", "predict", "predict_mean"]
 
 _NUGGETS = 10.0 ** np.array([-9.0, -7.0, -5.0, -3.0, -1.0, 1.0])
-_LOG_SCALES = -2.0, 4.0  # bounds of the logarithms of the length scales, in units of the inputs
+_LOG_SCALES = -2.0, 4.0  # bounds of the logarithms of the length scales, in units of the inputs, and of the shape
 _TINY = 1e-300
 
 
@@ -36,7 +37,7 @@ class GaussianProcess(NamedTuple):
     """A fitted process."""
 
     inputs: np.ndarray  # (m, d) of training
-    log_scales: np.ndarray  # logarithms of the length scales (d,)
+    log_scales: np.ndarray  # logarithms of the length scales and of the shape (d + 1,)
     linear: np.ndarray  # coefficients of the linear part (1 + d, k)
     weights: np.ndarray  # of the covariances with the training inputs (m, k)
     variances: np.ndarray  # s_k^2 (k,)
@@ -47,10 +48,15 @@ def _basis(inputs: np.ndarray) -> np.ndarray:
     return np.column_stack([np.ones(len(inputs)), inputs])
 
 
-def _covariance(first: np.ndarray, second: np.ndarray, log_scales: np.ndarray) -> np.ndarray:
-    a, b = first / np.exp(log_scales), second / np.exp(log_scales)
+def _logarithm(first: np.ndarray, second: np.ndarray, log_scales: np.ndarray) -> np.ndarray:
+    """Minus the logarithm (n, m) of the covariance over the shape, log(1 + q / 2a), of inputs (n, d) and (m, d)."""
+    a, b = first / np.exp(log_scales[:-1]), second / np.exp(log_scales[:-1])
     squared = (a * a).sum(axis=1)[:, None] + (b * b).sum(axis=1)[None] - 2.0 * a @ b.T
-    return np.exp(-0.5 * np.maximum(squared, 0.0))
+    return np.log1p(0.5 * np.exp(-log_scales[-1]) * np.maximum(squared, 0.0))
+
+
+def _covariance(first: np.ndarray, second: np.ndarray, log_scales: np.ndarray) -> np.ndarray:
+    return np.exp(-np.exp(log_scales[-1]) * _logarithm(first, second, log_scales))
 
 
 def _restricted(
@@ -58,10 +64,11 @@ def _restricted(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Minus twice the restricted log-likelihood of every nugget and output, (n_nuggets, k), up to a constant.
 
-    Also the derivatives (d,) of its mean with shares (k,), each output at its best nugget, by the logarithms of the
-    length scales: with R = N (N'KN + g)^-1 N', they are tr(R K') - y'R K'R y / s^2 for an output y.
+    Also the derivatives (d + 1,) of its mean with shares (k,), each output at its best nugget, by the logarithms of the
+    length scales and the shape: with R = N (N'KN + g)^-1 N', they are tr(R K') - y'R K'R y / s^2 for an output y.
     """
-    covariance = _covariance(inputs, inputs, log_scales)
+    logarithm, shape = _logarithm(inputs, inputs, log_scales), np.exp(log_scales[-1])
+    covariance = np.exp(-shape * logarithm)
     values, vectors = np.linalg.eigh(contrasts.T @ covariance @ contrasts)
     rotated = vectors.T @ targets
     spread = np.maximum(values, 0.0)[None] + _NUGGETS[:, None]
@@ -70,8 +77,11 @@ def _restricted(
     best, basis = losses.argmin(axis=0), contrasts @ vectors
     solved = basis @ (rotated / spread[best].T * np.sqrt(share / variances[best, np.arange(len(best))]))
     by_covariance = ((basis * (share @ (1.0 / spread[best]))) @ basis.T - solved @ solved.T) * covariance
+    less = np.exp(-logarithm)  # 1 / (1 + q / 2a)
+    by_shape = shape * float((by_covariance * (1.0 - less - logarithm)).sum())
+    by_covariance *= less
     squares = np.square(inputs).T @ by_covariance.sum(axis=1) - (inputs * (by_covariance @ inputs)).sum(axis=0)
-    return losses, 2.0 * squares * np.exp(-2.0 * log_scales)
+    return losses, np.append(2.0 * squares * np.exp(-2.0 * log_scales[:-1]), by_shape)
 
 
 def fit_process(
@@ -83,8 +93,8 @@ def fit_process(
 ) -> GaussianProcess:
     """Fit a process to outputs (m, k) at m >= d + 3 inputs (m, d) of about unit spread, by restricted likelihood.
 
-    `importance` (k,) weights the outputs in the search for the length scales, which starts at `log_scales` (d,), such
-    as those of an earlier fit; 0 iterations keep the start.
+    `importance` (k,) weights the outputs in the search for the length scales, which starts at `log_scales` (d + 1,),
+    such as those of an earlier fit; 0 iterations keep the start.
     """
     m, d = inputs.shape
     basis, share = _basis(inputs), importance / importance.sum()
@@ -96,12 +106,13 @@ def fit_process(
         return float(losses.min(axis=0) @ share), gradient
 
     if log_scales is None:  # one common scale first: cheap, and a good start for the others
-        log_scales = min((np.full(d, scale) for scale in np.arange(0.2, 3.4, 0.4)), key=lambda scales: loss(scales)[0])
+        starts = (np.append(np.full(d, scale), 1.0) for scale in np.arange(0.2, 3.4, 0.4))
+        log_scales = min(starts, key=lambda scales: loss(scales)[0])
     log_scales = np.asarray(log_scales, dtype=float)
     if iterations > 0:
         from scipy.optimize import minimize  # slow to import
 
-        bounds, options = [_LOG_SCALES] * d, {"maxiter": iterations}
+        bounds, options = [_LOG_SCALES] * (d + 1), {"maxiter": iterations}
         log_scales = minimize(loss, log_scales, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
     nuggets = _NUGGETS[_restricted(log_scales, *fixed)[0].argmin(axis=0)]
     covariance = _covariance(inputs, inputs, log_scales)
