@@ -6,9 +6,10 @@ Each output is a linear function of the inputs plus a Gaussian process with rati
 
 with one length scale l per input and a shape a, common to all outputs, and a variance s_k^2 and a nugget g_k per
 output. A small shape is a mixture of many length scales, as of a structure whose bars yield one after the other; for a
-large one the covariance is the squared exponential. The linear part is integrated out with a flat prior: restricted maximum likelihood (C. E. Rasmussen, C. K. I. Williams, 2006,
-"Gaussian Processes for Machine Learning", MIT Press, sections 2.7 and 4.2). With N an orthonormal basis of the contrasts, which
-the linear part cannot explain, N'KN = U D U' is decomposed once per length scale; a nugget and output then costs a sum.
+large one the covariance is the squared exponential. The linear part is integrated out with a flat prior: restricted
+maximum likelihood (C. E. Rasmussen, C. K. I. Williams, 2006, "Gaussian Processes for Machine Learning", MIT Press,
+sections 2.7 and 4.2). With N an orthonormal basis of the contrasts, which the linear part cannot explain, N'KN = U D U'
+is decomposed once per length scale; a nugget and output then costs a sum.
 """
 
 from typing import NamedTuple

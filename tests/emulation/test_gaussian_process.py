@@ -36,7 +36,7 @@ def test_left_out_errors_are_those_of_processes_without_the_point():
 def test_inputs_far_apart_are_a_linear_regression():
     rng = np.random.default_rng(5)
     inputs, outputs = 30.0 * rng.standard_normal((12, 2)), rng.standard_normal((12, 1))
-    process = fit_process(inputs, outputs, np.ones(1), np.zeros(2), iterations=0)
+    process = fit_process(inputs, outputs, np.ones(1), np.array([0.0, 0.0, 4.0]), iterations=0)
     squares = np.linalg.lstsq(np.column_stack([np.ones(12), inputs]), outputs, rcond=None)[1]
     (level,) = process.levels
     np.testing.assert_allclose(process.variances * (1.0 + level.nugget), squares / (12 - 3))
