@@ -14,7 +14,7 @@ from ..units import to_si
 from .channels import Channel, Measurements
 from .records import Record
 from .sampling import expect
-from .strong_motion import Series, read_series, recognise
+from .strong_motion import OF_OBSPY, Series, read_series, recognise
 from .tables import (
     WORKBOOKS,
     agree_on_unit,
@@ -48,6 +48,7 @@ def read_record(
     time: int | str | None = None,
     time_unit: str | None = None,
     skip: int | None = None,
+    inventory: str | Path | None = None,
 ) -> Record:
     """Read a ground motion from a file in any supported format, which is recognised by the first lines.
 
@@ -96,6 +97,9 @@ def read_record(
         times, unless `time` is another one.
     skip : int, optional
         Number of lines above the table, if they are not found. What they state is ignored.
+    inventory : str or path, optional
+        StationXML file of the recorder, with which counts in a miniSEED file become m/s2 (obspy's
+        ``remove_response``). The lowest frequencies of a seismometer for velocities are not restored.
 
     Returns
     -------
@@ -121,6 +125,8 @@ def read_record(
         raise ValueError(f"{path}: give channel= or column=, not both; they name the same")
     channel = column if channel is None else channel
     form, file = recognise(path), str(path)
+    if inventory is not None and form not in OF_OBSPY:
+        raise ValueError(f"{path}: inventory= is for miniSEED, SAC and GSE2 files; leave it out")
     options = {"time": time, "time_unit": time_unit, "skip": skip, "missing": missing}
     if form is None:
         try:
@@ -144,7 +150,7 @@ def read_record(
     elif unused := ", ".join(name for name, option in options.items() if option is not None):
         raise ValueError(f"{path}: a file of format {form} states its times and samples; leave {unused} out")
     else:
-        series = read_series(path, form, channel, member)
+        series = read_series(path, form, channel, member, inventory)
     unit = agree_on_unit(series.unit, units, "acceleration", series.file or file)
     # The source has the file name without its folder, because it is written into data sets that are shared.
     source = series.source or Path(file).name + (f": {series.title}" if series.title else "")

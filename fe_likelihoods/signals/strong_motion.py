@@ -83,7 +83,13 @@ class Found(NamedTuple):
     parse: Callable[[], Series]
 
 
-def read_series(path: str | Path, form: str, channel: int | str | None = None, member: str | None = None) -> Series:
+def read_series(
+    path: str | Path,
+    form: str,
+    channel: int | str | None = None,
+    member: str | None = None,
+    inventory: str | Path | None = None,
+) -> Series:
     """The samples of the only channel with a number or name in a file of a format that `recognise` names.
 
     ValueError if there are several, which lists them. A text for V2 files is a number too, or the end of a file's name.
@@ -92,7 +98,7 @@ def read_series(path: str | Path, form: str, channel: int | str | None = None, m
         series = _SINGLE[form](_text(path), str(path))
         return series._replace(name=Path(path).name) if form == "knet" else series  # the ending is the direction
     if form in OF_OBSPY:
-        return _parse_obspy(path, form, channel)
+        return _parse_obspy(path, form, channel, inventory)
     if form == "v2" and isinstance(channel, str):
         channel, member = (int(channel), member) if channel.isdecimal() else (None, channel)
     candidates = find_channels(path, form, member)
@@ -637,8 +643,8 @@ _SINGLE = {"at2": _parse_at2, "smc": _parse_smc, "knet": _parse_knet, "esm": _pa
 _NO_ACCELERATION = {6: "displacement", 7: "velocity"}  # IDEP in a SAC header
 
 
-def _parse_obspy(path: str | Path, form: str, channel: str | None) -> Series:
-    """The samples of one trace in a miniSEED, SAC or GSE2 file."""
+def _parse_obspy(path: str | Path, form: str, channel: str | None, inventory: str | Path | None) -> Series:
+    """The samples of one trace in a miniSEED, SAC or GSE2 file, in m/s2 with the `inventory` of its recorder."""
     try:
         import obspy
     except ImportError as error:
@@ -658,14 +664,22 @@ def _parse_obspy(path: str | Path, form: str, channel: str | None) -> Series:
     advice = "an excitation needs all samples: cut the record, or fill the gaps in obspy"
     lacking = np.ma.count_masked(trace.data)
     expect(not lacking, path, "all samples", f"{trace.id} without {lacking} samples", advice)
-    if not np.issubdtype(trace.data.dtype, np.floating):
-        raise ValueError(
-            f"{path}: the samples of {trace.id} are whole numbers, counts of a recorder; remove its response in obspy "
-            "(trace.remove_response with output='ACC') and make a Record of the samples"
-        )
+    if inventory is not None:
+        try:
+            # neither taper nor mean are removed: the record of an event may begin and end with motion
+            stations = obspy.read_inventory(io.BytesIO(read_bytes(inventory)), format="STATIONXML")
+            trace.remove_response(stations, output="ACC", water_level=60.0, zero_mean=False, taper=False)
+        except Exception as error:  # no response of this channel at this time, or anything else
+            raise ValueError(
+                f"{path}: obspy cannot apply the inventory {inventory} to {trace.id} ({error}); give the StationXML "
+                "file with the response of this channel at the time of the record"
+            ) from error
+    got, advice = f"whole numbers, counts of the recorder {trace.id}", "give its StationXML file, inventory="
+    expect(np.issubdtype(trace.data.dtype, np.floating), path, "accelerations", got, advice)
     quantity = _NO_ACCELERATION.get(trace.stats.get("sac", {}).get("idep"))
     got = f"{quantity} by the SAC header of {trace.id}"
     expect(quantity is None, path, "acceleration", got, "differentiate it")
     rate = round(1.0 / trace.stats.delta)  # SAC has the step in single precision
     dt = 1.0 / rate if rate and abs(rate * trace.stats.delta - 1.0) < 1e-6 else trace.stats.delta
-    return Series(trace.id, float(dt), None, np.asarray(trace.data, dtype=np.float64), name=trace.id)
+    unit = None if inventory is None else "m/s2"
+    return Series(trace.id, float(dt), unit, np.asarray(trace.data, dtype=np.float64), name=trace.id)

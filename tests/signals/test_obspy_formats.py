@@ -37,7 +37,9 @@ def test_what_is_refused(tmp_path, trace):
     counts, late = trace.copy(), trace.copy()
     counts.data = (1e6 * VALUES).astype(np.int32)
     counts.write(str(tmp_path / "counts.mseed"), format="MSEED")
-    with pytest.raises(ValueError, match="whole numbers, counts of a recorder; remove its response in obspy"):
+    with pytest.raises(
+        ValueError, match="got whole numbers, counts of the recorder XX.SYN..HNZ; give its StationXML file"
+    ):
         read_record(tmp_path / "counts.mseed", units="g")
     late.stats.starttime += 2.0
     obspy.Stream([trace, late]).write(str(tmp_path / "gap.mseed"), format="MSEED")
@@ -67,3 +69,55 @@ def test_without_obspy(tmp_path, monkeypatch):
     (tmp_path / "a.mseed").write_bytes(b"000001D SYN     HNZXX" + bytes(500))
     with pytest.raises(ValueError, match="needs the package obspy: install it with pip install obspy, or write"):
         read_record(tmp_path / "a.mseed", units="g")
+
+
+def response_file(path, unit, zeros, poles):
+    """A StationXML file of a recorder with a sensor for acceleration (M/S**2) or velocity (M/S)."""
+    from obspy import UTCDateTime
+    from obspy.core.inventory import Channel, Inventory, Network, Response, Site, Station
+
+    response = Response.from_paz(
+        zeros,
+        poles,
+        stage_gain=4e5,
+        input_units=unit,
+        output_units="COUNTS",
+        stage_gain_frequency=5.0,
+        normalization_frequency=5.0,
+        normalization_factor=1.0
+        / abs(np.prod([10j * np.pi - z for z in zeros]) / np.prod([10j * np.pi - p for p in poles])),
+    )
+    place = {"latitude": 45.0, "longitude": 12.0, "elevation": 0.0}
+    channel = Channel("HNZ", "", depth=0.0, response=response, sample_rate=200.0, **place)
+    station = Station("SYN", site=Site("synthetic"), channels=[channel], creation_date=UTCDateTime(0), **place)
+    Inventory([Network("XX", [station])], source="synthetic").write(str(path), format="STATIONXML")
+
+
+@pytest.mark.parametrize("unit", ["M/S**2", "M/S"])
+def test_counts_become_accelerations_with_an_inventory(tmp_path, trace, unit):
+    time = 0.005 * np.arange(4000)
+    shape = np.exp(-(((time - 10.0) / 1.5) ** 2))
+    acceleration = 2.0 * shape * np.cos(2.0 * np.pi * 5.0 * time)
+    if unit == "M/S**2":
+        zeros, poles, motion = [], [-2e4 + 2e4j, -2e4 - 2e4j], acceleration
+    else:  # a geophone of 1 Hz
+        zeros, poles = [0j, 0j], [-4.4 + 4.4j, -4.4 - 4.4j]
+        frequencies = 2j * np.pi * np.fft.rfftfreq(time.size, 0.005)
+        gain = np.square(frequencies) / np.prod([frequencies - pole for pole in poles], axis=0)
+        velocity = np.fft.rfft(acceleration)[1:] / frequencies[1:]
+        motion = np.fft.irfft(np.concatenate([[0.0], velocity * gain[1:]]), time.size)
+        motion /= abs(np.square(10j * np.pi) / np.prod([10j * np.pi - pole for pole in poles]))
+    trace.data = np.round(4e5 * motion).astype(np.int32)
+    trace.write(str(tmp_path / "counts.mseed"), format="MSEED")
+    response_file(tmp_path / "station.xml", unit, zeros, poles)
+    record = read_record(tmp_path / "counts.mseed", inventory=tmp_path / "station.xml")
+    assert record.acceleration == pytest.approx(acceleration, abs=0.01 * 2.0)
+    with pytest.raises(ValueError, match="m/s2"):
+        read_record(tmp_path / "counts.mseed", units="g", inventory=tmp_path / "station.xml")
+    trace.stats.station = "OTHER"
+    trace.write(str(tmp_path / "other.mseed"), format="MSEED")
+    with pytest.raises(ValueError, match="obspy cannot apply the inventory .* to XX.OTHER..HNZ"):
+        read_record(tmp_path / "other.mseed", inventory=tmp_path / "station.xml")
+    (tmp_path / "table.csv").write_text("time_s,acc_g\n0,1\n0.1,2\n")
+    with pytest.raises(ValueError, match="inventory= is for miniSEED, SAC and GSE2 files"):
+        read_record(tmp_path / "table.csv", inventory=tmp_path / "station.xml")
