@@ -52,7 +52,7 @@ def test_what_is_refused(tmp_path, trace):
     assert read_record(tmp_path / "two.mseed", "HNE", "g").n_steps == 200
     trace.stats.sac = {"idep": 7}
     trace.write(str(tmp_path / "velocity.sac"), format="SAC")
-    with pytest.raises(ValueError, match="expected acceleration, the SAC header of XX.SYN..HNZ says velocity"):
+    with pytest.raises(ValueError, match="expected acceleration, got velocity by the SAC header of XX.SYN..HNZ"):
         read_record(tmp_path / "velocity.sac", units="g")
 
 
