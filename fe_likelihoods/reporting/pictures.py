@@ -59,7 +59,8 @@ def save_picture(figure: "Figure", file: Path | io.BytesIO, dpi: int = 150) -> N
     if (layout := figure.get_layout_engine()) is not None:
         layout.execute(figure)
         figure.set_layout_engine(None)
-    figure.savefig(file, format="png", dpi=dpi, facecolor="white")
+    quick = {"compress_level": 3}  # 2 % of a report's time for files that are 4 % larger
+    figure.savefig(file, format="png", dpi=dpi, facecolor="white", pil_kwargs=quick)
     plt.close(figure)
 
 
