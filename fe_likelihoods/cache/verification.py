@@ -5,8 +5,8 @@ Code and files cannot prove that the model with a declared identity still comput
 powers: ``docs/parallel.rst``. Rows belong to a generation, the simulations of one state of a model; the file says to
 which generation a label belongs.
 
-* The label is known: the row stored last and a random one before the first row is used in a process, and a random one
-  of every 100 rows used. A difference is an error, `StaleCache`.
+* The label is known: the row stored last and a random one before a likelihood uses its first row, and a random one of
+  every 100 rows used. A difference is an error, `StaleCache`.
 * The label is unknown: `ROWS` random rows. If all agree, the label is added to their generation
   (adoption). If one differs, or there are fewer rows, so that repeating them would save nothing, a new generation
   begins: the earlier rows stay in the file and are not used.

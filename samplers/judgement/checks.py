@@ -2,7 +2,7 @@
 
 Collapsed populations, and evidences or shares that disagree. Each check is a function of stages and arrays that returns
 a list of findings. How often each speaks in wrong runs and in right ones is
-in ``docs/which_sampler``.
+in ``docs/results``.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,7 +32,7 @@ __all__ = [
 
 # runs with right answers ended with correlations of up to 0.8, TMCMC as published with 0.98 and more
 HIGH_CORRELATION = 0.9
-# Differences of the two log-evidences, and standard errors, from 1619 right and 297 wrong runs (docs/which_sampler).
+# Differences of the two log-evidences, and standard errors, from 1619 right and 297 wrong runs (docs/results).
 # The limits are soft: with one of the 33 targets left out they wander from 0.8 to 1.5 and from 0.3 to 0.45.
 WRONG_DIFFERENCE, LARGE_DIFFERENCE = 1.0, 0.8
 LARGE_ERROR = 0.4
