@@ -49,8 +49,6 @@ USABLE_SHARE = 0.1
 # is hardly reached is an error of the log-evidence. Without the first, 1 of 10 ridges E h^3 is wrong (log Z off by .09
 # with an error of .015), without the second another 1 of 21 (.23, .015); with both none of 21.
 LARGEST_UNREACHED = 0.03
-# The guide is given up when the mean effective share of the last 4 rounds is below this: 1.5 of 30 draws.
-HOPELESS_ROUNDS, HOPELESS_SHARE = 4, 0.05
 UNSETTLED = (
     "the posterior is larger than its draws: the density that the guide emulates has grown to the end, as along a "
     "ridge of parameters that the data do not tell apart, or the response is rough. Evidence and standard deviations "
@@ -124,14 +122,14 @@ def all_impossible(rounds: Sequence[Round]) -> bool:
 
 
 def hopeless(rounds: Sequence[Round]) -> str:
-    """Why the guide is given up: no possible draw in two rounds, or few effective draws; empty if it is not."""
+    """Why the guide is given up, which is that two rounds have no possible draw; empty if it is not.
+
+    A small effective share is no reason: of 4 runs of a tested column, 3 had less than 5 % in 4 rounds, and all ended
+    with 16 % and more, and the right evidence.
+    """
     if len(rounds) >= 2 and all_impossible(rounds):
         return f"none of their first {sum(len(r.coords) for r in rounds)} has a finite log-probability"
-    recent = rounds[-HOPELESS_ROUNDS:]
-    share = np.mean([r.effective_share for r in recent])
-    if len(recent) < HOPELESS_ROUNDS or share >= HOPELESS_SHARE:
-        return ""
-    return f"the effective sample size of the last {len(recent)} rounds is {100 * share:.2g} % of their draws"
+    return ""
 
 
 def describe_rounds(last: Round, pooled: PooledRounds, made: int) -> str:
