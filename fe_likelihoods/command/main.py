@@ -3,7 +3,7 @@
 The modules that do the work are imported inside the commands, so that ``--help`` answers at once.
 
 Exit codes: 0 when a command has done its work, 1 for an error in the file, the data or the options, 3 when a run has
-ended and its verdict is "not usable", 130 after Ctrl-C.
+ended and its judgement is "do not use", 130 after Ctrl-C.
 """
 
 import shlex
