@@ -72,7 +72,7 @@ class SimulationCache:
         Largest size of all stored responses [bytes], at 8 bytes per channel and sample. The oldest are evicted.
     verify : bool
         Whether some stored rows are simulated again before other rows are used (`fe_likelihoods.cache.verification`).
-        If the model's label is known: two rows per process, and one of every 100. If it is unknown, because code, a
+        If the model's label is known: two rows per likelihood, and one of every 100. If it is unknown, because code, a
         file or a package has changed: 59 rows, which detect a change in 5 % of the parameter space with a probability
         of 95 %.
     tolerance : float

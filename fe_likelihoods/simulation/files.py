@@ -6,8 +6,8 @@ One audit hook (`sys.addaudithook`) sees what Python code of this process opens,
   simulation writes itself, and files of Python and installed packages.
 * Before a running simulation writes to a link in a folder of its own, a private file takes its place. A file outside of
   its folder is noted, unless the simulation has made it exclusively: other simulations may write it too, so it is
-  refused where several run at once (`refuse_shared`). Compiled code and programs write without an event: a file that
-  they have written is noticed when Python code reads it, since it has changed since the simulation began.
+  refused where several run at once. Compiled code and programs write without an event: a file that they have written
+  is noticed when Python code reads it, since it has changed since the simulation began.
 """
 
 import contextlib
