@@ -48,7 +48,7 @@ print("parameters: " + ", ".join(posterior.parameter_names))
 # draws. Every draw is simulated by the model and weighted, so the result does not depend on the guide being right.
 # The number of walkers is the effective sample size at which the run ends. ``max_simulations=`` limits the cost; after
 # a run that was limited, a larger limit continues where it stopped, and with ``cache="simulations.db"`` no simulation
-# is repeated in another process either. Every further step costs simulations, so one step is made.
+# is repeated in another process either. Every step of the chain costs simulations, so one is made.
 
 sampler = SMCSampler(100, posterior.ndim, posterior, vectorize=True, seed=1, guide=posterior.guide())
 sampler.run_mcmc(None, 1)
