@@ -46,6 +46,7 @@ _OF_CLASSES = set(
 _DATA = (int, float, complex, str, bytes, list, dict, set, np.ndarray)  # class attributes that running code may change
 _OF_SHELLS = {"_", "PWD", "OLDPWD", "SHLVL"}  # changes are irrelevant for simulations
 _PARTS = {"function", "class", "output", "statistic", "library", "python"}
+_first: dict[str, tuple[Any, str]] = {}  # first digests of values that running code changes, and the import they are of
 _sources: dict[str, tuple] = {}  # by name of a module: the module and its spec, digest of the source, words in it
 
 
@@ -54,14 +55,14 @@ class ModelLabel:
 
     Its code is the mapping ``code_parts()`` if the model has this method; for other user models, the object itself; and
     the residual statistic that is stored, if the user has defined one. `items` are digests of everything that is known
-    without a simulation, `changing` names those that simulations of this process have changed; `opened` is what
-    simulations opened; `observes` says whether they are observed, since they may run user code.
+    without a simulation, `opened` is what simulations opened; `observes` says whether they are observed, since they may
+    run user code.
     """
 
     def __init__(self, model: Any, statistic: Any = None) -> None:
         self._statistic = statistic if statistic is not None and _defined_by_user(statistic) else None
         self.items = self._present(model)
-        self.changing: set[str] = set()
+        self.items |= {name: _first[name][1] for name in self.changing}
         is_users = hasattr(model, "code_parts") or is_of_user(type(model).__module__)
         self.observes = is_users or self._statistic is not None
         self.opened = mapped() if self.observes else {}
@@ -89,8 +90,14 @@ class ModelLabel:
         return self._present(model) | digests_by_name(read_again(self.opened))
 
     def has_changed_itself(self, names: Iterable[str]) -> None:
-        """Record that simulations change some items."""
-        self.changing |= self.items.keys() & set(names) - _PARTS
+        """Record that simulations change some items; later labels of the same import keep their first digests."""
+        for name in self.items.keys() & set(names) - _PARTS - self.changing:
+            _first[name] = _import_of(name), self.items[name]
+
+    @property
+    def changing(self) -> set[str]:
+        """Names of items that simulations of this process have changed, such as a count of calls."""
+        return {name for name in self.items.keys() & _first.keys() if _first[name][0] is _import_of(name)}
 
     def _present(self, model: Any) -> dict[str, str]:
         parts: dict[str, Any] = dict(model.code_parts()) if hasattr(model, "code_parts") else {}
@@ -293,6 +300,15 @@ def _attribute(value: Any, name: str) -> Any:
         return object.__getattribute__(value, name)
     except (AttributeError, ValueError):  # an empty cell raises ValueError
         return None
+
+
+def _import_of(name: str) -> Any:
+    """What identifies the import of the module with a named item: its ``__spec__``, which a reload replaces."""
+    module = sys.modules.get(name)
+    while module is None and name:
+        name = name.rpartition(".")[0]
+        module = sys.modules.get(name)
+    return getattr(module, "__spec__", None)
 
 
 def _source(module: types.ModuleType) -> tuple[str, frozenset[str]]:

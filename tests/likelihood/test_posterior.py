@@ -92,12 +92,12 @@ class Polynomial:
 BAD = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 9.0)
 
 
-def polynomial_posterior(model):
+def polynomial_posterior(model, pool=None):
     rng = np.random.default_rng(5)
     measurements = Measurements(model.channels, model.dt, rng.normal(size=(2, model.n_steps)))
     names = ("offset", "slope", "sigma_a", "sigma_b")
     distributions = (Uniform(-10.0, 10.0), TruncatedNormal(0.2, 1.0, -math.inf), HalfNormal(1.0), LogNormal(1.0, 0.3))
-    return Posterior(FELikelihood(model, measurements), dict(zip(names, distributions, strict=True)))
+    return Posterior(FELikelihood(model, measurements, pool=pool), dict(zip(names, distributions, strict=True)))
 
 
 # formula ------------------------------------------------------------------------------------------------------------
@@ -230,13 +230,11 @@ def test_an_object_that_is_no_model_is_refused_with_the_missing_members(oscillat
 @pytest.mark.parametrize("threads", [0, 2])
 def test_a_failed_simulation_is_minus_infinity_with_its_reason(threads, caplog):
     model = Polynomial()
-    posterior = polynomial_posterior(model)
     x = np.array([[offset, 0.1, 0.5, 1.0] for offset in (*BAD, 0.5)])
     with warnings.catch_warnings(), caplog.at_level(logging.WARNING), ThreadPool(max(threads, 1)) as pool:
         warnings.simplefilter("error")
-        posterior.likelihood.simulator.pool = pool if threads else None
+        posterior = polynomial_posterior(model, pool if threads else None)
         values = posterior(x)
-    posterior.likelihood.simulator.pool = None
     assert np.isneginf(values[:-1]).all()
     assert np.isfinite(values[-1])
     report = posterior.report()
