@@ -178,7 +178,8 @@ def agree_on_unit(stated: str | None, given: str | None, dimension: str, file: s
     names = [name for name in (stated, given) if name is not None]
     if not names:
         example = "g" if dimension == "acceleration" else DIMENSIONS[dimension]
-        raise ValueError(f"{file} does not state the unit of its {dimension}: give units=, for instance {example!r}")
+        key = "unit=" if dimension == "frequency" else "units="  # as in `read_modal_data`
+        raise ValueError(f"{file} does not state the unit of its {dimension}: give {key}, for instance {example!r}")
     try:
         units = [find_unit(name, dimension) for name in names]
     except ValueError as error:
