@@ -1103,6 +1103,7 @@ def table_start(table: Table, step: float, zero: float | str = 0.0) -> float:
 
 _GAP = 1.5  # usual steps between two samples, from which on samples are missing
 _NEAR = 0.1  # usual steps from a sample, within which a time beside a gap has its value
+_MOST_REPEATED = 0.05  # share of rows that repeat a time; more are the times of packets
 _LARGEST_DIFFERENCE = 0.05  # relative, of the new step from the usual one
 
 
@@ -1115,9 +1116,11 @@ class UniformTimes(NamedTuple):
     usual: float  # mean step without gaps [s]
     gaps: NDArray[np.float64]  # (n_gaps,) lengths [s]
     note: str  # what is done, for the description of the data
+    kept: NDArray[np.bool_]  # (n_rows,) samples that are used: of those with equal times the first
 
     def interpolate(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Values (n_steps,) at the uniform times, linear between known samples, NaN in gaps and beyond the last."""
+        values = values[self.kept]
         known = np.flatnonzero(~np.isnan(values))
         if known.size == 0:
             return np.full(self.uniform.size, np.nan)
@@ -1136,10 +1139,15 @@ def uniform_times(times: NDArray[np.float64], step: float | None, where: str) ->
     """Return times with the uniform `step` [s] from the first to the last of the given times (n_samples,) [s].
 
     The default step is a whole number of samples per second within 5 % of the usual step, else the usual step. Raises
-    ValueError unless times increase, if more than half of the samples are missing, or if the step differs from the
-    usual one by more than 5 %: that would need a filter (`Record.resample`, `Measurements.decimate`).
+    ValueError if times decrease or many repeat, more than half of the samples are missing, or the step differs from the
+    usual one by more than 5 %: that would need a filter (`Record.resample`, `Measurements.decimate`). Of samples with
+    equal times the first one is used.
     """
     step = None if step is None else check_step(step, f"resample of {where}")
+    kept = np.concatenate([[True], np.diff(times) != 0.0])
+    if not 0 < (repeated := np.count_nonzero(~kept)) <= _MOST_REPEATED * times.size:
+        repeated, kept = 0, np.ones(times.size, dtype=bool)
+    first_repeated, times = times[np.argmin(kept)], times[kept]
     increments = np.diff(times)
     if times.size < 2 or not np.all(increments > 0.0):
         place = int(np.argmax(~(increments > 0.0))) if times.size > 1 else 0
@@ -1158,8 +1166,9 @@ def uniform_times(times: NDArray[np.float64], step: float | None, where: str) ->
     gaps, others = (increments[chosen] for chosen in (increments > _GAP * usual, increments <= _GAP * usual))
     note = f"interpolated linearly to a step of {step:g} s from steps of {others.min():.4g} to {others.max():.4g} s"
     note += f", with {gaps.size} gap(s) of up to {gaps.max():.4g} s" if gaps.size else ""
+    note += f", without {repeated} row(s) of a repeated time, the first at {first_repeated:g} s" if repeated else ""
     duration = times[-1] - times[0]
     got = f"{times.size} in {duration:.4g} s with a gap of {gaps.max(initial=0.0):.4g} s"
     expect(duration <= 2 * times.size * step, where, "samples at most times", got, "cut the file at its long gaps")
     uniform = times[0] + step * np.arange(int(duration / step + 1e-6) + 1)
-    return UniformTimes(times, step, uniform, usual, gaps, note)
+    return UniformTimes(times, step, uniform, usual, gaps, note, kept)

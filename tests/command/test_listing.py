@@ -234,12 +234,19 @@ def test_the_lines_for_faults_of_sensors_work(tmp_path):
     assert np.isnan(make_problem(read_job(job)).posterior.likelihood.measurements.values[:, 200:301]).all()
 
 
-def test_times_that_contradict_the_header_have_a_line(path):
+def test_times_that_repeat_or_contradict_the_header_have_a_line(path):
     times = np.round(0.02 * np.arange(60), 2)
+    channel = [Channel("top", "acceleration", "g")]
+    repeated = np.where(np.arange(60) == 30, times[29], times)
+    path.write_text("time_s,acc_g\n" + "".join(f"{t:.2f},{np.sin(t):.5f}\n" for t in repeated))
+    output, lines = listed(path)
+    assert "1 row(s) of a repeated time, the first at 0.58 s" in output
+    measured = read_columns(path, channel, ["acc_g"], resample=lines["measurements"]["resample"])
+    assert np.flatnonzero(np.isnan(measured.values[0])).tolist() == [30]
+    assert "without 1 row(s) of a repeated time, the first at 0.58 s" in measured.description
     path.write_text("dt = 0.01 s\ntime_s,acc_g\n" + "".join(f"{t:.2f},{np.sin(t):.5f}\n" for t in times))
     output, lines = listed(path)
     assert "the step is 0.02 s by the time column but 0.01 s by 'dt = 0.01 s'" in output
-    channel = [Channel("top", "acceleration", "g")]
     assert read_columns(path, channel, ["acc_g"], skip=lines["measurements"]["skip"]).dt == 0.02
 
 
