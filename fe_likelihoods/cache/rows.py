@@ -130,9 +130,9 @@ def _checksum(key, source, generation, theta, value, reason, session) -> int:  #
 
 
 def is_undamaged(row: tuple) -> bool:
-    """Whether the values of `COLUMNS` match their checksum."""
+    """Whether the values of `COLUMNS` match their checksum, which leaves out the size, and the size the value."""
     try:
-        return row[7] == _checksum(*row[:7])
+        return row[7] == _checksum(*row[:7]) and row[8] in (None, len(row[4]))
     except (TypeError, struct.error):  # damage may change the type of a value
         return False
 

@@ -322,6 +322,7 @@ def test_damage_anywhere_is_never_a_wrong_value(filled, thetas, expected, rng, h
         "generation = generation + 1",
         "session = 'soon'",
         "crc = crc + 1",
+        "size = 0",
     ],
 )
 def test_a_damaged_row_is_missing(filled, thetas, expected, caplog, change):
