@@ -166,9 +166,8 @@ def _si(table: Table, place: int, dimension: str, default: str) -> np.ndarray:
 
 def _in_hertz(table: Table, place: int, given: str | None) -> np.ndarray:
     """Frequencies [Hz] in a column; ValueError if the unit is not known, or is stated and given differently."""
-    return _si(
-        table, place, "frequency", agree_on_unit(stated_unit(table, place, "frequency"), given, "frequency", table.file)
-    )
+    unit = agree_on_unit(stated_unit(table, place, "frequency"), given, "frequency", table.file, "unit")
+    return _si(table, place, "frequency", unit)
 
 
 def read_matlab(path: str | Path) -> dict[str, Any]:
@@ -193,7 +192,7 @@ def _of_matlab(
             f"{dict(variables)}, the file has {', '.join(content)}"
         )
     values = {what: content[name] for what, name in variables.items()}
-    unit = agree_on_unit(None, unit, "frequency", path)
+    unit = agree_on_unit(None, unit, "frequency", path, "unit")
     return _of_columns(to_si(values.pop("frequencies"), unit, "frequency"), sensors, values, options)
 
 

@@ -170,16 +170,18 @@ def dimension_of(unit: str) -> str | None:
         return None
 
 
-def agree_on_unit(stated: str | None, given: str | None, dimension: str, file: str | Path) -> str:
-    """The canonical name of the unit that a file states or the caller gives.
+def agree_on_unit(
+    stated: str | None, given: str | None, dimension: str, file: str | Path, argument: str = "units"
+) -> str:
+    """The canonical name of the unit that a file states or the caller gives, by an `argument` that a message names.
 
     ValueError if both are None, they disagree, or a unit is unknown or of another dimension.
     """
     names = [name for name in (stated, given) if name is not None]
     if not names:
         example = "g" if dimension == "acceleration" else DIMENSIONS[dimension]
-        key = "unit=" if dimension == "frequency" else "units="  # as in `read_modal_data`
-        raise ValueError(f"{file} does not state the unit of its {dimension}: give {key}, for instance {example!r}")
+        missing = f"{file} does not state the unit of its {dimension}"
+        raise ValueError(f"{missing}: give {argument}=, for instance {example!r}")
     try:
         units = [find_unit(name, dimension) for name in names]
     except ValueError as error:

@@ -91,9 +91,9 @@ def test_units_are_stated_or_given(tmp_path):
         data = read_modal_data(written(tmp_path, head, *lines), **options)
         np.testing.assert_allclose(data.frequencies, [[1.0, 2.0]], rtol=1e-15)
     for head, options, text in (
-        ("frequency,a,b", {}, "does not state the unit of its frequency"),
+        ("frequency,a,b", {}, "does not state the unit of its frequency: give unit="),
         ("frequency_Hz,a,b", {"unit": "rad/s"}, "states the unit 'Hz'"),
-        ("omega,a,b", {}, "does not state the unit of its frequency"),
+        ("omega,a,b", {}, "does not state the unit of its frequency: give unit="),
         ("lambda,a,b", {}, "expected one column of frequencies"),
         ("frequency_Hz,a,b", {"sensors": ["c"]}, "the sensors are a, b"),
     ):
