@@ -176,7 +176,7 @@ def test_killed_server_is_waited_for_and_nothing_is_lost(kind):
     def values(likelihood):
         if kind == "misfits":
             return likelihood.misfit(np.random.default_rng(5).uniform(0.0, 3.5, (80, 2)))
-        sampler = SMCSampler(40, 4, Posterior(likelihood, prior), vectorize=True, seed=1)
+        sampler = SMCSampler(40, 4, Posterior(likelihood, prior), vectorize=True, seed=5)
         sampler.run_mcmc(None, 1)
         return sampler.get_chain(flat=True)
 
@@ -196,8 +196,7 @@ def test_killed_server_is_waited_for_and_nothing_is_lost(kind):
         with Process("package", first.port):
             np.testing.assert_array_equal(run.result(), expected)
     failures = [part.simulator.failures for part in (local, likelihood)]
-    assert failures[0].count == failures[1].count and failures[1].transient == 0
-    assert kind == "draws" or failures[0].count > 0
+    assert failures[0].count == failures[1].count > 0 == failures[1].transient
     if kind == "draws":
         assert (np.abs(expected.mean(axis=0) - [1.0, 0.5, 0.1, 0.1]) < 4.0 * expected.std(axis=0)).all()
 
