@@ -8,6 +8,8 @@ Gain g and lag of measurements y by responses r have the least errors, by their 
 
     c(lag) = sum_f Y conj(R) exp(2 pi i f lag),   g = c / sum_f |R|^2,   error^2 = 1 - c^2 / (sum_f |Y|^2 sum_f |R|^2)
 
+Errors are compared relative to the smaller of y and r: half a gain is then as far from one as a gain of two.
+
 Far below its lowest frequency a structure moves as its supports do, whatever its parameters. There, draws agree, and
 only these lines are compared, with the median of the draws. The motions of two supports are compared in the same way,
 in the lowest lines in which they are coherent. Counts of what is named are in docs/results.rst.
@@ -40,8 +42,8 @@ __all__ = [
     "supports_apart",
 ]
 
-BETTER = 0.6  # error (RRMSE) with a fault taken into account, as a share of the error without: study `fit_gate`
-EXPLAINED = 0.85  # error above which a response explains nothing: a correlation of a half
+BETTER = 0.6  # error with a fault taken into account, as a share of the error without: study `fit_gate`
+EXPLAINED = 0.85  # error (RRMSE) above which a response explains nothing: a correlation of a half
 FLOOR = 0.02  # error below which smaller ones count as equal
 FACTOR = 1.5  # from which a factor may be one between units
 SAME_UNITS = 1.25  # ratio of a factor to one between units, up to which it is named after them
@@ -101,9 +103,10 @@ def find_faults(measurements: Measurements, draws: np.ndarray) -> tuple[Fault, .
             after = _log_errors(y[group], corrected)
             row = int(np.argmin(errors.sum(axis=1) + (after - errors[:, group]).sum(axis=1)))
             gain = errors[best].sum() - errors[row].sum() + (errors[row, group] - after[row]).sum()
-            before, left = np.exp([errors[best, group].mean(), after[row].mean()]).tolist()
             least = -math.log(BETTER) * (1 if gains is None else len(group))  # a swap has no number to fit
-            if gain > max(least, most) and left < EXPLAINED and left < before * math.exp(-least / len(group)):
+            before, left = (_error(y[group], each) for each in (r[best, group], corrected[row]))
+            nearer = errors[best, group].mean() - after[row].mean() > least / len(group)
+            if gain > max(least, most) and nearer and left < EXPLAINED:
                 of = [names[k] for k in group]
                 faults = [Fault("swap", tuple(of), math.nan, before, left)]
                 if gains is not None:
@@ -127,8 +130,15 @@ def _named(names: Sequence[str], gain: float, lag: float, step: float, *more: An
 
 
 def _log_errors(y: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """Logarithms of the RRMSE (n, n_channels)."""
-    return np.log(np.maximum(np.linalg.norm(y - r, axis=-1) / np.linalg.norm(y, axis=-1), FLOOR))
+    """Logarithms of errors (n, n_channels) relative to the smaller of measurement and response."""
+    norms = np.minimum(np.linalg.norm(y, axis=-1), np.linalg.norm(r, axis=-1))
+    return np.log(np.maximum(np.linalg.norm(y - r, axis=-1) / np.maximum(norms, 1e-300), FLOOR))
+
+
+def _error(y: np.ndarray, r: np.ndarray) -> float:
+    """Geometric mean of the RRMSE of channels (n_channels, n)."""
+    errors = np.linalg.norm(y - r, axis=-1) / np.linalg.norm(y, axis=-1)
+    return float(np.exp(np.log(np.maximum(errors, FLOOR)).mean()))
 
 
 def _fitted(y: np.ndarray, r: np.ndarray, steps: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
