@@ -34,7 +34,7 @@ def _file(job: Job, section: str) -> tuple[Path, Dataset | None]:
     path = job.path(section, "file", given.file)
     if not is_dataset(job, section):
         return path, None
-    stated = {"column", "channel", "columns", "units", *given.READING, *({"zero"} if section == "measurements" else ())}
+    stated = {"column", "columns", "units", *given.READING, *({"zero"} if section == "measurements" else ())}
     if idle := [name for name in given.given() if name in stated]:
         raise ValueError(f"{job.where(section)} {idle[0]}: a data set states this itself: leave the key out")
     return path, job.located(section, read_dataset, path)
@@ -53,7 +53,7 @@ def read_base_motion(job: Job) -> Record | None:
     if given is not None and given.supports is not None:
         return read_supports(job)[0]
     path, dataset = _file(job, "record")
-    options = given.given("channel", "column", "units", "missing", *given.READING)
+    options = given.given("column", "units", "missing", *given.READING)
     record = dataset.record if dataset else job.located("record", read_record, path, **options)
     return record if given.scale is None else record.scale(given.scale)
 

@@ -16,14 +16,7 @@ from ..signals.channels import Channel, Measurements
 from ..signals.datasets import read_dataset
 from ..signals.read import read_columns
 from ..signals.strong_motion import find_channels, recognise
-from ..signals.tables import (
-    clock_text,
-    dimension_of,
-    read_table,
-    stated_unit,
-    text_unit,
-    value_columns,
-)
+from ..signals.tables import dimension_of, read_table
 from ..text_tables import number, text_table
 from ..units import from_si
 from .job import HDF5
@@ -144,25 +137,25 @@ def _motions(path: Path, form: str) -> _Lines:
     text = [f"{len(columns)} channel(s) of acceleration", *described, *text, *_twice(known)]
     if (first := next(iter(columns.values()))) is None:
         return text, {"record": _keys(options)}
-    base = [f"{'channel' if isinstance(first, int) else 'column'} = {_toml(first)}    # the base motion"]
+    base = [f"column = {_toml(first)}    # the base motion"]
     return text, {"record": base + _keys(options), "measurements": _keys({"columns": columns} | options) + repairs}
 
 
 def _table(path: Path) -> _Lines:
     """A table of samples, of modes or of load cases."""
     options, columns, units, unstated = dict[str, Any](), dict[str, str](), list[str](), dict[str, str]()
-    table, said = _advised(lambda missing=None: read_table(path, missing=missing), options)
+    table, said = _advised(lambda **more: read_table(path, **more), options)
     try:
         if table.time is None or table.clock is not None:  # days of several identifications are clocks as well
             return ["a table of modes", str(read_modal_data(path))], {"modes": []}
     except ValueError as error:
         if "unit of its frequency" in str(error) and table.clock is None:
             return ["a table of modes"], {"modes": _keys({"unit": "?"})}
-    names, clock = [column.name for column in table.columns], table.clock and clock_text(table.clock)
+    names, clock = [column.name for column in table.columns], table.clock and table.clock.text
     of_cases = re.search(r"case|load|truck|position|place", names[0], re.IGNORECASE) or table.columns[0].kind == "text"
     cases = bool(of_cases) and table.time is None and len(names) > 1
-    for k in (k for k in value_columns(table) if names.count(names[k]) == 1 and not (cases and k == 0)):
-        unit = stated_unit(table, k) or text_unit(table, k, "acceleration")  # as the readers of accelerations take it
+    for k in (k for k in table.value_columns if names.count(names[k]) == 1 and not (cases and k == 0)):
+        unit = table.stated_unit(k) or table.text_unit(k, "acceleration")  # as the readers of accelerations take it
         if unit and dimension_of(unit) is None:
             said.append(f"column {names[k]!r} has the unknown unit {unit!r}, and is left out")
             continue

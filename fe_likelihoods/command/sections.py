@@ -57,8 +57,9 @@ class Motion(Table):
     """``[record]``, the base motion."""
 
     file: Any = key("text", "Base acceleration: CSV, Excel, a data set (.h5), or a format of `read_record`")
-    column: Any = key("text", "Column of a CSV file or workbook, component (GeoNet), or file in an archive (V2)")
-    channel: Any = key("whole number", "Channel of a V2 file")
+    column: Any = key(
+        "text or whole number", "Column of a CSV file or workbook, component (GeoNet), channel or file (V2)"
+    )
     units: Any = key("text", "Unit of the acceleration, if the file does not state it")
     missing: Any = key("list of number or text", "What stands for missing samples in other columns")
     scale: Any = key("number", "Factor by which the record is multiplied; -1 for a reversed sensor")

@@ -11,7 +11,7 @@ import numpy as np
 from ..models.function import FunctionModel
 from ..signals.channels import Channel, Measurements
 from ..signals.read import units_of
-from ..signals.tables import read_table, table_values
+from ..signals.tables import read_table
 from ..units import to_si
 
 __all__ = ["LoadTest", "read_load_test"]
@@ -113,7 +113,7 @@ def read_load_test(
 
     given = zip(channels, units_of(channels, units), strict=True)
     wanted = [(column_of(each), each.dimension, unit, each.name) for each, unit in given]
-    values = [to_si(*each) for each in table_values(table, wanted, stacklevel=2)]
+    values = [to_si(*each) for each in table.samples(wanted, stacklevel=2)]
     chosen = cases or next((name for name in names[:1] if name not in [each[0] for each in wanted]), None)
     options = {"errors": errors, "description": f"load test of {Path(path).name}"}
     if chosen is None:

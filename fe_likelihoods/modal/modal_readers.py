@@ -9,7 +9,7 @@ import numpy as np
 
 from ..checks.finding import warn
 from ..checks.screening import check_phases
-from ..signals.tables import Column, Table, agree_on_unit, read_table, stated_unit
+from ..signals.tables import Column, Table, agree_on_unit, read_table
 from ..units import to_si
 from .modal_data import ModalData, real_shapes
 
@@ -17,11 +17,11 @@ __all__ = ["read_matlab", "read_modal_data"]
 
 # what a column is, by its name in lower case without a unit; all others of numbers are sensors
 _KINDS = {
-    "frequency": r"f|fn|freq|(natural[ _])?frequency|omega",
+    "frequency": r"f|fn|freq\.?|(natural[ _]|eigen)?(frequency|frequenz|fr[eé]quence|fre[ck]uencia|frequenza)|omega",
     "deviation": r"(f|fn|freq|frequency)[ _]std",
-    "damping": r"damping|zeta|xi",
-    "temperature": r"temp|temperature|t[ _]?[\[(]?(°c|degc|c)[\])]?",  # a T alone may be a sensor
-    "set": r"set|identification|date",
+    "damping": r"damping|d[äa]e?mpfung|zeta|xi",
+    "temperature": r"temp\.?|temp[eé]ratur[ea]?|t[ _]?[\[(]?(°c|degc|c)[\])]?",  # a T alone may be a sensor
+    "set": r"set|identification|date|datum",
     "mode": r"mode([ _]no\.?)?",
 }
 _NO_SENSOR = re.compile(r"\b(re|im|real|imag|mag|phase|angle|mac|mpc|order|std|sd|cv|period|factor)\b", re.IGNORECASE)
@@ -149,7 +149,7 @@ def _sensor_columns(table: Table, others: Sequence[int], sensors: Sequence[str])
     columns = {table.columns[k].name: table.columns[k] for k in others if table.columns[k].kind == "number"}
     if unknown := [name for name in sensors if name not in columns]:
         raise ValueError(f"{table.file}: no columns {', '.join(unknown)}; the sensors are {', '.join(columns)}")
-    units = {stated_unit(table, k, "dimensionless") for k in others if table.columns[k].name in columns}
+    units = {table.stated_unit(k, "dimensionless") for k in others if table.columns[k].name in columns}
     doubtful = [name for name in columns if _NO_SENSOR.search(name.replace("_", " "))]
     if not sensors and (doubtful or len(units) > 1):
         raise ValueError(
@@ -161,12 +161,12 @@ def _sensor_columns(table: Table, others: Sequence[int], sensors: Sequence[str])
 
 def _si(table: Table, place: int, dimension: str, default: str) -> np.ndarray:
     """Values of a column in the SI unit, or °C."""
-    return to_si(table.columns[place].values, stated_unit(table, place, dimension) or default, dimension)
+    return to_si(table.columns[place].values, table.stated_unit(place, dimension) or default, dimension)
 
 
 def _in_hertz(table: Table, place: int, given: str | None) -> np.ndarray:
     """Frequencies [Hz] in a column; ValueError if the unit is not known, or is stated and given differently."""
-    unit = agree_on_unit(stated_unit(table, place, "frequency"), given, "frequency", table.file, "unit")
+    unit = agree_on_unit(table.stated_unit(place, "frequency"), given, "frequency", table.file, "unit")
     return _si(table, place, "frequency", unit)
 
 

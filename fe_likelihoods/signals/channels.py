@@ -75,7 +75,7 @@ class Channel:
         return DIMENSIONS[self.dimension]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Measurements:
     """Samples of several channels, each at a constant step.
 
@@ -162,6 +162,11 @@ class Measurements:
         expected = f"a point for each of {values.shape[1]} samples along an axis other than time"
         expect(fits, "measurements", expected, f"{len(points)} points {got}")
         object.__setattr__(self, "points", points)
+
+    def __repr__(self) -> str:
+        channels = ", ".join(f"{channel.name} [{channel.unit}]" for channel in self.channels)
+        along = f"at a step of {self.dt} s" if self.is_history else f"along {self.axis!r}"
+        return f"Measurements of {channels}: {self.n_steps} samples {along}"
 
     @property
     def is_history(self) -> bool:

@@ -15,36 +15,21 @@ from .channels import Channel, Measurements
 from .records import Record
 from .sampling import expect
 from .strong_motion import OF_OBSPY, Series, read_series, recognise
-from .tables import (
-    WORKBOOKS,
-    agree_on_unit,
-    read_table,
-    row_times,
-    table_start,
-    table_step,
-    table_values,
-    uniform_times,
-)
+from .tables import WORKBOOKS, agree_on_unit, read_table, uniform_times
 
-__all__ = [
-    "read_columns",
-    "read_record",
-    "units_of",
-]
+__all__ = ["read_columns", "read_record", "units_of"]
 
 _TABLES = ("", ".csv", ".txt", ".dat", ".tsv", ".lvm", ".out", *WORKBOOKS)
 
 
 def read_record(
     path: str | Path,
-    channel: int | str | None = None,
+    column: int | str | None = None,
     units: str | None = None,
     missing: Sequence[float | str] | None = None,
-    member: str | None = None,
     resample: float | None = None,
     *,
     dt: float | None = None,
-    column: int | str | None = None,
     time: int | str | None = None,
     time_unit: str | None = None,
     skip: int | None = None,
@@ -69,10 +54,11 @@ def read_record(
     path : str or path
         A file, or a zip archive of CSMIP and COSMOS V2 files. Archives may contain archives; V1 files in them, which
         are uncorrected, are read if there are no V2 files. Lines of a table that start with ``#`` are comments.
-    channel : int or str, optional
-        Number of a channel at the station, or name of a file in the archive (V2), component such as ``"S16W"``
-        (GeoNet), end of the name of a trace such as ``"HNZ"`` (miniSEED), or column of a table, where there are
-        several.
+    column : int or str, optional
+        Where there are several: name of the column in a table, or its number from 1 without a header line, and
+        ``"rows"`` for numbers without a header line row after row, as those of the Fortran format ``8F10.5``. Number of
+        a channel at the station, or end of the name of a file in the archive, ``"Free Field.zip/CHAN012.V2"`` (V2);
+        component such as ``"S16W"`` (GeoNet); end of the name of a trace such as ``"HNZ"`` (miniSEED).
     units : str, optional
         Unit of the acceleration, if an AT2, CSV, miniSEED or SAC file does not state it.
     missing : sequence of float or str, optional
@@ -80,16 +66,11 @@ def read_record(
         excitation must not have. A warning names those that are not there. If not listed, -9999, -999.25, 1e30 and
         9.97e36 are refused unless further numbers lie within 1 % of them; -999, 99999, -99999, 32767 and -32768 unless
         a further number has half their size. ``()`` takes all numbers as measured.
-    member : str, optional
-        End of a file name in the archive, such as ``"Free Field.zip/CHAN012.V2"``, if several have the channel.
     resample : float, optional
         Nominal step of uneven times [s], to which the samples are interpolated linearly. The source of the record says
         what was done, and a warning names gaps, which are filled by straight lines.
     dt : float, optional
         Time step [s], needed for a file without times.
-    column : int or str, optional
-        Another name of `channel`: name of the column, or its number from 1 in a file without a header line. ``"rows"``
-        takes the numbers of a file without a header line row after row, as those of the Fortran format ``8F10.5``.
     time : str or int, optional
         Name or number of the column of times, if it is not found. Other columns that look like times are then ignored.
     time_unit : str, optional
@@ -121,24 +102,21 @@ def read_record(
     >>> read_record("motion.csv").acceleration.round(3)  # m/s²
     array([ 0.   ,  0.49 , -0.196])
     """
-    if channel is not None and column is not None:
-        raise ValueError(f"{path}: give channel= or column=, not both; they name the same")
-    channel = column if channel is None else channel
     form, file = recognise(path), str(path)
     if inventory is not None and form not in OF_OBSPY:
         raise ValueError(f"{path}: inventory= is for miniSEED, SAC and GSE2 files; leave it out")
     options = {"time": time, "time_unit": time_unit, "skip": skip, "missing": missing}
     if form is None:
         try:
-            table = read_table(path, along_rows=channel == "rows", **options)
-            rows = channel == "rows" and "rows" not in [each.name for each in table.columns]
-            wanted = (None if rows else channel, "acceleration", units, table.file)
-            ((values, unit, _),) = table_values(table, [wanted], stacklevel=2)
+            table = read_table(path, along_rows=column == "rows", **options)
+            rows = column == "rows" and "rows" not in [each.name for each in table.columns]
+            wanted = (None if rows else column, "acceleration", units, table.file)
+            ((values, unit, _),) = table.samples([wanted], stacklevel=2)
             absent = np.flatnonzero(np.isnan(values))
             where = f"{table.file}, line {table.lines[absent[0]]}" if absent.size else table.file
             advice = f"an excitation needs all samples, {absent.size} are missing: interpolate them, or cut the file"
             expect(not absent.size, where, "a number", "an empty cell or NaN", advice)
-            step, times = (table_step(table, dt), None) if resample is None else (np.nan, row_times(table, dt))
+            step, times = (table.step(dt), None) if resample is None else (np.nan, table.times(dt))
             series = Series(table.title, step, unit, values, times)
         except ValueError as error:
             if Path(path).suffix.lower() in _TABLES:
@@ -150,7 +128,7 @@ def read_record(
     elif unused := ", ".join(name for name, option in options.items() if option is not None):
         raise ValueError(f"{path}: a file of format {form} states its times and samples; leave {unused} out")
     else:
-        series = read_series(path, form, channel, member, inventory)
+        series = read_series(path, form, column, inventory)
     unit = agree_on_unit(series.unit, units, "acceleration", series.file or file)
     # The source has the file name without its folder, because it is written into data sets that are shared.
     source = series.source or Path(file).name + (f": {series.title}" if series.title else "")
@@ -267,14 +245,14 @@ def read_columns(
         steps, rows = [record.dt for record in records], [record.acceleration for record in records]
         return Measurements(tuple(channels), steps, rows, description, 0.0 - zero)
     table = read_table(path, skip, time_unit, time, missing=missing)
-    values = np.array([to_si(*each) for each in table_values(table, wanted, stacklevel=2)])
+    values = np.array([to_si(*each) for each in table.samples(wanted, stacklevel=2)])
     if resample is None:
-        step = table_step(table, dt)
+        step = table.step(dt)
     else:
-        even, step = uniform_times(row_times(table, dt), resample, table.file), resample
+        even, step = uniform_times(table.times(dt), resample, table.file), resample
         values = np.array([even.interpolate(row) for row in values])
         description = ", ".join(filter(None, (description, even.note)))
-    return Measurements(tuple(channels), step, values, description, table_start(table, step, zero))
+    return Measurements(tuple(channels), step, values, description, table.start(step, zero))
 
 
 def units_of(channels: Sequence[Channel], units: str | Sequence[str] | Mapping[str, str] | None) -> list[str | None]:

@@ -25,12 +25,10 @@ refused instead of misread. Fortran columns have no separators: they are split b
 
 import codecs
 import io
-import lzma
+import itertools
 import math
 import re
-import struct
 import zipfile
-import zlib
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -84,37 +82,30 @@ class Found(NamedTuple):
 
 
 def read_series(
-    path: str | Path,
-    form: str,
-    channel: int | str | None = None,
-    member: str | None = None,
-    inventory: str | Path | None = None,
+    path: str | Path, form: str, channel: int | str | None = None, inventory: str | Path | None = None
 ) -> Series:
     """The samples of the only channel with a number or name in a file of a format that `recognise` names.
 
     ValueError if there are several, which lists them. A text for V2 files is a number too, or the end of a file's name.
     """
-    if form in _SINGLE:
-        series = _SINGLE[form](_text(path), str(path))
-        return series._replace(name=Path(path).name) if form == "knet" else series  # the ending is the direction
     if form in OF_OBSPY:
         return _parse_obspy(path, form, channel, inventory)
+    if form in _SINGLE:
+        series = find_channels(path, form)[0].parse()
+        return series._replace(name=Path(path).name) if form == "knet" else series  # the ending is the direction
+    text, ending = "" if channel is None else str(channel).lower(), None
     if form == "v2" and isinstance(channel, str):
-        channel, member = (int(channel), member) if channel.isdecimal() else (None, channel)
-    candidates = find_channels(path, form, member)
-    chosen = [each for each in candidates if channel is None or str(each.channel).lower() == str(channel).lower()]
+        text, ending = (str(int(channel)), None) if channel.isdecimal() else ("", channel)
+    candidates = find_channels(path, form, ending)
+    chosen = [each for each in candidates if text in ("", str(each.channel).lower())]
     if len(chosen) != 1:
         listing = "\n  ".join(f"channel {each.channel}: {each.label} [{each.file}]" for each in chosen or candidates)
-        advice = "choose with channel= and member=, or in a TOML file with the end of a file name as column, among"
-        wanted = f"one channel with channel = {channel}, member = {member!r}, found {len(chosen)}"
-        expect(False, path, wanted, advice=f"{advice}\n  {listing}")
+        advice = "choose with column=, its number or the end of its file's name, among"
+        expected = f"one channel with column={channel!r}, found {len(chosen)}"
+        expect(False, path, expected, advice=f"{advice}\n  {listing}")
     file, series = chosen[0].file, chosen[0].parse()
     source = file.removeprefix(f"{Path(path).parent}/") if form == "v2" else ""
     return series._replace(name=series.title, file=file, source=source)
-
-
-def _text(path: str | Path) -> str:
-    return decode_text(read_bytes(path)).rstrip("\0\x1a")
 
 
 # which format ---------------------------------------------------------------------------------------------------------
@@ -129,15 +120,13 @@ def recognise(path: str | Path) -> str | None:
 
     ValueError if the file cannot be read, or has a known format that is not read.
     """
-    content, encoding = read_bytes(path), "latin-1"  # of binary files, one letter per byte
+    content = read_bytes(path)
     if Path(path).suffix.lower() in WORKBOOKS:
         return None
     if zipfile.is_zipfile(io.BytesIO(content)):
         return "v2"
-    if content.startswith(codecs.BOM_UTF8):
-        encoding = "utf-8-sig"
-    elif content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        encoding = "utf-16"
+    marks = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
+    encoding = next((each for mark, each in marks.items() if content.startswith(mark)), "latin-1")  # letters are bytes
     text = content[:8000].decode(encoding, errors="replace")
     lines = LINE_END.sub("\n", text).splitlines()
     name, form = ("", None) if _is_table(lines) else _form_of(lines[:_LOOK], text)
@@ -148,15 +137,13 @@ def recognise(path: str | Path) -> str | None:
 
 def _is_table(lines: list[str]) -> bool:
     """Whether two successive lines have numbers between commas, semicolons or tabs, which no format here has."""
-    before = False
-    for line in lines:
-        separator = next((each for each in (";", "\t", ",") if each in line), None)
-        cells = [] if separator is None else [cell.strip() for cell in line.split(separator)]
-        numbers = len(cells) > 1 and all(is_number(cell.replace(",", ".")) or is_clock(cell) for cell in cells)
-        if numbers and before:
-            return True
-        before = numbers
-    return False
+
+    def has_numbers(line: str) -> bool:
+        cells = [cell.strip() for cell in line.split(next((each for each in ";\t," if each in line), None))]
+        separated = any(each in line for each in ";\t,")
+        return separated and all(is_number(cell.replace(",", ".")) or is_clock(cell) for cell in cells)
+
+    return any(map(all, itertools.pairwise(map(has_numbers, lines))))
 
 
 def _form_of(lines: list[str], text: str) -> tuple[str, str | None]:
@@ -230,15 +217,13 @@ class Block(NamedTuple):
         for k in range(start, end):
             line = self.lines[k].rstrip() if k < len(self.lines) else ""
             wanted, found = min(per_line, count - len(values)), math.ceil(len(line) / width)
-            if found != wanted:
-                expected = f"{wanted} numbers of {width} columns after {len(values)} of {count} samples"
-                expect(False, self.where(k), expected, found, "the file is truncated or damaged")
+            expected = f"{wanted} numbers of {width} columns after {len(values)} of {count} samples"
+            expect(found == wanted, self.where(k), expected, found, "the file is truncated or damaged")
             values += [parse_number(line[i * width :][:width].strip(), self.where(k)) for i in range(wanted)]
         expect(len(values) > 1, self.file, "two samples or more", len(values))
         cut = len(line) % width and len(self.lines[start].rstrip()) % width == 0  # the last line ends within a number
-        expect(
-            not cut, self.where(end - 1), f"numbers of {width} columns, the last one is cut", advice="it is truncated"
-        )
+        expected = f"numbers of {width} columns, the last one is cut"
+        expect(not cut, self.where(end - 1), expected, advice="it is truncated")
         following = next((line for line in self.lines[end:] if line.strip()), "")
         more = last and is_number(following[:width].strip())
         expect(not more, self.where(start), f"{count} samples as the file announces, but it has more after them")
@@ -272,13 +257,8 @@ def _check_step(dt: float, where: str, stated: str | None = None) -> float:
 
 def _whole(number: float, file: str, what: str) -> int:
     """A number of lines or samples."""
-    whole = 0.0 <= number < 1e9 and abs(number - round(number)) <= 1e-6
-    expect(whole, file, f"a number of {what}", f"{number:g}")
+    expect(0.0 <= number < 1e9 and abs(number - round(number)) <= 1e-6, file, f"a number of {what}", f"{number:g}")
     return round(number)
-
-
-def _largest(values: NDArray[np.float64]) -> float:
-    return float(np.abs(values).max())
 
 
 def _uneven(title: str, unit: str, times: NDArray[np.float64], values: NDArray[np.float64]) -> Series:
@@ -350,26 +330,20 @@ _V2_TEXT, _CSMIP_FORM, _CSMIP_REALS = 25, (8, 10), 100
 _CSMIP_DT, _COSMOS_DT, _V1_COUNT, _V1_LENGTH, _V1_PEAK = 60, 33, 27, 2, 6
 # Limits of a zip archive and all within it: bytes and files. Stations have a few MiB.
 _LARGEST_CONTENT, _MOST_FILES = 64 * 2**20, 2000
-_ZIP_DAMAGE = (zipfile.BadZipFile, RuntimeError, NotImplementedError, OSError, EOFError, KeyError, IndexError) + (
-    OverflowError,
-    MemoryError,
-    struct.error,
-    zlib.error,
-    lzma.LZMAError,
-    UnicodeError,
-)
 
 
 def find_channels(path: str | Path, form: str, member: str | None = None) -> list[Found]:
-    """The accelerations in a file, or in the V2, else V1 files of an archive."""
-    if form in _SINGLE or form in OF_OBSPY:
-        return [Found(None, Path(path).name, str(path), partial(read_series, path, form))]
-    if form == "geonet":
-        return _parse_geonet(_text(path), str(path))
-    content = read_bytes(path)
-    files = [(str(path), content)]
+    """The accelerations in a file, or in the V2, else V1 files of an archive, or in its files with an end of a name."""
+    content, file = read_bytes(path), str(path)
+    if form in OF_OBSPY:
+        return [Found(None, Path(path).name, file, partial(_parse_obspy, path, form))]
+    if form != "v2":
+        text = decode_text(content).rstrip("\0\x1a")
+        alone = () if form == "geonet" else [Found(None, Path(path).name, file, partial(_SINGLE[form], text, file))]
+        return alone or _parse_geonet(text, file)
+    files = [(file, content)]
     if zipfile.is_zipfile(io.BytesIO(content)):
-        files = list(dict.fromkeys(_unzip(content, str(path), str(path), [_MOST_FILES, _LARGEST_CONTENT])))
+        files = list(dict.fromkeys(_unzip(content, file, file, [_MOST_FILES, _LARGEST_CONTENT])))
 
     def ending(*ends: str) -> list[tuple[str, bytes]]:
         return [(name, data) for name, data in files if name.lower().endswith(ends)]
@@ -395,16 +369,16 @@ def _unzip(content: bytes, name: str, archive: str, left: list[int]) -> Iterator
         with zipfile.ZipFile(io.BytesIO(content)) as opened:
             infos = opened.infolist()
             left[:] = left[0] - len(infos), left[1] - sum(info.file_size for info in infos)
-            expected = f"at most {_MOST_FILES} files with {_LARGEST_CONTENT} bytes in all"
-            expect(min(left) >= 0, archive, expected, "more", "unpack the archive and read the files")
-            for info in infos:
-                inner = f"{name}/{info.filename}"
-                if info.filename.lower().endswith(".zip"):
-                    yield from _unzip(opened.read(info), inner, archive, left)
-                elif not info.is_dir():
-                    yield inner, opened.read(info)
-    except _ZIP_DAMAGE as error:
+            members = (
+                [] if min(left) < 0 else [(each.filename, opened.read(each)) for each in infos if not each.is_dir()]
+            )
+    except Exception as error:  # a damaged archive may raise anything
         raise ValueError(f"{name}: the zip archive cannot be read ({error}); download it again") from error
+    expected = f"at most {_MOST_FILES} files with {_LARGEST_CONTENT} bytes in all"
+    expect(min(left) >= 0, archive, expected, "more", "unpack the archive and read the files")
+    for member, data in members:
+        inner = f"{name}/{member}"
+        yield from _unzip(data, inner, archive, left) if member.lower().endswith(".zip") else [(inner, data)]
 
 
 def _split_v2(text: str, file: str) -> list[Block]:
@@ -492,7 +466,7 @@ def _parse_v1(block: Block) -> Series:
     if unit.lower() in ("g", "g/10"):
         unit = "g" if scale == 0.1 else unit
         rounding = 0.505 * (scale * 10.0 ** -decimals_of(printed.strip()) + 10.0 ** -decimals_of(peak))
-        _check_peak(scale * _largest(values), abs(float(peak)), rounding, where)
+        _check_peak(scale * np.abs(values).max(), abs(float(peak)), rounding, where)
     title = f"{block.label}, uncorrected"
     return Series(title, dt, unit, scale * values) if times is None else _uneven(title, unit, times, scale * values)
 
@@ -529,7 +503,7 @@ def _parse_smc(text: str, file: str) -> Series:
     values = numbers[1::2] if uneven else numbers
     for stated, found in ((highest, values.max()), (lowest, values.min())):
         if abs(stated) < _SMC_NULL:
-            _check_peak(found, stated, 2e-4 * _largest(values), file)
+            _check_peak(found, stated, 2e-4 * np.abs(values).max(), file)
     station = next((line.strip() for line in block.lines[2:_SMC_TEXT] if line.startswith("station")), title)
     station = re.sub(r"\s+", " ", station)
     return _uneven(station, "cm/s2", numbers[::2], values) if uneven else Series(station, 1.0 / rate, "cm/s2", values)
@@ -564,7 +538,7 @@ def _geonet_component(block: Block, place: int) -> tuple[str, Series, int]:
     # the peak is rounded to the digits that are printed; the samples are rounded or cut
     printed = block.field(start, _GEONET_FORM, int(np.argmax(np.abs(values))))
     resolution = 1.01 * scale * 10.0 ** -decimals_of(printed) + 0.505 * 10.0 ** -decimals_of(peak[1])
-    _check_peak(_largest(values), abs(float(peak[1])), resolution, where)
+    _check_peak(np.abs(values).max(), abs(float(peak[1])), resolution, where)
     end = start + sum(math.ceil(count / _GEONET_FORM[0]) for count in counts)
     expected = f"{sum(counts)} numbers up to line {end}"
     expect(end <= len(lines), where, expected, advice="the file is truncated")
@@ -610,7 +584,7 @@ def _parse_knet(text: str, file: str) -> Series:
     # "(gal)/1048.2" means 1 gal; the stated peak is compared below
     values = (counts - counts.mean()) * (float(scale[1] or 1.0) / float(scale[2]))
     stated = parse_number(peak, f"{file}, Max. Acc.")
-    _check_peak(_largest(values), stated, 2e-3 * abs(stated) + 2e-3, file)
+    _check_peak(np.abs(values).max(), stated, 2e-3 * abs(stated) + 2e-3, file)
     return Series(f"{station}, channel {direction}, mean subtracted", 1.0 / rate, "gal", values)
 
 
@@ -631,7 +605,7 @@ def _parse_esm(text: str, file: str) -> Series:
     if (stated := header.get("PGA_CM/S^2")) and values.size:
         peak = abs(parse_number(stated, f"{file}, PGA_CM/S^2"))
         scale = float(to_si(1.0, agree_on_unit(unit, None, "acceleration", file)) / to_si(1.0, "cm/s2"))
-        _check_peak(scale * _largest(values), peak, 1e-4 * peak + 2e-6 * scale, file)
+        _check_peak(scale * np.abs(values).max(), peak, 1e-4 * peak + 2e-6 * scale, file)
     return Series(f"{header.get('NETWORK', '')}.{station} {stream}", dt, unit, values)
 
 
@@ -643,7 +617,9 @@ _SINGLE = {"at2": _parse_at2, "smc": _parse_smc, "knet": _parse_knet, "esm": _pa
 _NO_ACCELERATION = {6: "displacement", 7: "velocity"}  # IDEP in a SAC header
 
 
-def _parse_obspy(path: str | Path, form: str, channel: str | None, inventory: str | Path | None) -> Series:
+def _parse_obspy(
+    path: str | Path, form: str, channel: str | None = None, inventory: str | Path | None = None
+) -> Series:
     """The samples of one trace in a miniSEED, SAC or GSE2 file, in m/s2 with the `inventory` of its recorder."""
     try:
         import obspy
@@ -658,7 +634,7 @@ def _parse_obspy(path: str | Path, form: str, channel: str | None, inventory: st
     except Exception as error:  # a damaged file may raise anything
         raise ValueError(f"{path}: obspy cannot read the file ({error}); download it again") from error
     there = ", ".join(trace.id for trace in stream)
-    expected = f"one trace with channel = {channel!r}, found {len(traces)}"
+    expected = f"one trace with column={channel!r}, found {len(traces)}"
     expect(len(traces) == 1, path, expected, advice=f"the traces are {there}")
     (trace,) = traces
     advice = "an excitation needs all samples: cut the record, or fill the gaps in obspy"

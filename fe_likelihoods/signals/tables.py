@@ -5,8 +5,8 @@ Semicolons, tabs, commas or blanks separate cells, whichever splits most of the 
 are read if commas do not separate cells; separators of thousands go if a number shows them: ``1,234.5``, ``1.234,5``,
 ``1'234``. Text before the header line is left out, as are lines of numbers and words that a header line follows.
 
-`table_step` and `table_start` return seconds, `table_values` the samples of columns with NaN for missing ones, and the
-unit on which file and caller agree. The first part reads text, numbers and units, for other formats as well.
+A `Table` has step, start and times of its rows [s], samples with NaN for missing ones, and the units on which file and
+caller agree. The first part reads text, numbers and units, for other formats as well.
 """
 
 import codecs
@@ -34,12 +34,10 @@ __all__ = [
     "NUMBER",
     "WORKBOOKS",
     "Column",
-    "Statements",
     "Table",
     "agree_on_unit",
     "check_count",
     "check_peaks",
-    "clock_text",
     "decimals_of",
     "decode_text",
     "dimension_of",
@@ -50,15 +48,8 @@ __all__ = [
     "read_bytes",
     "read_statements",
     "read_table",
-    "row_times",
-    "stated_unit",
-    "table_start",
-    "table_step",
-    "table_values",
-    "text_unit",
     "uniform_times",
     "unit_in_name",
-    "value_columns",
 ]
 
 # text and numbers -----------------------------------------------------------------------------------------------------
@@ -87,10 +78,9 @@ def read_bytes(path: str | Path) -> bytes:
 
 
 def decode_text(content: bytes) -> str:
-    """The text of a file without padding and closing remarks after its last line.
+    """The text of a file in UTF-8, UTF-16 or Latin-1, without padding and closing remarks after its last line.
 
-    It is UTF-8 or UTF-16 with a byte-order mark, UTF-8 where it is valid, else Latin-1. Zero bytes directly after a
-    number are kept, so that this number is refused: a table that a crash has cut may have lost its last digits.
+    Zero bytes directly after a number are kept, so that it is refused: a crash may have cut its last digits.
     """
     wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     try:
@@ -108,10 +98,9 @@ def decode_text(content: bytes) -> str:
 
 
 def number_cells(line: str) -> list[str]:
-    """The fields of a line of numbers, which blanks separate or which touch, as in some Fortran formats.
+    """The fields of a line of numbers, which blanks separate or which touch; other text stays one field.
 
-    Numbers that touch have equally many decimals, and begin with a sign (``-12.34567-0.12345``) or are equally wide
-    (`` 12.34567100.12345``). Other text stays one field, which is no number.
+    Numbers that touch have equally many decimals, and signs (``-1.34567-0.12345``) or one width (``12.3456100.1234``).
     """
     cells, last = line.split(), _LAST_DECIMALS.search(line)
     if last is None or all(cell.count(".") < 2 for cell in cells):
@@ -179,9 +168,8 @@ def agree_on_unit(
     """
     names = [name for name in (stated, given) if name is not None]
     if not names:
-        example = "g" if dimension == "acceleration" else DIMENSIONS[dimension]
-        missing = f"{file} does not state the unit of its {dimension}"
-        raise ValueError(f"{missing}: give {argument}=, for instance {example!r}")
+        advice = f"give {argument}=, for instance {'g' if dimension == 'acceleration' else DIMENSIONS[dimension]!r}"
+        raise ValueError(f"{file} does not state the unit of its {dimension}: {advice}")
     try:
         units = [find_unit(name, dimension) for name in names]
     except ValueError as error:
@@ -257,9 +245,9 @@ def read_statements(lines: Sequence[str], decimal_commas: bool = False) -> State
     steps, counts, units, peaks = [], [], [], []
     for line in lines:
         line = re.sub(r"(?<=\d),(?=\d)", ".", line[:_LONGEST]) if decimal_commas else line[:_LONGEST]
-        for is_rate, found in ((k, each) for k, form in enumerate((_STEP, _RATE)) for each in form.finditer(line)):
+        for found in (*_STEP.finditer(line), *_RATE.finditer(line)):
             number, unit, bracket = float(found["number"]), found["unit"] or "", found["bracket"]
-            if is_rate:
+            if is_rate := found.re is _RATE:
                 stated = (unit or bracket or "").lower()
                 factors = [1e3 if stated == "khz" else 1.0] if stated else [1.0, 1e3]
             else:
@@ -330,8 +318,11 @@ class ClockTime(NamedTuple):
     zone: int | None  # minutes by which the clock is before UTC, None without a time zone
     halves: bool = False  # hours from 1 to 12 with AM and PM
 
-
-_UNIX_EPOCH = ClockTime(datetime.date(1970, 1, 1).toordinal(), 0.0, 0, 0)
+    @property
+    def text(self) -> str:
+        """The clock time as `zero` takes it."""
+        text = str((datetime.datetime.min + datetime.timedelta(seconds=self.seconds)).time())
+        return text if self.day is None else f"{datetime.date.fromordinal(self.day)} {text}"
 
 
 def is_clock(cell: str) -> bool:
@@ -339,20 +330,13 @@ def is_clock(cell: str) -> bool:
     return ":" in cell and _CLOCK.fullmatch(cell) is not None
 
 
-def clock_text(clock: ClockTime) -> str:
-    """A clock time as `zero` takes it."""
-    text = str((datetime.datetime.min + datetime.timedelta(seconds=clock.seconds)).time())
-    return text if clock.day is None else f"{datetime.date.fromordinal(clock.day)} {text}"
-
-
 def _parse_clock(cell: str, where: str) -> ClockTime:
     """The clock time in a cell; ValueError for anything else."""
     found, got = _CLOCK.fullmatch(cell), f"{cell[:100]!r}"
     expect(found, where, "a clock time such as '03:19:53.010' or '2019-07-06T03:19:53.010'", got)
     *_, hour, minute, second, fraction, half, zone = found.groups()
-    expect(
-        1 <= int(hour) <= 12 if half else int(hour) <= 24, where, f"hours from {'1 to 12' if half else '0 to 23'}", got
-    )
+    known, expected = (range(1, 13), "1 to 12") if half else (range(25), "0 to 23")
+    expect(int(hour) in known, where, f"hours from {expected}", got)
     hours = int(hour) % 12 + 12 * (half in ("P", "p")) if half else int(hour)
     if zone is not None:  # minutes of a time zone such as +02:00; Z and UTC are zero
         zone = 0 if zone.upper() in ("Z", "UTC") else int(f"{zone[0]}1") * (60 * int(zone[1:3]) + int(zone[-2:]))
@@ -373,8 +357,7 @@ def _parse_clock(cell: str, where: str) -> ClockTime:
 def _seconds_of(times: list[ClockTime | None], file: str) -> list[float]:
     """Seconds since the midnight before the first time, NaN for None.
 
-    Without dates, a time that is more than half a day earlier than the previous time belongs to the next day. 1 o'clock
-    after 12 o'clock is refused: it is on a 12-hour clock.
+    Without dates, a time more than half a day before the previous one belongs to the next day; 1 after 12 is refused.
     """
     known = [time for time in times if time is not None]
     for kinds, expected in (
@@ -383,16 +366,13 @@ def _seconds_of(times: list[ClockTime | None], file: str) -> list[float]:
         ({time.halves for time in known}, "AM or PM in all clock times or in none"),
     ):
         expect(len(kinds) == 1, file, expected, f"{len(kinds)} kinds", "write them alike")
-    day, last, found = 0, 0.0, []
-    for time in times:
-        if time is None:
-            found.append(math.nan)
-            continue
+    day, last, found = 0, 0.0, [math.nan] * len(times)
+    for place, time in ((place, time) for place, time in enumerate(times) if time is not None):
         back = not time.halves and 12 * _HOUR <= last < 13 * _HOUR and _HOUR <= time.seconds < 2 * _HOUR
         expect(not back, file, "hours from 0 to 23", "1 after 12 o'clock, as on a clock of 12 hours")
         day = time.day - known[0].day if time.day is not None else day + (time.seconds < last - _DAY / 2)
         last = time.seconds
-        found.append(day * _DAY + time.seconds)
+        found[place] = day * _DAY + time.seconds
     return found
 
 
@@ -414,11 +394,12 @@ _SPELLINGS = {  # of numbers, by the decimal mark and the mark between groups of
 }
 _MARKED = re.compile(rf"[,{_BLANKS}]|\..*\.")
 _THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}")  # 1,000: a thousand, or one with three decimals
-_HUNDREDS = re.compile(r"[-+]?[1-9]\d{2}")
-_BELOW_ONE = re.compile(r"0?\.\d+|\d(?:\.\d+)?[eEdD]-\d+")
-_NUMBERS = re.compile(r"[\s\d.+\-eEdD]*")
 _POINTS = "Numbers with decimal commas need another separator between columns, such as ';'"
 _SKIP = "If the text is about other samples, give skip= to leave it out"
+_CUT = "cut off the line if it is no row of samples"
+_TIME = re.compile(r"(elapsed |relative )?(t|(time|zeit|temps|tempo|tiempo)\d*)(\b|_)", re.IGNORECASE)
+_STAMP = re.compile(r"(timestamp|unix|epoch)(\b|_)", re.IGNORECASE)  # times if no other column has them
+_UNIX_EPOCH, _UNIX = ClockTime(datetime.date(1970, 1, 1).toordinal(), 0.0, 0, 0), (1e9, 4.2e9)  # [s], from 2001 to 2103
 
 _Line = tuple[int, list[str]]  # its number and cells
 
@@ -449,6 +430,253 @@ class Table(NamedTuple):
     time_unit: str | None = None  # as given by the caller
     chosen: bool = False  # whether the caller has chosen the column of times
 
+    @property
+    def value_columns(self) -> list[int]:
+        """The places of the columns with values."""
+        return [k for k, column in enumerate(self.columns) if column.kind == "number" and k != self.time]
+
+    @property
+    def listing(self) -> str:
+        """The columns, for messages."""
+        if self.named:
+            return f"the columns are {', '.join(column.name for column in self.columns)}"
+        return f"the columns have no names: give a number from 1 to {len(self.columns)}. {_POINTS}"
+
+    def place_of(self, name: int | str | None) -> int:
+        """The place of the named column of values, or of the only one."""
+        places = [k for k in self.value_columns if name is None or self.columns[k].name == str(name)]
+        if name is None and not self.named and len(places) > 1:
+            raise ValueError(
+                f"{self.file} has {len(self.columns)} columns and no header line; write one such as 'time_s,acc_g', or "
+                "give column=2 and time_unit='s' if the first column has the times, in seconds; else column=1 and the "
+                f"step dt=; or column='rows' and dt= if the samples follow each other along the rows. {_POINTS}"
+            )
+        which = f" named {name!r}" if name else "; choose it with column="
+        expect(len(places) == 1, self.file, f"one column of values{which}, {self.listing}")
+        return places[0]
+
+    # units and samples
+
+    def stated_unit(self, place: int, dimension: str | None = None) -> str | None:
+        """The unit of a column as the file states it, in its name or below the header line, or None.
+
+        With a `dimension` other than force, the N at the end of a name such as ``acc_N`` is the direction north, and an
+        S is the direction south unless it is a time.
+        """
+        column = self.columns[place]
+        end, below = column.name[-2:], column.below or None
+        direction = dimension and ((end == "_N" and dimension != "force") or (end == "_S" and dimension != "time"))
+        named = unit_in_name(column.name) if self.named and not direction else None
+        if named is None or below is None:
+            return named or below
+        both = f"{self.file} (name and line of units)"
+        return agree_on_unit(named, below, dimension_of(below) or dimension_of(named), both)
+
+    def text_unit(self, place: int, dimension: str, others: bool = False) -> str | None:
+        """The unit that comments or the text above the table state for a column of a dimension, or None.
+
+        With other units known (`others`), text that is no unit is ignored, except for counts.
+        """
+        for unit in self.stated.units:
+            known = dimension_of(unit)
+            alone = len(self.value_columns) == 1 and known != "time"
+            if known == dimension or (alone and (known or not others or "count" in unit.lower())):
+                return unit
+        peaks = self.peaks(place) if dimension == "acceleration" and not others and place in self.value_columns else ()
+        return next((unit for _, unit, _ in peaks if unit), None)
+
+    def peaks(self, place: int) -> list[tuple[str, str | None, str]]:
+        """Words, unit and number of the stated peaks of a column of values."""
+        places = self.value_columns
+        return self.stated.peaks_of([self.columns[k].name for k in places], places.index(place))
+
+    def samples(
+        self, columns: Sequence[tuple[str | int | None, str, str | None, str]], stacklevel: int
+    ) -> list[tuple[NDArray[np.float64], str, str]]:
+        """Samples of columns (n_rows,), units and dimensions, of columns' names, dimensions, units, words for messages.
+
+        Units are those on which file and caller agree; stated peaks are compared. Warns if a number for missing samples
+        is in none of the columns: the file may write it in another way.
+        """
+        found, places, given = [], [self.place_of(name) for name, *_ in columns], self.missing or ()
+        listed = [each for each in given if not isinstance(each, str)]
+        for place, (_, dimension, unit, where) in zip(places, columns, strict=True):
+            column, named = self.columns[place], self.stated_unit(place, dimension)
+            values = np.where(np.isin(column.values, listed), np.nan, column.values)
+            # a sentinel may be measured if the column has other numbers within 1 % of it, or the plausible ones if
+            # others have half its size, like the samples next to a peak
+            for sentinel in (*_SENTINELS, *_PLAUSIBLE_SENTINELS) if self.missing != () else ():
+                there, size = np.flatnonzero(values == sentinel), abs(sentinel)
+                close = sentinel in _SENTINELS
+                similar = np.abs(values - sentinel) <= 0.01 * size if close else np.abs(values) >= 0.5 * size
+                if there.size and np.count_nonzero(similar) == there.size:
+                    marks = [repr(each) if isinstance(each, str) else f"{each:g}" for each in (*given, sentinel)]
+                    got = f"{sentinel:g} in {there.size} rows, which usually stands for a missing sample"
+                    advice = f"give missing=[{', '.join(marks)}] to read it as NaN, or missing=[] if it was measured"
+                    expect(False, f"{self.file}, line {self.lines[there[0]]}", "a measured number", got, advice)
+            text = self.text_unit(place, dimension, others=named is not None or unit is not None)
+            stated = agree_on_unit(named, text, dimension, f"{where} (column and text)") if named or text else None
+            unit = agree_on_unit(stated, unit, dimension, where)
+            if dimension == "acceleration" and not np.isnan(values).any():
+                check_peaks(self.peaks(place), values, column.decimals, unit, self.file, f". {_SKIP}")
+            found.append((values, unit, dimension))
+        absent = [f"{each:g}" for each in listed if not any(each in self.columns[k].values for k in places)]
+        if absent:
+            warnings.warn(
+                f"{self.file}: missing={', '.join(absent)} is in none of the columns that "
+                "were read: check how the file writes missing samples, or leave it out",
+                UserWarning,
+                stacklevel=stacklevel + 1,
+            )
+        return found
+
+    # times
+
+    @property
+    def unit_of_times(self) -> float:
+        """The unit of the times [s]."""
+        column = self.columns[self.time]
+        if column.kind == "clock":
+            return 1.0
+        stated = self.stated_unit(self.time)
+        if stated is None and self.time_unit is None:
+            # the unit in which the times are Unix times of this century
+            unix = next(
+                (u for u in ("s", "ms", "us") if _UNIX[0] <= column.values[0] * find_unit(u).factor < _UNIX[1]), None
+            )
+            if unix is not None and re.search("unix|epoch", column.name, re.IGNORECASE):
+                return find_unit(unix).factor
+            hint = "" if unix is None else f" (for Unix times {unix!r} would fit the numbers)"
+            advice = f"call it time_s or time_ms, or give time_unit={hint}"
+            raise ValueError(f"{self.file}: the column {column.name!r} has no unit; {advice}")
+        return find_unit(agree_on_unit(stated, self.time_unit, "time", f"{self.file} (times)")).factor
+
+    def times(self, dt: float | None = None) -> NDArray[np.float64]:
+        """Times of the rows [s]; ValueError without them or some of them, for a `dt`, or if columns differ."""
+        if self.time is None or dt is not None:
+            either = "resample is for uneven times in the file and dt for a file without times; give one of them"
+            raise ValueError(f"{self.file}: {either}")
+        unit, own = self.unit_of_times, self.columns[self.time]
+        times = own.values * unit
+        where = f"{self.file}, line {self.lines[int(np.argmax(np.isnan(times)))]}"
+        expect(not np.isnan(times).any(), where, "a time", "an empty cell or NaN", f"write all times, or {_CUT}")
+        for place, other in enumerate(() if self.chosen or not self.named else self.columns):
+            if place == self.time or other.kind != own.kind:
+                continue
+            stated = self.stated_unit(place) if own.kind == "number" else None
+            named = _TIME.match(other.name) or (stated and _STAMP.match(other.name))
+            is_t = not stated and re.match(r"t(\b|_)", other.name, re.IGNORECASE)  # T may be a temperature
+            if own.kind == "number" and (not named or is_t or (stated and dimension_of(stated) != "time")):
+                continue
+            others_unit = unit if stated is None else find_unit(stated, "time").factor
+            ahead = other.values * others_unit - times
+            ahead = (
+                ahead - ahead[0] if _UNIX[0] <= abs(ahead[0]) < _UNIX[1] else ahead
+            )  # a Unix time beside an elapsed one
+            alike = np.all(np.abs(ahead) <= max(unit * 10.0**-own.decimals, others_unit * 10.0**-other.decimals))
+            got = f"the columns {own.name!r} and {other.name!r} with different times"
+            advice = "write one file for each of them with its columns of values, or name one, time="
+            expect(alike, self.file, "one column of times", got, advice)
+        return times
+
+    def uniform_step(self) -> tuple[float, float]:
+        """The mean step of the times [s], and the largest error in it that rounding can cause.
+
+        Printed times may differ from a uniform grid by one unit of the last digit: half a unit each for the time and
+        for the two ends of the grid. If it is more than half a step, it would hide a missing sample and is not applied.
+        """
+        times, column = self.times(), self.columns[self.time]
+        advice = "print the times with more digits, or leave the column out and give dt="
+        increasing = times.size > 1 and times[-1] > times[0]
+        expect(increasing, self.file, "times that increase over 2 rows or more", f"{times.size} row(s)", advice)
+        increments = np.diff(times)
+        step, largest = float(times[-1] - times[0]) / increments.size, float(np.abs(times).max())
+        digit = 10.0**-column.decimals
+        rounding = digit * self.unit_of_times * (1 + 1e-6)
+        with np.errstate(over="ignore"):  # whether each printed time is a float32, rounded to the printed digits
+            apart = np.abs(column.values.astype(np.float32).astype(np.float64) - column.values)
+        single = 2e-7 * largest if 2e-7 * largest <= 0.25 * step and np.all(apart <= 0.501 * digit) else 0.0
+        # no term may reach a step, otherwise it hides lost samples if the times are large, such as Unix times
+        tolerance = (rounding if rounding <= 0.501 * step else 0.0) + single
+        tolerance += min(1e-4 * step + 4 * float(np.spacing(largest)), 0.1 * step)
+        usual = float(np.median(increments))
+        bad = np.abs(increments - usual) > tolerance
+        bad = bad if bad.any() else np.abs(times - times[0] - step * np.arange(times.size))[1:] > tolerance
+        if bad.any():
+            index = int(np.argmax(bad))
+            advice = (
+                "insert rows with empty cells where the logger has missed samples, print the times with more digits"
+            )
+            if increments[index] < 0.0:
+                advice = "if the clock was set back, correct the later times, or leave the column out and give dt="
+            with suppress(ValueError):
+                even = uniform_times(times, None, self.file)
+                advice += f", or give resample={even.step:.6g} to interpolate to a uniform step"
+            got = f"{increments[index]:g} s from {times[index]:g} to {times[index + 1]:g} s"
+            where = f"{self.file}, line {self.lines[index + 1]}"
+            expect(False, where, f"a uniform time step of about {usual:g} s", got, advice)
+        tolerance /= increments.size
+        rate = round(1 / step) if 1 / step < 1e15 else 0
+        return (1 / rate if rate and abs(1 / rate - step) < min(tolerance, 1e-4 * step) else step), tolerance
+
+    def step(self, dt: float | None = None) -> float:
+        """The time step [s]: from the times, the comment ``dt = ... s`` and the argument, which must agree.
+
+        A whole number of samples per second is used where the mean step corresponds to it within the rounding of
+        printed times and a relative 1e-4.
+        """
+        step, tolerance = (None, 0.0) if self.time is None else self.uniform_step()
+        known = [] if dt is None else [("the argument dt", dt)]
+        known += [(repr(text), steps[0]) for text, steps, _ in self.stated.steps if len(steps) == 1]
+        known += [] if step is None else [("the time column", step)]
+        if not known:
+            unclear = "".join(f", and states {text!r} without a unit" for text, *_ in self.stated.steps[:1])
+            lacking = f"no times (column time_s) and no comment 'dt = ... s'{unclear}"
+            raise ValueError(f"{self.file} has {lacking}: give dt= in seconds, or the column of times, time=")
+        first, chosen = known[0]
+        agrees = step is None or abs(step - chosen) <= tolerance + 1e-6 * step
+        differs = f"{self.file}: the step is {chosen} s by {first} but"
+        if not agrees and dt is not None:
+            raise ValueError(f"{differs} {step} s by the time column; correct one")
+        first, chosen = known[0 if agrees else -1]  # the times show a step that the text rounds
+        for text, steps, error in self.stated.steps:
+            if not any(abs(other - chosen) <= tolerance + (error + 1e-6) * chosen for other in steps):
+                advice = "correct one, or give skip= to leave out text that is about other samples"
+                raise ValueError(
+                    f"{self.file}: the step is {chosen} s by {first} but {steps[0]} s by {text!r}; {advice}"
+                )
+        return chosen
+
+    def start(self, step: float, zero: float | str = 0.0) -> float:
+        """The time of the first row after `zero` [s or clock time]; a file without times begins at time zero.
+
+        With ``zero=0``, a start within the rounding of its printed digits from a whole number of steps is set to this
+        number; for another `zero`, within round-off.
+        """
+        column = None if self.time is None else self.columns[self.time]
+        unit = 1.0 if column is None else self.unit_of_times
+        if isinstance(zero, str):  # what it does not state is as in the first row
+            text, zero, first = zero, _parse_clock(zero, "zero"), self.clock
+            if column is None or column.kind != "clock":
+                first, is_unix = _UNIX_EPOCH, column is not None and _UNIX[0] <= column.values[0] * unit < _UNIX[1]
+                advice = "a column of clock times; give zero in seconds"
+                advice = "date and time zone, as in '2019-07-06T03:19:53Z', for Unix times" if is_unix else advice
+                if not is_unix or zero.day is None or zero.zone is None:
+                    raise ValueError(f"{self.file}: zero={text!r} needs {advice}")
+            for what, given, known in (("date", zero.day, first.day), ("time zone", zero.zone, first.zone)):
+                if given is not None and known is None:
+                    advice = f"give zero={text!r} without one, as in the file"
+                    raise ValueError(f"{self.file}: the times have no {what}; {advice}")
+            days = 0 if zero.day is None else zero.day - first.day
+            zero = _DAY * days + zero.seconds - (0 if zero.zone is None else 60 * (zero.zone - first.zone))
+        if column is None:
+            return 0.0 - zero
+        first, digit = float(column.values[0]) * unit, unit * 10.0**-column.decimals
+        start = first - zero
+        rounding = 0.5 * digit * (1 + 1e-6) if zero == 0.0 else 4 * float(np.spacing(max(abs(first), abs(zero))))
+        nearest = round(start / step)
+        return nearest * step if abs(start - nearest * step) <= rounding + 1e-9 * step else start
+
 
 def read_table(
     path: str | Path,
@@ -462,8 +690,7 @@ def read_table(
     """Read columns of numbers from a text file, or from the first sheet of an Excel workbook (needs openpyxl).
 
     Arguments are those of `read_record`; with `along_rows` the numbers are one column, row after row, and the column
-    `labels` ("": the first one) is text if not all its cells are numbers. ValueError if the file cannot be read, has no
-    rows, rows of different length, a cell that is no finite number, or states another number of samples.
+    `labels` ("": the first one) is text if not all its cells are numbers.
     """
     if skip is not None and (isinstance(skip, bool) or not isinstance(skip, int) or skip < 0):
         raise ValueError(f"skip must be a number of lines, zero or more, got {skip!r}")
@@ -504,7 +731,7 @@ def read_table(
         return table._replace(time=next(iter(named + clocks), None))
     places = [k for k, column in enumerate(columns) if column.name == str(time) and column.kind != "text"]
     expected = f"one column of times with time={time!r}, found {len(places)}"
-    expect(len(places) == 1, file, expected, advice=_listed_columns(table))
+    expect(len(places) == 1, file, expected, advice=table.listing)
     return table._replace(time=places[0], chosen=True)
 
 
@@ -534,7 +761,7 @@ def _workbook(path: str | Path) -> list[str]:
 
 def _split(line: str, separator: str, where: str = "") -> list[str]:
     if separator == " ":
-        return number_cells(line) if _NUMBERS.fullmatch(line) else line.split()
+        return number_cells(line) if re.fullmatch(r"[\s\d.+\-eEdD]*", line) else line.split()
     try:
         cells = next(csv.reader([line], delimiter=separator, skipinitialspace=separator != "\t"))
     except csv.Error as error:
@@ -599,19 +826,21 @@ def _along_rows(lines: list[_Line], file: str) -> list[_Line]:
 def _announced(lines: list[_Line], file: str) -> tuple[list[_Line], list[str]] | None:
     """One row per number below a line with their number and step, and title and step as comments; None without it.
 
-    eqsig writes this line above one sample per line, RSPMatch above several ones, with at most another integer. In a
-    table, the line would have as many cells as the rows.
+    eqsig and RSPMatch write it, with at most another integer; in a table it would have as many cells as the rows.
     """
     heads = [" ".join(cells).split() for _, cells in lines[: _LAST_LINES + 1]]
-    place = next((k for k, head in enumerate(heads[:-1]) if head and all(map(is_number, head))), None)
-    if place is None or not 2 <= len(head := heads[place]) <= 3 or len(heads[place + 1]) == len(head):
+    place = next((k for k, head in enumerate(heads[:-1]) if head and all(map(is_number, head))), 0)
+    head, below = heads[place] if heads[1:] else [], lines[place + 1 :]
+    stated = re.fullmatch(r"(\d+) (0?\.\d+|\d(?:\.\d+)?[eEdD]-\d+)(?: \d+)?", " ".join(head))
+    if (
+        not stated
+        or len(head) == len(heads[place + 1])
+        or not all(map(_known, (cell for _, row in below for cell in row)))
+    ):
         return None
-    numbers = all(_known(cell) for _, cells in lines[place + 1 :] for cell in cells)
-    if not numbers or not all(map(str.isdecimal, (head[0], *head[2:]))) or not _BELOW_ONE.fullmatch(head[1]):
-        return None
-    rows = _along_rows(lines[place + 1 :], file)
-    check_count(len(rows), head[0], f"{file}, line {lines[place][0]}")
-    return rows, [*(" ".join(cells) for _, cells in lines[: min(place, 1)]), f"dt = {head[1]} s"]
+    rows = _along_rows(below, file)
+    check_count(len(rows), stated[1], f"{file}, line {lines[place][0]}")
+    return rows, [*(" ".join(cells) for _, cells in lines[: min(place, 1)]), f"dt = {stated[2]} s"]
 
 
 def _logger_table(lines: list[_Line], file: str) -> tuple[list[_Line], list[str]]:
@@ -660,9 +889,7 @@ def _header(
 ) -> tuple[list[str], list[str], list[_Line]]:
     """Names, units below them, and rows of equal width, without columns that have neither a name nor a number.
 
-    The first row is as wide as most rows of numbers; the names are the last line of words above it that is as wide.
-    Separators at the ends of the rows may be missing at its end, and the other way round. Only then, if the last cells
-    of all rows are empty, it may have one cell less.
+    Names are the last line of words above the rows that is as wide, but for a separator at the ends of rows or names.
     """
     data = [*itertools.islice((k for k, (_, cells) in enumerate(lines) if _is_data(cells)), _LAST_LINES)]
     widths = [len(lines[k][1]) for k in data] or [max((len(cells) for _, cells in lines), default=0)]
@@ -699,6 +926,7 @@ def _header(
         if len(cells) != width:
             last = not names and len(cells) < width and number == rows[-1][0] and all(map(_known, cells))
             advice = "if the samples follow each other along the rows, give column='rows' and dt=" if last else ""
+            advice = _CUT if number == rows[-1][0] and not all(map(_known, filter(None, cells))) else advice
             expect(False, f"{file}, line {number}", f"{width} cells as in the first line", len(cells), advice)
     kept = [k for k in range(width) if (names and names[k]) or not all(_is_missing(cells[k]) for _, cells in rows)]
     kept = kept or [*range(width)]  # the others are empty after a separator at the end of each line
@@ -726,9 +954,9 @@ def _states_nothing(cell: str) -> bool:
 def _with_points(lines: list[_Line], separator: str, file: str) -> tuple[list[_Line], bool]:
     """Rows with decimal points and without separators of thousands, "" for missing cells; whether commas were decimal.
 
-    All numbers have one spelling. Commas and points between groups of digits need a number that shows them, such as
-    ``1,234.5`` or ``1.234.567``. Cells such as ``1,000`` have three decimals unless commas separate the cells and no
-    number shows that they are decimal, or the column has no other decimal comma and integers of three digits.
+    All numbers have one spelling, and separators of thousands need a number that shows them, such as ``1,234.5``. Cells
+    such as ``1,000`` have three decimals unless commas separate the cells and no number shows that they are decimal, or
+    the column has no other decimal comma and integers of three digits.
     """
     rows = [(number, ["" if _is_missing(cell) else cell for cell in cells]) for number, cells in lines]
     if not any(_MARKED.search(cell) for _, cells in rows for cell in cells):
@@ -748,7 +976,7 @@ def _with_points(lines: list[_Line], separator: str, file: str) -> tuple[list[_L
         doubtful = [k for k, cell in enumerate(column) if _THOUSANDS.fullmatch(cell)]
         own = any("," in cell and _is_value(cell) and not _THOUSANDS.fullmatch(cell) for cell in column)
         alone = separator == "," and (".", ",") in left
-        wrong = doubtful and not own and (alone or any(map(_HUNDREDS.fullmatch, column)))
+        wrong = doubtful and not own and (alone or any(re.fullmatch(r"[-+]?[1-9]\d{2}", cell) for cell in column))
         got = ", ".join(
             f"{column[k]!r}, which may have a separator of thousands or a decimal comma" for k in doubtful[:1]
         )
@@ -761,7 +989,7 @@ def _with_points(lines: list[_Line], separator: str, file: str) -> tuple[list[_L
     return rows, mark == ","
 
 
-# columns and units ----------------------------------------------------------------------------------------------------
+# columns ----------------------------------------------------------------------------------------------------
 
 _LONGEST_UNIT = 100
 _SENTINELS = (-9999.0, -999.25, 1e30, 9.97e36)  # numbers that loggers and formats write for missing samples
@@ -790,12 +1018,14 @@ def _columns(
                 try:
                     values[place] = parse_number(cell, lines[place]) if cell else math.nan
                 except ValueError as error:
-                    # text may be a missing sample, unless it is a damaged number or in a second header line
+                    # text may be a missing sample, unless it is a damaged number or in a second header line, or among
+                    # the times: then a line below the samples may state a largest value, a mean, or a date
                     alone = len(rows[place][1]) == 1 and cell not in names
                     word = _is_word(cell) or not any(map(str.isdigit, cell))
                     mark = word and (alone or any(map(_known, rows[place][1])))
                     advice = f"; if it stands for a missing sample, give missing={[*marks, cell[:100]]}" if mark else ""
-                    raise ValueError(f"{error}{advice}") from None
+                    of_time = names and _TIME.match(names[k]) and _is_word(cell)
+                    raise ValueError(f"{error}{f'; {_CUT}' if of_time else advice}") from None
             decimals = max(map(decimals_of, filled), default=0)
         name, unit = names[k] if names else str(k + 1), below[k] if below else ""
         columns.append(Column(name, np.array(values), decimals, unit, kind, cells))
@@ -820,67 +1050,6 @@ def unit_in_name(name: str) -> str | None:
     return bracket[1] if bracket else None
 
 
-def stated_unit(table: Table, place: int, dimension: str | None = None) -> str | None:
-    """The unit of a column as the file states it, in its name or below the header line, or None.
-
-    With a `dimension` other than force, the N at the end of a name such as ``acc_N`` is the direction north, and an S
-    is the direction south unless it is a time.
-    """
-    column = table.columns[place]
-    end, below = column.name[-2:], column.below or None
-    direction = dimension and ((end == "_N" and dimension != "force") or (end == "_S" and dimension != "time"))
-    named = unit_in_name(column.name) if table.named and not direction else None
-    if named is None or below is None:
-        return named or below
-    return agree_on_unit(
-        named, below, dimension_of(below) or dimension_of(named), f"{table.file} (name and line of units)"
-    )
-
-
-def text_unit(table: Table, place: int, dimension: str, others: bool = False) -> str | None:
-    """The unit that comments or the text above a table state for a column of a dimension, or None.
-
-    With other units known (`others`), text that is no unit is ignored, except for counts.
-    """
-    places = value_columns(table)
-    for unit in table.stated.units:
-        known = dimension_of(unit)
-        alone = len(places) == 1 and known != "time" and (known or not others or "count" in unit.lower())
-        if alone or known == dimension:
-            return unit
-    if dimension != "acceleration" or others or place not in places:
-        return None
-    names = [table.columns[k].name for k in places]
-    return next((unit for _, unit, _ in table.stated.peaks_of(names, places.index(place)) if unit), None)
-
-
-def value_columns(table: Table) -> list[int]:
-    """The places of the columns with values."""
-    return [k for k, column in enumerate(table.columns) if column.kind == "number" and k != table.time]
-
-
-def _listed_columns(table: Table) -> str:
-    if table.named:
-        return f"the columns are {', '.join(column.name for column in table.columns)}"
-    return f"the columns have no names: give a number from 1 to {len(table.columns)}. {_POINTS}"
-
-
-def _value_column(table: Table, column: int | str | None = None) -> int:
-    """The place of the named column, or of the only column that is not the time."""
-    places = value_columns(table)
-    if column is not None:
-        places = [place for place in places if table.columns[place].name == str(column)]
-    elif not table.named and len(places) > 1:
-        raise ValueError(
-            f"{table.file} has {len(table.columns)} columns and no header line; write one such as 'time_s,acc_g', or "
-            "give column=2 and time_unit='s' if the first column has the times, in seconds; else column=1 and the step "
-            f"dt=; or column='rows' and dt= if the samples follow each other along the rows. {_POINTS}"
-        )
-    which = f" named {column!r}" if column else "; choose it with column="
-    expect(len(places) == 1, table.file, f"one column of values{which}, {_listed_columns(table)}")
-    return places[0]
-
-
 def _checked_missing(missing: Sequence[float | str] | None) -> tuple[float | str, ...] | None:
     """Numbers and texts that stand for missing samples; ValueError for other values, and for numbers in quotes."""
     if missing is None:
@@ -893,212 +1062,6 @@ def _checked_missing(missing: Sequence[float | str] | None) -> tuple[float | str
                 f"missing must be finite numbers and texts, such as (-9999, 'OL'), or () for none; got {missing!r}"
             )
     return tuple(given)
-
-
-def table_values(
-    table: Table, columns: Sequence[tuple[str | int | None, str, str | None, str]], stacklevel: int
-) -> list[tuple[NDArray[np.float64], str, str]]:
-    """Samples of columns (n_rows,), units and dimensions, of columns' names, dimensions, units and words for messages.
-
-    Units are those on which file and caller agree; stated peaks are compared. Warns if a number for missing samples is
-    in none of the columns: the file may write it in another way.
-    """
-    found, places = [], [_value_column(table, name) for name, *_ in columns]
-    given = table.missing or ()
-    listed = [each for each in given if not isinstance(each, str)]
-    for place, (_, dimension, unit, where) in zip(places, columns, strict=True):
-        values, named = table.columns[place].values, stated_unit(table, place, dimension)
-        values = np.where(np.isin(values, listed), np.nan, values)
-        # a sentinel may be measured if the column has other numbers within 1 % of it, or the plausible ones if others
-        # have half its size, like the samples next to a peak
-        for sentinel in (*_SENTINELS, *_PLAUSIBLE_SENTINELS) if table.missing != () else ():
-            there, size = np.flatnonzero(values == sentinel), abs(sentinel)
-            close = sentinel in _SENTINELS
-            similar = np.abs(values - sentinel) <= 0.01 * size if close else np.abs(values) >= 0.5 * size
-            if there.size and np.count_nonzero(similar) == there.size:
-                marks = [repr(each) if isinstance(each, str) else f"{each:g}" for each in (*given, sentinel)]
-                got = f"{sentinel:g} in {there.size} rows, which usually stands for a missing sample"
-                advice = f"give missing=[{', '.join(marks)}] to read it as NaN, or missing=[] if it was measured"
-                expect(False, f"{table.file}, line {table.lines[there[0]]}", "a measured number", got, advice)
-        text = text_unit(table, place, dimension, others=named is not None or unit is not None)
-        stated = agree_on_unit(named, text, dimension, f"{where} (column and text)") if named or text else None
-        unit = agree_on_unit(stated, unit, dimension, where)
-        if dimension == "acceleration" and not np.isnan(values).any():
-            others, decimals = value_columns(table), table.columns[place].decimals
-            peaks = table.stated.peaks_of([table.columns[k].name for k in others], others.index(place))
-            check_peaks(peaks, values, decimals, unit, table.file, f". {_SKIP}")
-        found.append((values, unit, dimension))
-    values = [table.columns[place].values for place in places]
-    absent = [f"{each:g}" for each in listed if not any(each in column for column in values)]
-    if absent:
-        warnings.warn(
-            f"{table.file}: missing={', '.join(absent)} is in none of the columns that "
-            "were read: check how the file writes missing samples, or leave it out",
-            UserWarning,
-            stacklevel=stacklevel + 1,
-        )
-    return found
-
-
-# times ----------------------------------------------------------------------------------------------------------------
-
-_TIME = re.compile(r"(elapsed |relative )?(t|(time|zeit|temps|tempo|tiempo)\d*)(\b|_)", re.IGNORECASE)
-_STAMP = re.compile(r"(timestamp|unix|epoch)(\b|_)", re.IGNORECASE)  # times if no other column has them
-_UNIX = re.compile(r"unix|epoch", re.IGNORECASE)
-
-
-def _is_unix(seconds: float) -> bool:
-    return 1e9 <= seconds < 4.2e9  # since 1970, of the years 2001 to 2103
-
-
-def _time_unit(table: Table) -> float:
-    """Unit of the times [s]."""
-    column = table.columns[table.time]
-    if column.kind == "clock":
-        return 1.0
-    stated = stated_unit(table, table.time)
-    if stated is None and table.time_unit is None:
-        # the unit in which the times are Unix times of this century
-        unix = next((unit for unit in ("s", "ms", "us") if _is_unix(column.values[0] * find_unit(unit).factor)), None)
-        if unix is not None and _UNIX.search(column.name):
-            return find_unit(unix).factor
-        hint = "" if unix is None else f" (for Unix times {unix!r} would fit the numbers)"
-        raise ValueError(
-            f"{table.file}: the column {column.name!r} has no unit; call it time_s or time_ms, or give time_unit={hint}"
-        )
-    return find_unit(agree_on_unit(stated, table.time_unit, "time", f"{table.file} (times)")).factor
-
-
-def row_times(table: Table, dt: float | None = None) -> NDArray[np.float64]:
-    """Times of the rows [s]; ValueError if there are none or some are missing, for a `dt`, or if columns differ."""
-    if table.time is None or dt is not None:
-        raise ValueError(
-            f"{table.file}: resample is for uneven times in the file and dt for a file without times; give one of them"
-        )
-    unit, own = _time_unit(table), table.columns[table.time]
-    times = own.values * unit
-    line = table.lines[int(np.argmax(np.isnan(times)))]
-    expect(not np.isnan(times).any(), f"{table.file}, line {line}", "a time", "an empty cell or NaN", "write all times")
-    for place, other in enumerate(() if table.chosen or not table.named else table.columns):
-        if place == table.time or other.kind != own.kind:
-            continue
-        stated = stated_unit(table, place) if own.kind == "number" else None
-        named = _TIME.match(other.name) or (stated and _STAMP.match(other.name))
-        is_t = not stated and re.match(r"t(\b|_)", other.name, re.IGNORECASE)  # T may be a temperature
-        if own.kind == "number" and (not named or is_t or (stated and dimension_of(stated) != "time")):
-            continue
-        others_unit = unit if stated is None else find_unit(stated, "time").factor
-        ahead = other.values * others_unit - times
-        ahead = ahead - ahead[0] if _is_unix(abs(ahead[0])) else ahead  # a Unix time beside an elapsed one
-        alike = np.all(np.abs(ahead) <= max(unit * 10.0**-own.decimals, others_unit * 10.0**-other.decimals))
-        got = f"the columns {own.name!r} and {other.name!r} with different times"
-        advice = "write one file for each of them with its columns of values, or name one, time="
-        expect(alike, table.file, "one column of times", got, advice)
-    return times
-
-
-def _uniform_step(table: Table) -> tuple[float, float]:
-    """The mean step of the times [s], and the largest error in it that rounding can cause.
-
-    Printed times are rounded, so each may differ from a uniform grid by one unit of its last digit: half a unit because
-    it is rounded, half a unit because the two ends that define the grid are rounded. If this unit is more than half a
-    step, the tolerance would hide a missing sample, and it is not applied. Times that may have been stored as float32
-    may differ by 2e-7 times the largest time, if this is less than a quarter of a step. Other times must be uniform
-    within 1e-4 of a step and round-off.
-    """
-    times, column = row_times(table), table.columns[table.time]
-    advice = "print the times with more digits, or leave the column out and give dt="
-    increasing = times.size > 1 and times[-1] > times[0]
-    expect(increasing, table.file, "times that increase over 2 rows or more", f"{times.size} row(s)", advice)
-    increments = np.diff(times)
-    step, largest = float(times[-1] - times[0]) / increments.size, float(np.abs(times).max())
-    digit = 10.0**-column.decimals
-    rounding = digit * _time_unit(table) * (1 + 1e-6)
-    with np.errstate(over="ignore"):  # whether each printed time is a float32, rounded to the printed digits
-        apart = np.abs(column.values.astype(np.float32).astype(np.float64) - column.values)
-    single = 2e-7 * largest if 2e-7 * largest <= 0.25 * step and np.all(apart <= 0.501 * digit) else 0.0
-    # no term may reach a step, otherwise it hides lost samples if the times are large, such as Unix times
-    tolerance = (rounding if rounding <= 0.501 * step else 0.0) + single
-    tolerance += min(1e-4 * step + 4 * float(np.spacing(largest)), 0.1 * step)
-    usual = float(np.median(increments))
-    bad = np.abs(increments - usual) > tolerance
-    off_grid = np.abs(times - times[0] - step * np.arange(times.size))[1:] > tolerance
-    if bad.any() or off_grid.any():
-        index = int(np.argmax(bad) if bad.any() else np.argmax(off_grid))
-        advice = "insert rows with empty cells where the logger has missed samples, print the times with more digits"
-        if increments[index] < 0.0:
-            advice = "if the clock was set back, correct the later times, or leave the column of times out and give dt="
-        with suppress(ValueError):
-            even = uniform_times(times, None, table.file)
-            advice += f", or give resample={even.step:.6g} to interpolate to a uniform step"
-        got = f"{increments[index]:g} s from {times[index]:g} to {times[index + 1]:g} s"
-        where = f"{table.file}, line {table.lines[index + 1]}"
-        expect(False, where, f"a uniform time step of about {usual:g} s", got, advice)
-    tolerance /= increments.size
-    rate = round(1 / step) if 1 / step < 1e15 else 0
-    return (1 / rate if rate and abs(1 / rate - step) < min(tolerance, 1e-4 * step) else step), tolerance
-
-
-def table_step(table: Table, dt: float | None = None) -> float:
-    """The time step [s] of a table: from its times, the comment ``dt = ... s`` and the argument, which must agree.
-
-    A whole number of samples per second is used where the mean step corresponds to it within the rounding of printed
-    times and a relative 1e-4.
-    """
-    step, tolerance = (None, 0.0) if table.time is None else _uniform_step(table)
-    known = [("the argument dt", dt)] if dt is not None else []
-    known += [(repr(text), steps[0]) for text, steps, _ in table.stated.steps if len(steps) == 1]
-    known += [("the time column", step)] if step is not None else []
-    if not known:
-        unclear = "".join(f", and states {text!r} without a unit" for text, *_ in table.stated.steps[:1])
-        raise ValueError(
-            f"{table.file} has no times (column time_s) and no comment 'dt = ... s'{unclear}: give dt= in seconds, or "
-            "the column of times, time="
-        )
-    first, chosen = known[0]
-    if step is not None and not abs(step - chosen) <= tolerance + 1e-6 * step:
-        if dt is not None:
-            raise ValueError(
-                f"{table.file}: the step is {chosen} s by {first} but {step} s by the time column; correct one"
-            )
-        first, chosen = known[-1]  # the times show a step that the text rounds
-    for text, steps, error in table.stated.steps:
-        if not any(abs(other - chosen) <= tolerance + (error + 1e-6) * chosen for other in steps):
-            raise ValueError(
-                f"{table.file}: the step is {chosen} s by {first} but {steps[0]} s by {text!r}; correct one, "
-                "or give skip= to leave out text that is about other samples"
-            )
-    return chosen
-
-
-def table_start(table: Table, step: float, zero: float | str = 0.0) -> float:
-    """The time of the first row after `zero` [s or clock time]; a file without times begins at time zero.
-
-    With ``zero=0``, a start within the rounding of its printed digits from a whole number of steps is set to this
-    number; for another `zero`, within round-off.
-    """
-    column, file = None if table.time is None else table.columns[table.time], table.file
-    unit = 1.0 if column is None else _time_unit(table)
-    if isinstance(zero, str):  # what it does not state is as in the first row
-        text, zero, first = zero, _parse_clock(zero, "zero"), table.clock
-        if column is None or column.kind != "clock":
-            first, is_unix = _UNIX_EPOCH, column is not None and _is_unix(column.values[0] * unit)
-            if not is_unix or zero.day is None or zero.zone is None:
-                advice = "a column of clock times; give zero in seconds"
-                advice = "date and time zone, as in '2019-07-06T03:19:53Z', for Unix times" if is_unix else advice
-                raise ValueError(f"{file}: zero={text!r} needs {advice}")
-        for what, given, known in (("date", zero.day, first.day), ("time zone", zero.zone, first.zone)):
-            if given is not None and known is None:
-                raise ValueError(f"{file}: the times have no {what}; give zero={text!r} without one, as in the file")
-        days = 0 if zero.day is None else zero.day - first.day
-        zero = _DAY * days + zero.seconds - (0 if zero.zone is None else 60 * (zero.zone - first.zone))
-    if column is None:
-        return 0.0 - zero
-    first, digit = float(column.values[0]) * unit, unit * 10.0**-column.decimals
-    start = first - zero
-    rounding = 0.5 * digit * (1 + 1e-6) if zero == 0.0 else 4 * float(np.spacing(max(abs(first), abs(zero))))
-    nearest = round(start / step)
-    return nearest * step if abs(start - nearest * step) <= rounding + 1e-9 * step else start
 
 
 # uneven times, from a clock with jitter or a logger that loses packets ------------------------------------------------
@@ -1138,26 +1101,22 @@ class UniformTimes(NamedTuple):
 
 
 def uniform_times(times: NDArray[np.float64], step: float | None, where: str) -> UniformTimes:
-    """Return times with the uniform `step` [s] from the first to the last of the given times (n_samples,) [s].
+    """Times with the uniform `step` [s] from the first to the last of the given times (n_samples,) [s].
 
-    The default step is a whole number of samples per second within 5 % of the usual step, else the usual step. Raises
-    ValueError if times decrease or many repeat, more than half of the samples are missing, or the step differs from the
-    usual one by more than 5 %: that would need a filter (`Record.resample`, `Measurements.decimate`). Of samples with
-    equal times the first one is used.
+    The default is a whole number of samples per second near the usual step, else this step; ValueError for a step that
+    differs by more than 5 %, which would need a filter. Of a few samples with equal times the first one is used.
     """
     step = None if step is None else check_step(step, f"resample of {where}")
     kept = np.concatenate([[True], np.diff(times) != 0.0])
-    if not 0 < (repeated := np.count_nonzero(~kept)) <= _MOST_REPEATED * times.size:
-        repeated, kept = 0, np.ones(times.size, dtype=bool)
-    first_repeated, times = times[np.argmin(kept)], times[kept]
-    increments = np.diff(times)
-    if times.size < 2 or not np.all(increments > 0.0):
-        place = int(np.argmax(~(increments > 0.0))) if times.size > 1 else 0
-        got = f"{times[min(place + 1, times.size - 1)]:.15g} s after {times[place]:.15g} s"
-        advice = (
-            "if the times are those of packets, leave the column of times out and give dt=; if the clock was set back"
-        )
-        expect(False, where, "times that increase", got, f"{advice}, correct the later times")
+    kept |= np.count_nonzero(~kept) > _MOST_REPEATED * times.size
+    repeated, first_repeated, times = np.count_nonzero(~kept), times[np.argmin(kept)], times[kept]
+    increments = np.diff(times, append=np.inf if times.size > 1 else -np.inf)
+    place = int(np.argmin(increments > 0.0))
+    got = f"{times[(place + 1) % times.size]:.15g} s after {times[place]:.15g} s"
+    advice = "if the times are those of packets, leave the column of times out and give dt="
+    advice += "; if the clock was set back, correct the later times"
+    expect(increments[place] > 0.0, where, "times that increase", got, advice)
+    increments = increments[:-1]
     usual = float(increments[increments <= _GAP * np.median(increments)].mean())
     if step is None:
         whole = 1.0 / max(round(1.0 / usual), 1) if usual > 1e-9 else usual

@@ -371,7 +371,7 @@ def test_accelerations_of_a_v2_file(folder):
     (folder / "both.v2").write_text("\n".join(lines[0] + lines[1]))
     (folder / "frame.toml").write_text(
         "[model]\nkind = 'frame'\nmasses = [1.0]\nstiffnesses = [62.0]\nfloors = {top = 1}\n"
-        "[record]\nfile = 'both.v2'\nchannel = 3\n[measurements]\nfile = 'both.v2'\ncolumns = {top = 7}\n"
+        "[record]\nfile = 'both.v2'\ncolumn = 3\n[measurements]\nfile = 'both.v2'\ncolumns = {top = 7}\n"
         "[priors]\nstiffness_1 = 'normal(1, 0.3)'\ndamping_1 = 'normal(0.05, 0.02)'\n"
     )
     found = make_problem(read_job(folder / "frame.toml"))

@@ -31,7 +31,7 @@ def listed(path, code=0):
 def read_as_listed(lines):
     """The record and the measured accelerations that the lines name."""
     base, measured = lines["record"], lines.get("measurements")
-    record = read_record(base["file"], base.get("channel", base.get("column")), resample=base.get("resample"))
+    record = read_record(base["file"], base.get("column"), resample=base.get("resample"))
     if measured is None:
         return record, None
     options = {key: measured[key] for key in ("zero", "resample", "missing") if key in measured}
@@ -179,7 +179,7 @@ def test_data_without_time_have_sections_of_their_own(path, text, section, given
         ({"dt": 0.01}, "states a step of 0.02 s but dt = 0.01 was given"),
         (
             {"columns": [8]},
-            "expected one channel with channel = 8, .*found 0; choose with channel= and member=, or in a TOML file",
+            "expected one channel with column=8, .*found 0; choose with column=, its number or the end",
         ),
         ({"columns": [3, 7]}, "expected one column for each of 1 channels"),
         ({"resample": 0.01}, "a uniform step; leave resample out"),
@@ -248,6 +248,9 @@ def test_times_that_repeat_or_contradict_the_header_have_a_line(path):
     output, lines = listed(path)
     assert "the step is 0.02 s by the time column but 0.01 s by 'dt = 0.01 s'" in output
     assert read_columns(path, channel, ["acc_g"], skip=lines["measurements"]["skip"]).dt == 0.02
+    path.write_text("Samples: 99\n" + path.read_text())
+    result = CliRunner().invoke(main, ["data", str(path)])
+    assert result.exit_code == 1 and "'Samples: 99' announces 99 samples, the file has 60" in result.output
 
 
 def test_variables_of_matlab_and_files_that_are_no_data(tmp_path):

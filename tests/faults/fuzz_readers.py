@@ -74,7 +74,7 @@ def cases(folder):
     archive = zipped([("a.v2", files["V2"]), ("inner.zip", zipped([("b.V2", files["V2c"])]))])
     return [
         *(Case(name, partial(read_record, **given), [content.encode()]) for name, content, given in FILES.values()),
-        Case("zip", partial(read_record, channel=1, member="a.v2"), [archive]),
+        Case("zip", partial(read_record, column="a.v2"), [archive]),
         Case("any", read_record, [*files.values()]),
         Case("csv", read_record, styles),
         Case("uneven.csv", partial(read_record, resample=0.02), styles),

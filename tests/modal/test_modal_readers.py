@@ -35,6 +35,9 @@ def test_a_table_has_a_line_for_each_mode(tmp_path):
     [
         ("Mode No.;Natural frequency [Hz];a;b;c", "1;1,0;1;2;3", "2;3,0;-2;-1;2"),
         ("f [Hz],T (°C),a,b,c", "1,20,1,2,3", "3,20,-2,-1,2"),
+        ("Mode;Frequenz [Hz];Dämpfung [%];Temperatur [°C];a;b;c", "1;1,0;1;20;1;2;3", "2;3,0;1;20;-2;-1;2"),
+        ("Eigenfrequenz_Hz,a,b,c", "1,1,2,3", "3,-2,-1,2"),
+        ("Fréquence (Hz),a,b,c", "1,1,2,3", "3,-2,-1,2"),
         ("f [Hz],a,b,c,remark", "1,1,2,3,good", "3,-2,-1,2,poor"),
         ("Mode,omega [rad/s],zeta [%],a,b,c", "1,6.283185307179586,1,1,2,3", "2,18.84955592153876,1,-2,-1,2"),
     ],

@@ -74,6 +74,14 @@ class TestMeasurements:
             with pytest.raises(ValueError, match="no channel 'roof'; the channels are top, drift|sequence|different"):
                 measurements.select(wrong)
 
+    def test_printed_in_short(self, measurements):
+        assert (
+            repr(measurements)
+            == str(measurements)
+            == (f"Measurements of top [{TOP.unit}], drift [{DRIFT.unit}]: 100 samples at a step of 0.02 s")
+        )
+        assert repr(Measurements((TOP,), 1.0, [[1.0, 2.0]], axis="load case")).endswith("2 samples along 'load case'")
+
     def test_trim(self, measurements):
         np.testing.assert_array_equal(measurements.trim(0.2, 0.4).values, measurements.values[:, 10:21])
         with pytest.raises(ValueError, match="expected 0 <= start < stop <= 1.98 s"):

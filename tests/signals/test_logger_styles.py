@@ -108,7 +108,7 @@ def test_texts_that_stand_for_no_missing_sample_are_refused(tmp_path, missing):
 @pytest.mark.parametrize("line", ["time_s,acc_g", "0.02,1x", "end,end"])
 def test_a_second_header_line_and_a_damaged_number_are_no_missing_samples(tmp_path, line):
     (tmp_path / "a.csv").write_text(f"time_s,acc_g\n0.00,1\n0.01,2\n{line}\n0.03,2\n")
-    with pytest.raises(ValueError, match="line 4: expected a number, got '[^']*'$"):
+    with pytest.raises(ValueError, match="line 4: expected a number, got '[^']*'($|; cut off the line)"):
         read_record(tmp_path / "a.csv")
 
 
@@ -116,3 +116,14 @@ def test_a_first_sample_that_is_a_mark_is_no_header_line(tmp_path):
     (tmp_path / "a.csv").write_text("acc_g\nOL\n1\n2\n")
     found = read_columns(tmp_path / "a.csv", [TOP], ["acc_g"], dt=0.01, missing=["OL"])
     np.testing.assert_array_equal(found.values, [[np.nan, G0, 2 * G0]])
+
+
+@pytest.mark.parametrize("footer", ["Max;;17,2", "Max;17,2;;", "Exported 06.07.2019;;", ";;17,2", "Mittel"])
+def test_a_line_below_the_samples_is_to_be_cut_and_no_missing_sample(path, footer):
+    rows = [f"{0.01 * k:.2f};{0.5 * k:.1f};{17.2 - k:.1f}".replace(".", ",") for k in range(9)]
+    path.write_text("\n".join(["Logger;Nr. 12;", "Zeit [s];Weg [mm];Kraft [kN]", *rows, footer, ""]))
+    with pytest.raises(ValueError, match="line 12: expected .*; .*cut off the line if it is no row") as caught:
+        read_columns(path, [Channel("F", "force", "kN")], ["Kraft [kN]"])
+    assert "missing=" not in str(caught.value)
+    path.write_text(path.read_text().replace(f"{footer}\n", ""))
+    assert read_columns(path, [Channel("F", "force", "kN")], ["Kraft [kN]"]).values[0, 0] == 17200.0

@@ -28,7 +28,7 @@ def test_samples_and_step(tmp_path, trace, name, form):
         read_record(path)
     path.write_bytes(path.read_bytes()[:-300])
     with pytest.raises(ValueError, match="obspy cannot read the file") if form == "SAC" else pytest.raises(ValueError):
-        read_record(path, units="g", channel="HNZ") if form == "SAC" else read_record(path, channel="HNE", units="g")
+        read_record(path, units="g", column="HNZ") if form == "SAC" else read_record(path, column="HNE", units="g")
 
 
 def test_what_is_refused(tmp_path, trace):

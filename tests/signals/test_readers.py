@@ -262,8 +262,8 @@ class TestV2OnRealZips:
         for name, values in columns.items():
             if name != "time_s":
                 number = int(name.removeprefix("ch"))
-                member = f"Structure.zip/CHAN{number}.V2" if archive == PAINTER else None
-                record = read_record(shared / archive, channel=number, member=member)
+                channel = f"Structure.zip/CHAN{number}.V2" if archive == PAINTER else number
+                record = read_record(shared / archive, column=channel)
                 assert record.dt == dt
                 # The table ends with its shortest channel and has six significant digits.
                 np.testing.assert_allclose(record.acceleration[: values.size], to_si(values, "cm/s2"), rtol=5e-6)
@@ -275,11 +275,11 @@ class TestV2OnRealZips:
         with pytest.raises(
             ValueError, match=r"(?s)found 2; choose.*Structure.zip/CHAN12.V2.*Free Field.zip/CHAN012.V2"
         ):
-            read_record(shared / PAINTER, channel=12)
-        with pytest.raises(ValueError, match=r"(?s)channel = 99, .*found 0; .*channel 26: CHAN 13: 270 DEG"):
-            read_record(shared / MELOLAND, channel=99)
+            read_record(shared / PAINTER, column=12)
+        with pytest.raises(ValueError, match=r"(?s)column=99, found 0; .*channel 26: CHAN 13: 270 DEG"):
+            read_record(shared / MELOLAND, column=99)
         with pytest.raises(ValueError, match="none in 0 file.* named 'CHAN99.V2'"):
-            read_record(shared / MELOLAND, member="CHAN99.V2")
+            read_record(shared / MELOLAND, column="CHAN99.V2")
 
     def test_damage_is_found(self, shared, tmp_path):
         with zipfile.ZipFile(shared / MELOLAND) as archive:
@@ -358,7 +358,7 @@ class TestV2Forms:
         values = rng.uniform(-99, -10, size=(3, 21))  # ten columns each, without a blank between them
         lines = [line for k in range(3) for line in csmip(k + 1, values[k], 0.0125, " .013 sec, in cm/sec2. (8f10.6)")]
         path.write_text("\n".join(lines))
-        record = read_record(path, channel=2)
+        record = read_record(path, column=2)
         np.testing.assert_allclose(record.acceleration, values[1] / 100, atol=1e-8)
         assert record.dt == 0.0125, "the step is that of the real header, the data line has three decimals only"
         assert (record.name, record.source) == ("Chan 2: 360 Deg", "CE89146.V2")
@@ -371,7 +371,7 @@ class TestV2Forms:
         lines = cosmos(1, values[0], 0.02) + cosmos(1, values[0], 0.02, quantity="velocity", units="cm/sec(05)")
         path.write_text("\n".join(lines + cosmos(7, values[1], 0.005)))
         for channel, row, dt in [(1, 0, 0.02), (7, 1, 0.005)]:
-            record = read_record(path, channel=channel)
+            record = read_record(path, column=channel)
             np.testing.assert_allclose(record.acceleration, values[row] / 100, rtol=1e-6)
             assert record.dt == dt
 

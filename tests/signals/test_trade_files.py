@@ -288,7 +288,6 @@ def test_the_header_of_an_afad_file_states_everything(tmp_path):
         (text("Anzahl Werte = 3", "acc_g", "1", "2"), {"dt": 0.01}, "'Anzahl Werte = 3' announces 3 samples"),
         (text("Peak value = 2.5 g", "acc_g", "1.0", "2.0"), {"dt": 0.01}, "states 'Peak value = 2.5 g'"),
         (text("Abtastrate: 200,5 Hz", "acc_g;x", "1,5;1", "2,5;1"), {"dt": 0.005, "column": "acc_g"}, "but 0.00498"),
-        (text("1", "2"), {"channel": 1, "column": 1, "units": "g", "dt": 0.01}, "give channel= or column=, not both"),
         (EQSIG, {"units": "g", "dt": 0.02}, "0.02 s by the argument dt but 0.01 s by 'dt = 0.0100 s'"),
         (EQSIG.replace("40 0", "41 0"), {"units": "g"}, "line 2 announces 41 samples, the file has 40"),
         (RSPMATCH.replace("  40 ", "  39 "), {"units": "g"}, "line 2 announces 39 samples, the file has 40"),
