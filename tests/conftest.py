@@ -51,7 +51,7 @@ def shared_pool():
     A process of a pool takes a CPU second to start. Tests that leave a process busy or look at the processes make
     pools of their own.
     """
-    from fe_likelihoods.simulation.local_pool import LocalPool
+    from fe_likelihoods.simulation.executors import LocalPool
 
     pools = {}
     yield lambda workers: nullcontext(pools.get(workers) or pools.setdefault(workers, LocalPool(workers)))

@@ -20,14 +20,23 @@ from typing import Any
 
 from samplers.locks import locked_folder
 
-from .rows import COLUMNS, LABEL_COLUMNS, LAYOUT, STORE, STORE_LABEL, is_undamaged, is_undamaged_label, transaction
-
-__all__ = ["APPLICATION_ID", "SCHEMA_VERSION", "CacheFile"]
+__all__ = ["APPLICATION_ID", "SCHEMA_VERSION", "CacheFile", "transaction"]
 
 logger = logging.getLogger(__name__)
 
 APPLICATION_ID = 0x46454C43  # "FELC"
 SCHEMA_VERSION = 6
+LAYOUT = (
+    # the id orders rows by age; the size of a response [bytes] is 0 for failures of a model and empty for statistics
+    "CREATE TABLE rows (id INTEGER PRIMARY KEY, key BLOB NOT NULL UNIQUE, source INTEGER NOT NULL, "
+    "generation INTEGER NOT NULL, theta BLOB NOT NULL, value BLOB NOT NULL, reason BLOB NOT NULL, "
+    "session INTEGER NOT NULL, crc INTEGER NOT NULL, size INTEGER)",
+    "CREATE INDEX row_generations ON rows (source, generation)",
+    "CREATE INDEX response_sizes ON rows (size) WHERE size > 0",  # for their sum without reading the responses
+    # labels of models, and the generation of each label
+    "CREATE TABLE labels (source INTEGER NOT NULL, code BLOB NOT NULL, files BLOB NOT NULL, "
+    "generation INTEGER NOT NULL, crc INTEGER NOT NULL, UNIQUE (source, code, files))",
+)
 SQLITE_SIGNATURE = b"SQLite format 3\0"
 ID_START = 68  # place of the application id in SQLite's header [bytes]
 PAGE_SIZE = 4096  # SQLite's default [bytes]
@@ -51,6 +60,19 @@ def _before_fork() -> None:
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(before=_before_fork, after_in_parent=_lock.release, after_in_child=_lock.release)
+
+
+@contextlib.contextmanager
+def transaction(connection: sqlite3.Connection) -> Iterator[sqlite3.Connection]:
+    """A write transaction; an error inside rolls it back."""
+    connection.execute("BEGIN IMMEDIATE")
+    try:
+        yield connection
+        connection.execute("COMMIT")
+    except BaseException:
+        with contextlib.suppress(sqlite3.Error):  # SQLite itself may have ended it
+            connection.execute("ROLLBACK")
+        raise
 
 
 def _is_damage(error: Exception) -> bool:
@@ -77,7 +99,6 @@ class CacheFile:
         self._connection: sqlite3.Connection | None = None
         self._inode: tuple[int, int] | None = None
         self._inode_of_cache: tuple[int, int] | None = None  # of the last file that was identified as a cache
-        self._aside: Path | None = None  # a damaged file, whose rows are to be copied to the new file
         with _lock:
             _files.add(self)
 
@@ -90,18 +111,11 @@ class CacheFile:
 
     def check(self) -> None:
         """Open the file, before any costly work; see `SimulationCache` for the errors."""
-        folder = self.path.parent
-        if self.path.is_dir() or not folder.is_dir():
+        if self.path.is_dir() or not self.path.parent.is_dir():
             raise ValueError(f"{self.path}: expected the path of a file in an existing folder, as 'cache.sqlite'")
-        with self._exclusive():  # another process may move a damaged file aside between the two questions
-            is_usable = not self.path.exists() or os.access(self.path, os.R_OK | os.W_OK)
-            is_usable = is_usable and os.access(folder, os.W_OK | os.X_OK)
-        if not is_usable:
-            raise ValueError(
-                f"{self.path} or its folder is not writable or readable for this user; give another path, or copy it"
-            )
         try:
-            self._use(lambda connection: None)
+            with _lock, transaction(self._use(lambda connection: connection)):  # whether it can be written
+                pass
         except (OSError, sqlite3.Error) as error:
             raise ValueError(f"{self.path} cannot be opened as a cache: {error}; give another path") from error
 
@@ -140,18 +154,11 @@ class CacheFile:
             self.retry_times.pop(what, None)
             return result
 
-    def insist(self, action: Callable[[sqlite3.Connection], Any]) -> Any:
-        """Result of an action that the user has called explicitly; OSError if the file cannot be used."""
-        try:
-            return self._use(action)
-        except (sqlite3.Error, ValueError) as error:
-            raise OSError(f"{self.path} cannot be used: {error}") from error
-
     def select(self, query: str, values: tuple = ()) -> list[tuple]:
         """Rows of a query; none if the file cannot be read."""
         return self.attempt("read", lambda connection: connection.execute(query, values).fetchall(), [])
 
-    def write(self, *statements: tuple[str, list[tuple]], what: str = "written") -> bool:
+    def write(self, *statements: tuple[str, list[tuple]]) -> bool:
         """Execute statements, each for some rows, in one transaction; False if the file cannot be written."""
 
         def execute(connection: sqlite3.Connection) -> bool:
@@ -160,7 +167,7 @@ class CacheFile:
                     connection.executemany(statement, rows)
             return True
 
-        return self.attempt(what, execute, False)
+        return self.attempt("written", execute, False)
 
     def connection(self) -> sqlite3.Connection:
         """Connection of this process, opened if there is none.
@@ -172,10 +179,6 @@ class CacheFile:
                 self._inode = self.identity
                 self._connection = self._open()
                 self._inode = self._inode_of_cache = self.identity
-            if self._aside is not None:
-                aside, self._aside = self._aside, None
-                text = "%s: %d rows were salvaged; the others are lost"
-                logger.warning(text, aside.name, _salvage(aside, self._connection))
         return self._connection
 
     def close(self) -> None:
@@ -205,8 +208,7 @@ class CacheFile:
                 with contextlib.suppress(FileNotFoundError):
                     os.rename(f"{self.path}{suffix}", f"{aside}{suffix}")
             os.rename(self.path, aside)
-            self._aside = aside
-            text = "%s is damaged (%s): set aside as %s, and a new cache created"
+            text = "%s is damaged (%s): set aside as %s, and a new cache created, so that all is simulated again"
             logger.warning(text, self.path, why, aside.name)
 
     @property
@@ -255,11 +257,9 @@ class CacheFile:
         ((identity,),) = connection.execute("PRAGMA application_id").fetchall()
         ((version,),) = connection.execute("PRAGMA user_version").fetchall()
         if identity != APPLICATION_ID:
-            found = connection.execute("SELECT name FROM sqlite_master WHERE sql IS NOT NULL ORDER BY name").fetchall()
-            names = ", ".join(name.decode("utf-8", "replace") for (name,) in found if isinstance(name, bytes))
             raise ValueError(
                 f"{self.path} is another program's SQLite file (application id {identity:#x}, expected "
-                f"{APPLICATION_ID:#x}; tables and indices {names or 'none'}); give another path"
+                f"{APPLICATION_ID:#x}); give another path"
             )
         if version != SCHEMA_VERSION:
             raise ValueError(
@@ -284,24 +284,3 @@ class CacheFile:
             f"{self.path} is not a cache of simulations, and is not changed; give another path, such as "
             "'cache.sqlite'. If it is a cache with a damaged header, remove it"
         ) from None
-
-
-def _salvage(damaged: Path, connection: sqlite3.Connection) -> int:
-    """Copy the rows and labels of a damaged file that can be read to a new one; return the number of rows.
-
-    They are read from the first on and from the last on, until a damaged page. Each has a checksum, so nothing wrong is
-    copied.
-    """
-    with contextlib.suppress(sqlite3.Error), transaction(connection):
-        connection.executemany(STORE, filter(is_undamaged, _readable(damaged, "rows", COLUMNS)))
-        connection.executemany(STORE_LABEL, filter(is_undamaged_label, _readable(damaged, "labels", LABEL_COLUMNS)))
-    return connection.execute("SELECT count(*) FROM rows").fetchone()[0]
-
-
-def _readable(damaged: Path, table: str, columns: str) -> Iterator[tuple]:
-    for order in ("ASC", "DESC"):
-        with contextlib.suppress(sqlite3.Error, OSError, ValueError, MemoryError):
-            with contextlib.closing(sqlite3.connect(f"{damaged.as_uri()}?mode=ro", uri=True)) as source:
-                source.text_factory = bytes
-                yield from source.execute(f"SELECT {columns} FROM {table} ORDER BY rowid {order}")
-                return

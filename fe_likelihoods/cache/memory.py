@@ -86,12 +86,6 @@ class MemoryCache:
                 while self._size > self.most:
                     self._size -= self._size_of(self._outcomes.popitem(last=False)[1])
 
-    def successes(self, n_structural: int) -> np.ndarray:
-        """Structural parameters (n, n_structural) of cached simulations that did not fail."""
-        with self._lock:
-            keys = [key for key, outcome in self._outcomes.items() if not isinstance(outcome, str)]
-        return thetas_of(keys, n_structural)
-
     @staticmethod
     def _size_of(outcome: Any) -> int:
         return 1

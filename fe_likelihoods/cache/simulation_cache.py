@@ -10,35 +10,137 @@ A cache never makes a run fail. A row that does not match its checksum is simula
 aside, and while the file cannot be written, rows wait in memory.
 """
 
+import hashlib
+import json
 import logging
 import os
 import sqlite3
-from collections.abc import Collection
+import struct
+import zlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from .file import CacheFile
-from .rows import (
-    COLUMNS,
-    LABEL_COLUMNS,
-    STORE,
-    Row,
-    is_undamaged,
-    simulation_keys,
-    source_number,
-    transaction,
-)
+from ..simulation.faults import MisfitReason, TransientReason
+from .file import CacheFile, transaction
 
-__all__ = ["TOLERANCE", "CacheInfo", "SimulationCache"]
+__all__ = [
+    "LABEL_COLUMNS",
+    "STORE_LABEL",
+    "TOLERANCE",
+    "CacheInfo",
+    "Row",
+    "SimulationCache",
+    "is_undamaged_label",
+    "pack_label",
+    "pack_rows",
+    "source_number",
+]
 
 logger = logging.getLogger(__name__)
 
 MAX_WAITING_ROWS = 100_000  # rows kept in memory while the file cannot be written
 KEYS_PER_QUERY = 500  # keys in one SELECT
 TOLERANCE = 1e-9
-_ANY = "length(value) = ? OR length(reason) > 0"
+COLUMNS = "key, source, generation, theta, value, reason, session, crc, size"
+STORE = f"INSERT OR REPLACE INTO rows ({COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)"
+LABEL_COLUMNS = "source, code, files, generation, crc"
+STORE_LABEL = f"INSERT OR REPLACE INTO labels ({LABEL_COLUMNS}) VALUES (?, ?, ?, ?, ?)"
+KEY_BYTES = 16
+MAX_REASON_LENGTH = 2000
+NUMBERS = struct.Struct("<qqq")
+
+
+class Row(NamedTuple):
+    """A stored simulation: the values of `COLUMNS`; arrays are bytes."""
+
+    key: bytes
+    source: int
+    generation: int
+    theta: bytes  # structural parameters
+    value: bytes  # statistics or response; empty if it failed
+    reason: bytes  # of the failure
+    session: int  # number of the process that stored the row
+    crc: int
+    size: int | None
+
+    @property
+    def outcome(self) -> bytes | str:
+        """The value, or the reason of a failure."""
+        return self.reason.decode("utf-8", "replace") if self.reason else self.value
+
+
+def simulation_keys(fingerprint: str, thetas: np.ndarray, generation: int = 1) -> list[bytes]:
+    """Keys of simulations, digests of 128 bits.
+
+    `fingerprint` is the declared identity: everything that a simulation depends on, except the structural parameters
+    (n, n_structural), where -0.0 and 0.0 have the same key, and the generation.
+    """
+    start = hashlib.blake2b(f"{fingerprint}\0{generation}\0".encode(), digest_size=KEY_BYTES)
+    keys = []
+    for row in np.asarray(thetas, dtype="<f8") + 0.0:  # adding zero makes 0.0 of -0.0
+        digest = start.copy()
+        digest.update(row.tobytes())
+        keys.append(digest.digest())
+    return keys
+
+
+def source_number(fingerprint: str) -> int:
+    """64-bit number of a declared identity."""
+    return int.from_bytes(hashlib.blake2b(fingerprint.encode(), digest_size=8).digest(), signed=True)
+
+
+def pack_rows(
+    fingerprint: str,
+    thetas: np.ndarray,
+    values: np.ndarray,
+    reasons: Sequence[str],
+    generation: int,
+    session: int = 0,
+    of_model: bool = False,
+) -> list[Row]:
+    """Simulations as they are stored: statistics, or responses `of_model`.
+
+    Failures whose cause may be gone are left out: faults of the infrastructure, and in the rows of a model failures
+    that depend on the measurements.
+    """
+    source, rows = source_number(fingerprint), []
+    keys = simulation_keys(fingerprint, thetas, generation)
+    for key, theta, value, reason in zip(keys, thetas, values, reasons, strict=True):
+        if isinstance(reason, TransientReason) or (of_model and isinstance(reason, MisfitReason)):
+            continue
+        data = b"" if reason else np.asarray(value, dtype="<f8").tobytes()
+        text = reason[:MAX_REASON_LENGTH].encode("utf-8", "backslashreplace")
+        packed = key, source, generation, np.asarray(theta, dtype="<f8").tobytes(), data, text, session
+        rows.append(Row(*packed, _checksum(*packed), len(data) if of_model else None))
+    return rows
+
+
+def _checksum(key, source, generation, theta, value, reason, session) -> int:  # noqa: ANN001
+    """CRC-32 of a row; the key is included, so swapped rows count as damaged."""
+    numbers = NUMBERS.pack(source, generation, session)
+    return zlib.crc32(value, zlib.crc32(b"".join((key, numbers, theta, reason))))
+
+
+def is_undamaged(row: tuple) -> bool:
+    """Whether the values of `COLUMNS` match their checksum, which leaves out the size, and the size the value."""
+    try:
+        return row[7] == _checksum(*row[:7]) and row[8] in (None, len(row[4]))
+    except (TypeError, struct.error):  # damage may change the type of a value
+        return False
+
+
+def pack_label(source: int, code: str, files: dict[str, str], generation: int) -> tuple:
+    """Values of `LABEL_COLUMNS`."""
+    values = source, code.encode(), json.dumps(files, sort_keys=True).encode(), generation
+    return *values, zlib.crc32(repr(values).encode())
+
+
+def is_undamaged_label(row: tuple) -> bool:
+    """Whether the values of `LABEL_COLUMNS` match their checksum."""
+    return row[4] == zlib.crc32(repr(row[:4]).encode())
 
 
 class CacheInfo(NamedTuple):
@@ -82,7 +184,7 @@ class SimulationCache:
     Attributes
     ----------
     damaged : int
-        Rows that this object has found damaged and deleted, in this process.
+        Rows that this object has found damaged in this process; they are simulated and stored again.
     file : CacheFile
         The SQLite file and its connection.
 
@@ -142,14 +244,16 @@ class SimulationCache:
         Rows of another width count as damaged.
         """
         keys = simulation_keys(fingerprint, thetas, generation)
-        with self.file.lock:
-            good, bad = {}, []
-            for row in map(Row._make, self._rows(keys)):
-                if is_undamaged(row) and (row.reason or len(row.value) == 8 * width):
-                    good[row.key] = row
-                else:
-                    bad.append(row.key)
-            self._drop(bad)
+        found: list[Row] = []
+        for start in range(0, len(keys), KEYS_PER_QUERY):
+            part = keys[start : start + KEYS_PER_QUERY]
+            query = f"SELECT {COLUMNS} FROM rows WHERE key IN ({','.join('?' * len(part))})"
+            found += map(Row._make, self.file.select(query, tuple(part)))
+        good = {row.key: row for row in found if is_undamaged(row) and (row.reason or len(row.value) == 8 * width)}
+        if len(good) < len(found):
+            if not self.damaged:
+                logger.warning("%s has damaged rows; they are simulated again, see SimulationCache.damaged", self.path)
+            self.damaged += len(found) - len(good)
         return [good.get(key) for key in keys]
 
     def write(self, rows: list[Row]) -> None:
@@ -179,41 +283,22 @@ class SimulationCache:
         query = "SELECT generation FROM rows WHERE source = ? AND generation GROUP BY generation ORDER BY max(id) DESC"
         return [generation for (generation,) in self.file.select(query, (source_number(fingerprint),))]
 
-    def some_rows(self, fingerprint: str, generation: int, width: int, n: int, latest: bool = False) -> list[Row]:
-        """Undamaged rows of one identity and generation, at most n: random ones, or the latest successes."""
-        kind, order = ("length(reason) = 0 AND length(value) = ?", "id DESC") if latest else (_ANY, "random()")
+    def some_rows(
+        self, fingerprint: str, generation: int, width: int, n: int, other_than: int | None = None
+    ) -> list[Row]:
+        """Undamaged rows of one identity and generation, at most n: random ones, or the latest successes.
+
+        The latest ones are those of sessions `other_than` one with a number.
+        """
+        kind, order, more = "length(value) = ? OR length(reason) > 0", "random()", ()
+        if other_than is not None:
+            kind, order, more = "length(reason) = 0 AND length(value) = ? AND session != ?", "id DESC", (other_than,)
         chosen = f"SELECT id FROM rows WHERE source = ? AND generation = ? AND ({kind}) ORDER BY {order} LIMIT ?"
         query = f"SELECT {COLUMNS} FROM rows WHERE id IN ({chosen}) ORDER BY random()"
-        rows = self.file.select(query, (source_number(fingerprint), generation, 8 * width, n))
+        rows = self.file.select(query, (source_number(fingerprint), generation, 8 * width, *more, n))
         return [Row._make(row) for row in rows if is_undamaged(row)]
 
     # the file -----------------------------------------------------------------------------------------------------
-
-    def add(self, path: str | os.PathLike) -> int:
-        """Add the rows of another cache, which no other process uses; rows that are stored already are not changed.
-
-        Returns the number of simulations added. ValueError if the other file is not a cache, OSError if either file
-        cannot be used.
-        """
-        other = SimulationCache(path)
-        if other.path == self.path:
-            raise ValueError(f"{path} is the cache itself; give another file")
-        other.close()
-        before = self.info().simulations
-        tables = ("rows", COLUMNS), ("labels", LABEL_COLUMNS)
-
-        def insert(connection: sqlite3.Connection) -> None:
-            connection.execute("ATTACH ? AS other", (str(other.path),))
-            try:
-                with transaction(connection):
-                    for table, columns in tables:
-                        query = f"INSERT OR IGNORE INTO {table} ({columns}) SELECT {columns} FROM other.{table}"
-                        connection.execute(query)
-            finally:
-                connection.execute("DETACH other")
-
-        self.file.insist(insert)
-        return self.info().simulations - before
 
     def info(self) -> CacheInfo:
         """State of the cache."""
@@ -234,14 +319,17 @@ class SimulationCache:
         with self.file.lock:
             self._waiting = [row for row in self._waiting if row.source not in sources]
             delete, rows = "DELETE FROM rows WHERE source = ?", [(source,) for source in sources]
-            return self.file.insist(lambda connection: connection.executemany(delete, rows).rowcount)
+            deleted = self.file.attempt("written", lambda connection: connection.executemany(delete, rows).rowcount, -1)
+            if deleted < 0:
+                raise OSError(f"{self.path} cannot be written: nothing was deleted; try again later")
+            return deleted
 
     def discard(self, thetas: np.ndarray, *fingerprints: str, generation: int) -> None:
         """Delete the rows of some simulations, if possible."""
         keys = {key for fingerprint in fingerprints for key in simulation_keys(fingerprint, thetas, generation)}
         with self.file.lock:
             self._waiting = [row for row in self._waiting if row.key not in keys]
-            self._delete(keys)
+            self.file.write(("DELETE FROM rows WHERE key = ?", [(key,) for key in keys]))
 
     def close(self) -> None:
         """Store waiting rows, if possible, and close this process's connection; the next use opens a new connection."""
@@ -249,24 +337,3 @@ class SimulationCache:
             self.file.retry_times.clear()
             self.write([])
             self.file.close()
-
-    def _rows(self, keys: list[bytes]) -> list[tuple]:
-        """Stored rows with given keys, in any order."""
-        found = []
-        for start in range(0, len(keys), KEYS_PER_QUERY):
-            part = keys[start : start + KEYS_PER_QUERY]
-            marks = ",".join("?" * len(part))
-            found += self.file.select(f"SELECT {COLUMNS} FROM rows WHERE key IN ({marks})", tuple(part))
-        return found
-
-    def _delete(self, keys: Collection[bytes]) -> None:
-        self.file.write(("DELETE FROM rows WHERE key = ?", [(key,) for key in keys]), what="repaired")
-
-    def _drop(self, keys: list[bytes]) -> None:
-        """Delete rows that do not match their checksum."""
-        if not keys:
-            return
-        if not self.damaged:
-            logger.warning("%s has damaged rows; they are simulated again, see SimulationCache.damaged", self.path)
-        self.damaged += len(keys)
-        self._delete(keys)

@@ -7,12 +7,11 @@ which generation a label belongs.
 
 * The label is known: the row stored last and a random one before a likelihood uses its first row, and a random one of
   every 100 rows used. A difference is an error, `StaleCache`.
-* The label is unknown: `ROWS` random rows. If all agree, the label is added to their generation
-  (adoption). If one differs, or there are fewer rows, so that repeating them would save nothing, a new generation
-  begins: the earlier rows stay in the file and are not used.
+* The label is unknown: `ROWS` random rows. If all agree, the label is added to their generation (adoption). If one
+  differs, or there are fewer rows, a new generation begins: the earlier rows stay in the file and are not used.
 
-Failures are compared only if there is no successful simulation, since a changed model often fails at the same points.
-Rows are used without verification, with a warning, if the new simulations do not end, for example without a licence.
+A success is always among the rows, since a changed model often fails at the same points. Rows are used without
+verification, with a warning, if the new simulations do not end, for example without a licence.
 
 Results from two states of a model must not be mixed either, as when a value is set between two batches. So fingerprint,
 code, values and opened files are compared after simulations, in about 1 % of the time. User code may change values
@@ -27,7 +26,7 @@ import secrets
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from hashlib import blake2b
 from itertools import islice
@@ -40,31 +39,25 @@ from ..signals.comparison import Comparison
 from ..simulation.faults import ChangedModel, TransientReason
 from ..simulation.files import digests_by_name, observing, read_again
 from ..simulation.label import ModelLabel
-from ..simulation.model import (
-    MisfitBatch,
-    Model,
-    SimulationBatch,
-    misfit_of_responses,
-    most_responses,
-    simulate_batch,
-)
-from .comparison import Simulated, difference_in_words
+from ..simulation.model import MisfitBatch, Model, SimulationBatch, misfit_of_responses, most_responses, simulate_batch
 from .memory import MemoryCache, ResponseMemory
-from .rows import (
+from .simulation_cache import (
     LABEL_COLUMNS,
     STORE_LABEL,
+    TOLERANCE,
     Row,
+    SimulationCache,
     is_undamaged_label,
     pack_label,
     pack_rows,
     source_number,
 )
-from .simulation_cache import TOLERANCE, SimulationCache
 
-__all__ = ["ROWS", "StaleCache", "Trust", "VerifiedModel"]
+__all__ = ["ROWS", "Simulated", "StaleCache", "Trust", "VerifiedModel", "difference_in_words"]
 
 logger = logging.getLogger(__name__)
 
+ROUNDING = 1e-13  # relative error of a sum of squares, since processors add the terms in different orders
 ROWS = 59  # find a change of 5 % of the space with 95 %: 0.95 ** 59 < 0.05
 FIRST_ROWS = 2  # rows verified before the first row is used, if the label is known
 ROWS_PER_VERIFICATION = 100
@@ -77,7 +70,6 @@ NO_TIME = 5e-5  # [s]; a comparison that takes less is always made, since storin
 ROWS_PER_REPETITION = 100  # simulations between two repetitions if only items have changed that simulations change
 FINGERPRINT = "its fingerprint"
 OF_A_PROCESS = ("environment ", "library", "package ", "python", "source of ")  # items that differ between processes
-DIFFER = "stored simulations of this %s differ from new ones; they stay in the file and are not used"
 CHANGED = (
     "Something has changed that neither its declared identity nor its label contains, or the model does not repeat its "
     "results (make it depend on its parameters alone, for example with a fixed seed). Delete its rows with "
@@ -106,9 +98,9 @@ class StaleCache(ValueError):
 class Trust:
     """The label of a model, and which rows of a file this process trusts; likelihoods with one `key` share it.
 
-    `labels` has the rows of the file (see `pack_label`) by the source number of the model; `left` has the rows that may
-    be used until the next verification, by identity and whether any row is a success; `used` counts rows. Rows with the
-    number of the `session` were stored here and need no verification. `stale` is the error of a row that differed.
+    `labels` has the rows of the file (see `pack_label`) by the source number of the model; `used` counts rows that were
+    used after a verification, by identity, apart from failures alone. Rows with the number of the `session` were stored
+    here and need no verification. `stale` is the error of a row that differed.
     """
 
     _known: "OrderedDict[str, Trust]" = OrderedDict()  # of this process, the most recently used last
@@ -116,8 +108,7 @@ class Trust:
     def __init__(self, label: ModelLabel, key: str) -> None:
         self.label, self.key = label, key
         self.labels: dict[int, tuple] = {}
-        self.left: dict[tuple[str, bool], int] = {}
-        self.used = 0
+        self.used: dict[str, int] = {}
         self.stale: StaleCache | None = None
         self._owner = 0
 
@@ -139,22 +130,56 @@ class Trust:
             self._lock, self._owner, self.session = threading.RLock(), os.getpid(), secrets.randbits(62)
         return self._lock
 
-    def due(self, kind: tuple[str, bool], n: int) -> int:
+    def due(self, kind: str, n: int) -> int:
         """Number of rows to verify when n rows are used."""
-        due = 0 if kind in self.left else 1 if self.left else FIRST_ROWS  # others of the same code were verified
-        left = self.left.get(kind, ROWS_PER_VERIFICATION) - n
-        more = max(0, -left // ROWS_PER_VERIFICATION + 1)
-        self.left[kind], self.used = left + more * ROWS_PER_VERIFICATION, self.used + n
-        return due + more
+        before = self.used.get(kind, 0)
+        # the second: others of the same code were verified
+        first = 0 if kind in self.used else 1 if self.used else FIRST_ROWS
+        self.used[kind] = before + n
+        hundreds = [max(0, each) // ROWS_PER_VERIFICATION for each in (before, before + n)]
+        return first + hundreds[1] - hundreds[0]
 
 
-class _Comparison(NamedTuple):
-    """Result of a comparison of stored rows with new simulations."""
+class Simulated(NamedTuple):
+    """A simulation that was run again."""
 
-    compared: int
-    stopped: list[str]  # reasons of the new simulations that were stopped
-    row: Row | None = None  # that differs
-    new: Simulated | None = None
+    misfit: np.ndarray  # statistics (n_numbers,); NaN if it failed
+    reason: str  # of the failure
+    norm: np.ndarray  # (n_channels,) of the response [SI]
+
+
+def difference_in_words(
+    earlier: np.ndarray, reason: str, new: Simulated, names: Sequence[str], tolerance: float, of_response: bool
+) -> tuple[str, float]:
+    """How a simulation differs from an earlier one, in words and relative to the response norm; empty if it agrees.
+
+    It agrees within the `tolerance` of a response, relative to its norm; zero is for equal bits. `names` are those of
+    the channels, whose sums of squares come first; further numbers have the channel order and the scale of the sums,
+    and contain sums of squared responses if `of_response`. If a response with norm r changes by t r, the sum of squared
+    residuals s^2 changes by at most 2 s t r + (t r)^2, and so does a sum over products of two residuals of the channel;
+    a sum of squared responses by at most 2 r t r + (t r)^2. Rounding errors in the sums do not count as changes.
+    """
+    if reason or new.reason:
+        was, now = (f"failed ({text})" if text else "succeeded" for text in (reason, new.reason))
+        return ("" if reason and new.reason else f"it {was}; simulated again, it {now}"), 0.0
+    if np.array_equal(earlier, new.misfit):
+        return "", 0.0
+    n, channels = len(names), np.arange(len(earlier)) % len(names)
+    s, r = np.sqrt(np.minimum(earlier[:n], new.misfit[:n]))[channels], new.norm[channels]
+    if of_response:
+        s[n:] = r[n:]
+    difference = np.abs(earlier - new.misfit)
+    if tolerance:
+        difference = np.where(difference <= ROUNDING * s**2, 0.0, difference)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # the positive root of (t r)^2 + 2 s (t r) = difference, in a form without cancellation
+        change = np.where(difference == 0.0, 0.0, difference / (s + np.sqrt(s**2 + difference)) / r)
+    worst = int(np.argmax(np.nan_to_num(change, nan=np.inf)))
+    if change[worst] <= tolerance:
+        return "", 0.0
+    what = "sum of squared residuals" if worst < n else f"statistic {worst}"
+    values = f"stored {earlier[worst]:.17g}, simulated again {new.misfit[worst]:.17g}"
+    return f"channel {names[worst % n]!r}, {what}: {values}", float(change[worst])
 
 
 class VerifiedModel:
@@ -289,35 +314,15 @@ class VerifiedModel:
         is_first, succeeded = not self._points, [row for row, reason in enumerate(reasons) if not reason]
         points = [(thetas[row].copy(), misfit[row].copy()) for row in succeeded[:1] + succeeded[-1:]]
         self._points = (self._points or points)[:1] + points[-1:]
-        if self._points and (start := time.monotonic()) >= self._not_before:
-            try:
-                self._require_same(is_first and self.pool is None)
-            except ChangedModel:
-                self._clear()
-                for *_, generation, _ in self._trust.labels.values() if self.cache is not None else ():
-                    places = self._key, self.model.fingerprint
-                    self.cache.discard(np.concatenate(self._unchecked), *places, generation=generation)
-                raise
-            now = time.monotonic()
-            self._not_before = now + max(0.0, now - start - NO_TIME) / SHARE_OF_TIME
-
-    def _clear(self) -> None:
-        self.memory_cache.clear()
-        self.response_memory.clear()
-
-    def _changes(self) -> set[str]:
-        """Names of what has changed; a file counts from when a simulation opened it."""
-        known = digests_by_name(self.label.opened) | self._known
-        now = self.label.present(self.model) | {FINGERPRINT: self.model.fingerprint}
-        return {name for name in known.keys() | now.keys() if known.get(name) != now.get(name)}
-
-    def _require_same(self, is_first: bool) -> None:
-        """Raise `ChangedModel` if the model has changed, except for values that it changes itself, as the first may."""
+        if not self._points or (start := time.monotonic()) < self._not_before:
+            return
         if changed := self._changes():
             if changed <= self.label.changing and sum(map(len, self._unchecked)) < ROWS_PER_REPETITION:
                 return
             is_other = FINGERPRINT in changed
-            if is_other or not (is_first or self._repeats()):
+            # the first simulation may change values itself
+            if is_other or not ((is_first and self.pool is None) or self._repeats()):
+                self._drop_unchecked()
                 why = f"different: {', '.join(sorted(changed)[:3])}"
                 why += "" if is_other else ", and an earlier simulation gives another result"
                 raise ChangedModel(
@@ -330,6 +335,24 @@ class VerifiedModel:
             now = self.label.present(self.model)
             self._known |= {name: now.get(name) for name in changed}
         self._unchecked.clear()
+        now = time.monotonic()
+        self._not_before = now + max(0.0, now - start - NO_TIME) / SHARE_OF_TIME
+
+    def _drop_unchecked(self) -> None:
+        self._clear()
+        for *_, generation, _ in self._trust.labels.values() if self.cache is not None else ():
+            places = self._key, self.model.fingerprint
+            self.cache.discard(np.concatenate(self._unchecked), *places, generation=generation)
+
+    def _clear(self) -> None:
+        self.memory_cache.clear()
+        self.response_memory.clear()
+
+    def _changes(self) -> set[str]:
+        """Names of what has changed; a file counts from when a simulation opened it."""
+        known = digests_by_name(self.label.opened) | self._known
+        now = self.label.present(self.model) | {FINGERPRINT: self.model.fingerprint}
+        return {name for name in known.keys() | now.keys() if known.get(name) != now.get(name)}
 
     def _repeats(self) -> bool:
         """Whether the repeated simulations give the earlier results, or the model is not repeatable."""
@@ -421,16 +444,16 @@ class VerifiedModel:
             *(name, ROWS),
         )
         for generation, rows in candidates.items():
-            found = self._compare(rows, ROWS)
-            if found.row is not None:
+            compared, _, other = self._compare(rows, ROWS)
+            if other is not None:
                 continue
-            if found.compared < ROWS / 2:
+            if compared < ROWS / 2:
                 return 0
-            self._trust.left[identity, True] = ROWS_PER_VERIFICATION * found.compared
-            self._say("%d stored simulations of this %s agree with new ones: all are used", found.compared, name)
+            self._trust.used[identity] = -ROWS_PER_VERIFICATION * compared
+            self._say("%d stored simulations of this %s agree with new ones: all are used", compared, name)
             return generation
         if candidates:
-            self._say(DIFFER, name)
+            self._say("stored rows of this %s differ from new simulations: they stay in the file, not used", name)
         return self._new_generation(stored)
 
     def _known_generation(self, source: int) -> int | None:
@@ -479,25 +502,27 @@ class VerifiedModel:
                 return
             if trust.stale is not None:
                 raise StaleCache(str(trust.stale), trust.stale.theta)
-            succeeded, latest = any(not row.reason for row in others), []
-            if (identity, True) not in trust.left or not succeeded:
-                latest = self.cache.some_rows(identity, generation, width, 1, latest=True)
-                latest = [row for row in latest if row.session != trust.session]
-            # failures alone do not verify successful rows, which may be used later
-            used, kind = trust.used, (identity, bool(latest) or succeeded)
+            latest, kind = [], identity
+            if identity not in trust.used:
+                latest = self.cache.some_rows(identity, generation, width, 1, other_than=trust.session)
             shuffled = [others[place] for place in self._random.permutation(len(others))]
             shuffled.sort(key=lambda row: bool(row.reason))  # failures last
             chosen = latest + [row for row in shuffled if row not in latest]
-            found = self._compare(chosen, trust.due(kind, len(others)))
-            if found.row is not None:
-                self._refuse(found.row, found.new, used)
-            if found.stopped:
-                n, total = len(found.stopped), len(found.stopped) + found.compared
+            if chosen[0].reason and identity not in trust.used:
+                kind += " failures"  # alone, they verify no successes, which may be used later
+            used = sum(trust.used.values())
+            compared, stopped, other = self._compare(chosen, trust.due(kind, len(others)))
+            if other is not None:
+                self._refuse(*other, used)
+            if stopped:
                 text = "%d of %d stored simulations could not be verified, because the new simulation was stopped (%s)"
-                self._say(text, n, total, found.stopped[0])
+                self._say(text, len(stopped), len(stopped) + compared, stopped[0])
 
-    def _compare(self, rows: Iterable[Row], n: int) -> _Comparison:
-        """Simulate rows again, in growing batches, until n are compared, one differs, or too many stop."""
+    def _compare(self, rows: Iterable[Row], n: int) -> tuple[int, list[str], tuple[Row, Simulated] | None]:
+        """Simulate rows again, in growing batches, until n are compared, one differs, or too many stop.
+
+        Returns how many agree, the reasons of new simulations that were stopped, and the row that differs.
+        """
         rows, compared, stopped = iter(rows), 0, []
         while compared < n and len(stopped) < max(MAX_ATTEMPTS, compared):
             chosen = list(islice(rows, min(max(FIRST_COMPARED, 3 * compared), n - compared)))
@@ -511,10 +536,10 @@ class VerifiedModel:
                     stopped.append(each.reason)
                     self.verifications, self.unverified = self.verifications - 1, self.unverified + 1
                 elif self._row_difference(row, each)[0]:
-                    return _Comparison(compared, stopped, row, each)
+                    return compared, stopped, (row, each)
                 else:
                     compared += 1
-        return _Comparison(compared, stopped)
+        return compared, stopped, None
 
     def _row_difference(self, row: Row, new: Simulated) -> tuple[str, float]:
         """How a simulation differs from a stored one, as `_difference`."""
@@ -526,12 +551,12 @@ class VerifiedModel:
     def _refuse(self, row: Row, new: Simulated, used: int) -> None:
         """Raise `StaleCache`, now and for all rows until they are deleted."""
         trust, theta = self._trust, np.frombuffer(row.theta, dtype="<f8")
-        trust.left, trust.used, trust.session = {}, 0, secrets.randbits(62)
+        trust.used, trust.session = {}, secrets.randbits(62)
         difference, change = self._row_difference(row, new)
         point = ", ".join(f"{n} = {value:.17g}" for n, value in zip(self.model.parameter_names, theta, strict=True))
         text = f"{self.cache.path}: a stored simulation is not that of this {type(self.model).__name__}. At {point}: "
         text += f"{difference}. {CHANGED}"
-        if used:
+        if used > 0:
             text += f", and discard this run, which has used {used} rows"
         if row.reason:
             text += ". Also do so if failures depend on anything but the parameters, such as a licence"

@@ -15,7 +15,7 @@ import numpy as np
 from samplers.evaluation.point_queue import PointQueue
 
 from ..priors.points import as_points
-from ..simulation.local_pool import Threads, settle
+from ..simulation.executors import Threads, settle
 from ..simulation.model import has_batch_method
 
 __all__ = ["evaluation_queue"]

@@ -29,9 +29,8 @@ from ..noise.statistics import Statistic
 from ..priors.points import as_rows
 from ..signals.channels import Measurements
 from ..signals.comparison import Comparison, compare_with
-from ..simulation.executors import as_executor
+from ..simulation.executors import as_executor, result_of
 from ..simulation.folder import Observed
-from ..simulation.local_pool import result_of
 from ..simulation.model import (
     Model,
     SimulationBatch,

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import ndtri, stdtrit
 
-from ..cache.comparison import Simulated, difference_in_words
 from ..cache.simulation_cache import TOLERANCE
+from ..cache.verification import Simulated, difference_in_words
 from ..likelihood.likelihood import FELikelihood
 from ..likelihood.simulator import Simulator
 from ..models.linear_structure import LinearStructure

@@ -10,39 +10,28 @@ notebook functions work. The worker imports this library, installed packages and
 * A worker refuses everything if its version of this library has different source code.
 """
 
-import dis
 import functools
 import importlib.machinery
 import inspect
 import io
-import os
 import pickle
 import re
 import sys
 import threading
 import types
-from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from hashlib import blake2b
 from typing import Any, NamedTuple
 
 import cloudpickle
+from cloudpickle.cloudpickle import _dynamic_class_reduce
 
 from samplers.interrupts import become_worker, process_name
 
 from .faults import ChangedModel
 from .user_code import SCRIPTS, is_of_user, sources_digest
 
-__all__ = [
-    "Arrived",
-    "CannotLoad",
-    "Pickled",
-    "dumps",
-    "is_arriving",
-    "loaded_function",
-    "names_in",
-    "without_addresses",
-]
+__all__ = ["Arrived", "CannotLoad", "Pickled", "dumps", "is_arriving", "names_in", "without_addresses"]
 
 _LOCKS = (type(threading.Lock()), type(threading.RLock()))
 _CACHED = type(functools.cache(len))
@@ -51,19 +40,8 @@ _OF_THE_IMPORT = {"__builtins__", "__loader__", "__spec__", "__cached__"}
 _COMPILED = tuple(importlib.machinery.EXTENSION_SUFFIXES)
 _MOST_LOADED = 8
 _lock = threading.RLock()
-loaded_functions: "OrderedDict[bytes, Arrived]" = OrderedDict()  # in a worker, by key, the last used last
+loaded_functions: "dict[bytes, Arrived]" = {}  # in a worker, by key, the last used last
 _arriving: dict[str, types.ModuleType] | None = None  # modules of the function that is being loaded
-_present: dict[str, types.ModuleType] = {}  # modules of the function that ran last in this process
-
-
-def _forget_lock() -> None:
-    """In a forked process: another thread of the parent may have held the lock."""
-    global _lock
-    _lock = threading.RLock()
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_forget_lock)
 
 
 def without_addresses(message: str) -> str:
@@ -74,14 +52,6 @@ def without_addresses(message: str) -> str:
 def is_arriving() -> bool:
     """Whether an object from another process is being loaded."""
     return _arriving is not None
-
-
-def loaded_function(key: bytes) -> "Arrived | None":
-    """The function with a key, if it is one of the last that this process has loaded."""
-    with _lock:
-        if key in loaded_functions:
-            loaded_functions.move_to_end(key)
-        return loaded_functions.get(key)
 
 
 class CannotLoad(ValueError):
@@ -117,9 +87,9 @@ class Pickled(NamedTuple):
     def loaded(self) -> "Arrived":
         """The function, loaded unless it is one of the last that this process has loaded; see `load`."""
         with _lock:
-            function = loaded_functions[self.key] = loaded_function(self.key) or self.load()
+            function = loaded_functions[self.key] = loaded_functions.pop(self.key, None) or self.load()
             if len(loaded_functions) > _MOST_LOADED:
-                loaded_functions.popitem(last=False)
+                del loaded_functions[next(iter(loaded_functions))]
         return function
 
     def load(self) -> "Arrived":
@@ -157,23 +127,14 @@ class Arrived:
         self._function, self._modules = function, modules
 
     def __call__(self, item: Any) -> Any:
-        global _present
-        if _present is not self._modules:  # for functions that import them while they run
-            sys.modules.update(self._modules)
-            _present = self._modules
+        sys.modules.update(self._modules)  # for functions that import them while they run
         return self._function(item)
 
 
 def dumps(thing: Any) -> bytes:
     """Pickle an object, with user code and its values by value."""
-    with _lock:
-        pickler = _Pickler(file := io.BytesIO())
-        try:
-            pickler.dump(thing)
-        finally:
-            for module in pickler.registered:
-                cloudpickle.unregister_pickle_by_value(module)
-        return file.getvalue()
+    _Pickler(file := io.BytesIO()).dump(thing)
+    return file.getvalue()
 
 
 def _culprit(thing: Any, depth: int = 3) -> tuple[str, Any]:
@@ -181,17 +142,14 @@ def _culprit(thing: Any, depth: int = 3) -> tuple[str, Any]:
     try:
         if isinstance(thing, types.FunctionType):
             used = inspect.getclosurevars(thing)
-            values = used.globals if thing.__module__ in SCRIPTS else thing.__globals__
-            state = {**used.nonlocals, **{name: each for name, each in values.items() if not isinstance(each, _CODE)}}
-        elif isinstance(thing, types.ModuleType):
-            state = {name: each for name, each in vars(thing).items() if not isinstance(each, _CODE)}
+            state = used.nonlocals | (used.globals if thing.__module__ in SCRIPTS else thing.__globals__)
         else:
-            state = thing.__getstate__()
+            state = thing.__dict__ if isinstance(thing, types.ModuleType) else thing.__getstate__()
     except Exception:
         return "", thing
     for name, value in (state if isinstance(state, dict) else getattr(thing, "__dict__", {})).items():
         try:
-            dumps(None if name.startswith("__") else value)
+            dumps(None if name.startswith("__") or isinstance(value, _CODE) else value)
         except Exception:
             inner, culprit = _culprit(value, depth - 1) if depth else ("", value)
             return (f"{name}.{inner}", culprit) if inner else (name, value)
@@ -203,7 +161,6 @@ class _Pickler(cloudpickle.Pickler):
 
     def __init__(self, file: io.BytesIO) -> None:
         super().__init__(file, protocol=5)
-        self.registered: list[types.ModuleType] = []
         self._of_user: dict[Any, types.ModuleType | None] = {}
 
     def _module(self, name: Any) -> types.ModuleType | None:
@@ -214,10 +171,6 @@ class _Pickler(cloudpickle.Pickler):
             self._of_user[name] = (
                 module if is_sent and not str(vars(module).get("__file__")).endswith(_COMPILED) else None
             )
-            if self._of_user[name] is not None:
-                if name not in cloudpickle.list_registry_pickle_by_value():
-                    cloudpickle.register_pickle_by_value(module)
-                    self.registered.append(module)
         return self._of_user[name]
 
     def reducer_override(self, obj: Any) -> Any:
@@ -229,14 +182,10 @@ class _Pickler(cloudpickle.Pickler):
             return _new_cached, (obj.__wrapped__, *obj.cache_parameters().values())
         if isinstance(obj, _LOCKS):
             return (threading.RLock if isinstance(obj, _LOCKS[1]) else threading.Lock), ()
-        if not isinstance(obj, type):
-            return NotImplemented
-        self._module(obj.__module__)
-        reduced = super().reducer_override(obj)
-        if reduced is NotImplemented or len(reduced) != 6:
-            return reduced
+        if not isinstance(obj, type) or self._module(obj.__module__) is None:
+            return super().reducer_override(obj)
         # a new class for each function, since the methods of an earlier class may refer to earlier values
-        make, (*arguments, _, extra), (state, slots), *tail = reduced
+        make, (*arguments, _, extra), (state, slots), *tail = _dynamic_class_reduce(obj)
         members = types.MemberDescriptorType  # of slots with private names, which cloudpickle leaves
         state = {name: each for name, each in state.items() if not isinstance(each, members)}
         return make, (*arguments, None, extra), (state, slots), *tail
@@ -257,8 +206,8 @@ class _Pickler(cloudpickle.Pickler):
         """Reduce a function; a user function gets the namespace of its module, and the modules that it imports."""
         module = self._module(function.__globals__.get("__name__"))
         if module is None or vars(module) is not function.__globals__:
-            self._module(function.__module__)
-            return super().reducer_override(function)
+            is_sent = self._module(function.__module__) is not None
+            return self._dynamic_function_reduce(function) if is_sent else super().reducer_override(function)
         # where cloudpickle keeps the future globals of the functions of a module
         self.globals_ref.setdefault(id(function.__globals__), _Namespace(module))
         reduced = self._dynamic_function_reduce(function)
@@ -269,27 +218,17 @@ class _Pickler(cloudpickle.Pickler):
 
 @functools.lru_cache(maxsize=4096)
 def names_in(code: types.CodeType) -> frozenset[str]:
-    """Names in a code object and in the code objects inside it."""
-    return frozenset(code.co_names).union(*map(names_in, _inner(code)))
-
-
-@functools.lru_cache(maxsize=4096)
-def _imported_in(code: types.CodeType) -> frozenset[str]:
-    """Modules of import statements in the code, without the dots of relative ones."""
-    own = {step.argval for step in dis.get_instructions(code) if step.opname == "IMPORT_NAME"}
-    return frozenset(own).union(*map(_imported_in, _inner(code)))
-
-
-def _inner(code: types.CodeType) -> list[types.CodeType]:
-    return [constant for constant in code.co_consts if isinstance(constant, types.CodeType)]
+    """Names in a code object and in the code objects inside it, also of modules in its import statements."""
+    inner = [constant for constant in code.co_consts if isinstance(constant, types.CodeType)]
+    return frozenset(code.co_names).union(*map(names_in, inner))
 
 
 def _possible_modules(code: types.CodeType, package: str) -> list[str]:
     """Full names of modules that the code of a package may import."""
-    imported, parts = _imported_in(code), package.split(".")
-    packages = [".".join(parts[:n]) for n in range(1, len(parts) + 1)] if imported else []
-    found = imported | {f"{each}.{name}".rstrip(".") for each in packages for name in imported}
-    return sorted(found | {f"{each}.{name}" for each in found & sys.modules.keys() for name in names_in(code)})
+    names, parts = names_in(code), package.split(".")
+    packages = [".".join(parts[:n]) for n in range(1, len(parts) + 1)]
+    found = names | {f"{each}.{name}".rstrip(".") for each in packages for name in names}
+    return sorted(found | {f"{each}.{name}" for each in found & sys.modules.keys() for name in names})
 
 
 class _Namespace(NamedTuple):

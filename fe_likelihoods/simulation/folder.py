@@ -16,7 +16,6 @@ import shutil
 import sys
 import tempfile
 import threading
-import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -26,28 +25,25 @@ from .faults import SimulationFailed, TransientReason
 from .files import Opened, RunningSimulation, observing, of_this_library, running_simulation
 from .programs import removed_at_end
 
-__all__ = ["Observed", "Sender", "discard", "run_in_folder", "working_folder"]
+__all__ = ["Observed", "Sender", "run_in_folder", "working_folder"]
 
 _MOST_ENTRIES = 100  # in subfolders that are shown as folders; other subfolders are links. A copy takes 60 us
 _MOST_BYTES = 2**20  # of a copy
 _MOST_BESIDE = 3000  # entries beside the working folder, which ``..`` shows
-_CLOCK_TICK = 20_000_000  # [ns]; a file changed more recently may change again with the same modification time
 
 _mirror: "_Mirror | None" = None
-_places: set[str] = set()  # folders for the folders of workers
 
 
 class Sender(NamedTuple):
-    """The process that sends simulations: its name, its working folder, and a place for folders."""
+    """The process that sends simulations: its name, and its working folder."""
 
     process: bytes
     folder: str
-    place: str
 
     @classmethod
     def here(cls) -> "Sender":
         """This process."""
-        return cls(process_name(), working_folder(), _place(os.getpid()))
+        return cls(process_name(), working_folder())
 
 
 def working_folder() -> str:
@@ -135,7 +131,7 @@ def _mirror_for(sender: Sender) -> "_Mirror":
     try:
         if _mirror is None or _mirror.base != sender.folder or _mirror.owner != os.getpid():
             sys.path[:] = map(os.path.abspath, sys.path)
-            _mirror = _Mirror(sender)
+            _mirror = _Mirror(sender.folder)
         _mirror.show()
     except OSError as failure:
         text = f"the working folder of a simulation could not be made: {failure}"
@@ -143,25 +139,14 @@ def _mirror_for(sender: Sender) -> "_Mirror":
     return _mirror
 
 
-# places -------------------------------------------------------------------------------------------------------------
-
-
 @functools.cache
 def _place(pid: int) -> str:
-    """A temporary folder for the workers of this process, removed when this process ends, even if it is killed."""
+    """A temporary folder for the folders of this process, removed when this process ends, even if it is killed."""
     with of_this_library():
         place = os.path.realpath(tempfile.mkdtemp(prefix="fe_likelihoods_"))
         watcher = removed_at_end(place)
     atexit.register(lambda: pid == os.getpid() and watcher.communicate())  # waits until it is removed
-    _places.add(place)
     return place
-
-
-def discard(process: int) -> None:
-    """Remove the folder of a killed worker process."""
-    for place in _places:
-        with of_this_library():  # which may run in a simulation's thread
-            shutil.rmtree(os.path.join(place, str(process)), ignore_errors=True)
 
 
 class _Mirror:
@@ -171,13 +156,11 @@ class _Mirror:
     simulation gets another folder.
     """
 
-    def __init__(self, sender: Sender) -> None:
-        self.base, self.owner, self.path, self.is_new = sender.folder, os.getpid(), "", False
-        # by path here: path and stamp there, and time of modification here
-        self._shown: dict[str, tuple[str, Stamp | None, int]] = {}
-        place = sender.place if os.path.isdir(sender.place) else _place(os.getpid())  # on another machine
-        _places.add(place)
-        self._place = os.path.join(place, str(os.getpid()))
+    def __init__(self, base: str) -> None:
+        self.base, self.owner, self.path, self.is_new = base, os.getpid(), "", False
+        self._shown: dict[str, tuple] = {}  # by path here: path there, and the state of both
+        self._folders: list[str] = []
+        self._place = os.path.join(_place(os.getpid()), "shown")
         shutil.rmtree(self._place, ignore_errors=True)  # of a mirror of another folder
         os.mkdir(self._place)
         for entry in _scan(os.path.dirname(self.base), _MOST_BESIDE) if self.base else ():
@@ -186,19 +169,20 @@ class _Mirror:
 
     def show(self) -> None:
         """Show what `base` contains now, and nothing that another simulation has left."""
-        changed = [own for own, shown in self._shown.items() if not _is_as_shown(own, *shown)]
-        if not self.is_new or any(self._shown[own][2] == 0 for own in changed):  # a folder
+        changed = [own for own, (base, *states) in self._shown.items() if [_state(own), _state(base)] != states]
+        if not self.is_new or not set(changed).isdisjoint(self._folders):
             self._make()
         else:
             for own in changed:
                 self._copy(self._shown[own][0], own)
+                self._seal(os.path.dirname(own))
 
     def _make(self) -> None:
         shutil.rmtree(self.path, ignore_errors=True)
         self.path, self.is_new = tempfile.mkdtemp(prefix="run_", dir=self._place), True
         self._shown, left = {}, _MOST_ENTRIES
         for base, place in (folders := [(self.base, self.path)]):
-            self._shown[place] = base, _stamp(base), 0
+            self._shown[place] = base, None, _state(base)
             for entry in _scan(base):
                 own = os.path.join(place, entry.name)
                 if self._is_folder(entry) and (below := len(_scan(entry.path, left + 1))) <= left:
@@ -209,19 +193,25 @@ class _Mirror:
                     self._copy(entry.path, own)
                 else:
                     os.symlink(entry.path, own)
-        for _, place in folders:
-            os.utime(place, ns=(0, 0))
+        self._folders = [place for _, place in folders]
+        for place in self._folders:
+            self._seal(place)
 
     def _copy(self, base: str, own: str) -> None:
-        stamp = _stamp(base)
-        self._shown[own] = base, stamp, stamp[0] if stamp else 1
+        state = _state(base)
         with contextlib.suppress(FileNotFoundError):
             os.unlink(own)
         try:
             shutil.copy2(base, own)
         except OSError:  # the user may not read it, or it is not there any more
             os.symlink(base, own)
-        os.utime(os.path.dirname(own), ns=(0, 0))
+        self._shown[own] = base, _state(own), state
+
+    def _seal(self, own: str) -> None:
+        """Note the state of an own folder as it is now."""
+        os.utime(own, ns=(0, 0))
+        base, _, state = self._shown[own]
+        self._shown[own] = base, _state(own), state
 
     def _is_folder(self, entry: os.DirEntry) -> bool:
         """Whether an entry is shown as a folder: not if it is hidden, or contains the mirror."""
@@ -231,16 +221,6 @@ class _Mirror:
         return not any(os.path.join(os.path.realpath(each), "").startswith(above) for each in (self.base, self._place))
 
 
-Stamp = tuple[int, int, int]
-"""Time of modification [ns], size and inode of a file."""
-
-
-def _is_as_shown(own: str, base: str, stamp: Stamp | None, modified: int) -> bool:
-    """Whether a folder or file is as it was when it was shown, both there and here."""
-    shown = _status(own)
-    return stamp is not None and shown is not None and shown[0] == modified and _status(base) == stamp
-
-
 def _scan(folder: str, most: int | None = None) -> list[os.DirEntry]:
     """Entries of a folder, the first `most`; none if it cannot be read."""
     with contextlib.suppress(OSError), os.scandir(folder) as entries:
@@ -248,16 +228,9 @@ def _scan(folder: str, most: int | None = None) -> list[os.DirEntry]:
     return []
 
 
-def _status(path: str) -> Stamp | None:
-    """Stamp of a file; None if there is none."""
-    try:
+def _state(path: str) -> tuple | None:
+    """Time of modification [ns], size and inode of a file; None if there is none."""
+    with contextlib.suppress(OSError):
         status = os.stat(path)
-    except OSError:
-        return None
-    return status.st_mtime_ns, status.st_size, status.st_ino
-
-
-def _stamp(path: str) -> Stamp | None:
-    """Stamp of a file; None if there is none, or if the file may still change with the same time of modification."""
-    stamp = _status(path)
-    return None if stamp is None or stamp[0] > time.time_ns() - _CLOCK_TICK else stamp
+        return status.st_mtime_ns, status.st_size, status.st_ino
+    return None

@@ -60,7 +60,8 @@ class ModelLabel:
     """
 
     def __init__(self, model: Any, statistic: Any = None) -> None:
-        self._statistic = statistic if statistic is not None and _defined_by_user(statistic) else None
+        by_user = is_of_user(getattr(statistic, "__module__", None) or type(statistic).__module__)
+        self._statistic = statistic if by_user else None
         self.items = self._present(model)
         self.items |= {name: _first[name][1] for name in self.changing}
         is_users = hasattr(model, "code_parts") or is_of_user(type(model).__module__)
@@ -109,10 +110,6 @@ class ModelLabel:
         if self._statistic is not None:
             parts |= {"statistic": self._statistic}
         return (items_of(parts) if parts else {}) | {"library": sources_digest().hex()}
-
-
-def _defined_by_user(function: Any) -> bool:
-    return is_of_user(getattr(function, "__module__", None) or type(function).__module__)
 
 
 def value_digest(value: Any) -> str:

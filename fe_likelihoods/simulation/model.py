@@ -241,16 +241,13 @@ def misfit_of_responses(
     model: Model, batch: SimulationBatch, measured: np.ndarray | Comparison, statistic: Statistic | None = None
 ) -> MisfitBatch:
     """Sums of squared residuals, or another residual statistic, for given responses, as `sent_simulation`."""
-    misfit = np.full((len(batch.response), statistic_width(measured, statistic)), np.nan)
-    reasons = list(batch.reasons)
-    for place, response in enumerate(batch.response):
-        try:
-            misfit[place] = _reduced(response, measured, statistic or sums_of_squares)
-        except SimulationFailed as error:
-            reasons[place] = reasons[place] or error.reason
-    reasons = [reason or not_finite(model, row) for row, reason in zip(misfit, reasons, strict=True)]
-    misfit[[bool(reason) for reason in reasons]] = np.nan
-    return MisfitBatch(misfit, reasons)
+    outcomes = [
+        (None, reason)
+        if reason
+        else _attempt(lambda _, each: _reduced(each, measured, statistic or sums_of_squares), model, response)
+        for response, reason in zip(*batch, strict=True)
+    ]
+    return MisfitBatch(*_gathered(outcomes, (statistic_width(measured, statistic),)))
 
 
 def _response(model: Model, theta: np.ndarray) -> np.ndarray:
@@ -343,7 +340,12 @@ def run_each(
             result, opened = unpack(outcome)
             outcomes.append(result)
             note(opened)
-    values = np.full((len(thetas), *shape), np.nan)
+    return _gathered(outcomes, shape)
+
+
+def _gathered(outcomes: Sequence[tuple], shape: tuple[int, ...]) -> tuple[np.ndarray, list[str]]:
+    """Results (n, *shape), NaN for failures, and reasons."""
+    values = np.full((len(outcomes), *shape), np.nan)
     for row, (result, _) in zip(values, outcomes, strict=True):
         if result is not None:
             row[...] = result

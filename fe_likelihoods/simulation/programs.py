@@ -31,12 +31,7 @@ def removed_at_end(place: str | Path) -> subprocess.Popen:
 
 
 def run_program(
-    command: Sequence[str],
-    folder: Path,
-    stdout: Path,
-    stderr: Path,
-    place: Path,
-    watch: Callable[[float], float],
+    command: Sequence[str], folder: Path, stdout: Path, stderr: Path, place: Path, watch: Callable[[float], float]
 ) -> int:
     """Run a program to its end, kill all processes that it leaves behind, and return its exit code, as in `subprocess`.
 

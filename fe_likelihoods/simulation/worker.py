@@ -7,6 +7,7 @@ which it must also work, often may not use `multiprocessing`.
 """
 
 import ctypes
+import functools
 import json
 import math
 import os
@@ -21,19 +22,18 @@ import weakref
 from collections.abc import Callable, Mapping
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import suppress
-from functools import partial
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
-from typing import Any, NamedTuple
+from typing import Any
 
 from samplers.interrupts import become_worker
 
-from .by_value import CannotLoad, Pickled, loaded_function, without_addresses
+from .by_value import CannotLoad, Pickled, without_addresses
 from .faults import SimulationFailed, TransientReason, is_transient
 from .files import of_this_library
-from .folder import discard, working_folder
+from .folder import working_folder
 
-__all__ = ["Answer", "LoadingFailed", "Sandbox", "Worker", "describe_exit", "last_lines", "serve"]
+__all__ = ["Died", "Sandbox", "Worker", "describe_exit", "last_lines", "serve"]
 
 _BOOT = (
     "import json, sys; sys.path[:], sys.argv, *settings = json.loads(sys.argv[1]); "
@@ -41,34 +41,21 @@ _BOOT = (
 )
 _PR_SET_PDEATHSIG = 1
 _CHECK = 0.5  # [s] between checks that the process lives, while waiting for its answer
-_START_LIMIT = 120.0  # [s] for starting the process of an isolated function and loading the function
 
 
-class LoadingFailed(SimulationFailed):
-    """A worker process that died, or took too long, before it was given an item."""
+class Died(SimulationFailed):
+    """A worker process that died, or was stopped, before it answered."""
 
 
-def _renew_starter() -> None:
-    """Make the permanent thread that starts processes: Linux kills a process when the thread that started it ends."""
-    global _starter
-    _starter = ThreadPoolExecutor(1, "starts workers")
-
-
-_renew_starter()
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_renew_starter)
+@functools.cache
+def _starter(pid: int) -> ThreadPoolExecutor:
+    """A permanent thread that starts processes: Linux kills a process when the thread that started it ends."""
+    return ThreadPoolExecutor(1, "starts workers")
 
 
 def _start(start: Callable[[], subprocess.Popen]) -> subprocess.Popen:
     with of_this_library():
         return start()
-
-
-class Answer(NamedTuple):
-    """Answer of a worker: the result of the function, or the exception that it has raised."""
-
-    value: Any
-    error: BaseException | None
 
 
 class Worker:
@@ -84,41 +71,29 @@ class Worker:
         environment: Mapping[str, str] | None = None,
         memory_limit: int = 0,
         quiet: bool = False,
-        start_limit: float = math.inf,
         most_calls: float = math.inf,
     ) -> None:
-        self._settings, self._start_limit, self._most_calls = (
-            (environment, memory_limit, quiet),
-            start_limit,
-            most_calls,
-        )
+        self._settings, self._most_calls = (environment, memory_limit, quiet), most_calls
         self._process: subprocess.Popen | None = None
 
     def run(
         self, function: Pickled, item: Any, seconds: float = math.inf, given_up: Callable[[], bool] = lambda: False
-    ) -> Answer:
-        """Answer of a function for an item, or of a process that cannot load it; the process is killed without one.
+    ) -> Any:
+        """Result of a function for an item, or its exception.
 
-        LoadingFailed if the process dies or does not answer within `start_limit` [s] before it is given the item,
-        SimulationFailed if it dies or does not answer within `seconds` afterwards, CancelledError if it is `given_up`
-        before. TypeError and similar ones if the item cannot be pickled.
+        Without an answer, the process is killed: Died if it dies or does not answer within `seconds` after it was given
+        the item, CancelledError if it is `given_up` before. TypeError and similar ones if the item cannot be pickled.
         """
-        message = pickle.dumps(item, protocol=5)
+        message = b"\0" + pickle.dumps(item, protocol=5)
         if not self._is_ready():
             self._renew()
         if given_up():  # before, there was no process to kill
             raise CancelledError
         if self._key != function.key:
-            slow = "the worker process did not start within {:g} s"
-            answer = self._ask(b"\1" + function.key, self._start_limit, slow, LoadingFailed)
-            if answer.value is False:
-                payload = b"\2" + pickle.dumps(function, protocol=5)
-                answer = self._ask(payload, self._start_limit, slow, LoadingFailed)
-            if answer.error is not None:
-                return answer
+            self._ask(b"\1" + pickle.dumps(function, protocol=5), math.inf)
             self._key = function.key
         self._calls += 1
-        return self._ask(b"\3" + message, seconds, "stopped at the time limit of {:g} s", SimulationFailed)
+        return self._ask(message, seconds)
 
     def _is_ready(self) -> bool:
         is_own = self._process is not None and self._owner == os.getpid()  # not of the process that has forked this one
@@ -131,7 +106,7 @@ class Worker:
         output = subprocess.DEVNULL if quiet else None
         with theirs:
             texts = [[str(text) for text in texts] for texts in (sys.path, sys.argv)]
-            start = partial(
+            start = functools.partial(
                 subprocess.Popen,
                 [sys.executable, "-c", _BOOT, json.dumps([*texts, theirs.fileno(), memory_limit, os.getpid()])],
                 env={**os.environ, **(environment or {})},
@@ -142,15 +117,15 @@ class Worker:
                 start_new_session=True,
                 cwd=working_folder() or None,
             )
-            self._process = _starter.submit(_start, start).result()
+            self._process = _starter(os.getpid()).submit(_start, start).result()
         readable = select.poll()  # kept, since Connection.poll makes one for each call
         readable.register(self._connection, select.POLLIN)
         self._poll = readable.poll
         self._key, self._calls, self._owner = b"", 0, os.getpid()
         self._end = weakref.finalize(self, _kill, self._process, os.getpid())
 
-    def _ask(self, message: bytes, seconds: float, slow: str, failure: type[SimulationFailed]) -> Answer:
-        """Answer to a message; raises `failure` without one, and the process is killed."""
+    def _ask(self, message: bytes, seconds: float) -> Any:
+        """Answer to a message, a value or an exception; raises `Died` without one, and the process is killed."""
         stop = time.monotonic() + seconds
         try:
             self._connection.send_bytes(message)
@@ -159,24 +134,25 @@ class Worker:
                 if _ended(self._process) and not self._poll(0):
                     raise EOFError
                 if time.monotonic() >= stop:
-                    self.kill()
-                    raise failure(TransientReason(slow.format(seconds)))
-            return Answer(*pickle.loads(self._connection.recv_bytes()))
+                    raise Died(TransientReason(f"stopped at the time limit of {seconds:g} s"))
+            value, error = pickle.loads(self._connection.recv_bytes())
         except (EOFError, OSError):
             give_up = time.monotonic() + 5.0
             while not _ended(self._process) and time.monotonic() < give_up:  # it may end by itself, with its exit code
                 time.sleep(0.001)
             self.kill()
-            raise failure(TransientReason(describe_exit(self._process.wait(), "the worker process"))) from None
+            raise Died(TransientReason(describe_exit(self._process.wait(), "the worker process"))) from None
         except BaseException:
             self.kill()
             raise
+        if error is not None:
+            raise error
+        return value
 
     def kill(self) -> None:
         """Kill the process and its session."""
         if self._process is not None and self._owner == os.getpid():
             self._end()
-            discard(self._process.pid)
 
 
 class Sandbox:
@@ -206,13 +182,11 @@ class Sandbox:
         """Result of the function for an item, or its exception; SimulationFailed if the process died or was stopped."""
         function, limit, memory_limit, most_calls = self._arguments
         if (worker := getattr(self._of_thread, "worker", None)) is None:
-            worker = self._of_thread.worker = Worker(None, memory_limit, True, _START_LIMIT, most_calls or math.inf)
-        answer = worker.run(Pickled.of(function), item, math.inf if limit is None else limit)
-        if isinstance(answer.error, CannotLoad):
-            raise SimulationFailed(TransientReason(str(answer.error))) from answer.error
-        if answer.error is not None:
-            raise answer.error
-        return answer.value
+            worker = self._of_thread.worker = Worker(None, memory_limit, True, most_calls or math.inf)
+        try:
+            return worker.run(Pickled.of(function), item, math.inf if limit is None else limit)
+        except CannotLoad as error:
+            raise SimulationFailed(TransientReason(str(error))) from error
 
 
 def _ended(process: subprocess.Popen) -> bool:
@@ -255,8 +229,8 @@ def last_lines(file: Any, most: int) -> str:
 def serve(fileno: int, memory_limit: int, parent: int) -> None:
     """Main loop of a worker process: answer messages until the connection with a file descriptor closes.
 
-    A message is a key, answered by whether its function is loaded, a function to load, or an item for the function.
-    `memory_limit` is as for `Worker`, `parent` the id of the process that has started this process.
+    A message is a function to load, or an item for it. `memory_limit` is as for `Worker`, `parent` the id of the
+    process that has started this process.
     """
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
@@ -276,16 +250,10 @@ def serve(fileno: int, memory_limit: int, parent: int) -> None:
                 message = memoryview(connection.recv_bytes())
             except (EOFError, OSError):
                 return
-            kind, rest = message[0], message[1:]
             try:
-                if kind == 1:
-                    function = loaded_function(bytes(rest))
-                    answer = _packed(function is not None)
-                elif kind == 2:
-                    function = pickle.loads(rest).loaded()
-                    answer = _packed(None)
-                else:
-                    answer = _packed(function(pickle.loads(rest)))
+                if message[0]:
+                    function = pickle.loads(message[1:]).loaded()
+                answer = _packed(None if message[0] else function(pickle.loads(message[1:])))
             except BaseException as error:
                 answer = _packed(None, error)
             if os.getpid() != me:  # the function has forked, and its copy has returned as well
@@ -294,7 +262,7 @@ def serve(fileno: int, memory_limit: int, parent: int) -> None:
 
 
 def _packed(value: Any, error: BaseException | None = None) -> bytes:
-    """Pickled `Answer`; a `SimulationFailed` with the text of `error`, or why it cannot be pickled, if it cannot be."""
+    """Pickled value and error; if they cannot be pickled, a `SimulationFailed` with the text of the error, or why."""
     try:
         data = pickle.dumps((value, error), protocol=5)
         if error is not None:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fe_likelihoods.cache.rows import pack_rows
+from fe_likelihoods.cache.simulation_cache import pack_rows
 
 
 def store(cache, fingerprint, thetas, values, reasons, of_model=False):

@@ -126,7 +126,7 @@ def test_a_new_generation_begins_after_a_change(workshop, texts, caplog):
     first = workshop.run()
     workshop.write(**texts)
     second = workshop.run()
-    assert "differ from new ones; they stay in the file and are not used" in caplog.text
+    assert "differ from new simulations: they stay in the file, not used" in caplog.text
     np.testing.assert_array_equal(second.simulator.statistics(POINTS), true_values(workshop))
     assert second.simulator.cache.info().simulations == 600
     assert second.simulator.verifications <= 59

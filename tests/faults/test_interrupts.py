@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import Channel, FELikelihood, FunctionModel, Measurements
-from fe_likelihoods.simulation.local_pool import LocalPool
+from fe_likelihoods.simulation.executors import LocalPool
 from samplers import SMCSampler, TMCMCSampler
 from samplers.interrupts import deferred_interrupts
 from tests.contract.targets import Gaussian

@@ -14,7 +14,7 @@ from fe_likelihoods.noise.autoregressive import AutoregressiveNoise
 from fe_likelihoods.problems import bridge_column, isolated_bridge
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import DisplacementHistory, Record
-from fe_likelihoods.simulation.local_pool import LocalPool
+from fe_likelihoods.simulation.executors import LocalPool
 from fe_likelihoods.simulation.model import first_part
 
 RECORD = bridge_column(every=2, duration=8.0).likelihood.model.loading

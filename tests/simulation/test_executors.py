@@ -75,14 +75,11 @@ def test_same_bits_on_every_executor(name, oscillator, thetas, rng):
         np.testing.assert_array_equal(result.misfit, expected.misfit[:n])
         assert result.reasons == expected.reasons[:n]
     function = sent_simulation(oscillator, measured)
-    if executor is not None and executor.submits:
+    if executor is not None:
         outcomes = [future.result() for future in executor.submit_all(function, list(thetas))]
         np.testing.assert_array_equal([x for x, why in outcomes if not why], np.delete(expected.misfit, 5, axis=0))
         assert [why for _, why in outcomes] == expected.reasons
         assert executor.submit(function, thetas[5]).result() == (None, expected.reasons[5])
-    elif executor is not None:
-        with pytest.raises(ValueError, match="has map and no submit"):
-            executor.submit(function, thetas[0])
     responses = simulate_batch(oscillator, thetas, executor)
     np.testing.assert_array_equal(responses.response, simulate_batch(oscillator, thetas).response)
     for end in ("terminate", "shutdown", "close"):

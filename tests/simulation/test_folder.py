@@ -283,13 +283,18 @@ def test_folders_are_removed_with_the_process(tmp_path):
     code = (
         "import numpy as np\n"
         "from tests.simulation.test_folder import *\n"
-        "simulate_batch(model(of_program), THETAS[:2], as_executor(2))\n"
-        "simulate_batch(model(of_program, isolated=True), THETAS[:1])\n"
-        "print(len(list(Path(tempfile.gettempdir()).glob('fe_likelihoods_*/*'))))\n"
+        "pool, isolated = as_executor(2), model(of_program, isolated=True)\n"
+        "simulate_batch(model(of_program), THETAS[:2], pool)\n"
+        "simulate_batch(isolated, THETAS[:1])\n"
+        "print(len(list(Path(tempfile.gettempdir()).glob('fe_likelihoods_*'))))\n"
     )
     command, environment = [sys.executable, "-c", code], os.environ | {"TMPDIR": str(tmp_path)}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["3"]
+    for _ in range(500):  # each process has a shell that removes its folder
+        if not any(tmp_path.iterdir()):
+            break
+        time.sleep(0.02)
     assert list(tmp_path.iterdir()) == []
 
 
