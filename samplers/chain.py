@@ -229,8 +229,9 @@ def open_record(backend: Backend | None, nwalkers: int, ndim: int, slow: Sequenc
         logger.warning("the chain of %s is made again from %s", backend.filename, record.path)
         whole_file(backend).make(*shape, run)
     elif stored != run:
-        said = "%s was reset, or replaced by the chain of another run: a new record begins, the earlier one is kept as"
-        logger.warning(f"{said} %s", backend.filename, record.renew())
+        said = "%s was reset, or replaced by the chain of another run: its record begins anew, after the earlier one"
+        logger.warning(said, backend.filename)
+        record.renew()
     return record
 
 

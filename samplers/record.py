@@ -22,7 +22,6 @@ import weakref
 import zlib
 from collections import Counter
 from collections.abc import Callable, Sequence
-from itertools import groupby
 from numbers import Real
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -41,7 +40,6 @@ __all__ = [
     "RunStart",
     "as_limit",
     "kept_aside",
-    "merge_batches",
 ]
 
 logger = logging.getLogger(__name__)
@@ -91,19 +89,6 @@ class EvaluatedBatch(NamedTuple):
         return EvaluatedBatch(self.coords[rows], self.log_prob[rows], blobs, reasons)
 
 
-def merge_batches(batches: Sequence[EvaluatedBatch]) -> EvaluatedBatch:
-    """Several batches, one at least, with blobs of one type; points of a batch without blobs get blobs of zeros."""
-    blobs = next((batch.blobs for batch in batches if batch.blobs is not None), None)
-    if blobs is not None:
-        shape, dtype = blobs.shape[1:], blobs.dtype
-        filled = (np.zeros((len(b.coords), *shape), dtype) if b.blobs is None else b.blobs for b in batches)
-        blobs = np.concatenate([*filled])
-    first = np.cumsum([0, *(len(batch.coords) for batch in batches)]).tolist()
-    reasons = {start + row: text for start, b in zip(first, batches, strict=False) for row, text in b.reasons.items()}
-    coords, log_prob = (np.concatenate([batch[column] for batch in batches]) for column in (0, 1))
-    return EvaluatedBatch(coords, log_prob, blobs, reasons)
-
-
 class RunStart(NamedTuple):
     """Start of an annealing."""
 
@@ -136,24 +121,28 @@ class Record:
         self.count, self.is_complete = 0, False
         self.failed: list[tuple[np.ndarray, str]] = []
         self.counted: list[tuple[np.ndarray, str]] = []
-        self._batches: list[EvaluatedBatch] = []
-        self._known: dict[bytes, tuple[EvaluatedBatch, int]] = {}  # batch and row of each point
+        # log-probability, blobs (1, ...) or None, and reason of failure, empty without one, of each point
+        self._known: dict[bytes, tuple[float, np.ndarray | None, str]] = {}
         self.simulated: set[bytes] = set()  # keys of the points
         self._arrays: dict[str, list[list[np.ndarray]]] = {}
-        self._whole = self._seen = 0  # bytes of the file that were read; its size when it was read or closed
 
     def __getstate__(self):
         return {**self.__dict__, "_file": None, "_seen": self._seen if self._file is None else self._whole}
 
     # ------------------------------------------------------------------ evaluations
 
-    def find(self, coords: np.ndarray) -> tuple[np.ndarray, list[EvaluatedBatch]]:
-        """Which of points (n, ndim) are known, (n,) bool, and their values in order, in one or more batches."""
-        found = [self._known.get(row.tobytes()) for row in np.ascontiguousarray(coords)]
-        groups = groupby(filter(None, found), lambda each: id(each[0]))
-        parts = [list(group) for _, group in groups]
-        known = np.array([each is not None for each in found], dtype=bool)
-        return known, [part[0][0].rows([row for _, row in part]) for part in parts]
+    def knows(self, coords: np.ndarray) -> np.ndarray:
+        """Which of points (n, ndim) have been evaluated, (n,) bool."""
+        return np.array([row.tobytes() in self._known for row in np.ascontiguousarray(coords)], dtype=bool)
+
+    def values(self, coords: np.ndarray) -> EvaluatedBatch:
+        """Values of points (n, ndim) that have been evaluated; those without blobs beside others get blobs of zeros."""
+        found = [self._known[row.tobytes()] for row in np.ascontiguousarray(coords)]
+        blobs = next((np.zeros_like(blobs) for _, blobs, _ in found if blobs is not None), None)
+        if blobs is not None:
+            blobs = np.concatenate([blobs if own is None else own for _, own, _ in found])
+        reasons = {row: reason for row, (*_, reason) in enumerate(found) if reason}
+        return EvaluatedBatch(coords, np.array([each[0] for each in found]), blobs, reasons)
 
     @deferred_interrupts()
     def evaluated(self, batch: EvaluatedBatch) -> None:
@@ -164,10 +153,10 @@ class Record:
             self._enter(batch)
 
     def _enter(self, batch: EvaluatedBatch) -> None:
-        self._batches.append(batch)
-        coords = np.ascontiguousarray(batch.coords)
-        for row, point in enumerate(coords):
-            self._known.setdefault(point.tobytes(), (batch, row))
+        coords, blobs = np.ascontiguousarray(batch.coords), batch.blobs
+        for row, (point, log_prob) in enumerate(zip(coords, batch.log_prob.tolist(), strict=True)):
+            own = None if blobs is None else blobs[row : row + 1]
+            self._known.setdefault(point.tobytes(), (log_prob, own, batch.reasons.get(row, "")))
         self.simulated.update(self.keys(coords))
         self.count += len(coords)
         for row, reason in batch.reasons.items():
@@ -178,19 +167,15 @@ class Record:
         slow = np.ascontiguousarray(coords if self._slow is None else coords[:, self._slow])
         return [row.tobytes() for row in slow]
 
-    def latest(self, most: int) -> EvaluatedBatch | None:
-        """At least the latest `most` evaluated points, in the order of their evaluation; None without any."""
-        first = len(self._batches)
-        while first > 0 and most > 0:
-            first -= 1
-            most -= len(self._batches[first].coords)
-        return merge_batches(self._batches[first:]) if self._batches else None
+    def latest(self, most: int | None = None) -> EvaluatedBatch | None:
+        """All points, or the latest ones, in the order of their evaluation; None without any."""
+        points = list(self._known)[0 if most is None else -most :]
+        return self.values(np.frombuffer(b"".join(points)).reshape(len(points), -1)) if points else None
 
     def drop_old_points(self, most: int) -> None:
         """Forget points of a record in memory before the latest `most`: a long chain needs none of them."""
-        while self.path is None and self._batches and len(self._known) - len(self._batches[0].coords) >= most:
-            for point in np.ascontiguousarray(self._batches.pop(0).coords):
-                self._known.pop(point.tobytes(), None)
+        if self.path is None and len(self._known) > 2 * most:
+            self._known = dict(list(self._known.items())[-most:])
 
     # ------------------------------------------------------------------ simulations
 
@@ -332,16 +317,10 @@ class Record:
         is_closed = self.path is not None and self._file is None
         return is_closed and self.path.exists() and self.path.stat().st_size != self._seen
 
-    def renew(self) -> Path | None:
-        """Begin with an empty record; returns the new name of its file, if it has one."""
-        aside = None
-        if self.path is not None and self.path.exists():
-            self.open()  # another process that writes to the file owns it
-            self.close()
-            aside = _free_name(self.path, "before_reset")
-            os.replace(self.path, aside)
+    def renew(self) -> None:
+        """Begin with an empty record, whose blocks follow the earlier ones in the file."""
+        self.open()  # another process that writes to the file owns it
         self._clear()
-        return aside
 
     def _write(self, kind: bytes, text: Any, arrays: Sequence[np.ndarray]) -> None:
         """Append a block to the file, if there is one."""
@@ -373,6 +352,7 @@ class Record:
 
     def _read(self) -> None:
         self._clear()
+        self._whole = self._seen = 0  # bytes of the file that were read; its size when it was read or closed
         if self.path is None or not self.path.exists():
             return
         data, place = self.path.read_bytes(), len(MAGIC)
@@ -403,23 +383,19 @@ class Record:
             reasons = {int(row): reason for row, reason in text.items()}
             self._enter(EvaluatedBatch(coords, log_prob, blobs[0] if blobs else None, reasons))
         elif kind == b"RUN ":
+            self._clear()
             header, name, *rest = text
             self.start = RunStart(header, arrays[0], (name, arrays[1], *rest))
         else:
             self.remembered(text).append(arrays)
 
 
-def _free_name(path: Path, ending: str) -> Path:
-    """A name beside `path` with this ending that no file has: simulations are never overwritten."""
-    name, number = path.with_name(f"{path.name}.{ending}"), 2
-    while name.exists():
-        name, number = path.with_name(f"{path.name}.{ending}.{number}"), number + 1
-    return name
-
-
 def kept_aside(path: Path) -> Path:
     """The name of a copy of a damaged file."""
-    return Path(shutil.copyfile(path, _free_name(path, "damaged")))
+    name, number = path.with_name(f"{path.name}.damaged"), 2
+    while name.exists():
+        name, number = path.with_name(f"{path.name}.damaged.{number}"), number + 1
+    return Path(shutil.copyfile(path, name))
 
 
 def _close_in_child() -> None:

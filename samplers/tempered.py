@@ -179,7 +179,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         else:
             self._evaluator = Evaluator(*common)
         self._failed_before = target.failure_count or 0
-        known = self._record.latest(self._record.count) if reopened else None
+        known = self._record.latest() if reopened else None
         if known and self._record.start.header["log_prob_fn"] == getattr(target.function, "fingerprint", None):
             target.recall(known)
         self._seed = None if seed is None else np.ravel(seed).tolist()
@@ -485,7 +485,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         else:
             said = "%s has no record: the chain goes on from its last step, and other settings cannot be noticed"
             logger.warning(said, self._place)
-        known = self._record.latest(self._record.count) or self._previous_state
+        known = self._record.latest() or self._previous_state
         if getattr(self._target.function, "fingerprint", None) is not None or known is None:
             return []
         best = int(np.argmax(np.where(np.isfinite(known.log_prob), known.log_prob, -np.inf)))
@@ -579,7 +579,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
     def _annealed(self, population: Population, guidance: Guidance | None, stored: State | None) -> State:
         """The state at beta = 1 that an annealing has led to, or the last `stored` state of a run made again."""
         result, weighted = self._result, self._result.weighted
-        first = self._record.latest(self._record.count)
+        first = self._record.latest()
         coords, log_prob = first.coords[: self.nwalkers], first.log_prob[: self.nwalkers]  # of the prior, or of a guide
         log_prior = self._target.log_prior(coords)
         said = check_end(result, population.coords) + check_likelihood(log_prob, log_prior)

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from ..interrupts import deferred_interrupts
-from ..record import merge_batches
 from ..tempering.population import PendingPoints
 from .evaluator import Evaluator
 from .point_queue import PointQueue, pool_queue
@@ -86,7 +85,7 @@ class AsynchronousEvaluator(Evaluator):
         """Begin to evaluate points (n, ndim); the limit of simulations may allow only the first points."""
         n = len(coords)
         coords = coords[: self._allowed(coords)]
-        log_prior, asked, known, _ = self._look_up(coords)
+        log_prior, asked, known = self._look_up(coords)
         self.record.submitted(coords[asked])
         self.evaluations += len(asked)
         pending = PendingPoints(coords, log_prior, refused=len(coords) < n)
@@ -136,12 +135,11 @@ class AsynchronousEvaluator(Evaluator):
 
     def _arrive(self, numbers: list[int]) -> None:
         """Let points that were submitted together arrive, and check how many have failed."""
-        _, batches = self.record.find(self._points(numbers))
-        pending = self._running[numbers[0]][0]
+        coords, pending = self._points(numbers), self._running[numbers[0]][0]
         rows = np.array([self._running.pop(number)[1] for number in numbers])
         counts = len(self.record.failed), self.record.count + len(self._running)
-        self.check_failures(merge_batches(batches), *counts, len(numbers) == len(pending.coords))
-        pending.arrive(rows, self._pack(pending.log_prior[rows], np.arange(len(rows)), batches))
+        self.check_failures(self.record.values(coords), *counts, len(numbers) == len(pending.coords))
+        pending.arrive(rows, self._records(coords, pending.log_prior[rows], np.arange(len(rows))))
 
     def close(self) -> None:
         """End the evaluation of running points; points that have ended are entered in the record."""

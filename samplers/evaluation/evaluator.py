@@ -6,14 +6,14 @@ time, finished points are entered every 0.05 s, so that a killed process loses o
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from ..chain import check_storable
 from ..interrupts import interrupts_end_the_run
-from ..record import BudgetExhausted, EvaluatedBatch, Incomplete, Record, Remember, merge_batches
+from ..record import BudgetExhausted, EvaluatedBatch, Incomplete, Record, Remember
 from ..tempering.population import RECORD, PendingPoints
 from .user_target import Target, map_in
 
@@ -88,34 +88,47 @@ class Evaluator:
         """
         if self._allowed(coords) < len(coords):
             raise BudgetExhausted
-        log_prior, asked, known, batches = self._look_up(coords)
-        old, new = asked[known], asked[~known]
-        if observe is not None:
-            for part in (*(batch.coords for batch in batches), coords[new]):
-                if len(part) > 0:
-                    observe(part)
+        log_prior, asked, known = self._look_up(coords)
+        new = coords[asked[~known]]
+        for part in (coords[asked[known]], new):
+            if observe is not None and len(part) > 0:
+                observe(part)
         if len(new) > 0:
-            points, failed, stored, noted = coords[new], [], 0, time.perf_counter()
-            results: Any = []
-            self.count(len(points))
-            try:
-                with interrupts_end_the_run():
-                    for answer in self.target.answers(points, self.pool):
-                        if self.target.vectorize:
-                            results = answer  # of all points
-                            break
-                        results.append(answer)
-                        self.count(0, 1)
-                        if time.perf_counter() - noted > SECONDS_BETWEEN_NOTES:
-                            failed += self._store_successes(points, results, stored)
-                            stored, noted = len(results), time.perf_counter()
-            except BaseException:  # Ctrl-C, or a pool that cannot go on
-                self._store_successes(points, results, stored)
-                raise
-            self.count(0, self.running)
-            batches.append(self._settle(points, results, failed, stored, whole=len(new) == len(asked)))
+            self._make(new, whole=not known.any())
         self.evaluations += len(asked)
-        return then(coords, self._pack(log_prior, np.concatenate([old, new]), batches))
+        return then(coords, self._records(coords, log_prior, asked))
+
+    def _make(self, coords: np.ndarray, whole: bool) -> None:
+        """Evaluate points (n, ndim), a `whole` batch or a part of it; RuntimeError for many failures.
+
+        Failures are entered when all values have arrived, since they may yet end the run.
+        """
+        results, noted = [], time.perf_counter()
+        self.count(len(coords))
+        try:
+            with interrupts_end_the_run():
+                for answer in self.target.answers(coords, self.pool):
+                    if self.target.vectorize:
+                        results = answer  # of all points
+                        break
+                    results.append(answer)
+                    self.count(0, 1)
+                    if time.perf_counter() - noted > SECONDS_BETWEEN_NOTES:
+                        self._enter_successes(coords, results)
+                        noted = time.perf_counter()
+        except BaseException:  # Ctrl-C, or a pool that cannot go on
+            self._enter_successes(coords, results)
+            raise
+        self.count(0, self.running)
+        batch, before = self.as_batch(coords, results), self.record.knows(coords)
+        rest = batch.rows(np.flatnonzero(~before))
+        counts = len(self.record.failed) + np.count_nonzero(rest.failed), self.record.count + len(rest.coords)
+        try:
+            self.check_failures(rest, *counts, whole and not before.any())
+        except RuntimeError:
+            self._enter_successes(coords, results)
+            raise
+        self.record.evaluated(rest)
 
     def _allowed(self, coords: np.ndarray) -> int:
         """Number of the first points among (n, ndim) that the limit of simulations allows."""
@@ -124,42 +137,24 @@ class Evaluator:
         inside = np.flatnonzero(self.inside(coords))
         return int([*inside, len(coords)][self.record.fitting(coords[inside])])
 
-    def _look_up(self, coords: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[EvaluatedBatch]]:
-        """Log-prior (n,) of points (n, ndim), rows (m,) of those inside, which of these are known, and their values."""
+    def _look_up(self, coords: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Log-prior (n,) of points (n, ndim), rows (m,) of those inside, and which of these are known."""
         if not np.all(np.isfinite(coords)):
             raise ValueError("At least one parameter value was infinite or NaN")
         log_prior = self.target.log_prior(coords)
         asked = np.flatnonzero(log_prior > -np.inf)
-        known, batches = self.record.find(coords[asked])
+        known = self.record.knows(coords[asked])
         if not known.all() and self.record.is_complete:
             raise Incomplete
-        batches = [self.typed(batch) for batch in batches]
         self.count(int(sum(known)), int(sum(known)))
-        return log_prior, asked, known, batches
+        return log_prior, asked, known
 
-    def _store_successes(self, coords: np.ndarray, results: Any, stored: int) -> list[int]:
-        """Enter the successes among results beyond those `stored` in the record; returns the rows of failures.
-
-        Failures are entered when all values have arrived, since they may yet end the run.
-        """
-        if len(results) == stored:
-            return []
-        part = self.as_batch(coords[stored : len(results)], results[stored:])
-        self.record.evaluated(part.rows(np.flatnonzero(~part.failed)))
-        return (stored + np.flatnonzero(part.failed)).tolist()
-
-    def _settle(self, coords: np.ndarray, results: Any, failed: list[int], stored: int, whole: bool) -> EvaluatedBatch:
-        """Enter what is left of a `whole` batch, or of a part of it, and return it; RuntimeError for many failures."""
-        batch = self.as_batch(coords, results)
-        new = batch.rows([*failed, *range(stored, len(coords))])
-        counts = len(self.record.failed) + np.count_nonzero(new.failed), self.record.count + len(new.coords)
-        try:
-            self.check_failures(new, *counts, whole and stored == 0)
-        except RuntimeError:
-            self.record.evaluated(new.rows(np.flatnonzero(~new.failed)))
-            raise
-        self.record.evaluated(new)
-        return batch
+    def _enter_successes(self, coords: np.ndarray, results: Any) -> None:
+        """Enter the successes among the first points in the record, as far as it does not know them."""
+        coords = coords[: len(results)]
+        if len(coords) > 0:
+            part = self.as_batch(coords, results)
+            self.record.evaluated(part.rows(np.flatnonzero(~part.failed & ~self.record.knows(coords))))
 
     def check_failures(self, batch: EvaluatedBatch, count: int, total: int, whole: bool) -> None:
         """Raise RuntimeError if `count` of `total` evaluations with the latest `batch` have failed, and these are many.
@@ -179,6 +174,7 @@ class Evaluator:
             )
 
     def as_batch(self, coords: np.ndarray, results: Any) -> EvaluatedBatch:
+        """Values of points (n, ndim) from what the function has returned."""
         return self.typed(self.target.evaluated(coords, results))
 
     def typed(self, batch: EvaluatedBatch) -> EvaluatedBatch:
@@ -205,15 +201,14 @@ class Evaluator:
             )
         return batch
 
-    def _pack(self, log_prior: np.ndarray, rows: np.ndarray, batches: Sequence[EvaluatedBatch]) -> np.ndarray:
-        """Records of points with log-prior (n,), of which these `rows` were evaluated, in the order of `batches`."""
-        records = np.zeros(len(log_prior), dtype=[*RECORD, *(self._blobs or ())])
+    def _records(self, coords: np.ndarray, log_prior: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Records (n,) of points (n, ndim), of which these `rows` are known."""
+        batch = self.typed(self.record.values(coords[rows]))
+        records = np.zeros(len(coords), dtype=[*RECORD, *(self._blobs or ())])
         records["log_prob"], records["log_prior"] = -np.inf, log_prior
-        if batches:
-            batch = merge_batches(batches)
-            records["log_prob"][rows] = np.where(batch.failed, -np.inf, batch.log_prob)
-            if batch.blobs is not None:
-                records["blobs"][rows] = batch.blobs
+        records["log_prob"][rows] = np.where(batch.failed, -np.inf, batch.log_prob)
+        if batch.blobs is not None:
+            records["blobs"][rows] = batch.blobs
         return records
 
     def compute(self, coords: np.ndarray) -> EvaluatedBatch:

@@ -11,7 +11,7 @@ import copy
 import logging
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -161,7 +161,7 @@ def _stacked(blobs: list, dtype: Any, name: str) -> np.ndarray:
             if dtype is None:
                 found = np.array(blobs)
                 found = found.astype(np.result_type(found.dtype, float)) if found.dtype.kind in "biufc" else None
-                if found is None or (np.any(np.abs(found) >= LARGEST_EXACT) and _lost(blobs, found)):
+                if found is None or (np.any(np.abs(found) >= LARGEST_EXACT) and not _holds(found.tolist(), blobs)):
                     found = np.array(blobs, object)
             else:
                 found = np.array(blobs, dtype)
@@ -171,32 +171,22 @@ def _stacked(blobs: list, dtype: Any, name: str) -> np.ndarray:
         found = np.empty(len(blobs), dtype=object)
         for place, row in enumerate(blobs):
             found[place] = row
-    if dtype is not None and (value := _lost(blobs, found)):
+    lost = [] if dtype is None else [i for i, kept in enumerate(found.tolist()) if not _holds(kept, blobs[i])]
+    if lost:
         raise ValueError(
-            f"{name} must return blobs of the declared type, blobs_dtype={dtype}; got {value[0]!r}, which this type "
-            "cannot hold. Declare a wider one"
+            f"{name} must return blobs of the declared type, blobs_dtype={dtype}; got {blobs[lost[0]]!r}, which this "
+            "type cannot hold. Declare a wider one"
         )
     single = tuple(axis for axis in range(1, found.ndim) if found.shape[axis] == 1)
     return np.squeeze(found, single) if single else found
 
 
-def _leaves(values: Iterable) -> Iterator:
-    """The single values of nested sequences and arrays in order, as values of Python, whose comparisons are exact."""
-    for value in values.reshape(-1) if isinstance(values, np.ndarray) else values:
-        plain = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
-        if isinstance(plain, list | tuple):
-            yield from _leaves(plain)
-        else:
-            yield plain
-
-
-def _lost(given: Iterable, found: np.ndarray) -> list:
-    """The first of the values that an array of them has not kept, in a list; a float may have fewer digits."""
-    for value, kept in zip(_leaves(given), _leaves(found), strict=False):
-        both = value.encode() if isinstance(value, str) and isinstance(kept, bytes) else value
-        same = both is kept or both == kept or (kept != kept and (value != value or value is None))
-        if isinstance(value, float | complex) and isinstance(kept, float | complex):
-            same = np.isfinite(kept) or not np.isfinite(value)
-        if not same:
-            return [value]
-    return []
+def _holds(kept: Any, given: Any) -> bool:
+    """Whether an item of an array, as Python's value, is what was given; a float may have fewer digits."""
+    given = given.tolist() if isinstance(given, np.ndarray | np.generic) else given
+    if isinstance(given, list | tuple):
+        return all(map(_holds, kept if isinstance(kept, list | tuple) else [kept], given))
+    if isinstance(given, float | complex) and isinstance(kept, float | complex):
+        return bool(np.isfinite(kept) or not np.isfinite(given))
+    given = given.encode() if isinstance(given, str) and isinstance(kept, bytes) else given
+    return given is kept or kept == given or (kept != kept and given is None)

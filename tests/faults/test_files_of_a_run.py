@@ -176,8 +176,8 @@ def test_the_chain_of_another_run_begins_a_new_record(whole, tmp_path, caplog):
     earlier = record_of(path).read_bytes()
     sampler = make(path, kind)
     assert "replaced by the chain of another run" in caplog.text
-    assert Path(f"{record_of(path)}.before_reset").read_bytes() == earlier
     sampler.run_mcmc(None, 1)
+    assert record_of(path).read_bytes().startswith(earlier)
     assert np.array_equal(sampler.get_chain()[:1], other.get_chain())
 
 
