@@ -174,12 +174,13 @@ def _parent(count: int, repeats: int) -> dict:
         points = np.column_stack([thetas, np.full(ITEMS, 0.5)])
         rates = []
         for _ in range(repeats):
-            with posterior_of(Treacherous(), pool=pool).evaluation_queue() as queue:
-                for some in (points[: 2 * count] + [0.0, 1.0, 0.0], points):  # the first ones load the model
-                    start, left = time.perf_counter(), len(queue.submit(some))
-                    while left > 0:
-                        left -= len(queue.collect())
-                rates.append(ITEMS / (time.perf_counter() - start))
+            posterior = posterior_of(Treacherous(), pool=pool)
+            executor = posterior.executor()
+            for some in (points[: 2 * count] + [0.0, 1.0, 0.0], points):  # the first ones load the model
+                start = time.perf_counter()
+                for future in [executor.submit(posterior, point) for point in some]:
+                    future.result()
+            rates.append(ITEMS / (time.perf_counter() - start))
     return {"a batch": batch, "one by one": median(rates)}
 
 

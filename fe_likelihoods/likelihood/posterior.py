@@ -14,15 +14,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from samplers.evaluation.point_queue import PointQueue
-
 from ..priors.distributions import Distribution, RandomState
 from ..priors.points import as_points, complete_repr
 from ..priors.priors import Prior
 from ..simulation.faults import TransientReason
 from ..simulation.model import has_jacobian
-from .evaluation_queue import evaluation_queue
 from .gradient import likelihood_gradient, slopes_along
+from .in_threads import InThreads
 from .joint import JointLikelihood
 from .likelihood import FELikelihood
 from .parameters import Parameter
@@ -390,27 +388,19 @@ class Posterior:
 
         return find_modes(self, starts, seed, max_simulations, _TOP)
 
-    def evaluation_queue(self) -> PointQueue:
-        """A queue of points whose log-probabilities are returned in the order in which their simulations end.
+    def executor(self) -> InThreads:
+        """An executor whose threads call this posterior, each for one point, and wait for its simulations.
 
-        Samplers that propose points while others still run keep all workers of a pool busy with it. The values are the
-        same as from `log_prob`.
-
-        Returns
-        -------
-        samplers.evaluation.point_queue.PointQueue
-            Its own points only; every queue of a posterior uses the same caches and the same pool.
+        Samplers that propose points while others still run keep all workers of a pool busy with it.
 
         Examples
         --------
-        >>> with posterior.evaluation_queue() as queue:
-        ...     tickets = queue.submit(posterior.sample_prior(100))
-        ...     ended = queue.collect()  # tickets and log-probabilities of the first that have ended
-        >>> ended[0][0] in tickets
+        >>> future = posterior.executor().submit(posterior, posterior.sample_prior(1)[0])
+        >>> isinstance(future.result(), float)
         True
         """
         self._check_models("asynchronous work")
-        return evaluation_queue(self)
+        return InThreads(self)
 
     def when_simulated(self, callback: Callable[[float], None] | None) -> None:
         """Call a function with the number of points whose simulations have ended, for the progress of samplers.

@@ -32,7 +32,7 @@ from numbers import Integral
 from queue import SimpleQueue
 from typing import Any
 
-from samplers.evaluation.point_queue import workers_of
+from samplers.evaluation.pools import workers_of
 from samplers.interrupts import Ended, SentFunction
 
 from .by_value import Pickled

@@ -3,31 +3,29 @@
 The record of the run contains the finished points and, for each decision of the sampler (`AsynchronousEvaluator.wait`),
 which points had arrived before it, so that an interrupted run, when repeated, makes the same decisions. Points that
 were running when the process ended are submitted again.
-
-A queue (``posterior.evaluation_queue()``, or made for a pool) is a `samplers.evaluation.point_queue.PointQueue` or has
-its methods ``submit(coords)``, ``collect()`` and ``close()``, and its attribute ``workers``.
 """
 
 import hashlib
 import logging
+import threading
+from asyncio import CancelledError
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
-from ..interrupts import deferred_interrupts
+from ..interrupts import Ended, deferred_interrupts, interrupts_end_the_run
 from ..tempering.population import PendingPoints
 from .evaluator import Evaluator
-from .point_queue import PointQueue, pool_queue
+from .pools import submit_all, workers_of
 from .user_target import Target
+from .values import Caught, Failed
 
 __all__ = ["AsynchronousEvaluator", "check_asynchronous"]
 
 logger = logging.getLogger(__name__)
 
-
-def _has_queue(target: Target, pool: Any) -> bool:
-    """Whether the function provides a queue, and no pool is given."""
-    return pool is None and callable(getattr(target.function, "evaluation_queue", None))
+SECONDS_TO_FETCH = 10.0  # longest wait for the value of a point that has ended, when the run ends
 
 
 def check_asynchronous(target: Target, pool: Any, draws: bool) -> None:
@@ -37,18 +35,22 @@ def check_asynchronous(target: Target, pool: Any, draws: bool) -> None:
             "asynchronous=True cannot act here: moves and guides wait for all points that they propose: pass "
             "recycle=True, or leave it out"
         )
-    can_submit = callable(getattr(pool, "submit", None))
-    if not (target.vectorize if _has_queue(target, pool) else can_submit and not target.vectorize):
+    can_submit = callable(getattr(pool, "submit", None)) and not target.vectorize
+    if not (can_submit if pool is not None else _has_executor(target)):
         raise ValueError(
             "asynchronous=True needs points that can be submitted one by one: pass a posterior that has the method "
-            "evaluation_queue (Posterior of fe_likelihoods, with its own pool) and vectorize=True, or a function of "
-            "one point and a pool with the method submit (an executor of concurrent.futures, mpi4py or loky, a dask "
-            f"client); got {type(target.function).__name__}, pool={type(pool).__name__}, vectorize={target.vectorize}"
+            "executor (Posterior of fe_likelihoods, with its own pool), or a function of one point and a pool with the "
+            "method submit (an executor of concurrent.futures, mpi4py or loky, a dask client); got "
+            f"{type(target.function).__name__}, pool={type(pool).__name__}, vectorize={target.vectorize}"
         )
 
 
+def _has_executor(target: Target) -> bool:
+    return callable(getattr(target.function, "executor", None))
+
+
 class AsynchronousEvaluator(Evaluator):
-    """An evaluator whose `submit` returns without waiting."""
+    """An evaluator whose `submit` returns without waiting, with an executor or a dask client."""
 
     asynchronous = True
 
@@ -57,29 +59,27 @@ class AsynchronousEvaluator(Evaluator):
         self._forget_running()
 
     def __getstate__(self) -> dict:
-        return super().__getstate__() | {"_queue": None, "_running": {}, "_tickets": {}}
+        return super().__getstate__() | {"_ended": None, "_executor": None, "_running": {}, "_futures": {}}
 
     def _forget_running(self) -> None:
-        self._queue: Any = None
-        self._submitted = 0
+        self._ended, self._submitted = threading.Event(), 0
+        self._executor: Any = None
         self._running: dict[int, tuple[PendingPoints, int]] = {}  # points not yet arrived at a decision, by number
-        self._tickets: dict[int, int] = {}  # number of the point by ticket of the queue
-
-    def _opened(self) -> Any:
-        if self._queue is None and _has_queue(self.target, self.pool):
-            self._queue = self.target.function.evaluation_queue()
-        elif self._queue is None:
-            if self.pool is None:
-                raise ValueError(
-                    "this sampler was begun with a pool, which is not stored with it: set its attribute pool"
-                )
-            self._queue = pool_queue(self.target.caught, self.pool, self.target.as_points)
-        return self._queue
+        self._futures: dict[int, Any] = {}  # of points whose values were not collected, by number
 
     @property
     def workers(self) -> int:
         """Number of points that are evaluated at once."""
-        return self._opened().workers or 1
+        return workers_of(self._opened()) or 1
+
+    def _opened(self) -> Any:
+        if self._executor is None:
+            if self.pool is None and not _has_executor(self.target):
+                raise ValueError(
+                    "this sampler was begun with a pool, which is not stored with it: set its attribute pool"
+                )
+            self._executor = self.target.function.executor() if self.pool is None else self.pool
+        return self._executor
 
     def submit(self, coords: np.ndarray) -> PendingPoints:
         """Begin to evaluate points (n, ndim); the limit of simulations may allow only the first points."""
@@ -89,13 +89,16 @@ class AsynchronousEvaluator(Evaluator):
         self.record.submitted(coords[asked])
         self.evaluations += len(asked)
         pending = PendingPoints(coords, log_prior, refused=len(coords) < n)
-        numbers = range(self._submitted, self._submitted + len(asked))
+        numbers = np.arange(self._submitted, self._submitted + len(asked))
         self._submitted += len(asked)
-        self._running.update((number, (pending, int(row))) for number, row in zip(numbers, asked, strict=True))
+        self._running.update((number, (pending, int(row))) for number, row in zip(numbers.tolist(), asked, strict=True))
         if not known.all():
             self.count(int(sum(~known)))
-            tickets = self._opened().submit(coords[asked[~known]])
-            self._tickets.update(zip(tickets, np.array(numbers)[~known].tolist(), strict=True))
+            of_point = Caught(*self.target.called, vectorize=False)
+            futures = submit_all(self._opened(), of_point, self.target.as_points(coords[asked[~known]]))
+            self._futures.update(zip(numbers[~known].tolist(), futures, strict=True))
+            for future in futures:
+                future.add_done_callback(lambda _, ended=self._ended: ended.set())
         return pending
 
     def wait(self, most: int) -> None:
@@ -111,27 +114,51 @@ class AsynchronousEvaluator(Evaluator):
         for numbers in by_batch.values():
             self._arrive(numbers)
 
-    def _points(self, numbers: Any) -> np.ndarray:
+    def _points(self, numbers: Iterable[int]) -> np.ndarray:
         """Running points (m, ndim) by their numbers."""
         return np.array([pending.coords[row] for pending, row in map(self._running.__getitem__, numbers)])
 
     def _gather(self, most: int) -> np.ndarray:
         """Numbers (m,) of the points that have arrived when `most` other points are running."""
-        while len(self._tickets) > most:
-            self._take(self._opened().collect())
-        return np.array(sorted(set(self._running) - set(self._tickets.values())), dtype=np.int64)
+        while len(self._futures) > most:
+            self._collect()
+        return np.array(sorted(self._running.keys() - self._futures.keys()), dtype=np.int64)
 
-    def _take(self, collected: list[tuple[int, Any]]) -> None:
-        """Enter values of the queue that are not known yet in the record."""
-        new = {self._tickets[ticket]: (ticket, value) for ticket, value in collected if ticket in self._tickets}
-        if not new:
-            return
-        batch = self.as_batch(self._points(new), [value for _, value in new.values()])
-        with deferred_interrupts():
-            self.record.evaluated(batch)
-            for ticket, _ in new.values():
-                del self._tickets[ticket]
-        self.count(0, len(new))
+    @interrupts_end_the_run()
+    def _collect(self, wait: bool = True) -> None:
+        """Enter the values of all points that have ended in the record, after a `wait` for one.
+
+        What ends the run, as KeyboardInterrupt of a worker or a pool that cannot go on, is raised after that.
+        """
+        while wait and not any(future.done() for future in self._futures.values()):
+            self._ended.wait()
+            self._ended.clear()
+        values, fault, seconds = {}, None, None if wait else SECONDS_TO_FETCH
+        for number, future in [each for each in self._futures.items() if each[1].done()]:
+            try:  # `exception` does not raise what the function raised, which may be KeyboardInterrupt
+                error = future.exception(seconds)
+                value = future.result(seconds) if error is None else None
+            except (Exception, CancelledError) as raised:
+                error, value = raised, None
+                if not wait and isinstance(raised, TimeoutError):
+                    break  # nothing can be fetched from this pool any more
+            if type(error).__name__ == "KilledWorker":
+                error, value = None, Failed("every process that evaluated this point died")
+            error = value.error if isinstance(value, Ended) else error
+            if error is None:
+                values[number] = value
+            fault = fault or error
+        if values:
+            batch = self.as_batch(self._points(values), list(values.values()))
+            with deferred_interrupts():
+                self.record.evaluated(batch)
+                for number in values:
+                    del self._futures[number]
+            self.count(0, len(values))
+        if wait and isinstance(fault, CancelledError):
+            raise RuntimeError("the pool has cancelled a point: run again with a new pool") from fault
+        if wait and fault is not None:
+            raise fault
 
     def _arrive(self, numbers: list[int]) -> None:
         """Let points that were submitted together arrive, and check how many have failed."""
@@ -143,14 +170,13 @@ class AsynchronousEvaluator(Evaluator):
 
     def close(self) -> None:
         """End the evaluation of running points; points that have ended are entered in the record."""
-        queue, self._queue = self._queue, None
         try:
-            if isinstance(queue, PointQueue):
-                self._take(queue.collect(wait=False))
+            self._collect(wait=False)
         except Exception as error:  # another error or Ctrl-C is the reason why the run ends
             logger.warning("evaluations that have ended are not stored: %s", error)
         finally:
+            left = list(self._futures.values())
             self._forget_running()
             self.record.given_up()
-            if queue is not None:
-                queue.close()
+            for future in left:
+                future.cancel()

@@ -15,7 +15,8 @@ from ..chain import check_storable
 from ..interrupts import interrupts_end_the_run
 from ..record import BudgetExhausted, EvaluatedBatch, Incomplete, Record, Remember
 from ..tempering.population import RECORD, PendingPoints
-from .user_target import Target, map_in
+from .pools import map_in
+from .user_target import Target
 
 __all__ = ["Evaluator", "unpack"]
 

@@ -10,21 +10,13 @@ import numpy as np
 from ..emcee_names import ndarray_to_list_of_dicts, walkers_independent
 from ..interrupts import Ended, SentFunction, interrupts_end_the_run
 from ..record import EvaluatedBatch
+from .pools import map_in
 from .starts import not_of_the_prior
 from .values import Caught, log_densities, most_common_reasons, outcomes
 
-__all__ = ["Target", "map_in"]
+__all__ = ["Target"]
 
 logger = logging.getLogger(__name__)
-
-
-def map_in(pool: Any) -> Callable:
-    """``pool.map``, or Python's ``map`` without a pool; the futures of a dask client are gathered."""
-    if pool is None:
-        return map
-    if not hasattr(pool, "gather"):
-        return pool.map
-    return lambda function, items: pool.gather(pool.map(function, list(items), pure=False))
 
 
 class Target:
@@ -71,7 +63,8 @@ class Target:
                 f"object itself, not its bound method); got {self.log_prior_fn!r}"
             )
         self.ndim, self.vectorize, self.blobs_dtype = ndim, vectorize, blobs_dtype
-        self.caught = Caught(function, args, kwargs, vectorize)
+        self.called = function, args, kwargs
+        self.caught = Caught(*self.called, vectorize)
         self._owner = function if owner is None else owner  # of optional methods
         names, stated = self.names, getattr(function, "ndim", None)
         if isinstance(stated, Integral) and stated != ndim:

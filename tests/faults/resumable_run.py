@@ -35,28 +35,6 @@ KINDS = {
 }
 
 
-class Queue:
-    """A queue of a posterior, which evaluates one point when it is asked for values."""
-
-    workers = 2
-
-    def __init__(self, function):
-        self._function, self._submitted, self._waiting = function, 0, []
-
-    def submit(self, coords):
-        tickets = list(range(self._submitted, self._submitted + len(coords)))
-        self._submitted += len(coords)
-        self._waiting += zip(tickets, coords, strict=True)
-        return tickets
-
-    def collect(self):
-        ticket, point = self._waiting.pop(0)
-        return [(ticket, self._function(point))]
-
-    def close(self):
-        self._waiting = []
-
-
 class Watched(WithBlobs):
     """Writes the points of every call to a file, and fails for a few of them.
 
@@ -78,9 +56,6 @@ class Watched(WithBlobs):
         values = super().__call__(x)
         values[..., 0] = np.where(np.asarray(x)[..., 0] < -1.7, np.nan, values[..., 0])
         return values
-
-    def evaluation_queue(self):
-        return Queue(self)
 
 
 def calls(log) -> list[tuple[int, list[bytes]]]:

@@ -25,7 +25,7 @@ class Fragile(WithBlobs):
 
     def __call__(self, x):
         values = super().__call__(x)
-        values[x[:, 1] > 1.5, 0] = np.nan
+        values[..., 0] = np.where(x[..., 1] > 1.5, np.nan, values[..., 0])
         return values
 
 
@@ -33,11 +33,11 @@ def finished(path, order=0, **settings):
     """A run on a file, and what it has evaluated; `order` is the seed of the run lengths, and so of the arrivals."""
     settings = {"seed": 5, "asynchronous": True, "backend": emcee.backends.HDFBackend(str(path)), **settings}
     lengths = np.random.default_rng(order)
-    posterior = SimulatedCluster(Fragile(ndim=NDIM, sd=0.05), 5, lambda x: lengths.exponential(size=len(x)))
-    sampler = SMCSampler(N, NDIM, posterior, vectorize=True, recycle=True, **settings)
+    posterior, cluster = Fragile(ndim=NDIM, sd=0.05), SimulatedCluster(5, lambda x: lengths.exponential())
+    sampler = SMCSampler(N, NDIM, posterior, pool=cluster, recycle=True, **settings)
     sampler.run_mcmc(None, STEPS - sampler.iteration)
     sampler._record.close()
-    return sampler, posterior.evaluations
+    return sampler, posterior.calls
 
 
 def repeated(path, folder, order=99):
@@ -132,7 +132,7 @@ GUIDE = FixedGuide(POSTERIOR, POSTERIOR.mean, [np.diag(POSTERIOR.sd**2)])
 @pytest.mark.parametrize(
     ("Sampler", "settings", "error", "word"),
     [
-        (SMCSampler, {"vectorize": True}, ValueError, "evaluation_queue"),
+        (SMCSampler, {"pool": 1, "vectorize": True}, ValueError, "one by one: pass a posterior"),
         (SMCSampler, {"pool": 1, "guide": GUIDE}, ValueError, "guides wait"),
         (SMCSampler, {"pool": 1, "recycle": False}, ValueError, "moves and guides wait"),
         (SMCSampler, {"vectorize": True, "asynchronous": 1}, ValueError, "True or False"),

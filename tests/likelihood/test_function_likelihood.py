@@ -75,7 +75,6 @@ def test_the_fingerprint_follows_the_function_and_its_values():
     [
         lambda posterior: posterior.guide(),
         lambda posterior: posterior.mode(),
-        lambda posterior: posterior.evaluation_queue(),
     ],
 )
 def test_what_needs_a_model_says_so(call):
