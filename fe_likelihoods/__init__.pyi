@@ -1,7 +1,6 @@
 from . import problems
 from .cache.simulation_cache import SimulationCache
-from .checks.rehearsal import check_model
-from .checks.result import check_result
+from .checks.result import check_model, check_result
 from .checks.screening import check_data
 from .column_damage.damage import damage, limit_states
 from .column_damage.measures import damage_measures, damage_outputs

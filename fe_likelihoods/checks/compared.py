@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from time import perf_counter
@@ -20,24 +21,14 @@ from ..signals.events import find_events
 from ..simulation.faults import ChangedModel
 from ..simulation.model import SimulationFailed
 from ..text_tables import listed
-from .faults import FEWEST_DRAWS, MOST_DRAWS
+from .faults import FEWEST_DRAWS
 from .run import FinishedRun
 
-__all__ = [
-    "ChannelFit",
-    "Fit",
-    "Fits",
-    "ModalFit",
-    "checks_of",
-    "compare",
-    "data_sets_of",
-    "draws_to_compare",
-    "fit_data_sets",
-]
+__all__ = ["ChannelFit", "Fit", "ModalFit", "checks_of", "compare", "data_sets_of", "draws_to_compare", "fit_data_sets"]
 
 logger = logging.getLogger(__name__)
 
-SECONDS = 10.0  # of simulations of these draws
+MOST_DRAWS, SECONDS = 100, 10.0  # of the prior, and of their simulations
 
 
 class ModalFit(NamedTuple):
@@ -70,7 +61,7 @@ class Fit:
     measurements: Measurements
     draws: np.ndarray  # (n, n_channels, n_samples) at draws of the prior
     after: np.ndarray | None = None  # (n_channels, n_samples) of the fit
-    before: np.ndarray | None = None  # the same before the update
+    before: np.ndarray | None = None  # the same at the mean of the prior
     white: np.ndarray | None = None  # residuals of the fit as the noise whitens them; None without time
     assumed: np.ndarray | None = None  # (n_channels,) independent samples that the noise assumes at most
     deviations: np.ndarray | None = None  # (n_channels, 1) of errors without time, at draws of the prior
@@ -90,13 +81,13 @@ class Fit:
         for row, channel in enumerate(() if self.modal else self.measurements.channels):
             measured = self.measurements.values[row]
             n = int(np.isfinite(measured).sum())
-            before, after = (
+            errors = (
                 np.nan if each is None else float(relative_errors(measured - each[row], measured))
                 for each in (self.before, self.after)
             )
             checks = None if self.white is None else checks_of(self.white[row])
             worth = n if self.assumed is None else min(n, float(self.assumed[row]))
-            found.append(ChannelFit(channel, n, before, after, checks, worth))
+            found.append(ChannelFit(channel, n, *errors, checks, worth))
         return tuple(found)
 
     def where(self, *names: str) -> str:
@@ -104,20 +95,10 @@ class Fit:
         return f"{listed(names)}{f' ({self.title})' if self.title else ''}"
 
 
-class Fits(NamedTuple):
-    """The fits of all data sets and events; `before` and `after` say in words what the two responses are."""
-
-    fits: tuple[Fit, ...]
-    before: str
-    after: str
-
-
 def checks_of(residuals: np.ndarray) -> ResidualChecks | None:
     """The checks of one channel's residuals (n_samples,); None for too few samples, or an exact fit."""
-    try:
+    with suppress(ValueError):
         return residual_checks(residuals[None])
-    except ValueError:
-        return None
 
 
 def data_sets_of(posterior: Any) -> list[tuple[str, FELikelihood, np.ndarray]]:
@@ -126,52 +107,48 @@ def data_sets_of(posterior: Any) -> list[tuple[str, FELikelihood, np.ndarray]]:
     return [(key, *part) for key, part in zip(likelihood.likelihoods, likelihood.parts(), strict=True)]
 
 
-def draws_to_compare(posterior: Posterior, seconds: float | None = None) -> np.ndarray:
-    """Draws of the prior (n, ndim), always the same: 100, or fewer where they take ten seconds, of `seconds` each."""
+def draws_to_compare(posterior: Posterior) -> np.ndarray:
+    """Draws of the prior (n, ndim), always the same; none of a prior without draws."""
     try:
-        draws = posterior.sample_prior(MOST_DRAWS, np.random.RandomState(1))
-    except NotImplementedError:  # a prior without draws
+        return posterior.sample_prior(MOST_DRAWS, np.random.RandomState(1))
+    except NotImplementedError:
         return np.empty((0, posterior.ndim))
-    report = posterior.report()
-    if seconds is None and report["simulations"]:
-        seconds = report["seconds"] / report["simulations"]
-    for row in draws[:2] if seconds is None else ():  # the first one may compile
-        start = perf_counter()
-        posterior.likelihood.log_likelihood(row)
-        seconds = perf_counter() - start
-    return draws[: int(np.clip(SECONDS / max(seconds, 1e-6), FEWEST_DRAWS, MOST_DRAWS))]
 
 
 def compare(
     likelihood: FELikelihood,
     draws: np.ndarray,
     key: str = "",
+    samples: np.ndarray | None = None,
     point: np.ndarray | None = None,
     start: np.ndarray | None = None,
-    samples: np.ndarray | None = None,
 ) -> list[Fit]:
     """The fits of a data set with the name `key`.
 
-    Draws of the prior (n, ndim), the fit at a `point`, the `start` before the update (ndim,); of modal data, modes at
-    draws and at as many `samples` of the posterior.
+    Draws of the prior (n, ndim), as many as ten seconds allow; after a run, also samples of the posterior (n, ndim),
+    the `point` of the fit and the `start` before the update (ndim,).
     """
     measured, n = likelihood.measurements, len(likelihood.model.parameter_names)
-    if likelihood.is_modal:
-        return [Fit(key, measured, np.empty(0), modal=_modes(key, likelihood, draws, samples))]
     found, failed = dict[str, np.ndarray](), list[str]()
-    for name, theta in (("before", start), ("after", point)):
+    for name, theta in (("before", start), ("after", point)) if not likelihood.is_modal else ():
         batch = None if theta is None else likelihood.simulate(theta[None, :n])
         if batch is not None and batch.reasons[0]:
             failed.append(f"{name} the update: the simulation failed ({batch.reasons[0]})")
         elif batch is not None:
             found[name] = measured.values - likelihood.residuals_of(batch.response[0])
-    found["draws"] = np.empty((0, *measured.values.shape))
+    good, made, begin = list[np.ndarray](), 0, perf_counter()
     try:
-        batch = likelihood.simulate(draws[:, :n])
-        good = [likelihood.residuals_of(batch.response[k]) for k, why in enumerate(batch.reasons) if not why]
-        found["draws"] = measured.values - np.reshape(good, (-1, *measured.values.shape))
+        while made < len(draws) and (not made or perf_counter() - begin < SECONDS):
+            more = max(made, FEWEST_DRAWS, getattr(likelihood.simulator.pool, "n_workers", None) or 1)
+            batch = likelihood.simulate(draws[made : made + more, :n])
+            made = min(made + more, len(draws))
+            if not likelihood.is_modal:
+                good += [likelihood.residuals_of(batch.response[k]) for k, why in enumerate(batch.reasons) if not why]
     except (ChangedModel, StaleCache) as error:  # concerns the next sampling, not this result
         logger.warning("the fit is compared with no draws of the prior: %s", error)
+    if likelihood.is_modal:
+        return [Fit(key, measured, np.empty(0), modal=_modes(key, likelihood, draws[:made], samples))]
+    found["draws"] = measured.values - np.reshape(good, (-1, *measured.values.shape))
     noise = sampled_noise(likelihood.noise)
     by_channel, assumed = dict[str, np.ndarray](), getattr(noise, "effective_samples", None)
     if assumed is not None:
@@ -224,7 +201,7 @@ def _modes(key: str, likelihood: Any, draws: np.ndarray, samples: np.ndarray | N
     for points in (draws, samples):
         try:
             some = points is not None and len(points)
-            found.append(likelihood.predict_modes(points, most=4 * max(len(draws), 5)) if some else None)
+            found.append(likelihood.predict_modes(points, most=4 * max(len(draws), FEWEST_DRAWS)) if some else None)
         except (SimulationFailed, ChangedModel, StaleCache) as error:
             logger.warning("modes are not compared: %s", error)
             found.append(None)
@@ -233,21 +210,12 @@ def _modes(key: str, likelihood: Any, draws: np.ndarray, samples: np.ndarray | N
     return ModalFit(key, likelihood, found[0], few, found[1], held_out)
 
 
-def fit_data_sets(run: FinishedRun) -> Fits:
-    """Simulate two points of each data set, before and after the update; empty without a likelihood of this package."""
+def fit_data_sets(run: FinishedRun) -> tuple[Fit, ...]:
+    """The fits of each data set, at the centre of the samples; empty without a likelihood of this package."""
     if run.likelihood is None:
-        return Fits((), "", "")
-    start, start_name = _before(run)
-    points, fits = (draws_to_compare(run.posterior), run.centre, start, run.samples), list[Fit]()
+        return ()
+    draws, start, fits = draws_to_compare(run.posterior), run.posterior.prior.mean(), list[Fit]()
     for key, likelihood, columns in data_sets_of(run):
-        draws, point, first, samples = (each[..., columns] for each in points)
-        fits += compare(likelihood, draws, key, point, first, samples)
-    return Fits(tuple(fits), f"before: {start_name}", f"after: {run.centre_name}")
-
-
-def _before(run: FinishedRun) -> tuple[np.ndarray, str]:
-    """The point (ndim,) that represents the knowledge before the update, and its name."""
-    nominal = np.array([parameter.nominal for parameter in run.parameters])
-    known, fast = np.isfinite(nominal), np.isin(np.arange(len(nominal)), run.posterior.fast_parameters)
-    names = (["nominal values"] if known.any() else []) + ([] if (known | fast).all() else ["mean of the prior"])
-    return np.where(known, nominal, run.posterior.prior.mean()), " and ".join(names)
+        points = (each[..., columns] for each in (run.samples, run.centre, start))
+        fits += compare(likelihood, draws[:, columns], key, *points)
+    return tuple(fits)

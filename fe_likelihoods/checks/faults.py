@@ -28,19 +28,7 @@ from ..units import DIMENSIONS, UNITS, find_unit
 from .finding import WRONG, Finding, percent
 from .sensor_faults import runs_of
 
-__all__ = [
-    "BETTER",
-    "EXPLAINED",
-    "FACTOR",
-    "FEWEST_DRAWS",
-    "FLOOR",
-    "MOST_DRAWS",
-    "Fault",
-    "describe_unit",
-    "find_faults",
-    "finding_of",
-    "supports_apart",
-]
+__all__ = ["Fault", "describe_unit", "find_faults", "finding_of", "slow_motion", "supports_apart"]
 
 BETTER = 0.6  # error with a fault taken into account, as a share of the error without: study `fit_gate`
 EXPLAINED = 0.85  # error (RRMSE) above which a response explains nothing: a correlation of a half
@@ -251,21 +239,21 @@ OF_MODES = {  # ratios of frequencies; of stiffness or mass, the square roots
     1000.0**0.5: "a stiffness in kN instead of N, or a mass in t instead of kg",
     9.81**0.5: "a weight instead of a mass",
 }
-FAULTS = {
+FAULTS = {  # kind, text and action
     "factor": (
         "A {what} may be wrong",
-        "measured values are {value} times the computed ones",
+        "{measured} are {value} times {computed}",
         "Look up unit and gain of the channel and of the base motion, loads or stiffnesses, and correct the wrong one; "
         "a model of your own must return SI units.",
     ),
     "sign": (
         "A sign may be wrong",
-        "measured values have the opposite sign of the computed ones",
+        "{measured} have the opposite sign of {computed}",
         "Where the sensor counts the other way, change its sign in the file, or by `reversed` in [measurements].",
     ),
     "lag": (
         "Clocks may differ",
-        "measured values are {value} s {late} than the computed ones",
+        "{measured} are {value} s {late} than {computed}",
         "Check the clocks of sensors and motions, and when the motion begins (`zero` in [measurements], or "
         "measurements.shift); a lag that stays unknown can be a parameter (`Sensor`).",
     ),
@@ -275,7 +263,6 @@ FAULTS = {
         "Look up which cable, or column of the file, belongs to which; if they were exchanged, exchange the columns.",
     ),
 }
-"""Kind, text and action of each fault of data."""
 OF_SUPPORTS = (
     "Check unit, sign and clock of its file. Slow motions of one site are alike, except of supports that did move so, "
     "or that waves reach one by one."
@@ -286,25 +273,25 @@ def finding_of(
     fault: Fault, title: str, channels: Sequence[Channel] = (), severity: str = WRONG, error: str = "RRMSE"
 ) -> Finding:
     """A fault of a data set with a title, and its channels (of modes none); `error` is what was compared."""
-    of_modes, of_supports = fault.names == ("frequencies",), math.isnan(fault.before)
-    kinds = [("frequency", "")] if of_modes else [(each.dimension, each.unit) for each in channels]
+    of_supports, value, modes = math.isnan(fault.before), abs(fault.value), fault.names == ("frequencies",)
+    kinds = [("frequency", "")] if modes else [(each.dimension, each.unit) for each in channels]
     near = [describe_unit(fault.value, *each) for each in kinds] if fault.kind == "factor" else []
-    units, value = " or ".join(filter(None, dict.fromkeys(near))), abs(fault.value)
-    words = {
-        "value": f"{value:.0f}" if value >= 1e3 else f"{value:.3g}",
-        "late": "later" if fault.value > 0.0 else "earlier",
-        "what": "unit" if units or of_modes else "gain",
-    }
-    kind, text, action = (each.format(**words) for each in FAULTS[fault.kind])
+    units = " or ".join(filter(None, dict.fromkeys(near)))
+    words = {"measured": "slow motions", "computed": "other supports"} if of_supports else {}
+    words = {"measured": "measured values", "computed": "the computed ones"} | words
+    words |= {"value": f"{value:.0f}" if value >= 1e3 else f"{value:.3g}", "what": "unit" if units or modes else "gain"}
+    kind, text, action = (
+        each.format(late="later" if fault.value > 0.0 else "earlier", **words) for each in FAULTS[fault.kind]
+    )
     text = f"{listed(fault.names)}{f' ({title})' if title else ''}: {text}{f', as with {units}' if units else ''}"
-    if of_supports:
-        text = text.replace("measured values", "slow motions").replace("computed ones", "other supports")
-    else:
-        before, after = map(percent, (fault.before, fault.after))
-        text += f"; corrected, the error ({error}) is {after} instead of {before}{fault.where}"
     numbers = {"before": fault.before, "after": fault.after, fault.kind: fault.value}
     numbers = {name: number for name, number in numbers.items() if not math.isnan(number)}
-    return Finding(kind, severity, f"{text}.", OF_SUPPORTS if of_supports else action, numbers, "data")
+    if of_supports:
+        return Finding(kind, severity, f"{text}.", OF_SUPPORTS, numbers, "input")
+    text += (
+        f"; corrected, the error ({error}) is {percent(fault.after)} instead of {percent(fault.before)}{fault.where}."
+    )
+    return Finding(kind, severity, text, action, numbers, "data")
 
 
 def describe_unit(factor: float, dimension: str, unit: str = "") -> str:

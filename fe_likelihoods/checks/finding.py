@@ -6,25 +6,7 @@ from typing import NamedTuple
 
 from samplers.finding import CARE, NOTE, WRONG, Finding, by_severity
 
-__all__ = [
-    "CARE",
-    "CORRELATED",
-    "HALF",
-    "NOTE",
-    "SMALL_PROBABILITY",
-    "TAIL",
-    "WRONG",
-    "Finding",
-    "FindingWarning",
-    "Judgement",
-    "about",
-    "by_severity",
-    "in_order",
-    "judge",
-    "labelled",
-    "percent",
-    "warn",
-]
+__all__ = ["Finding", "FindingWarning", "Judgement", "in_order", "judge", "labelled", "percent", "warn"]
 
 SMALL_PROBABILITY = 0.01  # that chance explains what was found; of 100 independent tests of right results, one fails
 TAIL = 0.05  # share of samples or draws that is as much as a tail of a 90 % interval
@@ -32,11 +14,6 @@ HALF = 0.5  # of a power, or of what is inside a band: the other half is missed
 CORRELATED = "The errors are correlated"
 STATUS = {WRONG: "do not use", CARE: "use with care", NOTE: "use"}
 ORDER = ("input", "data", "fit", "samples")
-
-
-def about(what: str, findings: Iterable[Finding]) -> list[Finding]:
-    """Findings as those about one of `ORDER`."""
-    return [each._replace(about=what) for each in findings]
 
 
 def in_order(findings: Iterable[Finding]) -> tuple[Finding, ...]:
@@ -57,7 +34,7 @@ class Judgement(NamedTuple):
     def __str__(self) -> str:
         kinds = list(dict.fromkeys(each.kind for each in self.findings if each.severity != NOTE))
         reasons = [f"{kind[0].lower()}{kind[1:]}" for kind in kinds[:1]]
-        if others := len(kinds) - 1 if kinds else 0:
+        if others := len(kinds[1:]):
             reasons.append(f"fix this first, {others} other finding{'s' if others > 1 else ''} may follow from it")
         if self.width_factor > 1.0:
             reasons.append(f"multiply standard deviations by {self.width_factor:.2g}, because errors are correlated")
@@ -74,8 +51,8 @@ class Judgement(NamedTuple):
 
 def judge(findings: Iterable[Finding], tests: Iterable[tuple[str, str]] = ()) -> Judgement:
     """The judgement that follows from findings: the most severe one decides."""
-    found = tuple(findings)
-    return Judgement(STATUS[by_severity(found)[0].severity] if found else "use", in_order(found), tuple(tests))
+    found = by_severity(findings)
+    return Judgement(STATUS[found[0].severity] if found else "use", in_order(found), tuple(tests))
 
 
 class FindingWarning(UserWarning):

@@ -11,25 +11,15 @@ from ..priors.between_events import spread_of
 from ..signals.channels import Channel
 from ..signals.error_measures import relative_errors
 from ..text_tables import listed
-from .compared import Fit, checks_of
-from .faults import EXPLAINED, MOST_DRAWS, find_faults, finding_of, supports_apart
-from .finding import CARE, CORRELATED, HALF, NOTE, SMALL_PROBABILITY, WRONG, Finding, about, percent
+from .compared import MOST_DRAWS, Fit, checks_of
+from .faults import EXPLAINED, find_faults, finding_of, supports_apart
+from .finding import CARE, CORRELATED, HALF, NOTE, SMALL_PROBABILITY, WRONG, Finding, percent
 from .modal import check_modes, squares_of_modes
 from .model import LARGE_SHIFT, motions_to_replace
 from .run import ParameterRow
 
-__all__ = [
-    "SAME_AS_PRIOR",
-    "check_other_events",
-    "check_parameters",
-    "check_residuals",
-    "check_responses",
-    "check_stated_errors",
-    "check_supports",
-    "describe_residuals",
-]
+__all__ = ["check_other_events", "check_residuals", "check_responses", "check_stated_errors", "check_supports"]
 
-SAME_AS_PRIOR = 0.9  # ratio of the standard deviations of posterior and prior: a fifth of the variance is gone
 FEWEST = 10  # samples that the tests of correlation and distribution need
 
 
@@ -38,42 +28,38 @@ def check_responses(fits: Iterable[Fit]) -> list[Finding]:
 
     Faults are those that draws of the prior show, before a run and after it: a fit may make up for them.
     """
-    found, others = list[Finding](), list[Fit]()
+    found, others = list[Finding](), [fit for fit in fits if not fit.modal]
     for fit in fits:
-        if fit.modal:
-            found += check_modes(fit.modal)
-            continue
-        others.append(fit)
-        history = fit.measurements.is_history
+        found += check_modes(fit.modal) if fit.modal else []
+    for fit in others:
         for fault in find_faults(fit.measurements, fit.draws):
             channels = [each for each in fit.measurements.channels if each.name in fault.names]
             # of right real events, 5 to 20 draws blame 19 of 396, 50 or 70 draws 3 of 264, and 100 draws 0 of 43
             severity = WRONG if fault.where or len(fit.draws) >= HALF * MOST_DRAWS else CARE
             found.append(finding_of(fault, fit.title, channels, severity))
-        if history and fit.after is not None:
-            found += _check_offset(fit)
+        found += _check_offset(fit)
     for why in dict.fromkeys(fit.failed for fit in others if fit.failed):
         found.append(Finding("A response is missing", CARE, f"{why}.", "Mend the model at this point.", about="fit"))
-    return found + (about("fit", _check_errors(others)) if all(each.severity != WRONG for each in found) else [])
+    return found + (_check_errors(others) if all(each.severity != WRONG for each in found) else [])
 
 
 def check_supports(model: Any) -> list[Finding]:
     """Supports of one structure whose slow motion has another sign, size or clock than that of the others."""
-    motions = motions_to_replace(model) if getattr(model, "supports", ()) else ()
+    motions, found = motions_to_replace(model) if getattr(model, "supports", ()) else (), list[Finding]()
     if len({(each.n_steps, each.dt) for each in motions}) != 1:
         return []
-    names, found = [f'motion "{each.name}"' for each in motions], list[Finding]()
+    names = [f'motion "{each.name}"' for each in motions]
     for k, faults in supports_apart([each.acceleration for each in motions], names, motions[0].dt).items():
         if k not in getattr(model, "inputs", ()):  # whose gains and lags are parameters of a `SensedModel`
             one = [Channel(names[k], "acceleration", "g")]  # waves make lags too
             found += [finding_of(each, "", one, CARE if each.kind == "lag" else WRONG) for each in faults]
-    return about("input", found)
+    return found
 
 
 def _check_offset(fit: Fit) -> list[Finding]:
     """Channels whose residuals are mostly a constant, a slope or a parabola: 3 / n of n independent samples."""
-    large = {}
-    for channel, values in zip(fit.measurements.channels, fit.residuals, strict=True):
+    large, residuals = dict[str, float](), fit.residuals if fit.measurements.is_history else None
+    for channel, values in () if residuals is None else zip(fit.measurements.channels, residuals, strict=True):
         left = values[np.isfinite(values)]
         if len(left) >= FEWEST and left.any():
             smooth = np.polynomial.Legendre.fit(np.arange(len(left)), left, 2)(np.arange(len(left)))
@@ -103,27 +89,20 @@ def _check_errors(fits: Sequence[Fit]) -> list[Finding]:
                 chance = min(checks.white[0], checks.normal[0])
                 useless |= {name: float(size)} if chance < SMALL_PROBABILITY else {}
     shown = listed([f"{percent(size)} in {name}" for name, size in (useless or far).items()])
-    if useless:
-        text = f"The update leaves more than half of the power unexplained: the error (RRMSE) is {shown}; 71 % is half."
-        action = (
-            "Check that it is the right column, its unit, sign and clock, and the place of the sensor in the model; if "
-            "all of them are right, the model lacks what moves it."
-        )
-        return [Finding("The model does not follow the measurements", WRONG, text, action, useless)]
+    kind, severity = "The prior does not reach the measurements", CARE
     text = f"No draw of the prior comes near the measurements; the best one has an error (RRMSE) of {shown}."
     action = (
         "Check model and priors. A model of your own must return SI units (m, m/s², N, Pa, rad), and zero in "
         "[measurements] is the time at which the base motion begins."
     )
-    return [Finding("The prior does not reach the measurements", CARE, text, action, far)] if far else []
-
-
-def check_parameters(rows: Sequence[ParameterRow]) -> list[Finding]:
-    """Parameters that the data do not inform."""
-    flat = [row.label for row in rows if row.sd > SAME_AS_PRIOR * row.prior_sd]
-    text = f"The posterior of {listed(flat)} is nearly as wide as its prior: these data say little about it."
-    action = "Do not report it as identified. A stronger excitation or another sensor may inform it."
-    return [Finding("Not informed by the data", NOTE, text, action)] if flat else []
+    if useless:
+        kind, severity = "The model does not follow the measurements", WRONG
+        text = f"The update leaves more than half of the power unexplained: the error (RRMSE) is {shown}; 71 % is half."
+        action = (
+            "Check that it is the right column, its unit, sign and clock, and the place of the sensor in the model; if "
+            "all of them are right, the model lacks what moves it."
+        )
+    return [Finding(kind, severity, text, action, useless or far, "fit")] if useless or far else []
 
 
 def check_other_events(rows: Sequence[ParameterRow]) -> list[Finding]:

@@ -7,25 +7,20 @@ from typing import Any
 
 import numpy as np
 
-from ..text_tables import listed
-from .faults import BETTER, FACTOR, FLOOR, MOST_DRAWS, Fault, finding_of
-from .finding import CARE, HALF, NOTE, TAIL, WRONG, Finding, about, percent
+from .compared import MOST_DRAWS
+from .faults import BETTER, FACTOR, FLOOR, Fault, finding_of
+from .finding import CARE, HALF, Finding
 
 __all__ = ["check_modes", "squares_of_modes"]
 
-RESEMBLES = HALF  # MAC; one shape cannot have more than this with two orthogonal ones
-
 
 def check_modes(fit: Any) -> list[Finding]:
-    """What a `ModalFit` shows: faults at draws of the prior, and a pairing that changes in the posterior, if any."""
-    found = list[Finding]()
-    if fit.draws is not None:
-        found += [finding_of(each, fit.title, error="of frequencies") for each in _unit(fit.draws)]
-        of_sensor = [finding_of(each, fit.title, error="of shapes") for each in _faults_of_sensors(fit.draws)]
-        found = about("data", found + (of_sensor or _check_shapes(fit.draws)) or _check_reach(fit.draws))
-    if fit.samples is not None and all(each.severity != WRONG for each in found):
-        found += _check_pairs(fit.samples)
-    return found
+    """Faults, and modes without a counterpart, that a `ModalFit` shows at draws of the prior."""
+    if fit.draws is None:
+        return []
+    found = [finding_of(each, fit.title, error="of frequencies") for each in _unit(fit.draws)]
+    of_sensor = [finding_of(each, fit.title, error="of shapes") for each in _faults_of_sensors(fit.draws)]
+    return found + (of_sensor or _check_shapes(fit.draws))
 
 
 def _unit(modes: Any) -> list[Fault]:
@@ -63,37 +58,12 @@ def _number(modes: Any, k: int) -> str:
 def _check_shapes(modes: Any) -> list[Finding]:
     """Measured modes that no computed one resembles."""
     found, resembling, numbers = [], np.median(modes.assurance, axis=0), modes.data.mode_numbers
-    for k in np.flatnonzero(resembling < RESEMBLES):
+    for k in np.flatnonzero(resembling < HALF):  # MAC; one shape cannot have more than a half with two orthogonal ones
         others = [number for number in numbers if number != numbers[k]]
         text = f"No computed mode resembles the measured mode {_number(modes, k)}: its best MAC is {resembling[k]:.2f}."
         action = f"Leave it out, data.select({others}) or modes = {others} in a TOML file; or compute more modes."
-        found.append(Finding("A mode has no counterpart", CARE, text, action, {"mac": float(resembling[k])}))
+        found.append(Finding("A mode has no counterpart", CARE, text, action, {"mac": float(resembling[k])}, "data"))
     return found
-
-
-def _check_pairs(modes: Any) -> list[Finding]:
-    """Measured modes that are different computed modes in the posterior, which no result has to suffer from."""
-    found = []
-    for k, column in enumerate(modes.numbers.T):
-        numbers, counts = np.unique(column, return_counts=True)
-        if counts.max() < (1.0 - TAIL) * len(column):
-            shares = listed([f"{each} ({percent(n / len(column))})" for each, n in zip(numbers, counts, strict=True)])
-            text = f"The measured mode {_number(modes, k)} is paired with different computed modes: {shares}."
-            action = "Parameters may have several regions; more sensors tell the shapes apart."
-            found.append(Finding("The pairing of modes changes", NOTE, text, action))
-    return found
-
-
-def _check_reach(modes: Any) -> list[Finding]:
-    """Frequencies further from the nearest draw than all draws are from each other."""
-    logs = np.log(modes.data.mean_frequencies / modes.frequencies)
-    beyond = np.maximum(logs.min(axis=0), -logs.max(axis=0)) > np.ptp(logs, axis=0)
-    low, high = modes.frequencies.min(axis=0), modes.frequencies.max(axis=0)
-    shown = [f"{_number(modes, k)}, computed {low[k]:.4g} to {high[k]:.4g} Hz" for k in np.flatnonzero(beyond)]
-    text = f"No draw of the prior comes near the measured frequency of mode {listed(shown)}."
-    action = "Check masses, boundary conditions and priors of the model, and the numbers of the modes."
-    few = len(logs) < HALF * MOST_DRAWS or not shown
-    return [] if few else [Finding("The prior does not reach the measurements", CARE, text, action)]
 
 
 def squares_of_modes(fit: Any) -> Iterator[tuple[str, dict[str, float], int]]:

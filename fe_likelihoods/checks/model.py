@@ -1,8 +1,7 @@
 """Checks of a model: does it repeat itself and read its motion, and are step and mesh fine enough for its data?
 
-Before a run, `check_model` simulates a few times what a run would simulate thousands of times. At a fit, the response
-changes by d with half the step. With the derivatives J of the response by the parameters, each in units of its
-posterior standard deviation, and the weights W = 1 / sigma^2 of the residuals, ::
+At a fit, the response changes by d with half the step. With the derivatives J of the response by the parameters, each
+in units of its posterior standard deviation, and the weights W = 1 / sigma^2 of the residuals, ::
 
     delta = (J^T W J + P)^-1 J^T W d
 
@@ -19,17 +18,14 @@ import numpy as np
 from ..likelihood.posterior import Posterior
 from ..signals.events import motions_of
 from ..signals.records import Record
-from ..simulation.model import SimulationBatch, simulate_batch
+from ..simulation.model import simulate_batch
 from .finding import CARE, WRONG, Finding, percent
 
 __all__ = [
-    "LARGE_SHIFT",
-    "STEP",
     "check_chance",
+    "check_motion",
     "check_same_response",
-    "check_stronger_motion",
     "halve_steps",
-    "has_steps",
     "motions_to_replace",
     "refuse_chance",
     "relative_difference",
@@ -42,32 +38,22 @@ __all__ = [
 SHIFT, LARGE_SHIFT = 0.5, 2.0
 NOTHING = 1e-6  # difference of two responses, relative to their norm, well above the round-off of a long response
 STEP, MESH = "Time step", "Mesh"
-NO_STEP = "the model takes neither a motion nor a step that could be halved"
-
-Simulate = Callable[[Any, np.ndarray], SimulationBatch]
-"""Simulates a model at points (n, n_parameters)."""
 
 
-def has_steps(likelihood: Any) -> bool:
-    """Whether any data of a likelihood, or None, may be histories; modes and load cases have no steps."""
-    return likelihood is None or any(part.measurements.is_history for part, _ in likelihood.parts())
-
-
-def halve_steps(
-    posterior: Posterior, point: np.ndarray, sd: np.ndarray, simulate: Simulate
-) -> tuple[list[Finding], dict[str, str]]:
+def halve_steps(posterior: Posterior, point: np.ndarray, sd: np.ndarray) -> tuple[list[Finding], dict[str, str]]:
     """Halve step and mesh at a fit (ndim,), and compare the parameters' change with their standard deviations (ndim,).
 
-    Returns findings, and what was tested, by name. ``simulate(model, points)`` returns a `SimulationBatch`. A model
-    that fails with half a step, or whose response does not change, keeps a step of its own, which is not tested.
+    Returns findings, and what was tested, by name. A model that fails with half a step, or whose response does not
+    change, keeps a step of its own, which is not tested.
     """
     widths = sd / np.array([row[3] for row in posterior.prior.table()[1]])
     precision = np.diag(np.square(np.where(np.isfinite(widths), widths, 0.0)))
-    pulls, squares, tests = dict[str, np.ndarray](), dict[str, np.ndarray](), {STEP: f"not tested: {NO_STEP}"}
+    pulls, squares = dict[str, np.ndarray](), dict[str, np.ndarray]()
+    tests = {STEP: "not tested: the model takes neither a motion nor a step that could be halved"}
     for likelihood, columns in posterior.likelihood.parts():
         model, n = likelihood.model, len(likelihood.model.parameter_names)
         theta, at = point[columns][:n], columns[:n]
-        batch = simulate(model, theta + np.vstack([np.zeros(n), np.diag(sd[at])]))
+        batch = likelihood.simulate(theta + np.vstack([np.zeros(n), np.diag(sd[at])]))
         if reason := next(filter(None, batch.reasons), ""):
             return [], {STEP: f"not tested: a simulation failed ({reason})"}
         response = batch.response[0]
@@ -76,7 +62,7 @@ def halve_steps(
         jacobian = ((batch.response[1:] - response) * weights).reshape(n, -1)
         precision[np.ix_(at, at)] += jacobian @ jacobian.T
         for what, name, finer, every in _finer(model):
-            fine = simulate(finer, theta[None])
+            fine = simulate_batch(finer, theta[None])
             if fine.reasons[0]:
                 tests[name] = f"not tested: with half of {what} the simulation fails ({fine.reasons[0]})"
                 continue
@@ -99,15 +85,13 @@ def halve_steps(
     return found, tests
 
 
-def check_stronger_motion(model: Any, theta: np.ndarray, response: np.ndarray) -> list[Finding]:
-    """Whether twice the motion, if it can be replaced, fails or does not change the response (n_channels, n_steps)."""
+def check_motion(model: Any, theta: np.ndarray, response: np.ndarray) -> list[Finding]:
+    """Whether twice the motion, if it can be replaced, does not change the response (n_channels, n_steps)."""
     if not motions_to_replace(model):
         return []
     batch = simulate_batch(_under(model, lambda each: each.scale(2.0)), theta[None])
-    if batch.reasons[0]:
-        text = f"Under twice the base motion the simulation fails: {batch.reasons[0]}."
-        return [Finding("A stronger motion fails", CARE, text, "Predictions of stronger events may fail as well.")]
-    return check_same_response(relative_difference(batch.response[0] - response, response), "twice the motion")
+    difference = None if batch.reasons[0] else relative_difference(batch.response[0] - response, response)
+    return check_same_response(difference, "twice the motion")
 
 
 def check_same_response(difference: float | None, motion: str = "this motion") -> list[Finding]:
@@ -119,17 +103,17 @@ def check_same_response(difference: float | None, motion: str = "this motion") -
     return [Finding("The motion changes nothing", WRONG, text, action, {"difference": difference}, "input")]
 
 
-def check_chance(response: np.ndarray, later: SimulationBatch) -> list[Finding]:
-    """Whether later simulations of the same parameters give the same response."""
-    text = ""
-    for again, reason in zip(later.response, later.reasons, strict=True):
-        share = np.inf if reason else relative_difference(again - response, response)
+def check_chance(model: Any, theta: np.ndarray, response: np.ndarray, pool: Any) -> list[Finding]:
+    """Whether later simulations of the same parameters give the same response (n_channels, n_steps)."""
+    batch, text, numbers = simulate_batch(model, np.tile(theta, (2, 1)), pool), "", dict[str, float]()
+    for again, reason in zip(batch.response, batch.reasons, strict=True):
         if reason:
             text = f"The first simulation at the mean of the prior succeeded, a later one failed: {reason}."
-        elif share > NOTHING:
-            text = f"Two simulations of the same parameters differ by {100.0 * share:.2g} %: no sampler converges."
+        elif (share := relative_difference(again - response, response)) > NOTHING:
+            text, numbers = f"Two simulations of the same parameters differ by {percent(share)}", {"difference": share}
+            text += ": no sampler converges."
     action = "Set the seeds of the model, give each simulation a folder of its own, read no results of earlier runs."
-    return [Finding("The model is not repeatable", WRONG, text, action, about="input")] if text else []
+    return [Finding("The model is not repeatable", WRONG, text, action, numbers, "input")] if text else []
 
 
 def refuse_chance(posterior: Posterior) -> None:
@@ -137,10 +121,10 @@ def refuse_chance(posterior: Posterior) -> None:
     mean = posterior.prior.mean()
     for likelihood, columns in posterior.likelihood.parts():
         theta = mean[columns][: len(likelihood.model.parameter_names)]
-        first = likelihood.simulate(theta[None])
-        later = simulate_batch(likelihood.model, np.tile(theta, (2, 1)), likelihood.simulator.pool)
-        for finding in () if any((*first.reasons, *later.reasons)) else check_chance(first.response[0], later):
-            raise ValueError(str(finding))
+        first, pool = likelihood.simulate(theta[None]), likelihood.simulator.pool
+        found = [] if first.reasons[0] else check_chance(likelihood.model, theta, first.response[0], pool)
+        if found and found[0].numbers:
+            raise ValueError(str(found[0]))
 
 
 def relative_difference(difference: np.ndarray, reference: np.ndarray) -> float:

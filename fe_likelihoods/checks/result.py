@@ -1,40 +1,93 @@
-"""One judgement over the result of a run: sampling, fit, residuals, failures, priors, data, and what was not tested."""
+"""What is judged before a run (`check_model`) and after it (`check_result`): data, model, fit, sampling, failures."""
 
+from collections import Counter
+from collections.abc import Iterable
+from time import perf_counter
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..likelihood.posterior import Posterior
 from ..signals.events import find_events
-from ..simulation.model import SimulationBatch, simulate_batch
-from .compared import Fits, fit_data_sets
-from .finding import CARE, NOTE, TAIL, WRONG, Finding, Judgement, judge
-from .fit import (
-    check_other_events,
-    check_parameters,
-    check_residuals,
-    check_responses,
-    check_stated_errors,
-    check_supports,
-)
-from .model import STEP, halve_steps, has_steps, motions_to_replace
-from .run import Failures, FinishedRun, ParameterRow, failures, moments_of, read_run, rows_of
+from .compared import SECONDS, Fit, compare, data_sets_of, draws_to_compare, fit_data_sets
+from .finding import CARE, NOTE, TAIL, WRONG, Finding, Judgement, in_order, judge
+from .fit import check_other_events, check_residuals, check_responses, check_stated_errors, check_supports
+from .model import STEP, check_chance, check_motion, halve_steps, motions_to_replace
+from .run import Failure, Failures, FinishedRun, ParameterRow, failures, read_run, rows_of
 from .screening import check_data
 
-__all__ = ["JudgedRun", "check_failures", "check_result", "judge_run"]
+__all__ = ["JudgedRun", "ModelCheck", "check_failures", "check_model", "check_result", "judge_run"]
 
 # effective, below which the interval between the 5 % and 95 % quantiles of n samples, which holds a further sample with
 # the probability 0.9 (n - 1) / (n + 1), loses as much as a tail of it: 0.85; with 57 it is 0.87
 FEW_SAMPLES = 36.0
-LARGEST_TEST, TEST_SECONDS = 0.05, 10.0  # of step and mesh: share of the simulations of the run, below which it is made
+LARGEST_TEST = 0.05  # of step and mesh: share of the simulations of the run, below which it is made
+
+
+class ModelCheck(NamedTuple):
+    """What `check_model` has found, causes first."""
+
+    findings: tuple[Finding, ...]
+    seconds: float  # per simulation [s]
+    fits: tuple[Fit, ...]  # measurements beside the draws of the prior that were simulated
 
 
 class JudgedRun(NamedTuple):
     """A judgement of a run, and what it is made from."""
 
     rows: list[ParameterRow]
-    fits: Fits
+    fits: tuple[Fit, ...]
     failures: Failures
     judgement: Judgement
+
+
+def check_model(posterior: Posterior) -> ModelCheck:
+    """Try the model and the data of a posterior before a run.
+
+    It simulates the mean of the prior three times, under twice the motion, and up to 100 draws of the prior (as many as
+    ten seconds allow, and five at least), in which it looks for wrong units, signs, clocks and channels of the data.
+    `fe_likelihoods.check_data` looks at the data alone. Whether step and mesh are fine enough is judged after a run
+    (`fe_likelihoods.check_result`), where the precision of the parameters is known.
+
+    Parameters
+    ----------
+    posterior : Posterior
+
+    Returns
+    -------
+    ModelCheck
+
+    Raises
+    ------
+    ValueError
+        If the simulation at the mean of the prior fails.
+
+    Examples
+    --------
+    >>> wrong_sign = Measurements(measurements.channels, record.dt, -measurements.values)
+    >>> checked = check_model(Posterior(FELikelihood(model, wrong_sign), prior))
+    >>> [finding.kind for finding in checked.findings if finding.severity == "wrong"]
+    ['A sign may be wrong']
+    """
+    found, fits, seconds, likelihood = list[Finding](), list[Fit](), 0.0, posterior.likelihood
+    mean, draws = posterior.prior.mean(), draws_to_compare(posterior)
+    for key, part, columns in data_sets_of(posterior):
+        theta = mean[columns][: len(part.model.parameter_names)]
+        batch = part.simulate(theta[None])
+        if batch.reasons[0]:
+            reason = batch.reasons[0]
+            raise ValueError(f"the simulation at the mean of the prior has failed: {reason}; check model, priors")
+        fits += compare(part, draws[:, columns], key)
+        start = perf_counter()  # generators of workers have moved on meanwhile
+        chance = check_chance(part.model, theta, batch.response[0], part.simulator.pool)
+        seconds += (perf_counter() - start) / (2 if part.simulator.pool is None else 1)
+        # where responses differ by chance, other differences say nothing
+        found += chance or check_motion(part.model, theta, batch.response[0])
+    found += _check_inputs(likelihood, fits)
+    report, attempts = posterior.report(), sum(part.simulator.failures.outcomes for part, _ in likelihood.parts())
+    rows = tuple(Failure(*each, "") for each in Counter(report["failure_reasons"]).most_common(1))
+    found += check_failures(Failures(rows, report["failure_count"], attempts))
+    return ModelCheck(in_order(found), seconds, tuple(fits))
 
 
 def check_result(sampler: Any, posterior: Any = None, *, discard: int = 0) -> Judgement:
@@ -77,28 +130,18 @@ def judge_run(run: FinishedRun) -> JudgedRun:
 
     A run that says nothing about the parameters gets no findings that compare its samples with prior, truth or noise.
     """
-    rows, fits = rows_of(run.parameters, run.prior, moments_of(run), run.truth), fit_data_sets(run)
-    of_model, tested = _check_steps(run)
+    rows, fits, parts = rows_of(run), fit_data_sets(run), [] if run.likelihood is None else run.likelihood.parts()
+    histories = not parts or any(part.measurements.is_history for part, _ in parts)
+    found, tested = _check_steps(run) if parts and histories else ([], {})
     failed = failures(run)  # those of the fits included
-    found = check_responses(fits.fits) + of_model  # first, because they explain a sampling that is not good
-    found += _check_sampling(run) + _check_chain(run) + check_failures(failed)
-    parts = [] if run.likelihood is None else [likelihood for likelihood, _ in run.likelihood.parts()]
-    for each in parts:
-        found += check_supports(each.model)
-        found += check_data(each.measurements, motions_to_replace(each.model))
-        if text := getattr(each.model, "range_remark", ""):  # also of simulations that verify stored rows
-            action = "See whether samples of the posterior are concerned, or only draws far from it."
-            kind = "Beyond the range of a law of the model"
-            found.append(Finding(kind, CARE, f"{text[0].upper()}{text[1:]}.", action))
-    if not run.is_inconclusive:
-        found += check_parameters(rows)
-        if all(each.severity != WRONG for each in found):  # a fault explains the residuals
-            found += check_residuals(fits.fits) + check_stated_errors(fits.fits)
-            events = [find_events(each.model) for each in parts]
-            if len(parts) == 1 and has_steps(run.likelihood) and (events[0] is None or len(events[0].names) == 1):
-                found += check_other_events([row for row in rows if row.name in parts[0].model.parameter_names])
-    checked = sum(each.checks is not None for fit in fits.fits for each in fit.channels)
-    responses = max((len(each.modal.points if each.modal else each.draws) for each in fits.fits), default=0)
+    found += _check_inputs(run.likelihood, fits) + _check_samples(run) + check_failures(failed)
+    if not run.is_inconclusive and all(each.severity != WRONG for each in found):  # a fault explains the residuals
+        found += check_residuals(fits) + check_stated_errors(fits)
+        events = [find_events(part.model) for part, _ in parts]
+        if len(parts) == 1 and histories and (events[0] is None or len(events[0].names) == 1):
+            found += check_other_events([row for row in rows if row.name in parts[0][0].model.parameter_names])
+    checked = sum(each.checks is not None for fit in fits for each in fit.channels)
+    responses = max((len(each.modal.points if each.modal else each.draws) for each in fits), default=0)
     alone = "the length of the chain alone: a Markov chain gives no verdict"
     tests = {
         "Sampling": "by the sampler" if run.tempered else alone,
@@ -110,42 +153,42 @@ def judge_run(run: FinishedRun) -> JudgedRun:
     return JudgedRun(rows, fits, failed, judge(unique, (tests | tested).items()))
 
 
+def _check_inputs(likelihood: Any, fits: Iterable[Fit]) -> list[Finding]:
+    """Findings about the data of a likelihood, or of none, by themselves and beside responses."""
+    found = check_responses(fits)
+    for part, _ in [] if likelihood is None else likelihood.parts():
+        found += check_supports(part.model)
+        found += check_data(part.measurements, motions_to_replace(part.model))
+        if text := getattr(part.model, "range_remark", ""):  # also of simulations that verify stored rows
+            action = "See whether samples of the posterior are concerned, or only draws far from it."
+            kind = "Beyond the range of a law of the model"
+            found.append(Finding(kind, CARE, f"{text[0].upper()}{text[1:]}.", action))
+    return found
+
+
 def _check_steps(run: FinishedRun) -> tuple[list[Finding], dict[str, str]]:
     """The error of step and mesh at the centre of the samples, and what was tested.
 
     This takes a simulation for each parameter and more; where they are many and take long, it is not tested.
     """
-    if run.likelihood is None or run.prior is None or run.is_inconclusive or not has_steps(run.likelihood):
+    if run.prior is None or run.is_inconclusive:
         return [], {}
-    known = {likelihood.model.fingerprint: likelihood for likelihood, _ in run.likelihood.parts()}
     report = run.likelihood.report()
     needed = sum(2 + len(likelihood.model.parameter_names) for likelihood, _ in run.likelihood.parts())
     seconds = report["seconds"] / max(report["simulations"], 1)
     if run.n_modes > 1:
         return [], {STEP: "not tested: the samples have several modes, which have no common standard deviation"}
-    if needed > LARGEST_TEST * report["simulations"] and needed * seconds > TEST_SECONDS:
+    if needed > LARGEST_TEST * report["simulations"] and needed * seconds > SECONDS:
         return [], {STEP: f"not tested: the test takes about {needed} simulations of {seconds:.2g} s"}
-
-    def simulate(model: Any, points: np.ndarray) -> SimulationBatch:
-        cached = known.get(model.fingerprint)
-        return simulate_batch(model, points) if cached is None else cached.simulate(points)
-
-    return halve_steps(run.posterior, run.centre, run.samples.std(axis=0), simulate)
+    return halve_steps(run.posterior, run.centre, run.samples.std(axis=0))
 
 
-def _check_sampling(run: FinishedRun) -> list[Finding]:
-    """What the sampler has found, as it has said it."""
-    if not run.tempered:
-        return []
-    if run.verdict is None:
+def _check_samples(run: FinishedRun) -> list[Finding]:
+    """What the sampler has found, and whether samples, of a Markov chain too, are many enough and have one mode."""
+    found, n, size = list(run.verdict.findings if run.verdict else ()), len(run.samples), run.effective_sample_size
+    if run.tempered and run.verdict is None:
         text = "The file of this run holds no verdict, so nothing is known about its convergence."
-        return [Finding("No verdict", CARE, text, "Run it again with this version.")]
-    return list(run.verdict.findings)
-
-
-def _check_chain(run: FinishedRun) -> list[Finding]:
-    """Whether the samples are many enough, for a Markov chain too, and have one mode."""
-    found, n, size = list[Finding](), len(run.samples), run.effective_sample_size
+        found.append(Finding("No verdict", CARE, text, "Run it again with this version."))
     if run.is_inconclusive and not run.tempered:
         time = f"{run.autocorrelation_time:.0f} iterations" if np.isfinite(run.autocorrelation_time) else "not known"
         text = (
@@ -174,12 +217,12 @@ def _check_chain(run: FinishedRun) -> list[Finding]:
 
 def check_failures(failed: Failures) -> list[Finding]:
     """How many simulations failed; the verdict of a sampler says whether they border on the samples."""
-    if not failed.count:
-        return []
     share = failed.count / max(failed.attempts, 1)
+    most = f", most often: {failed.rows[0].reason}" if failed.rows else ""
     text = (
-        f"{failed.count} of {failed.attempts} simulations failed ({100.0 * share:.2g} %). A failed simulation counts "
-        "as impossible: the posterior has no samples there."
+        f"{failed.count} of {failed.attempts} simulations failed ({100.0 * share:.2g} %){most}. A failed simulation "
+        "counts as impossible: the posterior has no samples there."
     )
-    action = "See the table of failures: mend the model where its parameters are plausible, else narrow the prior."
-    return [Finding("Simulations failed", CARE if share > TAIL else NOTE, text, action, {"share": share})]
+    action = "Mend the model where its parameters are plausible, else narrow the prior."
+    severity = CARE if share > TAIL else NOTE
+    return [Finding("Simulations failed", severity, text, action, {"share": share})] if failed.count else []

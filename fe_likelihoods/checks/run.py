@@ -20,18 +20,7 @@ from ..likelihood.likelihood import FELikelihood
 from ..likelihood.parameters import Parameter
 from ..priors.priors import Prior
 
-__all__ = [
-    "Failure",
-    "Failures",
-    "FinishedRun",
-    "Moments",
-    "ParameterRow",
-    "failures",
-    "moments",
-    "moments_of",
-    "read_run",
-    "rows_of",
-]
+__all__ = ["Failure", "Failures", "FinishedRun", "ParameterRow", "failures", "moments_of", "read_run", "rows_of"]
 
 LONGEST_AUTOCORRELATION = 50.0  # iterations per autocorrelation time that emcee recommends
 
@@ -45,15 +34,14 @@ class FinishedRun(NamedTuple):
     prior: Prior | None
     parameters: tuple[Parameter, ...]
     samples: np.ndarray  # (n, ndim) of the posterior [unit of the parameter]
-    log_prob: np.ndarray  # (n,)
     mean_error: np.ndarray  # (ndim,) Monte Carlo standard error of the mean; NaN where it is not known
     sd_error: np.ndarray  # (ndim,) the same of the standard deviation
     effective_sample_size: float  # independent samples with the same error of the mean, the smallest
+    autocorrelation_time: float  # the largest, of emcee's own sampler [iterations]; else NaN
     truth: np.ndarray  # (ndim,), NaN where none is known
     discard: int  # iterations left out at the beginning of the chain
     tempered: bool
     verdict: Verdict | None
-    autocorrelation_time: float  # the largest, of emcee's own sampler [iterations]; else NaN
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -75,13 +63,9 @@ class FinishedRun(NamedTuple):
     @property
     def centre(self) -> np.ndarray:
         """The point that stands for the posterior (ndim,): its mean, or the best sample of several modes."""
-        best = self.samples[int(np.argmax(self.log_prob))]
-        return best if self.n_modes > 1 else self.samples.mean(axis=0)
-
-    @property
-    def centre_name(self) -> str:
-        """What `centre` is, in words."""
-        return "sample of highest posterior density" if self.n_modes > 1 else "posterior mean"
+        if self.n_modes == 1:
+            return self.samples.mean(axis=0)
+        return self.samples[int(np.argmax(self.sampler.get_log_prob(flat=True, discard=self.discard)))]
 
 
 def read_run(
@@ -112,80 +96,63 @@ def read_run(
     described = getattr(posterior, "parameters", None) if names is None else None
     known = names or getattr(posterior, "parameter_names", None) or [f"x{i}" for i in range(samples.shape[1])]
     parameters = tuple(Parameter(str(name)) for name in known) if described is None else tuple(described)
+    labels = [each.name for each in parameters]
     if len(parameters) != samples.shape[1]:
         raise ValueError(
             f"the chain has {samples.shape[1]} parameters, but the posterior or names= has {len(parameters)} "
-            f"({', '.join(each.name for each in parameters)}): give the posterior that was sampled"
+            f"({', '.join(labels)}): give the posterior that was sampled"
         )
+    true = truth if isinstance(truth, Mapping) else {} if truth is None else dict(zip(labels, truth, strict=False))
+    if set(true) - set(labels) or not (isinstance(truth, Mapping | None) or np.shape(truth) == (len(labels),)):
+        raise ValueError(f"truth must have values of parameters ({', '.join(labels)}), or one for each; got {truth!r}")
     tempered, verdict = hasattr(sampler, "ladder") and bool(sampler.ladder), None
     with suppress(ValueError):  # a file may hold no verdict
         verdict = sampler.verdict if tempered else None
     likelihood, prior = getattr(posterior, "likelihood", None), getattr(posterior, "prior", None)
-    errors = _errors(sampler, samples, tempered, discard)
     return FinishedRun(
-        sampler=sampler,
-        posterior=posterior,
-        likelihood=likelihood if isinstance(likelihood, FELikelihood | JointLikelihood) else None,
-        prior=prior if isinstance(prior, Prior) else None,
-        parameters=parameters,
-        samples=samples,
-        log_prob=sampler.get_log_prob(flat=True, discard=discard),
-        **errors,
-        truth=_truth(truth, [each.name for each in parameters]),
-        discard=discard,
-        tempered=tempered,
-        verdict=verdict,
+        sampler,
+        posterior,
+        likelihood if isinstance(likelihood, FELikelihood | JointLikelihood) else None,
+        prior if isinstance(prior, Prior) else None,
+        parameters,
+        samples,
+        *_errors(sampler, samples, tempered, discard),
+        np.array([float(true.get(name, np.nan)) for name in labels]),
+        discard,
+        tempered,
+        verdict,
     )
 
 
-def _truth(truth: Mapping[str, float] | Sequence[float] | None, names: Sequence[str]) -> np.ndarray:
-    known = truth if isinstance(truth, Mapping) else {} if truth is None else dict(zip(names, truth, strict=False))
-    if set(known) - set(names) or (not isinstance(truth, Mapping | None) and np.shape(truth) != (len(names),)):
-        raise ValueError(f"truth must have values of parameters ({', '.join(names)}), or one for each; got {truth!r}")
-    return np.array([float(known.get(name, np.nan)) for name in names])
-
-
-def _errors(sampler: EnsembleSampler, samples: np.ndarray, tempered: bool, discard: int) -> dict[str, Any]:
+def _errors(
+    sampler: EnsembleSampler, samples: np.ndarray, tempered: bool, discard: int
+) -> tuple[np.ndarray, np.ndarray, float, float]:
     """Errors of means and deviations, effective sample size, and autocorrelation time, NaN for a chain too short."""
-    spread, names = samples.std(axis=0), ("mean_error", "sd_error", "effective_sample_size", "autocorrelation_time")
+    spread = samples.std(axis=0)
     if tempered:
         error = sampler.mean_error(discard=discard)
         size = float(np.min((spread[error > 0.0] / error[error > 0.0]) ** 2, initial=len(samples)))
-        return dict(zip(names, (error, sampler.sd_error(discard=discard), size, np.nan), strict=True))
+        return error, sampler.sd_error(discard=discard), size, np.nan
     with np.errstate(all="ignore"):
         time = float(np.max(sampler.get_autocorr_time(discard=discard, tol=0)))  # NaN if one is
     size = min((sampler.iteration - discard) * sampler.nwalkers / time, float(len(samples)))  # min keeps a first NaN
     of_variance = np.square(samples - samples.mean(axis=0)).std(axis=0)
     sd_error = 0.5 * of_variance / np.where(spread > 0.0, spread, 1.0) / np.sqrt(size)
-    time = time if np.isfinite(time) else np.nan
-    return dict(zip(names, (spread / np.sqrt(size), sd_error, float(size), time), strict=True))
+    return spread / np.sqrt(size), sd_error, float(size), time if np.isfinite(time) else np.nan
 
 
-class Moments(NamedTuple):
-    """Means and standard deviations, their Monte Carlo errors, 5 %, 50 % and 95 % quantiles (ndim,)."""
+def moments_of(run: FinishedRun) -> np.ndarray:
+    """Mean, its error, standard deviation, its error, and 5 %, 50 % and 95 % quantiles (7, ndim).
 
-    mean: np.ndarray
-    mean_error: np.ndarray
-    sd: np.ndarray
-    sd_error: np.ndarray
-    low: np.ndarray
-    median: np.ndarray
-    high: np.ndarray
-
-
-def moments(samples: np.ndarray, mean_error: Any = np.nan, sd_error: Any = np.nan) -> Moments:
-    """Moments of samples (n, ndim), and their errors (ndim,) if they are known."""
-    quantiles, none = np.quantile(samples, [0.05, 0.5, 0.95], axis=0), np.zeros(samples.shape[1])
-    return Moments(samples.mean(axis=0), none + mean_error, samples.std(axis=0), none + sd_error, *quantiles)
-
-
-def moments_of(run: FinishedRun) -> Moments:
-    """Moments of the chain, or of the signed sample if that has smaller errors and determines all deviations."""
+    They are those of the chain, or of the signed sample if that has smaller errors and determines all deviations.
+    """
+    probabilities = (0.05, 0.5, 0.95)
     if (signed := getattr(run.sampler, "signed_sample", None)) is not None:
         mean, sd = signed.expectation(), signed.standard_deviation()
         if np.all(mean.error < run.mean_error) and np.all(sd.value > 0.0):
-            return Moments(*mean, *sd, *(signed.quantile(probability).value for probability in (0.05, 0.5, 0.95)))
-    return moments(run.samples, run.mean_error, run.sd_error)
+            return np.stack([*mean, *sd, *(signed.quantile(probability).value for probability in probabilities)])
+    quantiles = np.quantile(run.samples, probabilities, axis=0)
+    return np.stack([run.samples.mean(axis=0), run.mean_error, run.samples.std(axis=0), run.sd_error, *quantiles])
 
 
 class ParameterRow(NamedTuple):
@@ -200,22 +167,24 @@ class ParameterRow(NamedTuple):
     mean_error: float  # Monte Carlo standard error
     sd: float
     sd_error: float
-    cv: float  # coefficient of variation [-]; NaN for a mean of zero
     low: float  # 5 % quantile
     median: float
     high: float  # 95 % quantile
     nominal: float
     truth: float
 
+    @property
+    def cv(self) -> float:
+        """Coefficient of variation [-]; NaN for a mean of zero."""
+        return self.sd / abs(self.mean) if self.mean else np.nan
 
-def rows_of(
-    parameters: Sequence[Parameter], prior: Prior | None, moments: Moments, truth: np.ndarray | None = None
-) -> list[ParameterRow]:
-    """One row for each parameter; errors of the means and true values (ndim,) may be NaN."""
-    rows, known = [], [] if prior is None else prior.table()[1]
-    for i, parameter in enumerate(parameters):
-        family, *of_prior = ("", np.nan, np.nan, -np.inf, np.inf) if prior is None else known[i][1:]
-        true = np.nan if truth is None else truth[i]
+
+def rows_of(run: FinishedRun) -> list[ParameterRow]:
+    """One row for each parameter."""
+    rows, moments = [], moments_of(run).T
+    priors = [("", np.nan, np.nan, -np.inf, np.inf)] * len(moments)
+    priors = priors if run.prior is None else [each[1:] for each in run.prior.table()[1]]
+    for parameter, (family, *of_prior), numbers, truth in zip(run.parameters, priors, moments, run.truth, strict=True):
         mean, prior_sd, lower, upper = (float(each) for each in parameter.shown(of_prior))
         family = family.split("(")[0]
         text = f"{family}, mean {mean:.4g}, sd {prior_sd:.3g}" if family else ""
@@ -224,11 +193,9 @@ def rows_of(
         elif family:
             bounds = (("above", lower), ("below", upper))
             text += "".join(f", {side} {bound:.4g}" for side, bound in bounds if np.isfinite(bound))
-        numbers = parameter.shown([*(each[i] for each in moments), parameter.nominal, true])
-        mean, mean_error, sd, sd_error, *others = (float(each) for each in numbers)
-        unit, cv = parameter.label.removeprefix(parameter.name).strip(), sd / abs(mean) if mean else np.nan
-        shown = text, prior_sd, mean, mean_error, sd, sd_error, cv, *others
-        rows.append(ParameterRow(parameter.name, parameter.label, unit, *shown))
+        shown = (float(each) for each in parameter.shown([*numbers, parameter.nominal, truth]))
+        unit = parameter.label.removeprefix(parameter.name).strip()
+        rows.append(ParameterRow(parameter.name, parameter.label, unit, text, prior_sd, *shown))
     return rows
 
 
@@ -251,30 +218,27 @@ class Failures(NamedTuple):
 
 def failures(run: FinishedRun) -> Failures:
     """Failed simulations by reason, counted in likelihoods, also of first parts of the record, or in the sampler."""
-    reasons, known, attempts, unknown = Counter(), list[tuple[str, dict]](), 0, ""
+    known, count, attempts, unknown = list[tuple[str, dict]](), 0, 0, ""
     for likelihood, columns in [] if run.likelihood is None else run.likelihood.parts():
         logs = [each.simulator.failures for each in (likelihood, *likelihood.shortened)]
         known += [(each["reason"], each["parameters"]) for log in logs for each in log.records]
-        reasons = sum((each.reasons for each in logs), reasons)
-        attempts += sum(each.outcomes for each in logs)
-        samples = run.samples[:, columns[: len(likelihood.model.parameter_names)]]
-        if logs[0].outcomes < len(np.unique(samples, axis=0)):
+        count, attempts = count + sum(each.count for each in logs), attempts + sum(each.outcomes for each in logs)
+        if logs[0].outcomes < len(np.unique(run.samples[:, columns[: len(likelihood.model.parameter_names)]], axis=0)):
             unknown = "Not known: simulations of this run were made in another process, or are no longer in memory."
-    count = reasons.total()
-    if run.likelihood is None and not run.tempered:
+    if run.likelihood is None:
         unknown = "Not known: neither the sampler nor the log-density counts failures."
-    elif run.likelihood is None:
-        known = [
-            (each["reason"], dict(zip(run.names, each["parameters"], strict=True))) for each in run.sampler.failures
-        ]
-        reasons, count = Counter(reason for reason, _ in known), run.sampler.failure_count
-        attempts, unknown = run.sampler.evaluations, "Not known: whether a log-density of -inf is a failed simulation."
-    rows, examples = Counter(), dict[str, str]()  # reasons that differ in their numbers only are one
+    if run.likelihood is None and run.tempered:
+        unknown = "Not known: whether a log-density of -inf is a failed simulation."
+        count, attempts, failed = run.sampler.failure_count, run.sampler.evaluations, run.sampler.failures
+        known = [(each["reason"], dict(zip(run.names, each["parameters"], strict=True))) for each in failed]
+    rows, examples = Counter[str](), dict[str, str]()  # reasons that differ in their numbers only are one
     for text, point in known:
-        shown = ", ".join(f"{name} = {value:.4g}" for name, value in point.items())
-        reason = reason_without_numbers(text)
+        reason, shown = (
+            reason_without_numbers(text),
+            ", ".join(f"{name} = {value:.4g}" for name, value in point.items()),
+        )
         examples.setdefault(reason, shown if text == reason else f"{text}: {shown}")
-    for text, each in reasons.items():
-        rows[reason_without_numbers(text)] += each
+        rows[reason] += 1
+    rows += Counter({"later ones, whose reasons are not kept": count - len(known)})  # if there are any
     table = tuple(Failure(reason, each, examples.get(reason, "")) for reason, each in rows.most_common())
     return Failures(table, count, max(attempts, count), unknown)

@@ -1,4 +1,4 @@
-"""Faults that the samples of one sensor show by themselves: clipped, stuck, spikes, offset, drift, noise.
+"""Faults that the samples of one sensor show by themselves: clipped, stuck, spikes, gaps, offset, drift, noise.
 
 All sizes are relative to the channel: its peak, its usual step from sample to sample, its neighbouring samples. So
 units, sampling rates and kinds of structures do not matter. The limits were set on the channels of five structures,
@@ -11,9 +11,9 @@ import numpy as np
 
 from .finding import HALF
 
-__all__ = ["SensorFault", "find_sensor_faults", "runs_of", "straight_parts"]
+__all__ = ["SensorFault", "find_sensor_faults", "runs_of"]
 
-FEWEST = 50  # samples that are judged
+FEWEST = 50  # samples that are judged, and for each spike
 MATTERS = 0.25  # of the peak, or of the standard deviation: smaller parts hardly change a sum of squares
 DIGITS = 3.0  # the steps beside, in smallest steps; without it, 10 of 181 right channels are named for 4
 STILL = 3  # equal samples at an extremum, half of those elsewhere; right channels: 2, or between small steps
@@ -23,13 +23,13 @@ LEVEL = 0.02  # smallest mean of a tenth of a channel, or change of such means, 
 SMOOTH = 0.9  # share of the variance of these means in a polynomial; right channels: 0.8
 WHITE = 0.25  # largest autocorrelation at lags of one to six samples; right channels: 0.37; noise is 3/4 of the power
 STRAIGHT = 15  # equal steps of a motion in a row; right motions: 11; found in 99 % of 2355 gaps of 0.2 to 1 s
-WIDEST, AROUND, MOST_SPIKES = 3, 10, 200  # samples of a spike, samples around it that are looked at, and their number
+WIDEST, AROUND = 3, 10  # samples of a spike, and samples around it that are looked at
 
 
 class SensorFault(NamedTuple):
     """A fault of one channel."""
 
-    kind: str  # "clipped", "stuck", "spikes", "offset", "drift" or "noise"; of a motion also "straight"
+    kind: str  # "clipped", "stuck", "spikes", "straight", "offset", "drift" or "noise"
     spans: tuple[tuple[int, int], ...]  # first and last samples, both included
     size: float  # of the peak, as the kind needs it [-]
     level: tuple[float, ...] = ()  # offset, or drift at evenly spaced samples, the first and the last included
@@ -38,10 +38,13 @@ class SensorFault(NamedTuple):
 def find_sensor_faults(values: np.ndarray, dimension: str = "") -> tuple[SensorFault, ...]:
     """Faults of the samples (n,) of a channel, NaN where missing; each without the samples of faults found before it.
 
-    An acceleration returns to zero; forces and strains of dead loads, and displacements after yielding, do not.
+    An acceleration returns to zero and is never straight; forces and strains of dead loads, and displacements after
+    yielding, do not return to zero.
     """
     x, found = np.array(values, dtype=float), list[SensorFault]()
-    for kind, look in (("spikes", _spikes), ("clipped", _clipped), ("stuck", _stuck), ("", None)):
+    looks = {"spikes": _spikes, "clipped": _clipped, "stuck": _stuck}
+    looks |= {"straight": _straight} if dimension == "acceleration" else {}
+    for kind, look in (*looks.items(), ("", None)):
         # enough neighbouring samples, and not all equal
         if np.isfinite(np.diff(x)).sum() < FEWEST or not np.nanmax(x) > np.nanmin(x):
             return tuple(found)
@@ -111,8 +114,8 @@ def _stuck(x: np.ndarray) -> tuple[tuple[int, int], ...]:
     return tuple((first, stop - 1) for first, stop in runs_of(still) if first > 0 or stop == len(x))
 
 
-def straight_parts(x: np.ndarray) -> tuple[tuple[int, int], ...]:
-    """First and last samples of straight lines in a motion (n,) that moves before and after, as readers fill gaps."""
+def _straight(x: np.ndarray) -> tuple[tuple[int, int], ...]:
+    """Straight lines between parts that move, as readers and loggers fill gaps."""
     steps, still, found = np.diff(x), 4.0 * _round_off(x), []
     moves = np.abs(steps) > still
     equal = (np.abs(np.diff(steps)) <= still) & moves[1:]
@@ -122,8 +125,8 @@ def straight_parts(x: np.ndarray) -> tuple[tuple[int, int], ...]:
     for first, last in runs_of(equal):
         sides = x[max(first + first - last, 0) : first], x[last + 2 : last + last + 2 - first]
         rounded = abs(steps[last] / digit - round(steps[last] / digit)) < 1e-3
-        beside = min(side.std() if len(side) else 0.0 for side in sides)
-        if last - first >= STRAIGHT and not rounded and beside >= MATTERS * x.std():
+        beside = min(np.nanstd(side) if np.isfinite(side).any() else 0.0 for side in sides)
+        if last - first >= STRAIGHT and not rounded and beside >= MATTERS * np.nanstd(x):
             found.append((first, last + 1))
     # a motion with a larger step that was interpolated is straight wherever it moves
     return tuple(found) if sum(last - first for first, last in found) < HALF * np.count_nonzero(moves) else ()
@@ -143,7 +146,7 @@ def _spikes(x: np.ndarray) -> tuple[tuple[int, int], ...]:
     """
     cubic = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0  # a sample less the cubic through its four neighbours
     x, found = x.copy(), list[tuple[int, int]]()
-    for _ in range(MOST_SPIKES):
+    for _ in range(len(x) // FEWEST):
         peak, best = _peak(x), (SPIKE, 0, 0)
         errors = np.convolve(x, cubic, "same")
         errors[:2] = errors[-2:] = np.nan

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from ..checks.compared import data_sets_of, draws_to_compare
 from ..checks.finding import labelled
-from ..checks.rehearsal import ModelCheck, check_model
+from ..checks.result import ModelCheck, check_model
 from ..signals.error_measures import rrmse
 from ..text_tables import text_table
 from .job import read_job
@@ -72,7 +72,8 @@ def _draw(problem: Problem, checked: ModelCheck, picture: Path) -> list[Path]:
     from ..reporting.pictures import save_picture
 
     posterior, files = problem.posterior, []
-    points, modes = draws_to_compare(posterior, checked.seconds), {fit.title: fit.modal for fit in checked.fits}
+    most, modes = max(len(fit.draws) for fit in checked.fits), {fit.title: fit.modal for fit in checked.fits}
+    points = draws_to_compare(posterior)[:most]  # as many as were simulated
     for key, part, columns in data_sets_of(posterior):
         measured = part.measurements
         if part.is_modal:

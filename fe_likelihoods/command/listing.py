@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ..checks.finding import labelled
 from ..checks.screening import check_sensors, repair_lines, screen
 from ..modal.modal_readers import read_matlab, read_modal_data
 from ..signals.channels import Channel, Measurements
@@ -115,7 +116,7 @@ def _screened(measured: Measurements | None, marks: Sequence[Any] = (), unstated
     if measured is None:
         return [], []
     faults = [each._replace(unit="") if each.name in unstated else each for each in screen(measured)]
-    cautions = [f"CAUTION: {each.kind}: {each.text}" for each in check_sensors(faults)]
+    cautions = labelled(each._replace(action="") for each in check_sensors(faults))
     return [*describe(measured, unstated), *cautions], repair_lines(faults, marks)
 
 

@@ -24,7 +24,7 @@ def write_summary(folder: Path, run: FinishedRun, judged: JudgedRun, said: Seque
     moments = Summary(*(rows["parameter" if name == "names" else name] for name in Summary._fields))
     evidence = f"log-evidence {run.sampler.log_evidence:.2f} +- {run.sampler.log_evidence_error:.2g}"
     lines = [str(judged.judgement), "", str(moments), "", evidence, str(run.verdict), ""]
-    for fit in judged.fits.fits:
+    for fit in judged.fits:
         title = f" ({fit.title})" if fit.title else ""
         errors = [f"  {each.channel.name}: {100 * each.after:.1f} %" for each in fit.channels]
         lines += [f"Relative RMS error of the response (RRMSE){title}:", *errors] if errors else []

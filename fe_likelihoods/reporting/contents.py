@@ -1,12 +1,13 @@
 """The contents of a report in words and numbers, section by section, before they are put on a page."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..checks.compared import Fit, Fits
+from ..checks.compared import Fit
 from ..checks.finding import Judgement
-from ..checks.fit import SAME_AS_PRIOR, describe_residuals
+from ..checks.fit import describe_residuals
 from ..checks.run import FinishedRun, ParameterRow
 from ..likelihood.likelihood import FELikelihood
 from ..noise.protocol import noise_title
@@ -66,7 +67,7 @@ def _named(excitation: Any) -> str:
 
 
 def summary_sentences(
-    run: FinishedRun, rows: list[ParameterRow], fits: Fits, judgement: Judgement | None = None
+    run: FinishedRun, rows: list[ParameterRow], fits: Sequence[Fit], judgement: Judgement | None = None
 ) -> list[str]:
     """Whether to use the result, what was updated with which data, what was found, and from how many samples."""
     sets = data_sets(run)
@@ -89,18 +90,14 @@ def summary_sentences(
     return [*first, what, _finding([row for i, row in enumerate(rows) if i not in fast], fits), _worth(run)]
 
 
-def _finding(rows: list[ParameterRow], fits: Fits) -> str:
+def _finding(rows: list[ParameterRow], fits: Sequence[Fit]) -> str:
     known = [(row.sd / row.prior_sd, row.name) for row in rows if row.prior_sd > 0.0]
     found = ""
     if known:
         ratio, best = min(known)
-        found = (
-            f"The data inform {best} most: its standard deviation shrank to {100.0 * ratio:.2g} % of its prior value"
-            if ratio < SAME_AS_PRIOR
-            else "No parameter has a standard deviation clearly smaller than in its prior"
-        )
-    errors = [(each.before, each.after) for fit in fits.fits for each in fit.channels]
-    assured = [f"{low:.3f} to {high:.3f}" for low, high in map(_assurance, fits.fits) if np.isfinite(low)]
+        found = f"The data inform {best} most: its standard deviation is {100.0 * ratio:.2g} % of its prior value"
+    errors = [(each.before, each.after) for fit in fits for each in fit.channels]
+    assured = [f"{low:.3f} to {high:.3f}" for low, high in map(_assurance, fits) if np.isfinite(low)]
     if assured:
         fit = f"the MAC of the measured modes is {' and '.join(assured)}"
         found = f"{found}; {fit}" if found else f"T{fit[1:]}"
@@ -168,9 +165,9 @@ def evidence(run: FinishedRun) -> list[str]:
     return [*lines, f"It was not checked by independent draws{why}."]
 
 
-def residual_sentences(fits: Fits) -> list[str]:
+def residual_sentences(fits: Sequence[Fit]) -> list[str]:
     """The checks of the residuals, one sentence per channel and event; values without an order in time have none."""
-    histories = [fit for fit in fits.fits if fit.residuals is not None and fit.measurements.is_history]
+    histories = [fit for fit in fits if fit.residuals is not None and fit.measurements.is_history]
     channels = [(fit, each) for fit in histories for each in fit.channels]
     return [f"{fit.where(each.channel.name)}: {describe_residuals(each.checks)[0]}" for fit, each in channels]
 

@@ -147,7 +147,8 @@ def gather(
 ) -> dict[str, Any]:
     """What the template shows, by name; a run that was not judged is judged, which may simulate."""
     rows, fits, failed, judgement = judge_run(run) if judged is None else judged
-    sets = data_sets(run)
+    sets, after = data_sets(run), "posterior mean" if run.n_modes == 1 else "sample of highest posterior density"
+    before, after = "before: mean of the prior", f"after: {after}"
     models = " and ".join(dict.fromkeys(each.model for each in sets)) or "a log-density"
     return {
         "title": title or f"Bayesian updating of {models}",
@@ -162,11 +163,11 @@ def gather(
         "has_nominal": any(np.isfinite(row.nominal) for row in rows),
         "evidence": evidence(run),
         "fits": fits,
+        "before": before,
+        "after": after,
         "told": _told(run),
         "posterior_pictures": draw_posterior(run),
-        "fit_pictures": [
-            (fit.title, [*draw_fit(fit, fits.before, fits.after), *draw_residuals(fit)]) for fit in fits.fits
-        ],
+        "fit_pictures": [(fit.title, [*draw_fit(fit, before, after), *draw_residuals(fit)]) for fit in fits],
         "run_pictures": draw_run(run),
         "events": list(events),
         "event_pictures": [draw_event(each) for each in events],

@@ -12,7 +12,6 @@ from fe_likelihoods import (
     LinearOscillator,
     Measurements,
     Posterior,
-    SimulationFailed,
     TruncatedNormal,
     check_model,
     check_result,
@@ -20,7 +19,6 @@ from fe_likelihoods import (
 from fe_likelihoods.checks.model import halve_steps, refuse_chance
 from fe_likelihoods.emulation.modes import find_modes
 from fe_likelihoods.problems import table_motion
-from fe_likelihoods.simulation.model import simulate_batch
 from tests.emulation.problems import guided
 
 MOTION = table_motion().trim(0.0, 4.0).resample(0.01)
@@ -72,7 +70,7 @@ def test_a_coarse_step_is_compared_with_the_width_that_the_data_give(noise, weig
     mode = find_modes(posterior, starts=1).modes[0]
     coords = np.random.default_rng(1).multivariate_normal(mode.coords, mode.covariance, 400)
     sd = posterior.prior.from_normal(coords).std(axis=0)
-    found = halve_steps(posterior, mode.parameters, sd, simulate_batch)[0]
+    found = halve_steps(posterior, mode.parameters, sd)[0]
     assert [each.severity for each in found] == weight
     assert all("stiffness by" in each.text and "the time step" in each.text for each in found)
 
@@ -116,12 +114,6 @@ def test_a_motion_that_is_not_read_is_named():
 
 
 def test_failures_and_sizes_are_named():
-    def weak(theta, record):
-        if np.abs(record.acceleration).max() > 10.0:
-            raise SimulationFailed("no convergence")
-        return central_differences(theta, record, 4)
-
-    assert "A stronger motion fails" in names(check_model(posterior_of(weak)))
     model = LinearOscillator(MOTION.scale(9.80665), 0.4)  # a motion in g, taken for m/s², and then for g again
     values = LinearOscillator(MOTION, 0.4).simulate(TRUE)
     prior = {"stiffness": TruncatedNormal(1.0, 0.3), "damping": TruncatedNormal(1.0, 0.3)}
@@ -149,7 +141,7 @@ def test_a_model_that_keeps_its_own_step_is_not_tested():
     for function in (own_samples, own_steps):
         posterior = posterior_of(function)
         point, sd = np.array([1.1, 0.9, 0.001]), np.array([0.01, 0.01, 1e-4])
-        found, tests = halve_steps(posterior, point, sd, simulate_batch)
+        found, tests = halve_steps(posterior, point, sd)
         assert not found and tests["Time step"].startswith("not tested: ")
-    tests = halve_steps(posterior_of(central_differences), point, sd, simulate_batch)[1]
+    tests = halve_steps(posterior_of(central_differences), point, sd)[1]
     assert tests == {"Time step": "the time step was halved at the fit"}

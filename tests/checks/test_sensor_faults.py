@@ -5,7 +5,7 @@ import pytest
 
 from fe_likelihoods import Channel, Measurements, Record, check_data
 from fe_likelihoods.checks.screening import repair_lines, screen
-from fe_likelihoods.checks.sensor_faults import find_sensor_faults, straight_parts
+from fe_likelihoods.checks.sensor_faults import find_sensor_faults
 from tests.checks.real_channels import real_channels
 
 STEP, N = 0.01, 3000
@@ -133,12 +133,11 @@ def test_a_finding_says_when_and_has_a_line():
     rounded = np.round(np.sin(np.pi * k / 4000) * np.sin(np.pi * k / 100), 2)  # straight parts, all at two digits
     for x, gap in ((line, True), (coarse, False), (padded, False), (rounded, False)):
         found = check_data(Measurements([top], STEP, [response(2)]), Record("EQ", STEP, x))
-        assert ("A motion has a gap" in {each.kind for each in found}) == gap
+        assert ("A channel has gaps" in {each.kind for each in found}) == gap
 
 
 @pytest.mark.slow
 def test_real_records_and_measurements_are_left_alone(shared):
     named = {each.name for each in real_channels(shared) if find_sensor_faults(each.values, each.dimension)}
-    assert not [each.name for each in real_channels(shared) if straight_parts(each.values) and "acc" in each.dimension]
     # an accelerometer that is not level, and gravity
     assert all(name.startswith("Flexible_3_story") and name.endswith(("_y", "_z")) for name in named)

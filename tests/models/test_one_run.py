@@ -16,7 +16,7 @@ from fe_likelihoods import (
     SimulationCache,
     check_result,
 )
-from fe_likelihoods.checks.rehearsal import check_model
+from fe_likelihoods.checks.result import check_model
 from fe_likelihoods.modal.load_cases import LoadTest
 from fe_likelihoods.modal.mode_models import modal_channels, modal_response
 from fe_likelihoods.models import one_run as module
