@@ -114,7 +114,7 @@ class GuideTick(NamedTuple):
     phase: str  # "search", "round 3", or "after round 3" while the guide learns
     simulations: float  # so far
     target: int  # wanted effective sample size of all rounds; the population has the present one
-    finished: bool  # whether a batch is finished; False when a phase begins
+    expected: float  # simulations of the search, about; 0 where the guide does not know
 
 
 class GuidedRound(NamedTuple):

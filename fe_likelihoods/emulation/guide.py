@@ -36,7 +36,7 @@ from samplers.tempering.guide import Guide
 
 from .density import EmulatedPosterior, Region, student_mixture, tempered
 from .emulator import ResponseEmulator
-from .modes import ModeSearch, Search, check_starts, draw_starts
+from .modes import EXPECTED, ModeSearch, Search, check_starts, draw_starts
 from .target import SCALES, ResponseTarget, Steps, at_once
 
 __all__ = ["ResponseGuide"]
@@ -104,6 +104,12 @@ class ResponseGuide(Guide):
     def simulations(self) -> float:
         """Simulations run by the guide: parts of a record are fractions, a call of a ``jacobian`` counts as one."""
         return 0.0 if self._searching is None else self._searching.spent
+
+    @property
+    def expected_simulations(self) -> float:
+        """Simulations that the search takes, about: more if further starts begin."""
+        begun = 0 if self._searching is None else self._searching.begun
+        return max(self._starts, begun) * (EXPECTED[0] + EXPECTED[1] * self._target.n_structural)
 
     def check(self, log_prob_fn: Callable) -> None:
         """Raise ValueError if a sampler evaluates another object: every draw would be simulated twice."""

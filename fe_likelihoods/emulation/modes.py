@@ -27,6 +27,8 @@ _APART = 0.25  # prior standard deviations in one coordinate that part ends on a
 _FEW = 6  # parameters whose differences cost about as much as two steps
 _MOST_STARTS, _DRAWN = 2, 4  # times the number asked for: that begin, and of which the highest begin
 _STEP = 1e-4  # of the derivatives of parameters by coordinates
+# Simulations per start, constant and per parameter, for progress bars: 12 starts take XXX
+EXPECTED = 3.0, 1.5
 _SHARES = 0.03, 0.1, 0.3, 0.6  # of the Arias intensity, at which the parts of the record end
 
 
@@ -179,6 +181,11 @@ class Search:
         parts = [*target.shortened(_SHARES), target]
         self._parts = [_Part(part, part.n_steps / target.n_steps, {}, Jacobians()) for part in parts]
         self._standing_for: list[int] = []  # start that has taken the place of each; -1 for none
+
+    @property
+    def begun(self) -> int:
+        """Number of starts that have begun."""
+        return len(self._standing_for)
 
     def run(self, starts: int) -> Steps:
         """Returns a `ModeSearch`; yields functions that simulate, and is sent their results, and None after each batch.

@@ -8,6 +8,7 @@ density is zero.
 
 import hashlib
 import json
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from numbers import Real
 from typing import TYPE_CHECKING, Any
@@ -32,6 +33,18 @@ if TYPE_CHECKING:
 __all__ = ["Posterior"]
 
 _TOP = 1e-3  # log-density below the top of a mode: .04 standard deviations
+
+
+class _Compiling(logging.Handler):
+    """Passes the announcement that kernels are compiled to a function, instead of to the terminal."""
+
+    def __init__(self, callback: Callable[..., None]) -> None:
+        super().__init__(logging.WARNING)
+        self._callback = callback
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Announce it."""
+        self._callback(0.0, "compiling (once)")
 
 
 class Posterior:
@@ -402,12 +415,17 @@ class Posterior:
         self._check_models("asynchronous work")
         return InThreads(self)
 
-    def when_simulated(self, callback: Callable[[float], None] | None) -> None:
+    def when_simulated(self, callback: Callable[..., None] | None) -> None:
         """Call a function with the number of points whose simulations have ended, for the progress of samplers.
 
         The number is divided by that of the data sets; the function must not raise, and None ends the announcements. A
-        batch without a pool and without a cache on disk is then run in parts of about 5 s.
+        batch without a pool and without a cache on disk is then run in parts of about 5 s. A compilation of kernels is
+        announced as ``callback(0.0, "compiling (once)")``.
         """
+        announces = logging.getLogger("fe_likelihoods.kernels.jit")  # of its first compilation
+        announces.handlers = [each for each in announces.handlers if not isinstance(each, _Compiling)]
+        if callback is not None:
+            announces.addHandler(_Compiling(callback))
         parts = self.likelihood.parts()
         share = 1.0 / max(len(parts), 1)
         for likelihood, _ in parts:

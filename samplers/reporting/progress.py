@@ -1,7 +1,8 @@
 """Progress of a run: a bar of tqdm in a terminal or a notebook, and one line per minute elsewhere.
 
-The bar of the annealing counts evaluated points and names the latest stage. The most important figures come first,
-because a narrow terminal cuts off the rest.
+The bar of the annealing counts evaluated points and names the latest stage; the bar of a guide counts simulations of
+its search, then the effective size of its draws. The most important figures come first, because a narrow terminal cuts
+off the rest.
 """
 
 import sys
@@ -18,6 +19,7 @@ __all__ = ["Progress"]
 
 SECONDS_BETWEEN_LINES = 60.0
 SECONDS_BETWEEN_FIGURES = 0.1
+OF_GUIDES = "{desc} [{elapsed}{postfix}]"
 ORDER = ("beta", "log Z", "failures", "ESS", "acceptance", "simulations", "running")  # the most important figures first
 
 
@@ -62,12 +64,22 @@ def _open_bar(display: bool | str, total: int | None, **kwargs: Any) -> Any:
     return tqdm(total=total, **{"miniters": 0, "bar_format": counted} | kwargs)
 
 
+def _count(search: GuideTick) -> str:
+    """Which simulation of a search runs, of about how many, rounded to two digits."""
+    if not search.simulations + search.expected:
+        return search.phase
+    number, most = max(1, round(search.simulations)), float(f"{search.expected:.2g}")
+    about = f" of {'about' if number <= most else 'more than'} {most:.0f}" if most else ""
+    return f"{search.phase}: simulation {number}{about}"
+
+
 class Progress:
     """Shows a run in a bar: a context manager that observes an `Evaluator`.
 
     `bar` has the arguments ``progress`` and ``progress_kwargs`` of `emcee.EnsembleSampler.sample`. The posterior
-    `function` may have ``when_simulated(callback)``, which announces simulations as they end. The bar counts
-    "evaluations"; any other `unit` is counted by `step`, up to a `total`.
+    `function` may have ``when_simulated(callback)``, which announces simulations as they end by ``callback(number)``,
+    and what they wait for by ``callback(0, text)``. The bar counts "evaluations"; any other `unit` is counted by
+    `step`, up to a `total`.
     """
 
     def __init__(
@@ -83,6 +95,9 @@ class Progress:
         self._bar = _open_bar(bar["progress"] if total != 0 else False, total, **labels)
         self._evaluator, self._counts_points = evaluator, unit == "evaluations"
         self._own = "" if labels["desc"] == label else f"{labels['desc']}, "  # a label of the user is kept
+        self._text = ""  # what the run does at present; empty before it is known
+        self._search: GuideTick | None = None  # the latest one of the search of a guide
+        self._count_is_ours = bar["progress"] is True and "bar_format" not in labels
         self._announce: Callable = getattr(function, "when_simulated", lambda callback: None)
         self._silent = not hasattr(self._bar, "set_postfix")  # emcee's silent bar has only update
         self._figures: dict[str, Any] = {}
@@ -105,8 +120,13 @@ class Progress:
             self._draw()
         self._bar.__exit__(*error)
 
-    def _simulated(self, points: float) -> None:
-        """Simulations of points that are evaluated have ended."""
+    def _simulated(self, points: float, waits: str = "") -> None:
+        """Simulations of points that are evaluated, or of a search, have ended, or wait for something."""
+        if waits:
+            self._bar.set_description_str(f"{self._own}{waits}")
+            return
+        if self._search is not None:
+            self._search = self._search._replace(simulations=self._search.simulations + points)
         self._part += points if self._evaluator.running > 0 else 0.0
         whole = int(self._part + 1e-9)
         self._part -= whole
@@ -116,10 +136,13 @@ class Progress:
         """Show a report of the annealing."""
         if self._silent or not isinstance(report, Sweep | Stage | GuideTick | Restart):
             return
-        effective = f"{population.effective_sample_size:.0f}"
+        begins, effective = False, f"{population.effective_sample_size:.0f}"
         if isinstance(report, GuideTick):
-            self._bar.set_description_str(f"{self._own}{report.phase}", refresh=False)
-            self._figures = {"simulations": round(report.simulations), "ESS": f"{effective}/{report.target}"}
+            begins, self._search = not self._text, report if report.phase == "search" else None
+            self._text = f"draws: effective size {effective} of {report.target}"
+            self._figures = {} if self._search else {"simulations": round(report.simulations)}
+            if self._count_is_ours:
+                self._bar.bar_format = OF_GUIDES
             if result.rounds:
                 self._figures["log Z"] = f"{result.rounds[-1].log_evidence:.2f}"
         elif isinstance(report, Sweep) or not result.rounds:
@@ -127,8 +150,10 @@ class Progress:
             self._figures = {"beta": f"{population.beta:.3g}", "ESS": effective, "acceptance": acceptance}
             if result.ladder:
                 self._figures["log Z"] = f"{sum(stage.log_evidence_increment for stage in result.ladder):.2f}"
-                self._bar.set_description_str(f"{self._own}stage {len(result.ladder)}", refresh=False)
+                self._text = f"stage {len(result.ladder)}"
         self._draw()
+        if begins:  # the first simulation may take long
+            self._bar.refresh()
 
     def step(self, steps: int) -> None:
         """Advance a bar that does not count points."""
@@ -148,5 +173,7 @@ class Progress:
             steps, self._shown = evaluator.done - self._shown, evaluator.done
         counts = {"failures": len(evaluator.record.failed + evaluator.record.counted), "running": evaluator.running}
         figures = self._figures | {name: number for name, number in counts.items() if number}
+        if text := _count(self._search) if self._search else self._text:
+            self._bar.set_description_str(f"{self._own}{text}", refresh=False)
         self._bar.set_postfix({name: str(figures[name]) for name in ORDER if name in figures}, refresh=False)
         self._bar.update(steps)

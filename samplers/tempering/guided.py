@@ -138,20 +138,20 @@ def draw_rounds(
     rounds: list[Round] = []
     pooled = None
 
-    def tick(phase: str, finished: bool) -> tuple[Population, GuideTick]:
-        return population, GuideTick(phase, budget.simulations, size, finished)
+    def tick(phase: str) -> tuple[Population, GuideTick]:
+        return population, GuideTick(phase, budget.simulations, size, guide.expected_simulations)
 
     def asked(steps: Generator | None, phase: str) -> Generator[tuple[Population, Any], Any, None]:
         answer, steps = None, (iter(()) if steps is None else steps)
         with suppress(StopIteration):
             while True:
                 item = next(steps) if answer is None else steps.send(answer)
-                answer = yield (population, item) if callable(item) else tick(phase, True)
+                answer = yield (population, item) if callable(item) else tick(phase)
 
-    yield tick("search", False)
+    yield tick("search")
     yield from asked(guide.prepare(session), "search")
     while True:
-        yield tick(f"round {len(rounds) + 1}", False)
+        yield tick(f"round {len(rounds) + 1}")
         coords = checked_draws(guide, _next_size(rounds, size), random, population.coords.shape[1])
         latest, refused = _evaluated(coords, density, guide, session)
         outcome = None
@@ -160,7 +160,7 @@ def draw_rounds(
             pooled = pool_rounds(rounds)
             population = population._replace(effective_sample_size=pooled.effective_sample_size)
             yield population, _report(latest, pooled)
-            yield tick(f"round {len(rounds)}", True)
+            yield tick(f"round {len(rounds)}")
             outcome = _outcome(rounds, pooled, size)
         if refused or budget.refused:  # a search that was cut short goes on first, if the limit is raised
             return _stopped(rounds, pooled, guide)
