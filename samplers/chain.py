@@ -341,12 +341,12 @@ class Chain:
             self.provisional = False
             self.write(*state)
 
-    def store_provisional_step(self, state: State) -> None:
-        """Store the estimate of a run that the limit of simulations ended, as a step that is replaced later."""
+    def store_step(self, state: State, accepted: bool, provisional: bool = False) -> None:
+        """Store a step that no move has made; a `provisional` one, of a run that the limit ended, is replaced later."""
         self.trim()
         self._backend.grow(1, state.blobs)
-        self._backend.save_step(state, np.zeros(len(state.coords), dtype=bool))
-        self.provisional = True
+        self._backend.save_step(state, np.full(len(state.coords), accepted))
+        self.provisional = provisional
         self.write()
 
 

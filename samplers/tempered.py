@@ -77,8 +77,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
         blobs; the log-prior is added to its values. Its attributes are used like attributes of `log_prob_fn`.
     guide : Guide, optional
         An object that proposes draws near the posterior (`samplers.tempering.guide`). Its weighted draws replace the
-        annealing, and the sweeps at beta = 1 are proposals of the guide. If the draws cannot be trusted, the run is
-        "not usable", with a `SamplingWarning`.
+        annealing, the first stored step is walkers resampled from them, and later ones are proposals of the guide. If
+        the draws cannot be trusted, the run is "not usable", with a `SamplingWarning`.
     max_simulations : float, optional
         Largest number of simulations (`simulations`). When it is reached, the posterior is estimated from the known
         points, the final walkers are stored as one step if the chain is empty, and a `SamplingWarning` says so; see
@@ -145,6 +145,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         settings, moves = self._chosen(settings, moves, nwalkers)
         self.settings = given = Settings(**{"max_moves": most_moves(ndim)} | settings)
         self._given_guide, self._guide = guide, None
+        self._guided: np.ndarray | None = None  # the walkers (nwalkers, ndim) as the draws of the guide have left them
         if guide is not None:
             check_guide(guide, target.function, vectorize)
 
@@ -331,11 +332,20 @@ class TemperedSampler(RunResults, EnsembleSampler):
                 if store:
                     self._chain.trim()
                 ended, advanced, stored, new = self._must_repeat, None, State(state, copy=True), 0
+                # walkers resampled from a guide's draws are the first step: moves would replace them by as good ones
+                untouched = self._guided is not None and np.array_equal(state.coords, self._guided)
+                if untouched and store and iterations and not ended and self.backend.iteration == 0:
+                    stored.random_state = self.random_state
+                    with deferred_interrupts():
+                        self._chain.store_step(stored, True)
+                        self._chain.step_stored()
+                    arguments["iterations"], new = iterations - 1, 1
+                    yield State(stored, copy=True)
                 steps = (
                     () if ended else super().sample(state, skip_initial_state_check=skip, **arguments, progress=False)
                 )
                 per_step = 1 if thin else int(thin_by)
-                sweeps = None if iterations is None else iterations * per_step
+                sweeps = None if iterations is None else (iterations - new) * per_step
                 shown = Progress(bar, self._evaluator, self._target.function, "sweeps at beta = 1", "sweeps", sweeps)
                 try:
                     with shown:
@@ -391,7 +401,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
                 setattr(advanced, name, getattr(stored, name))
         self.random_state = stored.random_state
         if store and missing > 0 and self.backend.iteration == 0:
-            self._chain.store_provisional_step(stored)
+            self._chain.store_step(stored, False, provisional=True)
         text = describe_early_stop(self.verdict, self._record.limit, self._result, new, missing)
         # only steps at beta = 1 are missing in a converged run: nothing to be warned of
         logger.info(text) if self.verdict.status == CONVERGED else warn(text)
@@ -592,7 +602,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
             independent_points=independent_points(result, population.coords),
         )
         ended = bool(result.ended)
-        if weighted is not None and weighted.guided and not ended:
+        self._guided = population.coords.copy() if weighted is not None and weighted.guided and not ended else None
+        if self._guided is not None:
             moves = with_fast_sweeps([GuideMove(self._guide)], self._fast, self.ndim, self.settings.fast_sweeps)
             schedule = MoveSchedule(moves, np.ones(1))
             schedule.calibrate(population.coords, np.full(self.nwalkers, 1.0 / self.nwalkers))

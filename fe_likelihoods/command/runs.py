@@ -92,7 +92,8 @@ def _go_on(job: Job, folder: Path, file: Path, samples: bool, progress: bool) ->
     for k in range(job.sampler.chains):  # independent runs
         backend = emcee.backends.HDFBackend(str(folder / (f"run-{k + 1}.h5" if k else CHAIN)))
         sampler = make_sampler(job, problem, backend, k)
-        missing = max(job.sampler.steps - sampler.iteration, 0)
+        # the first step with a guide is its draws, and costs no simulation
+        missing = max((job.sampler.steps or (1 if job.sampler.guide else 4)) - sampler.iteration, 0)
         if not samples and not sampler.iteration:
             raise ValueError(f"the run in {folder} has no samples yet; continue it with: {again}")
         if samples or not missing:

@@ -143,7 +143,10 @@ class Sampler(Section):
 
     kind: Any = key("one of smc, tmcmc", "Sampler", "smc")
     walkers: Any = key("whole number >= 1", "Number of walkers", 500)
-    steps: Any = key("whole number >= 1", "Sweeps at beta = 1, each of which stores all walkers", 4)
+    steps: Any = key(
+        "whole number >= 1",
+        "Stored steps at beta = 1 of all walkers: 4, or 1 with a guide, whose draws are the first step",
+    )
     seed: Any = key("whole number >= 0", "Seed", 1)
     chains: Any = key("whole number >= 1", "Independent runs with successive seeds; the report is of the first", 1)
     guide: Any = key("yes or no", "Find the posterior from the responses, with hundreds of simulations", False)

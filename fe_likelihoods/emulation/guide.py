@@ -36,7 +36,7 @@ from samplers.tempering.guide import Guide
 
 from .density import EmulatedPosterior, Region, student_mixture, tempered
 from .emulator import ResponseEmulator
-from .modes import EXPECTED, ModeSearch, Search, check_starts, draw_starts
+from .modes import ModeSearch, Search, check_starts, draw_starts, expected_simulations
 from .target import SCALES, ResponseTarget, Steps, at_once
 
 __all__ = ["ResponseGuide"]
@@ -109,7 +109,7 @@ class ResponseGuide(Guide):
     def expected_simulations(self) -> float:
         """Simulations that the search takes, about: more if further starts begin."""
         begun = 0 if self._searching is None else self._searching.begun
-        return max(self._starts, begun) * (EXPECTED[0] + EXPECTED[1] * self._target.n_structural)
+        return expected_simulations(max(self._starts, begun), self._target.n_structural)
 
     def check(self, log_prob_fn: Callable) -> None:
         """Raise ValueError if a sampler evaluates another object: every draw would be simulated twice."""

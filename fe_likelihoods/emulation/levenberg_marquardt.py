@@ -28,7 +28,7 @@ _CHECKED_CHANGE = 1e-3  # of the response by a step, relative, where the model's
 _CHECKED_ERROR = 0.05
 # Parameters up to which every start makes differences. Without them, secants of the first ascent lead all starts into
 # its mode: in 8 parameters, a mode was lost in 11 of 12 searches, and with them in 2.
-_OWN = 12
+OWN = 12
 _RETRIES = -1.0, 0.3, -0.3, 0.05  # steps tried where the simulation of a difference fails, as multiples
 _NEAREST_RUNS = 3, 10  # runs that secants are fitted to: per dimension, and in addition
 _TOO_CLOSE = 1e-8  # squared distance of runs that tell nothing about derivatives: residuals have seven digits
@@ -155,7 +155,7 @@ class Climb:
         self._here, self._of = found[0], None
         joined = self._explained()
         if joined is None and not (self.target.data.differentiable and (steps is None or not self.whole)):
-            if steps is not None or not self.jacobians.known or len(start) <= _OWN:
+            if steps is not None or not self.jacobians.known or len(start) <= OWN:
                 yield from self._difference(FIRST_DIFFERENCE * np.eye(len(start)) if steps is None else steps)
                 self._of = self.number
         if joined is None:

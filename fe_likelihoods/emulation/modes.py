@@ -15,10 +15,19 @@ from samplers.judgement.guides import DOUBTED_SHARE
 from samplers.tempering.guide import GuideSession
 
 from ..text_tables import text_table
-from .levenberg_marquardt import FIRST_DIFFERENCE, TOLERANCE, Ascent, Climb, Jacobians, axes_of
+from .levenberg_marquardt import FIRST_DIFFERENCE, OWN, TOLERANCE, Ascent, Climb, Jacobians, axes_of
 from .target import ResponseTarget, Runs, Steps, at_once, nothing_stored
 
-__all__ = ["Mode", "ModeSearch", "Search", "check_starts", "draw_starts", "find_modes", "laplace"]
+__all__ = [
+    "Mode",
+    "ModeSearch",
+    "Search",
+    "check_starts",
+    "draw_starts",
+    "expected_simulations",
+    "find_modes",
+    "laplace",
+]
 
 _NEGLIGIBLE = 15.0  # a mode whose log-evidence is lower than the largest by more than this is dropped
 _LOOSEST = 5.0  # largest tolerance of a short part of the record
@@ -27,8 +36,6 @@ _APART = 0.25  # prior standard deviations in one coordinate that part ends on a
 _FEW = 6  # parameters whose differences cost about as much as two steps
 _MOST_STARTS, _DRAWN = 2, 4  # times the number asked for: that begin, and of which the highest begin
 _STEP = 1e-4  # of the derivatives of parameters by coordinates
-# Simulations per start, constant and per parameter, for progress bars: 12 starts take XXX
-EXPECTED = 3.0, 1.5
 _SHARES = 0.03, 0.1, 0.3, 0.6  # of the Arias intensity, at which the parts of the record end
 
 
@@ -305,6 +312,17 @@ class Search:
             led.append(next((number for number, (_, start) in enumerate(kept) if start == k), -1))
         names, grown = tuple(self._target.posterior.parameter_names), len(self._parts) > 1
         return ModeSearch(tuple(mode for mode, _ in kept), tuple(led), self.spent, finished, grown, names)
+
+
+def expected_simulations(starts: int, n_structural: int) -> float:
+    """Simulations of a search from a number of starts, for progress bars.
+
+    Of 38 searches on 18 posteriors with 2 to 50 parameters, 26 took between half of these and twice as many, and 6 on
+    ridges 2.4 to 5 times as many.
+    """
+    if n_structural > OWN:  # starts share derivatives
+        return 3.0 * (starts + n_structural)
+    return starts * (3.0 + 1.5 * n_structural)
 
 
 def draw_starts(target: ResponseTarget, n: int, random: Any) -> np.ndarray:

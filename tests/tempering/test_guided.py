@@ -171,14 +171,14 @@ def test_guided_runs_are_pickled():
     assert np.array_equal(sampler.get_chain(), again.get_chain())
 
 
-def test_the_progress_bar_counts_searches_rounds_and_sweeps(capfd):
+def test_the_progress_bar_counts_simulations_draws_and_sweeps(capfd):
     posterior = Gaussian()
     sampler = SMCSampler(N, 3, posterior, vectorize=True, seed=1, guide=SearchingGuide(posterior))
     sampler.run_mcmc(None, 2, progress=True)
     shown = capfd.readouterr().err
-    evaluations = sum(found.draws for found in sampler.rounds)
-    assert "2/2" in shown
-    assert re.search(rf"round {len(sampler.rounds)}: {evaluations} evaluations", shown)
+    drawn = sampler.simulations_of_guides + sum(found.draws for found in sampler.rounds)
+    assert "1/1" in shown  # the draws are the first step
+    assert re.search(rf"draws: effective size \d+ of {N} \[[^]]*simulations={drawn:.0f}", shown)
 
 
 def _rounds(rng, spreads, ndim=3):
