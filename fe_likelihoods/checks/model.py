@@ -38,6 +38,11 @@ __all__ = [
 SHIFT, LARGE_SHIFT = 0.5, 2.0
 NOTHING = 1e-6  # difference of two responses, relative to their norm, well above the round-off of a long response
 STEP, MESH = "Time step", "Mesh"
+FINER = {
+    "the integration step": "Double `substeps` of the model, or halve its `step`,",
+    "the fibers of the section": "Double `mesh` of the model",
+    "the time step": "Let the model make several integration steps between two samples of its motion",
+}
 
 
 def halve_steps(posterior: Posterior, point: np.ndarray, sd: np.ndarray) -> tuple[list[Finding], dict[str, str]]:
@@ -79,7 +84,7 @@ def halve_steps(posterior: Posterior, point: np.ndarray, sd: np.ndarray) -> tupl
         moves = ", ".join(f"{name} by {by:.2g}" for name, by in numbers.items())
         change = percent(np.sqrt(squares[what][0] / squares[what][1]))
         text = f"Half of {what} changes the response by {change}, which moves {moves} posterior standard deviations."
-        severity, action = WRONG if (shift > LARGE_SHIFT).any() else CARE, f"Halve {what} until this is small."
+        severity, action = WRONG if (shift > LARGE_SHIFT).any() else CARE, f"{FINER[what]} until this is small."
         title = "The model is too coarse for its data"
         found += [Finding(title, severity, text, action, numbers, "fit")] if numbers else []
     return found, tests

@@ -1,14 +1,16 @@
 """What the command ``check`` does: read everything, simulate a few times, draw the picture."""
 
 from collections.abc import Callable
+from datetime import datetime, timedelta
 from pathlib import Path
 
 from ..checks.compared import data_sets_of, draws_to_compare
+from ..checks.faults import FAULTS
 from ..checks.finding import labelled
 from ..checks.result import ModelCheck, check_model
 from ..signals.error_measures import rrmse
 from ..text_tables import text_table
-from .job import read_job
+from .job import Job, read_job
 from .listing import describe
 from .models import Problem, make_problem
 from .runs import default_folder, make_sampler
@@ -27,6 +29,8 @@ def check_job(file: Path, picture: Path, say: Callable[[str], None]) -> None:
     _say_data(problem, say)
     checked = check_model(problem.posterior)
     _say_simulation(problem, checked, say)
+    if zero := _zero_of(job, problem, checked):
+        say(zero)
     if (most := job.budget.max_simulations) is not None:
         say(f"The run stops at {most} simulations (max_simulations)")
     names = ", ".join(map(str, _draw(problem, checked, picture)))
@@ -62,6 +66,25 @@ def _say_simulation(problem: Problem, checked: ModelCheck, say: Callable[[str], 
         say(f"At the mean of the prior the error of the response (RRMSE) is {fit}")
     for line in labelled(checked.findings):
         say(line)
+
+
+def _zero_of(job: Job, problem: Problem, checked: ModelCheck) -> str:
+    """The line of ``[measurements]`` that moves all channels by the time by which all are late, else empty."""
+    found = [each for each in checked.findings if each.kind == FAULTS["lag"][0]]
+    late, said = [each.numbers["lag"] for each in found], " ".join(each.text for each in found)
+    parts = [part.measurements for part, _ in problem.posterior.likelihood.parts()]
+    alike = late and max(late) - min(late) <= min(min(part.steps) for part in parts)
+    if not alike or any(channel.name not in said for part in parts for channel in part.channels):
+        return ""
+    zero, shift = job.measurements.zero or 0.0, sum(late) / len(late)
+    if not isinstance(zero, str):
+        return f"In [measurements], if the clocks differ: zero = {round(zero + shift, 6)!r}"
+    day = "" if "-" in zero else "2000-01-01 "
+    try:
+        moved = datetime.fromisoformat(day + zero) + timedelta(seconds=shift)
+    except ValueError:  # another way to write a date
+        return ""
+    return f'In [measurements], if the clocks differ: zero = "{moved.isoformat(" ")[len(day) :]}"'
 
 
 def _draw(problem: Problem, checked: ModelCheck, picture: Path) -> list[Path]:

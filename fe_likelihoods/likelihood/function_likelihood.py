@@ -11,7 +11,7 @@ from ..priors.points import as_points
 from ..simulation.faults import reason_of
 from ..simulation.label import items_of
 from .failure_log import FailureLog
-from .parameters import Parameter
+from .parameters import Parameter, parameter_of
 from .sum_of_parts import COUNTS, SumOfParts
 
 __all__ = ["FunctionLikelihood"]
@@ -33,6 +33,12 @@ class FunctionLikelihood(SumOfParts):
     vectorize : bool
         Whether the function takes points (n, ndim), as in emcee.
 
+    Attributes
+    ----------
+    parameter_units, nominal, nominal_units : dict of str to str, float and str
+        To be set for labels, by the name of the parameter, as those of a model: units of the samples in words, and
+        nominal values [SI] of which samples are multiples, with the units in which these are shown.
+
     Raises
     ------
     ValueError
@@ -42,8 +48,9 @@ class FunctionLikelihood(SumOfParts):
     --------
     >>> own = FunctionLikelihood(lambda theta: -0.5 * np.sum((theta - 1.0) ** 2), ["k", "c"])
     >>> both = Posterior(own, {"k": LogNormal(1.0, 0.3), "c": LogNormal(1.0, 0.3)})
-    >>> both.parameter_names
-    ['k', 'c']
+    >>> own.parameter_units = {"k": "kN/m"}
+    >>> [parameter.label for parameter in both.parameters]
+    ['k [kN/m]', 'c']
     """
 
     fast_parameters = ()
@@ -61,13 +68,14 @@ class FunctionLikelihood(SumOfParts):
         if not names or len(set(names)) != len(names) or not all(isinstance(name, str) and name for name in names):
             raise ValueError(f"FunctionLikelihood: expected different names of parameters; got {parameter_names!r}")
         self.function, self.parameter_names, self.vectorize = function, names, vectorize
+        self.parameter_units, self.nominal, self.nominal_units = {}, {}, {}
         self._failures = FailureLog(names)
         self._evaluations = 0
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """Names of the parameters."""
-        return tuple(map(Parameter, self.parameter_names))
+        """Names, units and nominal values of the parameters."""
+        return tuple(parameter_of(self, name) for name in self.parameter_names)
 
     def log_likelihood(self, x: Any, inside: Any = True) -> np.ndarray | float:
         """Log-likelihood (n,) of points (n, ndim), or a float; -inf where the function fails and not `inside`."""

@@ -6,7 +6,7 @@ nominal values, and noise parameters in SI units. `Parameter` says how to show s
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from ..signals.channels import Channel
 from ..simulation.model import Model
 from ..units import find_unit
 
-__all__ = ["Parameter", "channels_of_deviations", "describe_parameters"]
+__all__ = ["Parameter", "channels_of_deviations", "describe_parameters", "parameter_of"]
 
 
 class Parameter(NamedTuple):
@@ -66,10 +66,11 @@ def describe_parameters(model: Model, noise: Noise) -> tuple[Parameter, ...]:
     These map names: ``nominal`` to the nominal values [SI] of which the parameters are multiples, ``nominal_units`` to
     the units in which these are shown, and ``parameter_units`` to the units of other parameters in words.
     """
-    return (*(_of_model(model, name) for name in model.parameter_names), *_of_noise(noise, model.channels))
+    return (*(parameter_of(model, name) for name in model.parameter_names), *_of_noise(noise, model.channels))
 
 
-def _of_model(model: Model, name: str) -> Parameter:
+def parameter_of(model: Any, name: str) -> Parameter:
+    """A parameter of a model, or of a function that has these members as well."""
     units, nominal = getattr(model, "parameter_units", {}), getattr(model, "nominal", {})
     if name in units:
         return Parameter(name, str(units[name]))

@@ -430,6 +430,21 @@ def test_check_warns_of_what_is_likely_wrong(folder):
     assert f'missing = [["acceleration", {times[0]:.3f}, {times[1]:.3f}]]' in output
 
 
+@pytest.mark.parametrize(("clock", "zero"), [(False, "0.3"), (True, '"10:32:00.300000"')])
+def test_check_prints_the_line_for_another_clock(folder, clock, zero):
+    """The motion begins 0.3 s later in the file of measurements than its settings say."""
+    head, *rows = (folder / "top.csv").read_text().splitlines()
+    late = [(float(time) + 0.3, rest) for time, _, rest in (row.partition(",") for row in rows)]
+    texts = [f"10:32:{time:06.3f},{rest}" if clock else f"{time:.2f},{rest}" for time, rest in late]
+    (folder / "top.csv").write_text("\n".join([head, *texts]))
+    first = '"10:32:00"' if clock else "0.0"
+    text = OSCILLATOR.replace("[measurements]", f"[measurements]\nzero = {first}")
+    (folder / "oscillator.toml").write_text(text)
+    assert f"In [measurements], if the clocks differ: zero = {zero}\n" in call("check", "oscillator.toml")
+    (folder / "oscillator.toml").write_text(text.replace(first, zero))
+    assert "clocks" not in call("check", "oscillator.toml").lower()
+
+
 def test_a_sensor_with_the_opposite_sign_is_reversed(folder):
     usual = make_problem(read_job(folder / "oscillator.toml")).posterior.likelihood.measurements
     for name, code in (("displacement", 0), ("displacment", 1)):
