@@ -3,7 +3,7 @@
 Structures: transverse and longitudinal decks of the Painter Street Overpass (eleven events) and of the Meloland Road
 Overcrossing on recorded supports at the base of the column and at or beside the abutments, and a three-storey frame on
 a shake table (three shakings). Each event is calibrated under white noise, to the best mode of a search; samples are
-those of the mode. The judgement is `fe_likelihoods.check_result`'s without that of a sampler.
+of the mode. The judgement is `fe_likelihoods.check_result`'s without the judgement of a sampler.
 
 A row counts, for a fault, the cases whose judgement is not "use" and names the fault ("named"), names something else
 ("other"), is "use" ("silent"), or is "use" with a frequency within 5 % and a damping within 0.02 of the right fit

@@ -1,6 +1,6 @@
 """Time per simulation of the isolated bridge, compared with the solvers of scipy.
 
-The record has 15 s at 200 samples/s. Errors are those of the worst of twelve channels, relative to its peak, against
+The record has 15 s at 200 samples/s. Errors are of the worst of twelve channels, relative to its peak, against
 a solver with a tight tolerance.
 """
 

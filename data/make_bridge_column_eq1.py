@@ -2,7 +2,7 @@
 
 The record and the responses of Ramancha et al. (2022) are not public. This script makes a stochastic base motion
 (`ground_motion`) with **assumed** parameters. They give the features of Fig. 3 of the paper: 50 s, about 0.2 g, and a
-displacement of the top of about ±2 in at the posterior means of the paper. The responses are those of a refined model
+displacement of the top of about ±2 in at the posterior means of the paper. The responses are from a refined model
 with white noise added.
 
 Run the script with ``make data``. It writes the same file every time.

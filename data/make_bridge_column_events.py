@@ -5,7 +5,7 @@ about a1. EQ2, 10 s later, is another draw of the same stochastic model, with **
 It yields the bars to a strain of 0.013 and displaces the top by 5 in, so that the data of both events inform all five
 structural parameters.
 
-The responses are those of the model that is updated, with its number of strips and its time step: the posterior is so
+The responses are from the model that is updated, with its number of strips and its time step: the posterior is so
 sharp that the error of this discretization, compared with a refined model, is 1 of its standard deviations. White noise
 is added with the levels `SENSOR_NOISE`, which are **assumed**.
 

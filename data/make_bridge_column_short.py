@@ -1,7 +1,7 @@
 """Make templates/bridge_column_short.h5: ten seconds of synthetic data for the first examples of the bridge column.
 
 The truth is **assumed** and lies within the priors of Ramancha et al. (2022). Of the published means, one is six
-standard deviations away from its prior mean. The responses are those of the model that is updated, so that they differ
+standard deviations away from its prior mean. The responses are from the model that is updated, so that they differ
 from the model by the noise alone, and a run finds the truth.
 
 Run the script with ``make data``. It writes the same file every time.

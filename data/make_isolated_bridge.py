@@ -1,7 +1,7 @@
 """Make templates/isolated_bridge.h5 and isolated_bridge_means.h5: synthetic tests of the isolated bridge.
 
 The records and responses of the tests are not public, and most nominal values of the model are assumed. The table
-motion is stochastic and **assumed** (`table_motion`). The responses are those of the model with a fifth of the
+motion is stochastic and **assumed** (`table_motion`). The responses are from the model with a fifth of the
 default integration step, at parameters that differ from the nominal values, at every second sample (100 Hz). White
 noise is added, with a given fraction of the root mean square of each channel.
 

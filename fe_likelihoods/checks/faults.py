@@ -216,7 +216,7 @@ def slow_motion(y: np.ndarray, r: np.ndarray, step: float, n: int) -> SlowMotion
 
 
 def supports_apart(motions: Sequence[np.ndarray], names: Sequence[str], step: float) -> dict[int, list[Fault]]:
-    """Faults of motions (n,), by number, whose slow part has another sign, size or clock than that of all others."""
+    """Faults of motions (n,), by number, whose slow part has another sign, size or clock than all others."""
     spectra, found = {k: _spectra(motion) for k, motion in enumerate(motions) if np.any(motion)}, {}
     for k, own in spectra.items():
         slow = list[SlowMotion]()

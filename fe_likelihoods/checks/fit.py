@@ -44,7 +44,7 @@ def check_responses(fits: Iterable[Fit]) -> list[Finding]:
 
 
 def check_supports(model: Any) -> list[Finding]:
-    """Supports of one structure whose slow motion has another sign, size or clock than that of the others."""
+    """Supports of one structure whose slow motion has another sign, size or clock than the others."""
     motions, found = motions_to_replace(model) if getattr(model, "supports", ()) else (), list[Finding]()
     if len({(each.n_steps, each.dt) for each in motions}) != 1:
         return []

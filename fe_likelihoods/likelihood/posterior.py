@@ -418,8 +418,8 @@ class Posterior:
     def when_simulated(self, callback: Callable[..., None] | None) -> None:
         """Call a function with the number of points whose simulations have ended, for the progress of samplers.
 
-        The number is divided by that of the data sets; the function must not raise, and None ends the announcements. A
-        batch without a pool and without a cache on disk is then run in parts of about 5 s. A compilation of kernels is
+        It is divided by the number of data sets; the function must not raise, and None ends the announcements. A batch
+        without a pool and without a cache on disk is then run in parts of about 5 s. A compilation of kernels is
         announced as ``callback(0.0, "compiling (once)")``.
         """
         announces = logging.getLogger("fe_likelihoods.kernels.jit")  # of its first compilation

@@ -111,7 +111,7 @@ class GaussianNoise:
     other noises only approximately, because the level is computed from the measurements.
 
     A share of the response that was calibrated on a part of a motion, with a gap, or with a long quiet end refers to
-    another mean square than that of the whole motion: calibrate and predict whole motions, or use ``local=1``. Do not
+    another mean square than the whole motion has: calibrate and predict whole motions, or use ``local=1``. Do not
     choose `local` by the evidence alone: where the model is wrong, a `local` near 1 may prefer a response that is too
     large, because it permits larger errors. Compare the RRMSE of the fit with ``level="si"``. The
     statistics are not quadratic in the residuals, so samplers cannot use a guide.

@@ -97,7 +97,7 @@ def test_the_same_model_is_verified_once(filled, thetas):
 
 
 def test_the_row_that_was_stored_last_is_verified_even_if_it_is_not_requested(filled, thetas):
-    """Rows that another model stored under the key, after those of this model."""
+    """Rows that another model stored under the key, after the rows of this model."""
     other = likelihood_of(Scaled(2.0), SimulationCache(filled, verify=False))
     other.misfit(thetas[:5] + 1.0)
     with pytest.raises(StaleCache, match="stored .*, simulated again"):

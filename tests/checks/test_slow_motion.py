@@ -24,7 +24,7 @@ PRIOR = {"frequency": Uniform(0.5, 10.0), "damping": Uniform(0.005, 0.8), "share
 
 
 def motions(rng, n=3):
-    """Motions that are alike where they are slow, as those of the supports of a short bridge."""
+    """Motions that are alike where they are slow, as the supports of a short bridge have them."""
     envelope = np.exp(-(((TIME - 8.0) / 4.0) ** 2))
     kernel = np.hanning(30)
     common = np.convolve(rng.standard_normal(len(TIME)), kernel, "same")

@@ -73,7 +73,7 @@ def progressed(place, process, number):
 
 
 def check_result(place, interruptions):
-    """Every simulation that ended is kept, and the evidence is that of one machine without interruptions.
+    """Every simulation that ended is kept, and the evidence equals that from one machine without interruptions.
 
     No evaluation has failed, so that none was given up because of the ends of its workers. Every simulation that ended
     is in the record and in the cache.

@@ -92,7 +92,7 @@ def test_other_models_have_modes(tmp_path):
 
 
 def test_held_out_modes_are_predicted_and_shown(tmp_path, monkeypatch):
-    """The intervals of the report are those of the summary."""
+    """Report and summary have equal intervals."""
     monkeypatch.chdir(tmp_path)
     errors = ("frequency_cv = 0.005", "frequency_cv = [0.005, 0.005, 0.005, 0.01]")  # of those held out as well
     path = changed(tmp_path, "modal", ("modes = [1, 2, 3]", "held_out = [4, 3]"), errors)

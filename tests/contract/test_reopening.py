@@ -52,7 +52,7 @@ class Counted(WithBlobs):
 
 
 def make(kind, path, posterior, seed=7, **changes):
-    """A sampler on a file; `seed` is that of its first run."""
+    """A sampler on a file; `seed` is the seed of its first run."""
     Sampler, settings = KINDS[kind]
     np.random.seed(seed)  # noqa: NPY002  all three take their seed from the global generator
     backend = None if path is None else emcee.backends.HDFBackend(str(path))

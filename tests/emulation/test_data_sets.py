@@ -149,7 +149,7 @@ def exact(posterior):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
 def test_two_events_take_hundreds_of_simulations():
-    """The result is that of quadrature; every simulation is one run of each model."""
+    """The result equals quadrature; every simulation is one run of each model."""
     log_evidence, mean, sd = exact(joint())
     chains, variance = [], 0.0
     for seed in range(3):

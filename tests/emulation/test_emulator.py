@@ -15,7 +15,7 @@ SCALE = np.array([0.01, 0.05])  # of the training points, in standard deviations
 
 
 def structural_coordinates(target, points):
-    """Coordinates (n, 2) of structural parameters (n, 2), beside those of the median of the noise."""
+    """Coordinates (n, 2) of structural parameters (n, 2), beside the coordinates of the median noise."""
     median = target.parameters(np.zeros((1, target.ndim)))[:, 2:]
     return target.coordinates(np.column_stack([points, np.repeat(median, len(points), axis=0)]))[:, :2]
 
@@ -72,7 +72,7 @@ def test_a_line_is_straight_in_scaled_parameters(scale, damping):
 
 
 def test_uncertainty_enters_through_the_expected_likelihood():
-    """Against a Monte Carlo average over the coefficients, with variances that are as large as those of the noise."""
+    """Against a Monte Carlo average over the coefficients, with variances as large as the noise variances."""
     target, emulator = emulator_of(vibration("white", damping=TruncatedNormal(1.0, 1.0)))
     emulator.process = emulator.process._replace(variances=emulator.process.variances * 1e8)
     noise = target.fit_noise(target.archive.statistics[0]).coords

@@ -68,7 +68,7 @@ def test_every_noise_is_sampled_together_with_its_parameters(noise):
 
 
 def test_densities_are_normalised_and_draws_are_inside_the_support():
-    """The mean over draws of any normalised density divided by that of the guide is one."""
+    """The mean over draws of any normalised density divided by the density of the guide is one."""
     posterior = vibration()
     guide = guided(posterior, steps=0).guide
     coords = guide.draw(4000, np.random.RandomState(5))

@@ -267,7 +267,7 @@ def _rough(theta, size, key):
 @pytest.mark.slow
 @pytest.mark.parametrize(("size", "cases", "most"), [(2e-4, 5, 3), (4e-4, 30, 13)])
 def test_a_rough_likelihood_rarely_splits_a_mode_and_prolongs_no_search(size, cases, most):
-    """Jumps of 2e-4 of the response are jumps of the log-density by about 0.5, and those of 4e-4 by 2.
+    """Jumps of 2e-4 of the response are jumps of the log-density by about 0.5, and jumps of 4e-4 by 2.
 
     Two modes were found in 0 of 20 searches with 2e-4, and in 3 of 20 with 6e-4. If 5 % and 15 % are split, more than
     `most` are split with a probability below 1e-4.

@@ -190,7 +190,7 @@ def test_test_beside_the_population_is_a_warning(one):
 
 
 def test_prior_narrower_than_the_population_is_a_warning_that_names_the_test():
-    """T0 is hardly informed: its samples are those of a prior that leaves out most of the population."""
+    """T0 is hardly informed: its samples are draws of a prior that leaves out most of the population."""
     tests = several(4.0 * DATA[1:, :1], ERRORS[:1, :1], 400, 10.0)
     tests["T0"] = stored(np.array([0.5]), np.array([[4.0]]), 400, 0, sd=0.5)
     posterior = HierarchicalPosterior(tests, {"a": LINEAR})

@@ -54,7 +54,7 @@ def hierarchy_of(measured, n=2000, seed=0, **options) -> Hierarchy:
 
 
 def check(left_out, posterior, name) -> None:
-    """Means and standard deviations are those of the other tests, on the grid."""
+    """Means and standard deviations are from the other tests, on the grid."""
     weights = on_grid(posterior.without(name))
     mean = weights @ GRID
     sd = np.sqrt(weights @ np.square(GRID - mean))

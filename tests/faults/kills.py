@@ -1,7 +1,7 @@
 """Kills by signal 9, after which the same script is started again until it ends: ``python -m tests.faults.kills 12 7``.
 
 Kills come before, within or after a write to the record or to the HDF5 file (through a Python file), or in an
-evaluation. The outcome must be that of a run without kills, and only evaluations that were running are made again.
+evaluation. The outcome must equal a run without kills, and only evaluations that were running are made again.
 """
 
 import contextlib

@@ -405,7 +405,7 @@ def test_a_full_disk_does_not_stop_the_run(path, thetas, expected, caplog, full,
 
 @pytest.fixture
 def open_folder():
-    """A folder that another user can enter, unlike those of pytest."""
+    """A folder that another user can enter, unlike the folders of pytest."""
     with tempfile.TemporaryDirectory() as folder:
         os.chmod(folder, 0o755)
         yield Path(folder)

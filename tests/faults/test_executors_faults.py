@@ -44,7 +44,7 @@ def nothing_is_left():
 
 
 def workers_now():
-    """Worker processes of this process, also those of pools that other tests share."""
+    """Worker processes of this process, also in pools that other tests share."""
     return {child for child in descendants(os.getpid()) if b"fe_likelihoods.simulation.worker" in _command(child)}
 
 

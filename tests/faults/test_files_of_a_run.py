@@ -144,7 +144,7 @@ def test_a_chain_that_something_else_has_changed_is_made_again(whole, change, tm
 
 
 def test_a_lost_record_leaves_the_chain(whole, tmp_path):
-    """The chain goes on as with emcee, where its last step is that of the same posterior."""
+    """The chain goes on as with emcee, where its last step is of the same posterior."""
     kind, path, _ = whole
     path = copied(path, tmp_path)
     record_of(path).unlink()

@@ -254,7 +254,7 @@ class Copies:
 
 
 def test_faults_in_the_pool_of_a_sampler_are_in_its_records(seed):
-    """The records of the posterior are those of its copy in a worker."""
+    """The records of the posterior equal the records of its copy in a worker."""
     points = np.random.default_rng(seed).uniform(0.2, 0.8, size=(20, 3))
     points[7, 0] = 0.05
     posterior = bad.posterior_of(FullDisk())

@@ -116,7 +116,7 @@ def test_standard_errors_cover_another_set_of_draws():
 
 
 def test_derivatives_of_the_model_replace_differences():
-    """Of an oscillator with bounded and correlated parameters: the slopes are those of fine differences."""
+    """Of an oscillator with bounded and correlated parameters: the slopes equal fine differences."""
     motion = problems.table_motion().trim(0.0, 4.0).resample(0.02)
     model = LinearOscillator(motion, 0.5)
     without = FunctionModel(model.simulate, model.parameter_names, model.channels, model.dt, model.n_steps)

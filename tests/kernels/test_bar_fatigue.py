@@ -87,7 +87,7 @@ def test_a_bar_that_hardly_fails_is_that_of_the_law(rng):
 
 
 def test_half_cycles_of_constant_amplitude_follow_coffin_and_manson():
-    """The number of half cycles to fracture is that of the closed form, over a factor of ten in life."""
+    """The number of half cycles to fracture is as in the closed form, over a factor of ten in life."""
     found, expected = [], []
     for amplitude in (0.02, 0.03, 0.045, 0.06):
         strain = path(*[amplitude, -amplitude] * 40)

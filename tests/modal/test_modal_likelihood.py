@@ -226,7 +226,7 @@ def test_a_model_without_modes_is_refused(rng):
 
 
 def test_the_user_s_code_is_known_within_the_paired_modes():
-    """Else a cache of their predictions would return those of other code."""
+    """Else a cache of their predictions would return predictions of other code."""
     functions = (
         (lambda theta: (theta * [1.0, 2.0], np.empty((2, 0)))),
         (lambda theta: (theta * [1.0, 3.0], np.empty((2, 0)))),

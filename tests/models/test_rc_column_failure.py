@@ -116,7 +116,7 @@ def test_a_drift_beyond_the_limit_is_a_collapse():
 
 
 def test_a_column_without_its_bars_has_collapsed_and_one_with_most_of_them_has_failed(column):
-    """The simulation that fails has lost three quarters of its bars; the reason is that of the larger part."""
+    """The simulation that fails has lost three quarters of its bars; the reason is the one that the larger part has."""
     model = replace(column, fatigue=LowCycleFatigue(cf=0.036, cd=0.389), analysis=ColumnAnalysis(max_increment=0.02))
     with pytest.raises(SimulationFailed, match="bars with 78% of the area") as error:
         replace(model, axial_load=16e6).simulate([1.0])

@@ -1,4 +1,4 @@
-"""Outputs of the column besides those of its top: names, closed forms, likelihood, wrong names.
+"""Outputs of the column below its top: names, closed forms, likelihood, wrong names.
 
 `tests/kernels/test_against_opensees.py` compares them with the recorders of OpenSees.
 """
@@ -20,7 +20,7 @@ SENSORS = ("base_moment", "base_shear", "axial_force", "curvature@0.3", "strain@
 
 @pytest.fixture(scope="module")
 def shaken():
-    """Two seconds of the bundled record, with sensors besides those of the top."""
+    """Two seconds of the bundled record, with sensors below the top."""
     part = bridge_column_data().record.trim(6.0, 8.0)
     return RCColumn.lhpost(part, outputs=("acceleration", "displacement", *SENSORS))
 
@@ -121,7 +121,7 @@ def test_the_slope_of_the_deflected_shape_is_the_rotation(geometry, tolerance, p
 
 
 def test_motions_below_the_top():
-    """Newmark's identities between displacement, velocity and acceleration of every node, and those of the top."""
+    """Newmark's identities between displacement, velocity and acceleration of every node, the top among them."""
     names = ("displacement", "velocity", "relative_acceleration", "acceleration")
     record = bridge_column_data().record.trim(6.0, 8.0)
     height = RCColumn.lhpost(record).height

@@ -103,7 +103,7 @@ def measured(gain=1.0, lag=0.0, seed=0):
 
 
 def test_the_gain_has_its_closed_form():
-    """y = g r + e with normal g and e: posterior and evidence are those of Gaussian regression."""
+    """y = g r + e with normal g and e: posterior and evidence are as in Gaussian regression."""
     data, prior_sd, sigma = measured(1.2), 0.3, 0.05
     prior = TruncatedNormal(1.0, prior_sd, lower=-np.inf)
     sensed = SensedModel(STRUCTURE, {"top": Sensor(prior)})

@@ -79,7 +79,7 @@ def test_a_noise_of_other_channels_is_refused(rng):
 
 
 def test_predictions_draw_correlated_errors(rng):
-    """The standard deviation of a sample is sigma for any correlation; that of the mean grows with the correlation."""
+    """Samples have the deviation sigma for any correlation; the deviation of the mean grows with the correlation."""
     sigma, rho, n = 0.3, 0.8, 4000
     likelihood = FELikelihood(Line(), measured_by(Line(), rng), AutoregressiveNoise(CHANNELS))
     names = likelihood.parameter_names

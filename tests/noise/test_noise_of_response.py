@@ -93,7 +93,7 @@ def test_draws_have_the_deviations_of_the_density():
 
 
 def test_gaps_and_times_of_channels(rng):
-    """Samples that are there are those of the density. One channel has its own step."""
+    """The density has the samples that are there. One channel has its own step."""
     values = response([1.0]) + rng.standard_normal((2, N)) * [[0.1], [0.001]]
     gap, parameters, simulated = values.copy(), PARAMETERS, response([1.2])
     gap[0, 100:130] = np.nan
@@ -156,7 +156,7 @@ def test_measurements_that_do_not_fit_are_refused():
 
 
 def test_events_have_levels_of_their_own_response(rng):
-    """Two events with a pause, of which the second is ten times weaker: the shares are those of both."""
+    """Two events with a pause, of which the second is ten times weaker: the shares belong to both."""
     time = DT * np.arange(400)
     strong = Record("EQ1", DT, np.exp(-(((time - 4.0) / 1.5) ** 2)) * rng.standard_normal(400))
     events = Events([strong, strong.scale(0.1)], rest=4.0, names=["EQ1", "EQ2"])
@@ -186,7 +186,7 @@ def test_events_have_levels_of_their_own_response(rng):
 
 
 def test_a_gap_makes_the_share_that_of_another_level(rng):
-    """The share of the whole response is too large beside a gap in the strong part; that of the envelope is not."""
+    """The share of the whole response is too large beside a gap in the strong part; the envelope is not."""
     motion = response([1.0])
     strong = slice(*np.searchsorted(np.cumsum(motion[0] ** 2) / np.sum(motion[0] ** 2), [0.2, 0.8]))
     shares = np.linspace(0.02, 1.0, 400)

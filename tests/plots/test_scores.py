@@ -12,7 +12,7 @@ CHANNELS = (Channel("deck", "absolute acceleration", "g"), Channel("drift", "rel
 
 
 def numbers(measured, rng, factor=1.0, center=None):
-    """Scores of lognormal predictions about `center`; their spread is `factor` times the one of events, 20 %."""
+    """Scores of lognormal predictions about `center`; their spread is `factor` times the spread of events, 20 %."""
     values = (measured if center is None else center) * np.exp(0.2 * factor * rng.normal(size=(500, len(measured))))
     return score_values([c.name for c in CHANNELS], [c.unit for c in CHANNELS], values, measured, 0.9)
 

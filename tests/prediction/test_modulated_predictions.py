@@ -1,4 +1,4 @@
-"""Predictions with shares of the response: gaps are those of the calibration; what has no level is refused before it
+"""Predictions with shares of the response: gaps are as in the calibration; what has no level is refused before it
 runs."""
 
 import warnings

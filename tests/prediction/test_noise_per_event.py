@@ -16,7 +16,7 @@ from fe_likelihoods import (
 
 @pytest.fixture
 def likelihood(rng):
-    """Under two events and with a step of measurements twice that of the model; EQ2 has no displacement."""
+    """Under two events, with a step of measurements of two steps of the model; EQ2 has no displacement."""
     records = [Record(name, 0.02, rng.normal(size=n)) for name, n in (("EQ1", 61), ("EQ2", 51))]
     model = LinearOscillator(Events(records, rest=0.98), period=0.5)
     coarse = {name: LinearOscillator(each).simulate([1, 1])[:, ::2] for name, each in zip("12", records, strict=True)}

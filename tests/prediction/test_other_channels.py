@@ -1,4 +1,4 @@
-"""Predictions of channels that were not measured: their noise is the mean of that of the measured ones."""
+"""Predictions of channels that were not measured: their noise is the mean of the noise of the measured ones."""
 
 import re
 import warnings
@@ -75,7 +75,7 @@ def drawn(likelihood, rng, n=30):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_prediction_is_that_of_a_noise_of_all_channels_with_mean_parameters(kind, rng):
-    """Stacked by the names of the parameters: those of middle are the means of those of low and top, without drift."""
+    """Stacked by the names of the parameters: parameters of middle are the means of low and top, without drift."""
     levels = {LOW: 0.7, MIDDLE: 1.7, TOP: 2.7, DRIFT: 0.07}  # middle has the mean
     likelihood = FELikelihood(
         wave(MEASURED), measured(MEASURED), KINDS[kind](MEASURED, sensors(MEASURED), [levels[c] for c in MEASURED])
@@ -115,7 +115,7 @@ def test_the_noise_of_measured_channels_is_that_of_the_posterior(rng):
 
 
 def test_a_model_under_another_excitation_is_compared_with_the_calibration(rng):
-    """Peaks of the measured channels that are ten times those of the calibration are said."""
+    """Peaks of the measured channels that are ten times as large as in the calibration are warned of."""
     likelihood = FELikelihood(wave(MEASURED), measured(MEASURED))
     samples = drawn(likelihood, rng)
     (peaks,) = quiet(likelihood, samples, model=wave(ALL, 10.0), noise=True).findings

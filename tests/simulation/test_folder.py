@@ -51,7 +51,7 @@ def of_program(theta):
 
 
 def of_recorder(theta):
-    """A bar in OpenSees, whose displacement and force are those of a recorder with a fixed name."""
+    """A bar in OpenSees, whose displacement and force are from a recorder with a fixed name."""
     import openseespy.opensees as ops
 
     ops.wipe()

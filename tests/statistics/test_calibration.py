@@ -1,7 +1,7 @@
 """Simulation-based calibration: over draws of the prior and of data, the truth is one more draw of the posterior.
 
-Among independent draws of the posterior, the rank of theta is uniform, parameter by parameter, and so is the one of the
-log-likelihood. Talts, Betancourt, Simpson, Vehtari & Gelman (2018), arXiv:1804.06788; Modrak et al. (2023),
+Among independent draws of the posterior, the rank of theta is uniform, parameter by parameter, and so is the rank of
+the log-likelihood. Talts, Betancourt, Simpson, Vehtari & Gelman (2018), arXiv:1804.06788; Modrak et al. (2023),
 doi:10.1214/23-BA1404 (which functions).
 """
 

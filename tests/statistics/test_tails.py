@@ -1,4 +1,4 @@
-"""Heavy tails: recycling keeps the variance of posteriors whose tails are heavier than those of its mixtures."""
+"""Heavy tails: recycling keeps the variance of posteriors whose tails are heavier than the tails of its mixtures."""
 
 import numpy as np
 import pytest

@@ -212,7 +212,7 @@ def test_rounds_that_each_miss_a_part_have_a_large_error(rng):
 
 
 def test_rounds_with_different_means_have_the_error_of_their_spread(rng):
-    """Constant weights in each of three rounds: the error is that between rounds and that of the known density."""
+    """Constant weights in each of three rounds: the error is that between rounds and the error of the known density."""
     rounds, levels, known = [], np.array([0.0, 0.1, 0.3]), KnownDensity(None, None, None, 0.2)
     for level in levels:
         records = np.full(50, level).astype([("log_prob", float)])
