@@ -30,7 +30,7 @@ from ..priors.points import as_rows
 from ..signals.channels import Measurements
 from ..signals.comparison import Comparison, compare_with
 from ..simulation.executors import as_executor, result_of
-from ..simulation.folder import Observed
+from ..simulation.files import Observed
 from ..simulation.model import (
     Model,
     SimulationBatch,

@@ -13,8 +13,8 @@ import numpy as np
 from ..models.base import digest
 from ..signals.channels import Channel, Measurements
 from ..signals.sampling import array_digest
+from ..simulation.by_value import code_within, is_of_user
 from ..simulation.model import Model, SimulationFailed, has_jacobian
-from ..simulation.user_code import code_within, is_of_user
 from .modal_data import ModalData
 from .modal_noise import ModeSums
 from .mode_models import ABSENT

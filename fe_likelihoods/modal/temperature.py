@@ -11,8 +11,8 @@ import numpy as np
 
 from ..models.base import digest
 from ..signals.channels import Channel
+from ..simulation.by_value import code_within, is_of_user
 from ..simulation.model import Model, SimulationBatch
-from ..simulation.user_code import code_within, is_of_user
 
 __all__ = ["REFERENCE_TEMPERATURE", "SLOPE", "ModesWithSlope"]
 

@@ -21,8 +21,7 @@ import numpy as np
 from ..signals.channels import Channel
 from ..signals.records import Record
 from ..simulation.faults import SimulationFailed, TransientReason, reason_of
-from ..simulation.programs import run_program
-from ..simulation.worker import describe_exit, last_lines
+from ..simulation.worker import describe_exit, last_lines, run_program
 from ..units import find_unit
 from .user_model import UserModel, content_digest
 from .validation import positive_float

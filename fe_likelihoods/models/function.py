@@ -18,8 +18,7 @@ from ..signals.channels import Channel
 from ..signals.records import Record
 from ..signals.sampling import sample_window
 from ..simulation.faults import UnusableModel
-from ..simulation.files import note
-from ..simulation.folder import Observed
+from ..simulation.files import Observed, note
 from ..simulation.worker import Sandbox
 from .user_model import UserModel
 from .validation import check_theta, positive_float

@@ -19,8 +19,8 @@ from ..priors.distributions import Distribution
 from ..signals.channels import Channel
 from ..signals.interpolation import interpolate, make_interpolation
 from ..signals.records import Record
+from ..simulation.by_value import code_within, is_of_user
 from ..simulation.model import Model, SimulationBatch, first_part, has_batch_method, simulate_batch
-from ..simulation.user_code import code_within, is_of_user
 from .base import digest
 from .validation import check_theta
 

@@ -30,9 +30,8 @@ from typing import Any
 
 import numpy as np
 
-from .by_value import names_in
+from .by_value import LIBRARY, SCRIPTS, is_of_user, names_in, package_version, sources_digest
 from .files import Opened, digests_by_name, file_digest, mapped, read_again
-from .user_code import LIBRARY, SCRIPTS, is_of_user, package_version, sources_digest
 
 __all__ = ["ModelLabel", "items_of", "value_digest"]
 

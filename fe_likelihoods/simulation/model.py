@@ -28,8 +28,7 @@ from ..noise.statistics import Statistic, reduce_response, statistic_width, sums
 from ..signals.channels import Channel
 from ..signals.comparison import Comparison
 from .faults import MisfitReason, SimulationFailed, is_transient, reason_of, shortened
-from .files import Opened, note
-from .folder import Observed, Sender, run_in_folder
+from .files import Observed, Opened, Sender, note, run_in_folder
 
 __all__ = [
     "MisfitBatch",

@@ -19,21 +19,21 @@ import sys
 import threading
 import time
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import suppress
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any
 
 from samplers.interrupts import become_worker
 
 from .by_value import CannotLoad, Pickled, without_addresses
 from .faults import SimulationFailed, TransientReason, is_transient
-from .files import of_this_library
-from .folder import working_folder
+from .files import of_this_library, removed_at_end, working_folder
 
-__all__ = ["Died", "Sandbox", "Worker", "describe_exit", "last_lines", "serve"]
+__all__ = ["Died", "Sandbox", "Worker", "describe_exit", "last_lines", "run_program", "serve"]
 
 _BOOT = (
     "import json, sys; sys.path[:], sys.argv, *settings = json.loads(sys.argv[1]); "
@@ -221,6 +221,59 @@ def last_lines(file: Any, most: int) -> str:
     data = os.pread(file.fileno(), 4096, max(0, size - 4096)).decode(errors="replace")
     lines = [line.strip() for line in data.splitlines() if line.strip()]
     return " / ".join(lines[-most:])[-300:]
+
+
+# programs -----------------------------------------------------------------------------------------------------------
+
+
+def run_program(
+    command: Sequence[str], folder: Path, stdout: Path, stderr: Path, place: Path, watch: Callable[[float], float]
+) -> int:
+    """Run a program to its end, kill all processes that it leaves behind, and return its exit code, as in `subprocess`.
+
+    The command has an absolute path; no shell is used, standard input is empty.
+    `place` is the folder of the run, which is removed if this process is killed. `watch` is called with the time since
+    the start [s] and returns the time until the next call [s], or raises an exception, which stops the program and is
+    passed on. OSError if the program cannot be started.
+    """
+    with of_this_library():
+        watcher, program = removed_at_end(place), None
+        try:
+            with open(stdout, "wb") as out, open(stderr, "wb") as error:
+                options = {"stdin": subprocess.DEVNULL, "stdout": out, "stderr": error, "process_group": watcher.pid}
+                program = subprocess.Popen(command, cwd=folder, **options)
+            start = time.monotonic()
+            waiter = threading.Thread(target=program.wait, daemon=True)  # without the pauses of a wait with a limit
+            waiter.start()
+            while waiter.is_alive():
+                waiter.join(watch(time.monotonic() - start))
+            return program.returncode
+        finally:
+            _kill_program(watcher, program)
+
+
+def _kill_program(watcher: subprocess.Popen, program: subprocess.Popen | None) -> None:
+    """Kill the group of a program, and the processes that it has started in other groups and that it waits for."""
+    for pid in [] if program is None or program.returncode is not None else _descendants(program.pid):
+        with suppress(ProcessLookupError, PermissionError):
+            os.kill(pid, signal.SIGKILL)
+    os.killpg(watcher.pid, signal.SIGKILL)
+    watcher.communicate()
+    if program is not None:
+        program.wait()
+
+
+def _descendants(pid: int) -> list[int]:
+    """Process ids of a process's descendants, from /proc; none on other systems than Linux."""
+    parents = {}
+    for name in filter(str.isdigit, os.listdir("/proc") if os.path.isdir("/proc") else ()):
+        with suppress(OSError), open(f"/proc/{name}/stat", "rb") as file:
+            parents[int(name)] = int(file.read().rpartition(b")")[2].split()[1])
+    found, new = [], [pid]
+    while new:
+        new = [child for child, parent in parents.items() if parent in new]
+        found += new
+    return found
 
 
 # in the worker ------------------------------------------------------------------------------------------------------

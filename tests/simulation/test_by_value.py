@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import FunctionModel
-from fe_likelihoods.simulation import by_value, user_code
+from fe_likelihoods.simulation import by_value
 from fe_likelihoods.simulation.by_value import Pickled
 from fe_likelihoods.simulation.executors import LocalPool, as_executor
 from fe_likelihoods.simulation.faults import ChangedModel
@@ -231,6 +231,6 @@ def test_modules_of_this_process_stay_when_a_function_is_loaded_in_it(user):
 
 def test_what_belongs_to_the_user():
     for module in (sys.modules[__name__], sys.modules["__main__"], types.ModuleType("made_by_hand")):
-        assert user_code.is_of_user(module)
+        assert by_value.is_of_user(module)
     for module in (np, pytest, threading, by_value, sys, np.random.mtrand):
-        assert not user_code.is_of_user(module)
+        assert not by_value.is_of_user(module)
