@@ -33,7 +33,7 @@ def make_posterior(pool=None) -> Posterior:
     names, channels = ["stiffness", "damping"], [Channel("top", "displacement", "mm")]
     noise = 0.002 * np.random.default_rng(1).standard_normal((1, 500))
     measured = Measurements(channels, 0.01, free_vibration(np.array([1.1, 0.8])) + noise)
-    # for a slow model also time_limit=7200.0 [s], memory_limit=4 * 2**30 [bytes] and runs_per_process=100
+    # for a slow model also time_limit=7200.0 [s] and runs_per_process=100
     model = FunctionModel(free_vibration, names, channels, 0.01, 500)
     prior = Prior({name: TruncatedNormal(1.0, 0.3) for name in names} | {"sigma_top": HalfNormal(0.01)})
     return Posterior(FELikelihood(model, measured, pool=pool, cache="simulations.db"), prior)

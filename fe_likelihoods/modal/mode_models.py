@@ -94,7 +94,7 @@ class FunctionModes(FunctionModel):
     n_modes : int
         Number of modes that are computed, if there are as many: twice the measured ones, to pass over local modes.
     **options
-        Of `FunctionModel`: ``version``, ``depends_on``, ``isolated``, ``time_limit``, ``memory_limit``.
+        Of `FunctionModel`: ``version``, ``depends_on``, ``isolated``, ``time_limit``.
 
     Examples
     --------

@@ -81,11 +81,10 @@ class FunctionModel(UserModel):
         Function with the arguments of `function` that returns the derivatives (n_parameters, n_channels, n_steps) of
         the response by the parameters, for the search of a guide (`fe_likelihoods.simulation.model.Model`).
     isolated : bool
-        Run the function in a separate process. Limits and `runs_per_process` imply it.
+        Run the function in a separate process. `time_limit` and `runs_per_process` imply it. The function may limit the
+        memory of the process, ``resource.setrlimit(resource.RLIMIT_AS, (n, n))`` with n in bytes.
     time_limit : float, optional
         Longest duration of a run [s]; a longer run is stopped and counts as failed.
-    memory_limit : int, optional
-        Largest address space of the process [bytes]. Allocations beyond it fail.
     runs_per_process : int, optional
         Number of runs after which a new process is started, against memory that compiled code leaks.
 
@@ -129,7 +128,6 @@ class FunctionModel(UserModel):
         jacobian: Callable[..., Any] | None = None,
         isolated: bool = False,
         time_limit: float | None = None,
-        memory_limit: int | None = None,
         runs_per_process: int | None = None,
     ) -> None:
         super().__init__(parameter_names, channels, dt, n_steps, depends_on, record, path_dependent)
@@ -151,16 +149,12 @@ class FunctionModel(UserModel):
             )
         self.version = version
         self.time_limit = None if time_limit is None else positive_float(time_limit, f"{kind}: time_limit", "seconds")
-        self.memory_limit = (
-            None if memory_limit is None else int(positive_float(memory_limit, f"{kind}: memory_limit", "bytes"))
-        )
         if runs_per_process is not None and (
             isinstance(runs_per_process, bool) or not isinstance(runs_per_process, int) or runs_per_process < 1
         ):
             raise ValueError(f"{kind}: runs_per_process must be None or a positive integer; got {runs_per_process!r}")
         self.runs_per_process = runs_per_process
-        settings = (time_limit, memory_limit, runs_per_process)
-        self.isolated = bool(isolated) or any(setting is not None for setting in settings)
+        self.isolated = bool(isolated) or time_limit is not None or runs_per_process is not None
         self._prepare()
 
     def _prepare(self, shortened: bool = False) -> None:
@@ -179,7 +173,7 @@ class FunctionModel(UserModel):
             function = _Bound(function, self.record, n_steps)
         if not self.isolated:
             return function
-        return Sandbox(Observed(function), self.time_limit, self.memory_limit or 0, self.runs_per_process)
+        return Sandbox(Observed(function), self.time_limit, self.runs_per_process)
 
     def code_parts(self) -> dict[str, Any]:
         """User code, for the label of stored simulations."""

@@ -173,7 +173,7 @@ class OpenSeesModel(FunctionModel):
         Function of the wiped module ``openseespy.opensees``, of theta (n_parameters,), and of the record if one is
         given, that returns the response (n_channels, n_steps) in SI units. It must be defined at the top level of a
         module. With an argument ``n_steps`` the model can be shortened; see `FunctionModel`.
-    parameter_names, channels, dt, n_steps, record, path_dependent, time_limit, memory_limit, version, depends_on
+    parameter_names, channels, dt, n_steps, record, path_dependent, time_limit, version, depends_on
         As for `FunctionModel`; the function receives a record as its third argument.
     runs_per_process : int or None
         Number of runs after which the process is replaced by a new one; None for never. OpenSees leaks memory: in
@@ -204,7 +204,6 @@ class OpenSeesModel(FunctionModel):
         record: Record | None = None,
         path_dependent: bool = True,
         time_limit: float | None = None,
-        memory_limit: int | None = None,
         runs_per_process: int | None = 1000,
         version: str | None = None,
         depends_on: Sequence[Any] = (),
@@ -229,7 +228,6 @@ class OpenSeesModel(FunctionModel):
             depends_on=depends_on,
             isolated=True,
             time_limit=time_limit,
-            memory_limit=memory_limit,
             runs_per_process=runs_per_process,
         )
 

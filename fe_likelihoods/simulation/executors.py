@@ -194,7 +194,7 @@ class LocalPool(Submitting):
                 "pool must be None, a positive number of processes, or an object with map(function, items); "
                 f"got {workers!r}"
             )
-        self.workers = int(workers)
+        self.n_workers = int(workers)  # items that run at once
         names = [f"{library}_NUM_THREADS" for library in _THREADS]
         self._environment = {name: "1" for name in names if name not in os.environ}
         self._set_up()
@@ -210,12 +210,7 @@ class LocalPool(Submitting):
         self.close()
 
     def __reduce__(self) -> tuple:
-        return type(self), (self.workers,)
-
-    @property
-    def n_workers(self) -> int:
-        """Number of items that run at once."""
-        return self.workers
+        return type(self), (self.n_workers,)
 
     def close(self) -> None:
         """Give up all items and end the processes; a later item starts new processes."""
@@ -227,7 +222,7 @@ class LocalPool(Submitting):
         """Futures as from `submit`, for several items; ValueError if the function cannot be sent to the processes."""
         pickled = Pickled.of(function)  # each time: the values that it uses may have changed
         jobs = [_Job(pickled, item) for item in items]
-        self._threads_here().submit_all(jobs, jobs, self.workers)
+        self._threads_here().submit_all(jobs, jobs, self.n_workers)
         return jobs
 
     def give_up(self, futures: Sequence[Future], running: bool = True) -> None:
@@ -271,19 +266,10 @@ class PoolExecutor(Submitting):
     """
 
     def __init__(self, pool: Any) -> None:
-        self.pool = pool
-        self._is_dask = hasattr(pool, "gather")
-
-    @property
-    def other_processes(self) -> bool:
-        """Whether the pool is known to run its work in other processes."""
-        is_known = isinstance(self.pool, Executor | Pool) and not isinstance(self.pool, ThreadPoolExecutor | ThreadPool)
-        return is_known or self._is_dask
-
-    @property
-    def submits(self) -> bool:
-        """Whether the pool can run single items: it has ``submit``."""
-        return hasattr(self.pool, "submit")
+        self.pool, self._is_dask = pool, hasattr(pool, "gather")
+        is_known = isinstance(pool, Executor | Pool) and not isinstance(pool, ThreadPoolExecutor | ThreadPool)
+        self.other_processes = is_known or self._is_dask  # as far as that is known
+        self.submits = hasattr(pool, "submit")
 
     @property
     def n_workers(self) -> int | None:

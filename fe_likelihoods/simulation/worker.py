@@ -62,18 +62,17 @@ class Worker:
     """Calls functions in one process after the other. Its methods may be called from one thread, apart from `kill`.
 
     The process is started for a call, and replaced if it has died or after `most_calls`. It is killed by `kill`, when
-    this object is garbage-collected, or when this process ends. `environment` adds variables; `memory_limit` [bytes] of
-    the address space (0: none) makes allocations fail beyond it; with `quiet`, its output is not shown.
+    this object is garbage-collected, or when this process ends. `environment` adds variables; with `quiet`,
+    its output is not shown.
     """
 
     def __init__(
         self,
         environment: Mapping[str, str] | None = None,
-        memory_limit: int = 0,
         quiet: bool = False,
         most_calls: float = math.inf,
     ) -> None:
-        self._settings, self._most_calls = (environment, memory_limit, quiet), most_calls
+        self._settings, self._most_calls = (environment, quiet), most_calls
         self._process: subprocess.Popen | None = None
 
     def run(
@@ -100,7 +99,7 @@ class Worker:
         return is_own and not _ended(self._process) and self._calls < self._most_calls
 
     def _renew(self) -> None:
-        environment, memory_limit, quiet = self._settings
+        environment, quiet = self._settings
         self.kill()
         self._connection, theirs = Pipe()
         output = subprocess.DEVNULL if quiet else None
@@ -108,7 +107,7 @@ class Worker:
             texts = [[str(text) for text in texts] for texts in (sys.path, sys.argv)]
             start = functools.partial(
                 subprocess.Popen,
-                [sys.executable, "-c", _BOOT, json.dumps([*texts, theirs.fileno(), memory_limit, os.getpid()])],
+                [sys.executable, "-c", _BOOT, json.dumps([*texts, theirs.fileno(), os.getpid()])],
                 env={**os.environ, **(environment or {})},
                 pass_fds=(theirs.fileno(),),
                 stdin=subprocess.DEVNULL,
@@ -160,18 +159,16 @@ class Sandbox:
 
     The process is replaced after a call that did not end by itself, and after `runs_per_process` calls (default:
     never), which limits memory leaks. Each thread has a process of its own. The function is sent by value, in its state
-    at the call; ValueError if it cannot be sent. `time_limit` [s] is for a call, without the start of the process;
-    `memory_limit` [bytes] for the address space (0: none).
+    at the call; ValueError if it cannot be sent. `time_limit` [s] is for a call, without the start of the process.
     """
 
     def __init__(
         self,
         function: Callable[[Any], Any],
         time_limit: float | None = None,
-        memory_limit: int = 0,
         runs_per_process: int | None = None,
     ) -> None:
-        self._arguments = function, time_limit, memory_limit, runs_per_process
+        self._arguments = function, time_limit, runs_per_process
         self._of_thread = threading.local()
         Pickled.of(function)  # an error is raised here instead of in the first call
 
@@ -180,9 +177,9 @@ class Sandbox:
 
     def __call__(self, item: Any) -> Any:
         """Result of the function for an item, or its exception; SimulationFailed if the process died or was stopped."""
-        function, limit, memory_limit, most_calls = self._arguments
+        function, limit, most_calls = self._arguments
         if (worker := getattr(self._of_thread, "worker", None)) is None:
-            worker = self._of_thread.worker = Worker(None, memory_limit, True, most_calls or math.inf)
+            worker = self._of_thread.worker = Worker(None, True, most_calls or math.inf)
         try:
             return worker.run(Pickled.of(function), item, math.inf if limit is None else limit)
         except CannotLoad as error:
@@ -279,21 +276,16 @@ def _descendants(pid: int) -> list[int]:
 # in the worker ------------------------------------------------------------------------------------------------------
 
 
-def serve(fileno: int, memory_limit: int, parent: int) -> None:
+def serve(fileno: int, parent: int) -> None:
     """Main loop of a worker process: answer messages until the connection with a file descriptor closes.
 
-    A message is a function to load, or an item for it. `memory_limit` is as for `Worker`, `parent` the id of the
-    process that has started this process.
+    A message is a function to load, or an item for it. `parent` is the id of the process that has started this process.
     """
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != parent:  # it has ended before
             os._exit(1)
     os.set_inheritable(fileno, False)
-    if memory_limit:
-        import resource
-
-        resource.setrlimit(resource.RLIMIT_AS, (memory_limit, memory_limit))
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the parent, which ends this process
     become_worker()
     function, me = None, os.getpid()

@@ -190,11 +190,6 @@ def process_id(theta: np.ndarray) -> np.ndarray:
     return np.full((1, N_STEPS), os.getpid())
 
 
-def eats(theta: np.ndarray) -> np.ndarray:
-    """Allocates more memory than there is."""
-    return np.ones((1, 10**11))
-
-
 def third(theta: np.ndarray) -> np.ndarray:
     """NaN in a third of the prior and an exception in a small part of it."""
     if theta[0] > 0.98:

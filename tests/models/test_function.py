@@ -117,17 +117,11 @@ def test_a_killed_process_is_a_failure_and_the_next_run_succeeds(name, guarded):
     np.testing.assert_array_equal(guarded.simulate(THETA), line(THETA))
 
 
-def test_memory_is_limited():
-    reason = failure(model_of(bad.eats, memory_limit=2**34), 0)
-    assert reason.startswith("MemoryError")
-
-
 @pytest.mark.parametrize(
     ("options", "advice"),
     [
         ({"time_limit": 0.0}, "time_limit must be a positive number of seconds"),
         ({"time_limit": "long"}, "time_limit"),
-        ({"memory_limit": 0}, "memory_limit must be a positive number of bytes"),
         ({"runs_per_process": 0}, "runs_per_process must be None or a positive integer"),
         ({"function": 3}, "expected a function"),
         (
