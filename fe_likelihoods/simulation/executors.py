@@ -32,7 +32,7 @@ from numbers import Integral
 from queue import SimpleQueue
 from typing import Any
 
-from samplers.evaluation.pools import workers_of
+from samplers.evaluation.pools import submit_all, workers_of
 from samplers.interrupts import Ended, SentFunction
 
 from .by_value import Pickled
@@ -225,9 +225,9 @@ class LocalPool(Submitting):
         self._threads_here().submit_all(jobs, jobs, self.n_workers)
         return jobs
 
-    def give_up(self, futures: Sequence[Future], running: bool = True) -> None:
-        """Cancel items; with `running`, also kill the processes that run them. Items with results keep them."""
-        started = [job for job in futures if not job.cancel() and running and not job.done()]
+    def give_up(self, futures: Sequence[Future]) -> None:
+        """Cancel items, and kill the processes that run them. Items with results keep them."""
+        started = [job for job in futures if not job.cancel() and not job.done()]
         for job in started:
             job.given_up = True  # before the question for its process: one of the two threads sees what the other did
             if (worker := job.worker) is not None:
@@ -278,27 +278,20 @@ class PoolExecutor(Submitting):
 
     def submit_all(self, function: Callable[[Any], Outcome], items: Sequence[Any]) -> list[Future]:
         """Futures as from `submit`, for several items; they have ended if the pool only has ``map``."""
-        sent = self._by_value(function)
-        if self._is_dask:  # which sends the function once
-            return self.pool.map(partial(_run, sent), list(items), pure=False) if len(items) else []
-        if self.submits:
-            return [self.pool.submit(sent, item) for item in items]
+        by_value = _ByValue(function)
+        if self.other_processes:
+            by_value.pickled  # noqa: B018  # now
+        if self.submits and len(items):
+            return submit_all(self.pool, partial(_run, by_value) if self._is_dask else by_value, items)
         futures = [Future() for _ in items]
-        for future, result in zip(futures, self.pool.map(sent, list(items)), strict=True):
+        for future, result in zip(futures, self.pool.map(SentFunction(by_value), list(items)), strict=True):
             future.set_result(result)
         return futures
 
-    def give_up(self, futures: Sequence[Future], running: bool = True) -> None:
+    def give_up(self, futures: Sequence[Future]) -> None:
         """Cancel items that the pool has not started."""
         for future in futures:
             future.cancel()
-
-    def _by_value(self, function: Callable) -> SentFunction:
-        """The function as it is sent to workers, pickled now if they are known to be other processes."""
-        by_value = _ByValue(function)
-        if self.other_processes:
-            by_value.pickled  # noqa: B018
-        return SentFunction(by_value)
 
 
 class _ByValue:
