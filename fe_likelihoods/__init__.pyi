@@ -1,4 +1,5 @@
 from . import problems
+from .adapters.identification import read_modal_data
 from .cache.simulation_cache import SimulationCache
 from .checks.result import check_model, check_result
 from .checks.screening import check_data
@@ -19,7 +20,6 @@ from .likelihood.likelihood import FELikelihood
 from .likelihood.posterior import Posterior
 from .modal.modal_data import ModalData
 from .modal.modal_likelihood import ModalLikelihood
-from .modal.modal_readers import read_modal_data
 from .modal.mode_models import FunctionModes
 from .models.executable import ExecutableModel
 from .models.function import FunctionModel

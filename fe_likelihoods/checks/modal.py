@@ -72,7 +72,7 @@ def squares_of_modes(fit: Any) -> Iterator[tuple[str, dict[str, float], int]]:
     if fit.samples is None or noise.parameter_names or getattr(noise, "student", True):
         return
     sums = likelihood.simulator.statistics(fit.points[:, : len(likelihood.model.parameter_names)])
-    deviations = np.repeat(np.concatenate(noise.deviations(np.zeros((1, 0))), axis=1), noise.n_sets, axis=1)
+    deviations = np.repeat(noise.deviations(np.zeros((1, 0))).reshape(1, -1), noise.n_sets, axis=1)
     squares = sums[:, len(noise.channels) :] / np.square(deviations)
     names = [
         f"the {what} of mode {_number(fit.samples, mode)}{f' in set {k + 1}' if noise.n_sets > 1 else ''}"
@@ -82,4 +82,4 @@ def squares_of_modes(fit: Any) -> Iterator[tuple[str, dict[str, float], int]]:
     ]
     best = np.nan_to_num(squares[np.nanargmin(squares.sum(axis=1))]).tolist()
     what = "At the best sample, frequencies and shapes"
-    yield what, dict(zip(names, best, strict=True)), sum(map(sum, noise.counts))
+    yield what, dict(zip(names, best, strict=True)), int(noise.counts.sum())

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from ..adapters.identification import read_matlab, read_modal_data
 from ..checks.finding import labelled
 from ..checks.screening import check_sensors, repair_lines, screen
-from ..modal.modal_readers import read_matlab, read_modal_data
 from ..signals.channels import Channel, Measurements
 from ..signals.datasets import read_dataset
 from ..signals.read import read_columns

@@ -10,6 +10,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ..adapters.identification import read_modal_data
 from ..cache.simulation_cache import SimulationCache
 from ..likelihood.joint import JointLikelihood
 from ..likelihood.likelihood import FELikelihood
@@ -18,9 +19,8 @@ from ..likelihood.posterior import Posterior
 from ..modal.load_cases import read_load_test
 from ..modal.modal_data import ModalData
 from ..modal.modal_likelihood import ModalLikelihood
-from ..modal.modal_readers import read_modal_data
 from ..modal.mode_models import FunctionModes, modal_channels
-from ..modal.temperature import SLOPE
+from ..modal.pairing import SLOPE
 from ..models.one_run import one_run
 from ..models.sensed import SensedModel, Sensor
 from ..noise.autoregressive import AutoregressiveNoise

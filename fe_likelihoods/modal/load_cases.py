@@ -30,7 +30,7 @@ class LoadTest:
     channels : sequence of Channel
         The sensors.
     cases : sequence of str, or of float
-        Names of the load cases, or numbers such as positions of a load.
+        Different names of the load cases, or numbers such as positions of a load.
     values : (n_channels, n_cases) array_like
         Measured values [SI]; NaN where one is missing.
     errors : mapping of str to float, optional
@@ -64,23 +64,21 @@ class LoadTest:
     description: str = "load test"
 
     def __post_init__(self) -> None:
-        channels, cases, errors = tuple(self.channels), tuple(self.cases), dict(self.errors or {})
-        names = [channel.name for channel in channels]
-        if isinstance(self.cases, str) or not cases or len(set(cases)) != len(cases):
+        names, errors = [channel.name for channel in self.channels], self.errors or {}
+        if isinstance(self.cases, str) or not len(self.cases) or len(set(self.cases)) != len(self.cases):
             raise ValueError(f"LoadTest: expected different names of load cases; got {self.cases!r}")
         if bad := {name: each for name, each in errors.items() if name not in names or not 0.0 < each < np.inf}:
             raise ValueError(
                 f"LoadTest: errors must be positive standard deviations [SI] of {', '.join(names)}; got {bad}"
             )
-        measurements = Measurements(channels, 1.0, self.values, self.description, axis=self.axis, points=cases)
-        found = {"channels": channels, "cases": cases, "values": measurements.values, "errors": errors}
-        for name, value in (found | {"measurements": measurements}).items():
-            object.__setattr__(self, name, value)
+        along = {"axis": self.axis, "points": tuple(self.cases)}
+        measurements = Measurements(tuple(self.channels), 1.0, self.values, self.description, **along)
+        object.__setattr__(self, "measurements", measurements)
 
     @property
     def known(self) -> dict[str, float]:
         """Known errors as numbers for the mapping of priors: ``{"sigma_<channel>": error}``."""
-        return {f"sigma_{name}": float(error) for name, error in self.errors.items()}
+        return {f"sigma_{name}": float(error) for name, error in (self.errors or {}).items()}
 
     def model(self, function: Callable[..., Any], parameter_names: Sequence[str], **options: Any) -> Any:
         """Model of a function of theta that returns (n_channels, n_cases) [SI], options of `FunctionModel`."""
@@ -103,24 +101,20 @@ def read_load_test(
     numbers from 1. `errors` are those of `LoadTest`. Raises ValueError if a column is missing, or a unit is unknown or
     not stated.
     """
-    table = read_table(path, labels=cases or "")
-    names = [column.name for column in table.columns]
-
-    def column_of(channel: Channel) -> str:
-        wanted = (columns or {}).get(channel.name, channel.name)
-        found = [name for name in names if wanted in (name, re.sub(r"\s*[\[(].*", "", name).strip())]
-        return found[0] if len(found) == 1 else wanted
-
-    given = zip(channels, units_of(channels, units), strict=True)
-    wanted = [(column_of(each), each.dimension, unit, each.name) for each, unit in given]
+    table, wanted = read_table(path, labels=cases or ""), []
+    columns_of = {column.name: column for column in table.columns}
+    for channel, unit in zip(channels, units_of(channels, units), strict=True):
+        name = (columns or {}).get(channel.name, channel.name)
+        named = [each for each in columns_of if name in (each, re.sub(r"\s*[\[(].*", "", each).strip())]
+        wanted.append((named[0] if len(named) == 1 else name, channel.dimension, unit, channel.name))
     values = [to_si(*each) for each in table.samples(wanted, stacklevel=2)]
-    chosen = cases or next((name for name in names[:1] if name not in [each[0] for each in wanted]), None)
-    options = {"errors": errors, "description": f"load test of {Path(path).name}"}
-    if chosen is None:
-        return LoadTest(channels, [str(k + 1) for k in range(len(table.lines))], values, **options)
-    if chosen not in names:
-        raise ValueError(f"{table.file}: no column {chosen!r} of load cases; the columns are {', '.join(names)}")
-    column = table.columns[names.index(chosen)]
-    if column.kind == "text" or np.isnan(column.values).any():  # names
-        return LoadTest(channels, column.cells, values, **options)
-    return LoadTest(channels, column.values.tolist(), values, axis=chosen, **options)
+    first = next(iter(columns_of))
+    cases = cases or (None if first in [name for name, *_ in wanted] else first)
+    if cases is not None and cases not in columns_of:
+        raise ValueError(f"{table.file}: no column {cases!r} of load cases; the columns are {', '.join(columns_of)}")
+    points, more = tuple(str(k + 1) for k in range(len(table.lines))), {}
+    if cases is not None:
+        column = columns_of[cases]
+        are_names = column.kind == "text" or np.isnan(column.values).any()
+        points, more = (column.cells, {}) if are_names else (tuple(column.values.tolist()), {"axis": cases})
+    return LoadTest(channels, points, values, errors=errors, description=f"load test of {Path(path).name}", **more)

@@ -1,21 +1,36 @@
-"""Identified natural frequencies and mode shapes as data."""
+"""Identified natural frequencies and mode shapes as data, and tables of them."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..models.base import digest
 from ..signals.sampling import array_digest
+from ..signals.tables import Column, Table, agree_on_unit, read_table
 from ..text_tables import text_table
-from .pairing import close_groups
+from ..units import to_si
 
-__all__ = ["ModalData", "real_shapes"]
+__all__ = ["ModalData", "close_groups", "read_mode_table", "real_shapes"]
 
 _LARGEST_SHARE = 0.5  # above it, an error was given in percent or in hertz
 _ABOVE_ZERO = np.finfo(float).tiny
+_OF_SETS = "frequencies", "damping", "temperatures"  # each has a value in each identification
 _CLOSE = 0.02  # ratio of frequencies, less 1, below which an identification finds the plane of two shapes only
+# what a column is, by its name in lower case without a unit; all others of numbers are sensors
+_KINDS = {
+    "frequency": r"f|fn|freq\.?|(natural[ _]|eigen)?(frequency|frequenz|fr[eé]quence|fre[ck]uencia|frequenza)|omega",
+    "deviation": r"(f|fn|freq|frequency)[ _]std",
+    "damping": r"damping|d[äa]e?mpfung|zeta|xi",
+    "temperature": r"temp\.?|temp[eé]ratur[ea]?|t[ _]?(°c|degc|[\[(]?c[\])]?)|.*[\[(](°c|degc)[\])]",  # not a T alone
+    "set": r"set|identification|date|datum|messung",
+    "mode": r"mode([ _]no\.?)?|nr\.?|no\.?",
+}
+_NO_SENSOR = re.compile(r"\b(re|im|real|imag|mag|phase|angle|mac|mpc|order|std|sd|cv|period|factor)\b|[|<∠]", re.I)
+_OF_MODE = re.compile(r"(?:fn?|freq|frequency|frequenz)[ _]?(\d+)(?:_hz)?\s*(?:[\[(].*)?", re.I)  # a column for each
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -51,6 +66,8 @@ class ModalData:
         Numbers of identifications, modes and sensors.
     mean_frequencies : (m,) ndarray
         Mean frequency of each mode [Hz].
+    frequency_errors : (m,) ndarray or None
+        Known coefficients of variation, also by the covariance.
     has_shape, known_shapes : (n_sets, m) and (n_sets, m, n_sensors) ndarray
         Whether each identification has a shape of each mode, and the shapes, zero where there is none.
 
@@ -83,40 +100,34 @@ class ModalData:
     def __post_init__(self) -> None:
         expected = "positive numbers [Hz] of shape (m,) or (n_sets, m), NaN where one of several missed the mode"
         frequencies = np.atleast_2d(_numbers("frequencies", self.frequencies, None, (_ABOVE_ZERO, np.inf), expected))
-        known, (n_sets, m) = ~np.isnan(frequencies), frequencies.shape
+        known, (n_sets, m), sensors = ~np.isnan(frequencies), frequencies.shape, tuple(self.sensors)
         if not known.any(axis=0).all():
             raise ValueError("ModalData: a mode has no frequency: leave out modes that were never identified")
-        numbers = range(1, m + 1) if self.mode_numbers is None else self.mode_numbers
-        expected = f"{m} different whole numbers from 1 on"
-        numbers = _numbers("mode_numbers", list(numbers), (m,), (1.0, 1e9), expected)
-        if len(set(numbers)) < m or (numbers % 1.0).any():
-            raise ValueError(f"ModalData: mode_numbers must be {expected}; got {self.mode_numbers!r}")
-        sensors = tuple(self.sensors)
         if len(set(sensors)) != len(sensors) or not all(isinstance(name, str) and name for name in sensors):
             raise ValueError(f"ModalData: the names of the sensors must differ and not be empty; got {sensors}")
-        shapes, means = _checked_shapes(self.shapes, n_sets, m, sensors, known), np.nanmean(frequencies, axis=0)
-        has_shape = ~np.isnan(shapes).any(axis=2) & (len(sensors) > 0)
-        values = {"frequencies": frequencies, "shapes": shapes, "sensors": sensors, "mean_frequencies": means}
-        values |= {"has_shape": has_shape, "known_shapes": np.where(has_shape[:, :, None], shapes, 0.0)}
-        values |= {"n_sets": n_sets, "n_modes": m, "n_sensors": len(sensors)}
-        values["mode_numbers"] = tuple(int(number) for number in numbers)
         share = f"one number, or one for each of {m} modes, between 0 and {_LARGEST_SHARE}, such as"
         ratios = "ratios from 0 to below 1, of the shape of frequencies, such as 0.015 for 1.5 % (in a file damping_%)"
-        for what, shape, limits, expected in (
-            ("frequency_cv", (m,), (_ABOVE_ZERO, _LARGEST_SHARE), f"{share} 0.005 for 0.5 %"),
-            ("shape_error", (m,), (_ABOVE_ZERO, _LARGEST_SHARE), f"{share} 0.02, for shapes with a norm of 1"),
-            (
-                "temperatures",
-                (n_sets,),
-                (-80.0, 80.0),
-                f"a [°C] for each of {n_sets} identifications, from -80 to 80",
-            ),
-            ("damping", (n_sets, m), (0.0, 1.0), ratios),
-            ("covariance", (m, m), (-np.inf, np.inf), f"a matrix ({m}, {m}) [Hz²], symmetric positive definite"),
+        days = f"a [°C] for each of {n_sets} identifications, from -80 to 80"
+        numbers = range(1, m + 1) if self.mode_numbers is None else self.mode_numbers
+        whole = f"{m} different whole numbers from 1 on"
+        values: dict[str, Any] = {"n_sets": n_sets, "n_modes": m, "n_sensors": len(sensors), "sensors": sensors}
+        for what, given, shape, limits, expected in (
+            ("mode_numbers", list(numbers), (m,), (1.0, 1e9), whole),
+            ("frequency_cv", self.frequency_cv, (m,), (_ABOVE_ZERO, _LARGEST_SHARE), f"{share} 0.005 for 0.5 %"),
+            ("shape_error", self.shape_error, (m,), (_ABOVE_ZERO, _LARGEST_SHARE), f"{share} 0.02, of a norm of 1"),
+            ("temperatures", self.temperatures, (n_sets,), (-80.0, 80.0), days),
+            ("damping", self.damping, (n_sets, m), (0.0, 1.0), ratios),
+            ("covariance", self.covariance, (m, m), (-np.inf, np.inf), f"a matrix ({m}, {m}) [Hz²]"),
         ):
-            if (given := getattr(self, what)) is not None:
-                values[what] = _numbers(what, given, shape, limits, expected)
-        if (covariance := values.get("covariance")) is not None and (
+            values[what] = None if given is None else _numbers(what, given, shape, limits, expected)
+        values["mode_numbers"] = tuple(int(number) for number in values["mode_numbers"])
+        if len(set(values["mode_numbers"])) < m or values["mode_numbers"] != tuple(numbers):
+            raise ValueError(f"ModalData: mode_numbers must be {whole}; got {self.mode_numbers!r}")
+        shapes, means = _checked_shapes(self.shapes, sensors, known), np.nanmean(frequencies, axis=0)
+        has_shape = ~np.isnan(shapes).any(axis=2) & (len(sensors) > 0)
+        values |= {"frequencies": frequencies, "shapes": shapes, "mean_frequencies": means, "has_shape": has_shape}
+        values["known_shapes"] = np.where(has_shape[:, :, None], shapes, 0.0)
+        if (covariance := values["covariance"]) is not None and (
             self.frequency_cv is not None
             or not known.all()
             or not np.allclose(covariance, covariance.T, rtol=1e-8, atol=0.0)
@@ -129,38 +140,30 @@ class ModalData:
                 "alone (frequency_cv) if the covariances are poorly known. If covariance and frequency_cv state the "
                 "same errors: leave one out (frequency_cv=None, where a file has them)"
             )
-        for name, value in values.items():
-            if isinstance(value, np.ndarray):
-                value.flags.writeable = False
-            object.__setattr__(self, name, value)
-        if (np.diff(means[np.argsort(numbers)]) < 0.0).any() and not has_shape.any(axis=0).all():
+        if (np.diff(means[np.argsort(values["mode_numbers"])]) < 0.0).any() and not has_shape.any(axis=0).all():
             raise ValueError(
                 f"ModalData: modes without a shape are found by their number, so frequencies must ascend; got "
                 f"{means.tolist()} Hz of the modes {self.mode_numbers}: sort them, or give mode_numbers"
             )
-
-    @property
-    def fingerprint(self) -> str:
-        """Hex digest of frequencies, shapes, sensors and mode numbers: what simulations are compared with."""
-        values = [np.where(np.isnan(each), np.nan, each) for each in (self.frequencies, self.shapes)]  # one NaN
-        return digest(repr([self.sensors, self.mode_numbers]), array_digest(*values))
-
-    @property
-    def frequency_errors(self) -> np.ndarray | None:
-        """Known coefficients of variation (m,) of the frequencies, also by their covariance."""
-        if self.covariance is None:
-            return self.frequency_cv
-        return np.sqrt(np.diag(self.covariance)) / self.mean_frequencies
+        values["frequency_errors"] = (
+            values["frequency_cv"] if covariance is None else np.sqrt(np.diag(covariance)) / means
+        )
+        one_nan = [np.where(np.isnan(each), np.nan, each) for each in (frequencies, shapes)]
+        values["fingerprint"] = digest(repr([sensors, values["mode_numbers"]]), array_digest(*one_nan))
+        for name, value in values.items():
+            if isinstance(value, np.ndarray):
+                value.flags.writeable = False
+            object.__setattr__(self, name, value)
 
     def groups(self) -> tuple[tuple[int, ...], ...]:
         """Modes so close to each other that an identification finds the plane of their shapes only, as groups.
 
         Modes without a shape, and groups whose plane would take up all sensors, are single.
         """
-        shaped = np.flatnonzero(self.has_shape.any(axis=0))
-        groups = [(mode,) for mode in range(self.n_modes) if mode not in shaped]
-        for group in close_groups(self.mean_frequencies[shaped], _CLOSE) if len(shaped) else ():
-            modes = tuple(int(shaped[each]) for each in group)
+        has_shape = self.has_shape.any(axis=0)
+        shaped, groups = np.flatnonzero(has_shape), [(mode,) for mode in np.flatnonzero(~has_shape).tolist()]
+        for group in close_groups(self.mean_frequencies[shaped], _CLOSE):
+            modes = tuple(shaped[list(group)].tolist())
             groups += [modes] if len(modes) < self.n_sensors else [(mode,) for mode in modes]
         return tuple(groups)
 
@@ -169,12 +172,10 @@ class ModalData:
         if unknown := [number for number in mode_numbers if number not in self.mode_numbers]:
             raise ValueError(f"ModalData has no modes {unknown}; the modes are {str(self.mode_numbers)[1:-1]}")
         rows = [self.mode_numbers.index(number) for number in mode_numbers]
-        names = ("frequencies", "damping", "frequency_cv", "shape_error")
-        per_mode = {name: each[..., rows] for name in names if (each := getattr(self, name)) is not None}
-        covariance = None if self.covariance is None else self.covariance[np.ix_(rows, rows)]
-        return replace(
-            self, **per_mode, covariance=covariance, shapes=self.shapes[:, rows], mode_numbers=tuple(mode_numbers)
-        )
+        given = {name: getattr(self, name) for name in ("frequencies", "damping", "frequency_cv", "shape_error")}
+        found = {name: each[..., rows] for name, each in given.items() if each is not None}
+        found["covariance"] = None if self.covariance is None else self.covariance[np.ix_(rows, rows)]
+        return replace(self, **found, shapes=self.shapes[:, rows], mode_numbers=tuple(mode_numbers))
 
     def mean(self) -> "ModalData":
         """Return the mean of several identifications, with their scatter as the errors `frequency_cv`, `shape_error`.
@@ -182,25 +183,18 @@ class ModalData:
         The scatter is not divided by the square root of the number of identifications: what they have in common, such
         as the temperature of the day, does not average out. ValueError for modes that were identified only once.
         """
-        if ((~np.isnan(self.frequencies)).sum(axis=0) < 2).any():
-            raise ValueError(
-                "ModalData.mean: the scatter needs two identifications or more of each mode: select others"
-            )
+        if (np.isfinite(self.frequencies).sum(axis=0) < 2).any():
+            raise ValueError("ModalData.mean: the scatter needs two identifications of each mode: select others")
         shapes, errors = np.full(self.shapes.shape[1:], np.nan), np.zeros(self.n_modes)
         for mode in np.flatnonzero(self.has_shape.any(axis=0)):
             found = self.shapes[self.has_shape[:, mode], mode]
             shapes[mode] = np.linalg.svd(found, full_matrices=False)[2][0]
             squares = np.maximum(1.0 - np.square(found @ shapes[mode]), 0.0).sum()
             errors[mode] = np.sqrt(squares / (max(len(found) - 1, 1) * max(self.n_sensors - 1, 1)))
-        means = {
-            name: np.nanmean(x, axis=0)
-            for name in ("damping", "temperatures")
-            if (x := getattr(self, name)) is not None
-        }
         cv = np.nanstd(self.frequencies, axis=0, ddof=1) / self.mean_frequencies
         error = errors if (errors > 0.0).all() else self.shape_error
-        found = {"frequencies": self.mean_frequencies, "shapes": shapes, "frequency_cv": cv, "shape_error": error}
-        return replace(self, **found, **means, covariance=None)
+        means = {name: None if (x := getattr(self, name)) is None else np.nanmean(x, axis=0) for name in _OF_SETS}
+        return replace(self, **means, shapes=shapes, frequency_cv=cv, shape_error=error, covariance=None)
 
     def __repr__(self) -> str:
         damping = [] if self.damping is None else ["damping"]
@@ -211,6 +205,13 @@ class ModalData:
             rows.append([str(number), f"{self.mean_frequencies[mode]:.4g}", *ratio, *(f"{x:.3f}" for x in shape)])
         what = f"modes {self.n_modes}, sensors {self.n_sensors}, identifications {self.n_sets}"
         return f"ModalData: {what}\n" + text_table(rows)
+
+
+def close_groups(frequencies: Sequence[float], close: float) -> tuple[tuple[int, ...], ...]:
+    """Groups of modes whose frequencies follow each other at ratios below 1 + `close`, in ascending order."""
+    order, ordered = np.argsort(frequencies, kind="stable"), np.sort(frequencies)
+    starts = np.flatnonzero(ordered[1:] >= (1.0 + close) * ordered[:-1]) + 1
+    return tuple(tuple(each.tolist()) for each in np.split(order, starts) if len(each))
 
 
 def real_shapes(shapes: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -249,9 +250,9 @@ def _numbers(
     return values if shape is None else np.broadcast_to(values, shape).copy()
 
 
-def _checked_shapes(given: Any, n_sets: int, m: int, sensors: Sequence[str], known: np.ndarray) -> np.ndarray:
-    """Shapes (n_sets, m, n_sensors) with a norm of 1, NaN where there is none."""
-    shape = n_sets, m, len(sensors)
+def _checked_shapes(given: Any, sensors: Sequence[str], known: np.ndarray) -> np.ndarray:
+    """Shapes (n_sets, m, n_sensors) with a norm of 1, NaN where there is none; `known` (n_sets, m) are frequencies."""
+    shape = *known.shape, len(sensors)
     if not sensors and (given is None or not np.size(given)):
         return np.full(shape, np.nan)
     shapes = np.array(given)
@@ -263,10 +264,10 @@ def _checked_shapes(given: Any, n_sets: int, m: int, sensors: Sequence[str], kno
     shapes = shapes.real.astype(float)
     shapes = shapes[None] if shapes.ndim == 2 else shapes
     if shapes.shape != shape:
-        advice = "transpose them" if shapes.shape == (n_sets, len(sensors), m) else "name each sensor in sensors="
+        turned = shapes.shape == (shape[0], shape[2], shape[1])
         raise ValueError(
             f"ModalData: expected shapes (n_sets, modes, sensors) = {shape}, of the sensors {', '.join(sensors)}; got "
-            f"{shapes.shape}: {advice}"
+            f"{shapes.shape}: {'transpose them' if turned else 'name each sensor in sensors='}"
         )
     lengths = np.linalg.norm(shapes, axis=2)
     good = np.isnan(shapes).all(axis=2) | (known & (lengths > 0.0) & (lengths < np.inf))
@@ -278,3 +279,86 @@ def _checked_shapes(given: Any, n_sets: int, m: int, sensors: Sequence[str], kno
             f"where its frequency is; got {named}: leave a sensor out, or give a row of NaN for a mode without a shape"
         )
     return shapes / lengths[..., None]
+
+
+def read_mode_table(path: str | Path, sensors: Sequence[str], unit: str | None, options: dict[str, Any]) -> ModalData:
+    """Read a table as `read_modal_data`, with `options` of `ModalData`."""
+    import pandas as pd  # slow to import
+
+    table, lines, found = read_table(path), pd.DataFrame(), dict[str, Any]()
+    kinds = ["" if column.name in sensors else _kind(column.name) for column in table.columns]
+    at = {kind: kinds.index(kind) for kind in _KINDS if kind in kinds}
+    of_modes = {k: match for k, each in enumerate(table.columns) if (match := _OF_MODE.fullmatch(each.name))}
+    if not ("frequency" in at or of_modes) or max(map(kinds.count, at), default=0) > 1:
+        raise ValueError(
+            f"{table.file}: expected one column of frequencies, such as frequency_Hz, and at most one of "
+            f"{', '.join(_KINDS)}; the columns are {', '.join(column.name for column in table.columns)}"
+        )
+    if "temperature" in at:
+        found["temperatures"] = lines["temperature"] = _si(table, at["temperature"], "temperature", "degC")
+    if "frequency" not in at:  # a line for each identification
+        frequencies = np.stack([_in_hertz(table, place, unit) for place in of_modes], axis=1)
+        return ModalData(frequencies, mode_numbers=[int(each[1]) for each in of_modes.values()], **found | options)
+    columns = _sensor_columns(table, [k for k, kind in enumerate(kinds) if not kind], sensors)
+    lines = pd.concat([lines, pd.DataFrame({k: column.values for k, column in enumerate(columns)})], axis=1)
+    lines["frequency"] = _in_hertz(table, at["frequency"], unit)
+    if "deviation" in at:  # the mean square of several identifications
+        usual = table.stated_unit(at["frequency"], "frequency") or unit
+        lines["square"] = np.square(_si(table, at["deviation"], "frequency", usual) / lines["frequency"])
+    if "damping" in at:
+        lines["damping"] = _si(table, at["damping"], "dimensionless", "1")
+    day = table.columns[at["set"]] if "set" in at else None
+    lines["set"] = 0 if day is None else day.cells if day.kind == "text" else day.values
+    lines["mode"] = table.columns[at["mode"]].values if "mode" in at else 1.0 + np.arange(len(lines))
+    unknown = "mode" not in at and lines["set"].nunique() > 1  # which mode has an identification missed?
+    if unknown or lines.duplicated(["set", "mode"]).any() or (lines["mode"] % 1 != 0).any():
+        raise ValueError(
+            f"{table.file}: expected a line for each mode, with different whole numbers in the column of modes; got "
+            f"{lines['mode'].tolist()}: several identifications need a column 'set' with their numbers, and a column "
+            "'mode', because one of them may miss a mode"
+        )
+    wide = lines.pivot(index="set", columns="mode")
+    found |= {"sensors": [each.name for each in columns], "mode_numbers": wide["frequency"].columns}
+    found["shapes"] = np.stack([wide[k] for k in range(len(columns))], axis=-1) if columns else None
+    if "damping" in lines:
+        found["damping"] = wide["damping"]
+    if "square" in lines:
+        found["frequency_cv"] = np.sqrt(wide["square"].mean())
+    if "temperature" in lines:
+        found["temperatures"] = wide["temperature"].mean(axis=1)
+        if (wide["temperature"].nunique(axis=1) != 1).any():
+            raise ValueError(f"{table.file}: expected one temperature for each identification (column 'set')")
+    return ModalData(wide["frequency"], **found | options)
+
+
+def _kind(name: str) -> str:
+    """What a column is, by its name with or without a unit; empty for a sensor."""
+    name = name.strip().lower()
+    plain = re.sub(r"[\s_]*([\[(].*[\])]|_(hz|rad/s|%|c|°c|degc))$", "", name)
+    return next((kind for kind, known in _KINDS.items() if any(re.fullmatch(known, x) for x in (name, plain))), "")
+
+
+def _sensor_columns(table: Table, others: Sequence[int], sensors: Sequence[str]) -> list[Column]:
+    """The columns of the sensors among those at the places `others`: all of them, or those with the given names."""
+    columns = {table.columns[k].name: table.columns[k] for k in others if table.columns[k].kind == "number"}
+    if unknown := [name for name in sensors if name not in columns]:
+        raise ValueError(f"{table.file}: no columns {', '.join(unknown)}; the sensors are {', '.join(columns)}")
+    units = {table.stated_unit(k, "dimensionless") for k in others if table.columns[k].name in columns}
+    doubtful = any(_NO_SENSOR.search(name.replace("_", " ")) for name in columns)
+    if not sensors and (doubtful or len(units) > 1):
+        raise ValueError(
+            f"{table.file}: some of the columns {', '.join(columns)} may be no components of real shapes (other units, "
+            "a name as of a phase or a quality): give those that are sensors, sensors=[...] (columns in a TOML file)"
+        )
+    return [columns[name] for name in sensors or columns]
+
+
+def _si(table: Table, place: int, dimension: str, usual: str | None) -> np.ndarray:
+    """Values of a column in the SI unit, or °C; `usual` is the unit of one that states none."""
+    return to_si(table.columns[place].values, table.stated_unit(place, dimension) or usual, dimension)
+
+
+def _in_hertz(table: Table, place: int, given: str | None) -> np.ndarray:
+    """Frequencies [Hz] in a column; ValueError if the unit is not known, or is stated and given differently."""
+    unit = agree_on_unit(table.stated_unit(place, "frequency"), given, "frequency", table.file, "unit")
+    return _si(table, place, "frequency", unit)

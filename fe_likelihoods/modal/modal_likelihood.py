@@ -1,4 +1,4 @@
-"""Log-likelihood of natural frequencies and mode shapes, and the modes that samples of a posterior predict."""
+"""Log-likelihood of natural frequencies and mode shapes, their errors, and the modes that samples predict."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -11,17 +11,19 @@ from ..cache.verification import Simulated, difference_in_words
 from ..likelihood.likelihood import FELikelihood
 from ..likelihood.simulator import Simulator
 from ..models.linear_structure import LinearStructure
+from ..noise.gaussian import HALF_LOG_TWO_PI
+from ..noise.student import check_degrees, student_constant
 from ..priors.points import as_points
 from ..signals.channels import Measurements
 from ..simulation.model import Model, SimulationBatch, SimulationFailed
 from ..text_tables import text_table
 from .modal_data import ModalData
-from .modal_noise import modal_noise
 from .mode_models import StructureModes
-from .paired_modes import PairedModes, sensor_rows
-from .temperature import ModesWithSlope
+from .pairing import ModesWithSlope, PairedModes
 
-__all__ = ["ModalLikelihood", "PredictedModes"]
+__all__ = ["ModalLikelihood", "ModalNoise", "PredictedModes"]
+
+_LEAST_ERRORS = 1e-4, 1e-3  # of frequencies and shapes, known where no error is stated
 
 _PROBABILITIES = (np.arange(32) + 0.5) / 32  # of an error, for each sample
 
@@ -84,12 +86,13 @@ class ModalLikelihood(FELikelihood):
     ) -> None:
         if not isinstance(data, ModalData):
             raise ValueError(f"ModalLikelihood: expected ModalData; got {type(data).__name__}")
-        model = _with_modes(model)
+        model = model.parts if isinstance(model, LinearStructure) else model
+        model = StructureModes(model) if hasattr(model, "assemble") else model
         self._paired = PairedModes(model if data.temperatures is None else ModesWithSlope(model), data)
-        noise = modal_noise(self._paired, (frequency_error, shape_error), student_t)
+        noise = ModalNoise(self._paired, (frequency_error, shape_error), student_t)
         self.held_out = held_out
         if held_out is not None:
-            sensor_rows(model, held_out)  # refuses what cannot be predicted
+            PairedModes(model, held_out)  # refuses what cannot be predicted
         super().__init__(self._paired, self._paired.measurements, noise, pool, **options)
 
     def _make_simulator(self, model: PairedModes, measurements: Measurements, **options: Any) -> Simulator:
@@ -101,11 +104,6 @@ class ModalLikelihood(FELikelihood):
         return self._paired
 
     @property
-    def measurements(self) -> Measurements:
-        """The data as measurements of the channels of the model."""
-        return self._paired.measurements
-
-    @property
     def measured(self) -> np.ndarray:
         """What responses are compared with (m, n_sets (1 + n_sensors))."""
         return self._paired.measurements.values
@@ -113,10 +111,10 @@ class ModalLikelihood(FELikelihood):
     def run(self, thetas: np.ndarray) -> tuple[np.ndarray, SimulationBatch]:
         """Statistics and responses of the paired modes at structural parameters, as `FELikelihood.run`."""
         statistics, batch = super().run(thetas)
-        found = np.full((len(batch.reasons), *self.measured.shape), np.nan)
-        for row in [row for row, reason in enumerate(batch.reasons) if not reason]:
-            found[row] = self._paired.response(batch.response[row])
-        return statistics, SimulationBatch(found, batch.reasons)
+        failed = np.full(self.measured.shape, np.nan)
+        each = zip(*batch, strict=True)
+        found = [failed if reason else self._paired.response(modes) for modes, reason in each]
+        return statistics, SimulationBatch(np.reshape(found, (-1, *failed.shape)), batch.reasons)
 
     def predict_modes(self, samples: Any, data: ModalData | None = None, most: int = 400) -> "PredictedModes":
         """Modes that samples of a posterior predict, beside measured ones, which may be others than the data.
@@ -141,7 +139,7 @@ class ModalLikelihood(FELikelihood):
         rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(most, len(rows))).round().astype(int))]
         rows, parameters, errors = rows[:, : len(names)], rows[:, len(names) :], np.zeros(len(rows))
         if parameters.shape[1] == len(self.noise.parameter_names):
-            known = np.zeros(1) if self.model.frequency_cv is None else self.model.frequency_cv
+            known = 0.0 if self.model.frequency_cv is None else self.model.frequency_cv
             squares = np.square(self.noise.standard_deviations(parameters)) - np.square(known)
             errors = np.sqrt(np.maximum(squares.mean(axis=1), 0.0))  # of the modes of the data, for any modes
         batch = self.simulator.simulate(rows)
@@ -153,6 +151,83 @@ class ModalLikelihood(FELikelihood):
         return PredictedModes.of(paired, batch.response[good], errors[good], self.noise.student)
 
 
+class ModalNoise:
+    """Errors of m modes, known, unknown or both, with a `Noise`'s members (``docs/theory/modes.rst``).
+
+    Known errors (2, m), and degrees of freedom `counts` (2, m, n_sets), are of frequencies and of shapes. What is
+    `unknown` of them is an error ``"common"`` to all modes, one for each (``"mode"``), or None: nothing beside known
+    ones. Where none is known, it is 1e-4 for frequencies, and 1e-3 for shapes, because digits and temperature leave no
+    identification more exact: a few frequencies that the parameters can fit exactly would give a spike of any height to
+    an error of zero. `student` are the degrees of freedom of Student-t errors, 0 for Gaussian ones.
+    """
+
+    level = "si"  # the errors do not depend on the response
+
+    def __init__(self, paired: PairedModes, unknown: tuple[Any, Any], student_t: float | None) -> None:
+        data, stated = paired.data, (paired.frequency_cv, paired.data.shape_error)
+        if data.covariance is not None and (unknown[0] is not None or student_t is not None):
+            raise ValueError(
+                "ModalLikelihood: beside a covariance of the frequencies, neither an unknown frequency_error nor "
+                "student_t is possible: leave it out, or give the data frequency_cv and no covariance"
+            )
+        if wrong := [each for each in unknown if each not in (None, "common", "mode")]:
+            raise ValueError(
+                f'ModalLikelihood: frequency_error and shape_error must be "common" or "mode"; got {wrong[0]!r}: known '
+                "errors belong to the data (frequency_cv, shape_error), or are numbers in the mapping of priors"
+            )
+        freedoms = data.has_shape.T * data.n_sensors
+        for group in map(list, paired.groups):  # what is fitted: a scale, or a place in the plane of close modes
+            freedoms[group] = np.maximum(freedoms[group] - len(group), 0)
+        self.counts = np.stack([~np.isnan(data.frequencies).T, freedoms])
+        self.known, names, places = np.zeros((2, data.n_modes)), [], []  # of unknown errors, and where each is added
+        modes = [(f"_{number}", place) for place, number in enumerate(data.mode_numbers)]
+        for k, what in enumerate(("frequency_error", "shape_error")):
+            self.known[k] = _LEAST_ERRORS[k] if stated[k] is None else stated[k]
+            kind = unknown[k] or ("common" if stated[k] is None else "")
+            ends = {"common": [("", slice(None))], "mode": modes}.get(kind, []) if self.counts[k].any() else []
+            for end, place in ends:
+                names.append(what + end)
+                places.append(np.zeros((2, data.n_modes)))
+                places[-1][k, place] = 1.0
+        self.parameter_names, self._places = tuple(names), np.reshape(places, (-1, 2, data.n_modes))
+        self.channels, self.n_sets, self.statistic = paired.channels, data.n_sets, paired.sums
+        self.student, self.title = 0.0, "errors of natural frequencies and mode shapes"
+        if student_t is not None:
+            self.student = check_degrees("ModalLikelihood: student_t", student_t)
+            self.title += f", Student-t with {self.student:g} degrees of freedom"
+
+    def __repr__(self) -> str:
+        return f"ModalNoise({self.parameter_names}, {self.known.tolist()}, {self.counts.tolist()}, {self.student})"
+
+    def deviations(self, parameters: np.ndarray) -> np.ndarray:
+        """Standard deviations (n, 2, m) of frequencies and of components of shapes, at parameters (n, n_noise)."""
+        # an unknown error that is not positive is impossible, also beside a known one
+        variances = np.square(np.where(parameters > 0.0, parameters, np.nan))
+        return np.sqrt(np.square(self.known) + np.tensordot(variances, self._places, 1))
+
+    def log_likelihood(self, statistics: np.ndarray, n_samples: Any, parameters: np.ndarray) -> np.ndarray:
+        """Log-likelihood (n,) for the statistics (n, m + 2 m n_sets); -inf for impossible errors."""
+        d, spread = self.counts, self.deviations(parameters)[..., None]
+        squares = statistics[:, len(self.channels) :].reshape(len(statistics), *d.shape)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            ratios = squares / np.square(spread)
+            if self.student:
+                logs = 0.5 * (self.student + d) * np.log1p(ratios / self.student) - student_constant(self.student, d)
+            else:
+                logs = 0.5 * ratios + d * HALF_LOG_TWO_PI
+            total = -np.where(d > 0, d * np.log(spread) + logs, 0.0).sum(axis=(1, 2, 3))
+        return np.where(np.isnan(total) | (total == np.inf), -np.inf, total)
+
+    def standard_deviations(self, parameters: np.ndarray) -> np.ndarray:
+        """Standard deviations (n, m) of the frequencies, as shares."""
+        return self.deviations(parameters)[:, 0]
+
+    def response_deviations(self, parameters: np.ndarray, response: np.ndarray, dt: Any = None) -> np.ndarray:
+        """Standard deviations of all samples (m, n_sets (1 + n_sensors)); zero where nothing was measured."""
+        (deviations,), n = self.deviations(np.atleast_2d(parameters)), response.shape[1] // self.n_sets
+        return np.tile(np.repeat(deviations.T, [1, n - 1], axis=1), self.n_sets) * (np.asarray(response) != 0.0)
+
+
 class _ModesSimulator(Simulator):
     """Simulator of a model that has modes, compared as paired ones; the modes are kept, for predictions."""
 
@@ -162,17 +237,12 @@ class _ModesSimulator(Simulator):
         modes = paired.model
         anything = Measurements(modes.channels, modes.dt, np.ones((len(modes.channels), modes.n_steps)))
         super().__init__(modes, anything, paired, **options)
+        self.measurements = paired.measurements
 
     def _difference(self, earlier: np.ndarray, reason: str, new: Simulated) -> tuple[str, float]:
-        measured, tolerance = self.statistic.measurements, TOLERANCE if self.cache is None else self.cache.tolerance
+        measured, tolerance = self.measurements, TOLERANCE if self.cache is None else self.cache.tolerance
         names, norm = [each.name for each in measured.channels], np.linalg.norm(measured.values, axis=1)
         return difference_in_words(earlier, reason, new._replace(norm=norm), names, tolerance, False)
-
-
-def _with_modes(model: Any) -> Model:
-    """A model that has modes."""
-    model = model.parts if isinstance(model, LinearStructure) else model
-    return StructureModes(model) if hasattr(model, "assemble") else model
 
 
 class PredictedModes(NamedTuple):
@@ -181,7 +251,8 @@ class PredictedModes(NamedTuple):
     Shapes have the scale and sign of the measured ones (of the first identification that has them).
     """
 
-    paired: PairedModes  # the measured modes (``paired.data``), and the model
+    model: Model  # of the modes
+    data: ModalData  # the measured modes
     computed: np.ndarray  # (n, 1 + n_sensors, n_modes) all computed modes: frequencies [Hz], and shapes
     frequencies: np.ndarray  # (n, m) computed frequencies of the measured modes [Hz]
     assurance: np.ndarray  # (n, m) modal assurance criterion; NaN for modes without a measured shape
@@ -198,28 +269,17 @@ class PredictedModes(NamedTuple):
         numbers = np.stack([each.columns for each in found]) + 1
         shapes = np.stack([each.shapes[first, np.arange(len(first))] for each in found])
         unknown = np.broadcast_to(unknown, len(found))
-        return cls(paired, computed, frequencies, assurance, numbers, shapes, unknown, student)
-
-    @property
-    def data(self) -> ModalData:
-        """The measured modes."""
-        return self.paired.data
+        return cls(paired.model, paired.data, computed, frequencies, assurance, numbers, shapes, unknown, student)
 
     def against(self, data: ModalData) -> "PredictedModes":
         """The same computed modes beside other measured ones; nothing is simulated."""
-        paired = PairedModes(self.paired.model, data)
-        return self.of(paired, self.computed, self.unknown, self.student)
-
-    @property
-    def errors(self) -> np.ndarray:
-        """Known and unknown relative errors (n, m) of an identified frequency, together; scales if Student-t."""
-        known = 0.0 if (stated := self.data.frequency_errors) is None else stated
-        return np.hypot(self.unknown[:, None], known) * np.ones(self.data.n_modes)
+        return self.of(PairedModes(self.model, data), self.computed, self.unknown, self.student)
 
     def interval(self, level: float = 0.9) -> np.ndarray:
-        """Central intervals (2, m) of an identified frequency [Hz], with its errors."""
+        """Central intervals (2, m) of an identified frequency [Hz], with its known and unknown errors."""
+        known = 0.0 if self.data.frequency_errors is None else self.data.frequency_errors
         errors = stdtrit(self.student, _PROBABILITIES) if self.student else ndtri(_PROBABILITIES)
-        drawn = self.frequencies * (1.0 + self.errors * errors[:, None, None])
+        drawn = self.frequencies * (1.0 + np.hypot(self.unknown[:, None], known) * errors[:, None, None])
         return np.quantile(drawn, [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=(0, 1))
 
     def rows(self) -> list[list[str]]:

@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from ..models.base import digest
 from ..models.function import FunctionModel
 from ..models.linear_structure_parts import Parts
-from ..models.undamped_modes import Modes, mode_derivatives, undamped_modes
+from ..models.undamped_modes import mode_derivatives, undamped_modes
 from ..models.user_model import ExternalModel
 from ..models.validation import check_theta
 from ..signals.channels import Channel
@@ -64,12 +65,9 @@ def opensees_modes(ops: Any, n_modes: int, sensors: Sequence[tuple[int, int]]) -
 
     `ops` is ``openseespy.opensees``, as an `OpenSeesModel` passes it; `n_modes` is less than the number of degrees of
     freedom that have a mass; `sensors` are nodes and degrees of freedom in the order of the channels. Raises
-    SimulationFailed if ``ops.eigen`` fails, or an eigenvalue is not positive. (An example is in ``docs/modes.rst``.)
+    SimulationFailed if an eigenvalue is not positive. (An example is in ``docs/modes.rst``.)
     """
-    try:
-        squares = np.array(ops.eigen(n_modes) or [], dtype=float)
-    except Exception as error:  # openseespy raises its own class
-        raise SimulationFailed(f"ops.eigen failed: {error}") from error
+    squares = np.array(ops.eigen(n_modes) or [], dtype=float)
     if len(squares) != n_modes or not (squares > 0.0).all():
         raise SimulationFailed(
             f"ops.eigen({n_modes}) returned the eigenvalues {squares.tolist()}, expected {n_modes} positive ones: is "
@@ -114,12 +112,9 @@ class FunctionModes(FunctionModel):
         n_modes: int = 10,
         **options: Any,
     ) -> None:
-        self.rows = tuple(int(row) for row in sensors.values()) if isinstance(sensors, Mapping) else None
+        self.rows = [int(row) for row in sensors.values()] if isinstance(sensors, Mapping) else None
         super().__init__(function, parameter_names, modal_channels(tuple(sensors)), 1.0, n_modes, **options)
-
-    def code_parts(self) -> dict[str, Any]:
-        """User code and rows of the sensors, for the label of stored simulations."""
-        return super().code_parts() | {"rows of the sensors": self.rows}
+        self.fingerprint = digest(self.fingerprint, repr(self.rows))
 
     def _respond(self, theta: np.ndarray) -> np.ndarray:
         returned = super()._respond(theta)
@@ -134,7 +129,7 @@ class FunctionModes(FunctionModel):
             raise SimulationFailed("the function returns matrices: give sensors as a mapping of names to rows of these")
         mass = returned[1] if hasattr(returned[1], "diagonal") else np.array(returned[1])
         modes = undamped_modes(*returned, max(1, min(self.n_steps, np.count_nonzero(mass.diagonal()))))
-        return modal_response(modes.frequencies, modes.shapes[:, list(self.rows)], self.n_steps)
+        return modal_response(modes.frequencies, modes.shapes[:, self.rows], self.n_steps)
 
 
 class StructureModes(ExternalModel):
@@ -157,26 +152,23 @@ class StructureModes(ExternalModel):
         given = dict(zip(self.parameter_names, theta, strict=True))
         return self.parts.assemble(np.array([given.get(name, _DAMPING) for name in self.parts.parameter_names]))
 
-    def _modes(self, theta: np.ndarray) -> tuple[Any, Modes]:
-        system = self._system(theta)
-        return system, undamped_modes(system.stiffness, system.mass)
-
     def _respond(self, theta: np.ndarray) -> np.ndarray:
-        system, modes = self._modes(theta)
+        system = self._system(theta)
+        modes = undamped_modes(system.stiffness, system.mass)
         return modal_response(modes.frequencies, modes.shapes @ system.shape.T)
 
     def jacobian(self, theta: np.ndarray) -> np.ndarray:
         """Derivatives (n_parameters, 1 + n_sensors, n_modes) of the response, exact but for differences of matrices."""
         theta = check_theta(theta, self.parameter_names)
-        system, modes = self._modes(theta)
-        steps = _STEP * np.where(theta == 0.0, 1.0, np.abs(theta))
-        ends = [[self._system(theta + sign * step) for sign in (1.0, -1.0)] for step in np.diag(steps)]
-        pairs = list(zip(steps, ends, strict=True))
+        system, steps = self._system(theta), _STEP * np.where(theta == 0.0, 1.0, np.abs(theta))
+        ends = [(self._system(theta + step), self._system(theta - step)) for step in np.diag(steps)]
 
         def slopes_of(what: str) -> np.ndarray:
-            return np.stack([(getattr(up, what) - getattr(down, what)) / (2.0 * h) for h, (up, down) in pairs])
+            return np.stack([getattr(up, what) - getattr(down, what) for up, down in ends]) / (
+                2.0 * steps[:, None, None]
+            )
 
-        stiff, heavy, sensors = (slopes_of(what) for what in ("stiffness", "mass", "shape"))
-        slopes = mode_derivatives(modes, stiff, heavy)
-        shapes = slopes.shapes @ system.shape.T + modes.shapes @ sensors.transpose(0, 2, 1)
+        modes = undamped_modes(system.stiffness, system.mass)
+        slopes = mode_derivatives(modes, slopes_of("stiffness"), slopes_of("mass"))
+        shapes = slopes.shapes @ system.shape.T + modes.shapes @ slopes_of("shape").transpose(0, 2, 1)
         return np.concatenate([slopes.frequencies[:, None, :], shapes.transpose(0, 2, 1)], axis=1)
