@@ -63,6 +63,8 @@ def test_errors_and_what_is_no_sensor(tmp_path):
     assert data.sensors == ("a", "MAC") and data.temperatures == [12.0]
     data = read_modal_data(written(tmp_path, "f_Hz,T,B", "1.0,1,2"))  # top and bottom
     assert data.sensors == ("T", "B") and data.temperatures is None
+    data = read_modal_data(written(tmp_path, "frequency_Hz,frequency_std,f1,f2", "1.0,0.01,1,2"))  # floors
+    assert data.sensors == ("f1", "f2") and data.frequency_cv == pytest.approx([0.01])
     data = read_modal_data(written(tmp_path, "mode,frequency_Hz,damping_%", "1,2.0,1.5", "2,5.0,2"))
     assert data.sensors == () and data.damping.tolist() == [[0.015, 0.02]]
 
@@ -77,6 +79,7 @@ def test_errors_and_what_is_no_sensor(tmp_path):
         ("f_Hz,a_re,a_im", "2.0,1.0,0.1", "may be no components of real shapes"),
         ("f_Hz,Re(a),Im(a)", "2.0,1.0,0.1", "may be no components of real shapes"),
         ("f_Hz,a,MAC [%]", "2.0,1.0,0.1", "give those that are sensors"),
+        ("f_Hz,|a|,<a,|b|,<b", "2.0,1.0,3,0.1,181", "give those that are sensors"),
         ("f_Hz,a", "2.0,0.5+0.1i", "expected a number"),
         ("mode,f_Hz,a", "first bending,2.0,0.5", "whole numbers in the column of modes"),
         ("frequency_Hz,omega_rad/s,a", "1.0,6.3,1", "one column of frequencies"),
@@ -112,13 +115,17 @@ def test_a_table_of_several_identifications(tmp_path):
     assert np.isnan(missed.frequencies[1, 0]) and missed.has_shape.tolist() == [[True, True], [False, True]]
     with pytest.raises(ValueError, match="a column 'set'"):
         read_modal_data(written(tmp_path, "mode,frequency_Hz,a,b", "1,1.0,1,2", "1,1.1,1,2"))
+    lines = "1,1.0,1,2", "1,3.0,1,-1", "2,3.1,1,-1"  # the second identification has missed mode 1
+    with pytest.raises(ValueError, match="a column 'mode', because one of them may miss a mode"):
+        read_modal_data(written(tmp_path, "set,frequency_Hz,a,b", *lines))
 
 
 def test_a_table_of_days(tmp_path):
     """A line for each day, with a date and the temperature, and a column or a line for each mode."""
     days = "date,temperature_C,f1_Hz,f3_Hz", "2021-01-02,5,1.0,3.0", "2021-02-01,12,0.99,"
     modes = "date,mode,f_Hz,T_C", "2021-01-02,1,1.0,5", "2021-01-02,3,3.0,5", "2021-02-01,1,0.99,12"
-    for lines in (days, modes):
+    german = "Datum;Temperatur [°C];f1 [Hz];f3 [Hz]", "02.01.2021;5;1,00;3,00", "01.02.2021;12;0,99;"
+    for lines in (days, modes, german):
         data = read_modal_data(written(tmp_path, *lines))
         np.testing.assert_array_equal(data.frequencies, [[1.0, 3.0], [0.99, np.nan]])
         assert data.temperatures.tolist() == [5.0, 12.0] and data.mode_numbers == (1, 3)
