@@ -109,7 +109,10 @@ class ModalData:
         ratios = "ratios from 0 to below 1, of the shape of frequencies, such as 0.015 for 1.5 % (in a file damping_%)"
         days = f"a [°C] for each of {n_sets} identifications, from -80 to 80"
         numbers = range(1, m + 1) if self.mode_numbers is None else self.mode_numbers
-        whole = f"{m} different whole numbers from 1 on"
+        whole, matrix = (
+            f"{m} different whole numbers from 1 on",
+            f"a matrix ({m}, {m}) [Hz²], symmetric positive definite",
+        )
         values: dict[str, Any] = {"n_sets": n_sets, "n_modes": m, "n_sensors": len(sensors), "sensors": sensors}
         for what, given, shape, limits, expected in (
             ("mode_numbers", list(numbers), (m,), (1.0, 1e9), whole),
@@ -117,7 +120,7 @@ class ModalData:
             ("shape_error", self.shape_error, (m,), (_ABOVE_ZERO, _LARGEST_SHARE), f"{share} 0.02, of a norm of 1"),
             ("temperatures", self.temperatures, (n_sets,), (-80.0, 80.0), days),
             ("damping", self.damping, (n_sets, m), (0.0, 1.0), ratios),
-            ("covariance", self.covariance, (m, m), (-np.inf, np.inf), f"a matrix ({m}, {m}) [Hz²]"),
+            ("covariance", self.covariance, (m, m), (-np.inf, np.inf), matrix),
         ):
             values[what] = None if given is None else _numbers(what, given, shape, limits, expected)
         values["mode_numbers"] = tuple(int(number) for number in values["mode_numbers"])
