@@ -137,15 +137,12 @@ class Measurements:
         if not channels or len(set(names)) != len(names):
             raise ValueError(f"measurements need channels with different names, got {names}")
         values = _values_array(self.values, names)
-        bad = np.argwhere(np.isinf(values))
-        if bad.size:
-            row, step = bad[0]
+        for row, step in np.argwhere(np.isinf(values))[:1]:
             raise ValueError(
-                f"values must be finite, or NaN where a sample is missing: {len(bad)} are infinite, the first is "
-                f"sample {step} of channel {names[row]!r}; repair or cut the data"
+                f"values must be finite, or NaN where a sample is missing: {np.isinf(values).sum()} are infinite, the "
+                f"first is sample {step} of channel {names[row]!r}; repair or cut the data"
             )
-        empty = [name for name, there in zip(names, ~np.isnan(values).all(axis=1), strict=True) if not there]
-        if empty:
+        if empty := [name for name, row in zip(names, values, strict=True) if np.isnan(row).all()]:
             raise ValueError(
                 f"a channel needs at least one sample, all samples of {', '.join(map(repr, empty))} are missing (NaN); "
                 "leave these channels out (Measurements.select, or channels in a TOML file)"

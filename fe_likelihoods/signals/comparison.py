@@ -46,13 +46,9 @@ class Comparison:
         """Return the response (n_channels, n_steps) at the sample times, shape (n_channels, n_samples)."""
         if all(place is None for place in self.places):
             return response
-        n_samples = self.values.shape[1]
-        return np.stack(
-            [
-                row[:n_samples] if place is None else interpolate(row, place)
-                for row, place in zip(response, self.places, strict=True)
-            ]
-        )
+        rows = zip(response, self.places, strict=True)
+        n = self.values.shape[1]
+        return np.stack([row[:n] if place is None else interpolate(row, place) for row, place in rows])
 
     def residuals(self, response: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return response minus measurement, shape (n_channels, n_samples) [SI], NaN where a sample is missing."""

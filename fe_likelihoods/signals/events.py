@@ -85,9 +85,9 @@ class Events(Record):
         self, records: Sequence[Record], rest: float | Sequence[float] = 10.0, names: Sequence[str] | None = None
     ) -> None:
         given = [records] if isinstance(records, Record) else list(records)
-        if not given or not all(isinstance(record, Record) for record in given):
-            found = ", ".join(type(record).__name__ for record in given) or "none"
-            raise ValueError(f"Events expects a sequence of one Record or more, got {found}")
+        found = ", ".join(type(record).__name__ for record in given) or "none"
+        known = given and all(isinstance(record, Record) for record in given)
+        expect(known, "Events", "a sequence of one Record or more", found)
         parts, pauses, names = _flatten(given, rest, names)
         for part in parts[1:]:
             got = f"{parts[0].dt!r} s ({parts[0].name!r}) and {part.dt!r} s ({part.name!r})"
@@ -101,18 +101,11 @@ class Events(Record):
             windows.append(EventWindow(name, first, stop, first * dt, (stop - 1) * dt))
             samples += [part.acceleration, np.zeros(n_zeros)]
             first = stop + n_zeros
-        fields = {
-            "name": ", ".join(names),
-            "dt": dt,
-            "acceleration": np.concatenate(samples),
-            "source": "; ".join(f"{name}: {part.source}" for name, part in zip(names, parts, strict=True)),
-            "records": tuple(parts),
-            "windows": tuple(windows),
-            "rests": tuple(n * dt for n in zeros),
-        }
-        for field, value in fields.items():
+        source = "; ".join(f"{name}: {part.source}" for name, part in zip(names, parts, strict=True))
+        super().__init__(", ".join(names), dt, np.concatenate(samples), source)
+        rests = tuple(n * dt for n in zeros)
+        for field, value in {"records": tuple(parts), "windows": tuple(windows), "rests": rests}.items():
             object.__setattr__(self, field, value)
-        self.__post_init__()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -164,8 +157,8 @@ class Events(Record):
         >>> joined.values.shape
         (2, 500)
         """
-        if not isinstance(measurements, Mapping) or not measurements:
-            raise ValueError(f"expected Measurements for one or more of {', '.join(self.names)}; got {measurements!r}")
+        given = isinstance(measurements, Mapping) and measurements
+        expect(given, self.name, f"Measurements for one or more of {', '.join(self.names)}", repr(measurements))
         windows = {name: self.window(name) for name in measurements}
         first = next(iter(measurements.values()))
         channels: dict[str, Channel] = {}

@@ -146,11 +146,8 @@ def read_record(
                 UserWarning,
                 stacklevel=2,
             )
-        source, step, values = (
-            f"{source}; {even.note}",
-            resample,
-            np.interp(even.uniform, even.times, values[even.kept]),
-        )
+        source, step = f"{source}; {even.note}", resample
+        values = np.interp(even.uniform, even.times, values[even.kept])
     elif resample is not None:
         raise ValueError(f"{file}: the samples have a uniform step; leave resample out")
     if dt is not None and not abs(dt - step) <= 1e-6 * step:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..units import from_si
 from .response_spectrum import ResponseSpectrum, response_spectrum
-from .sampling import array_digest, check_samples, check_step, rest_samples, same_step, sample_window
+from .sampling import array_digest, check_samples, check_step, expect, rest_samples, same_step, sample_window
 
 __all__ = ["DisplacementHistory", "Record", "SubdividedHistory"]
 
@@ -187,20 +187,14 @@ class Record:
         """
         if not isinstance(other, Record):
             raise ValueError(f"{self.name!r} must be followed by a Record, got {type(other).__name__}")
-        if not same_step(self.dt, other.dt):
-            raise ValueError(
-                f"records that follow each other must have the same time step, got {self.dt!r} s ({self.name!r}) and "
-                f"{other.dt!r} s ({other.name!r}); use Record.resample(dt) on one of them"
-            )
+        got = f"{self.dt!r} s ({self.name!r}) and {other.dt!r} s ({other.name!r})"
+        advice = "use Record.resample(dt) on one of them"
+        expect(same_step(self.dt, other.dt), "records that follow each other", "the same time step", got, advice)
         zeros = np.zeros(rest_samples(rest, self.dt))
         samples = np.concatenate([self.acceleration, zeros, other.acceleration])
         note = f"after a pause of {zeros.size * self.dt:g} s followed by {other.name}"
-        return Record(
-            f"{self.name}, {other.name}",
-            self.dt,
-            samples,
-            self._source(f"{note} ({other.source})" if other.source else note),
-        )
+        note += f" ({other.source})" if other.source else ""
+        return Record(f"{self.name}, {other.name}", self.dt, samples, self._source(note))
 
     def spectrum(
         self, periods: Sequence[float] | NDArray[np.float64] | None = None, damping_ratio: float = 0.05
