@@ -278,7 +278,6 @@ def _uneven(title: str, unit: str, times: NDArray[np.float64], values: NDArray[n
 _AT2_COUNT = re.compile(r"NPTS\s*=\s*(\d+)\b", re.IGNORECASE)
 _AT2_STEP = re.compile(rf"\bDT\s*=\s*({NUMBER})\s*([a-z]*)", re.IGNORECASE)
 _AT2_OLD = re.compile(rf"\s*(\d+)\s+({NUMBER})\s*(?:,\s*)?NPTS\s*,\s*DT", re.IGNORECASE)
-_SECONDS = frozenset({"", "s", "sec", "secs", "second", "seconds"})
 _UNITS_OF = re.compile(r"UNITS?\s*(?:OF|ARE|IS|:|=)\s*[(\[]?\s*([^\s,;()\[\]]+?)[)\]]?[.]?(?=[\s,;]|$)", re.IGNORECASE)
 
 
@@ -295,8 +294,8 @@ def _parse_at2(text: str, file: str) -> Series:
     values = [parse_number(cell, f"{file}, line {number}") for number, row in rows for cell in number_cells(row)]
     check_count(len(values), stated[0], f"{file}: NPTS in line {index + 1}")
     step, where = f"{stated[1]} {stated[2]}", f"{file}, line {index + 1}"
-    known = stated[2].lower() in _SECONDS
-    expect(known, where, "DT in seconds, such as 'DT= .0100 SEC'", step, "write it in seconds")
+    seconds = stated[2].lower() in ("", "s", "sec", "secs", "second", "seconds")
+    expect(seconds, where, "DT in seconds, such as 'DT= .0100 SEC'", step, "write it in seconds")
     title = lines[index - 2].strip() if index >= 2 else ""
     return Series(title, float(stated[1]), units[1] if units else None, np.array(values))
 
@@ -391,12 +390,11 @@ def _split_v2(text: str, file: str) -> list[Block]:
         block = lines[first : index + (not end)]
         if _is_v1(block) or any(_CSMIP_DATA.match(each) or _COSMOS_DATA.match(each) for each in block):
             head = "\n".join(block[:25])
-            number = re.search(r"STA CHN:\s*(\d{1,12})", head, re.IGNORECASE)
             label = re.search(r"^\s*(?:STA )?CHAN\s*(\d{1,12}|\?)\s*:[^\n]*", head, re.IGNORECASE | re.MULTILINE)
-            if number is None and label is not None and label[1] != "?":
-                number = label
-            title = re.sub(r"\s+", " ", label[0]).strip() if label else Path(file).name
-            channels.append(Block(file, block, first + 1, int(number[1]) if number else None, title))
+            number = re.search(r"STA CHN:\s*(\d{1,12})", head, re.IGNORECASE) or label
+            known = int(number[1]) if number and number[1] != "?" else None
+            title = " ".join(label[0].split()) if label else Path(file).name
+            channels.append(Block(file, block, first + 1, known, title))
         first = index + 1
     return channels
 
@@ -428,8 +426,7 @@ def _parse_v2(block: Block) -> Series:
     else:
         unit, form = _COSMOS_DATA.match(line)[2], block.form_at_the_end_of(index)
         header = next((i for i in range(index) if _COSMOS_REALS.match(lines[i])), None)
-        expected = "a line 'N Real-header values follow on N lines, Format= (5F15.6)'"
-        expect(header is not None, where, expected)
+        expect(header is not None, where, "a line 'N Real-header values follow on N lines, Format= (5F15.6)'")
         dt = _check_step(float(block.field(header + 1, block.form_at_the_end_of(header), _COSMOS_DT)), where)
     values = block.samples(index + 1, int((csmip or _COSMOS_DATA.match(line))[1]), form)
     if csmip:
@@ -448,8 +445,8 @@ def _parse_v1(block: Block) -> Series:
         dt = _check_step(1.0 / rate if rate else 0.0, block.where(_V1_HEADER))
         form = block.form_at_the_end_of(_V1_HEADER)
         values = block.samples(_V1_HEADER + 1, count, form)
-        there, got = abs(count * dt - float(length)) <= 2.0 * dt, f"{count} samples at {1 / dt:g} per second"
-        expect(there, where, f"{length} s", got, "the file is damaged")
+        fits, got = abs(count * dt - float(length)) <= 2.0 * dt, f"{count} samples at {1 / dt:g} per second"
+        expect(fits, where, f"{length} s", got, "the file is damaged")
         printed = block.lines[_V1_HEADER + 1][: form[1]]
     else:
         found = _V1_UNITS.search("\n".join(block.lines[:_V1_TEXT]))
@@ -485,17 +482,14 @@ _GEONET_UNIT = re.compile(rf"in\s+units\s+of\s+({NUMBER})\s*mm/s/s", re.IGNORECA
 def _parse_smc(text: str, file: str) -> Series:
     """The samples of a USGS SMC file, uncorrected or corrected."""
     block = Block(file, text.splitlines())
-    title = " ".join(block.lines[0].split(maxsplit=1)) if block.lines else ""
-    known, expected = title.strip() in _SMC_TYPES, f"the first line of an SMC file, {' or '.join(_SMC_TYPES)}"
-    expect(known, file, expected, repr(title[:80]))
+    title = " ".join(block.lines[0].split(maxsplit=1)).strip() if block.lines else ""
+    expect(title in _SMC_TYPES, file, f"the first line of an SMC file, {' or '.join(_SMC_TYPES)}", repr(title[:80]))
     integers, start = block.header(_SMC_TEXT, 48, _SMC_INTEGERS)
     reals, start = block.header(start, 50, _SMC_REALS)
     comments, count = (_whole(integers[place], file, what) for place, what in ((15, "comment lines"), (16, "samples")))
     rate, highest, lowest = reals[1], reals[29], reals[31]
     uneven = rate >= _SMC_NULL  # pairs of time and acceleration
-    expected = (
-        "a positive number of samples per second as the second real, or none for an even number of times and values"
-    )
+    expected = "a positive number of samples per second as second real, or none and an even number of times and values"
     expect(rate > 0.0 and not (uneven and count % 2), file, expected, f"{rate:g} and {count} numbers")
     marked = all(line.startswith("|") for line in block.lines[start : start + comments])
     expect(marked, file, f"{comments} comment lines that start with '|'", advice="the file is damaged")
@@ -504,8 +498,7 @@ def _parse_smc(text: str, file: str) -> Series:
     for stated, found in ((highest, values.max()), (lowest, values.min())):
         if abs(stated) < _SMC_NULL:
             _check_peak(found, stated, 2e-4 * np.abs(values).max(), file)
-    station = next((line.strip() for line in block.lines[2:_SMC_TEXT] if line.startswith("station")), title)
-    station = re.sub(r"\s+", " ", station)
+    station = next((" ".join(line.split()) for line in block.lines[2:_SMC_TEXT] if line.startswith("station")), title)
     return _uneven(station, "cm/s2", numbers[::2], values) if uneven else Series(station, 1.0 / rate, "cm/s2", values)
 
 
@@ -574,13 +567,14 @@ def _parse_knet(text: str, file: str) -> Series:
     names = ("Station Code", "Sampling Freq(Hz)", "Duration Time(s)", "Dir", "Scale Factor", "Max Acc (gal)")
     station, frequency, duration, direction, factor, peak = _stated(header, names, file, "a K-NET")
     rate = parse_number(re.sub(r"\s*hz$", "", frequency, flags=re.IGNORECASE), f"{file}, Sampling Freq")
-    scale = _KNET_SCALE.match(factor)
-    known = scale is not None and float(scale[2]) > 0.0 and rate > 0.0
-    expected = "a positive sampling frequency and a scale factor such as '3920(gal)/6182761'"
-    expect(known, file, expected, f"{rate:g} and {factor!r}")
+    scale, expected = (
+        _KNET_SCALE.match(factor),
+        "a positive sampling frequency and a scale factor such as '3920(gal)/6182761'",
+    )
+    expect(scale and float(scale[2]) > 0.0 and rate > 0.0, file, expected, f"{rate:g} and {factor!r}")
     counts = _samples_below(lines, _KNET_TEXT, file)
-    expected = _whole(rate * parse_number(duration, f"{file}, Duration Time"), file, "samples")
-    check_count(counts.size, expected, f"{file}: frequency times duration")
+    count = _whole(rate * parse_number(duration, f"{file}, Duration Time"), file, "samples")
+    check_count(counts.size, count, f"{file}: frequency times duration")
     # "(gal)/1048.2" means 1 gal; the stated peak is compared below
     values = (counts - counts.mean()) * (float(scale[1] or 1.0) / float(scale[2]))
     stated = parse_number(peak, f"{file}, Max. Acc.")
@@ -590,12 +584,9 @@ def _parse_knet(text: str, file: str) -> Series:
 
 def _parse_esm(text: str, file: str) -> Series:
     """The samples of an ESM or ITACA file."""
-    lines, header = text.splitlines(), {}
-    for line in lines[:_ESM_TEXT]:
-        if not _ESM_NAME.match(line):
-            break
-        name, _, value = line.partition(":")
-        header[name] = value.strip()
+    lines = text.splitlines()
+    stated = (line.partition(":") for line in itertools.takewhile(_ESM_NAME.match, lines[:_ESM_TEXT]))
+    header = {name: value.strip() for name, _, value in stated}
     names = ("SAMPLING_INTERVAL_S", "NDATA", "UNITS", "DATA_TYPE", "STATION_CODE", "STREAM")
     interval, count, unit, kind, station, stream = _stated(header, names, file, "an ESM or ITACA")
     expect(kind.upper() == "ACCELERATION", file, "acceleration", f"DATA_TYPE {kind!r}", "take the ACC file")
@@ -614,8 +605,6 @@ _SINGLE = {"at2": _parse_at2, "smc": _parse_smc, "knet": _parse_knet, "esm": _pa
 
 # seismology -----------------------------------------------------------------------------------------------------------
 
-_NO_ACCELERATION = {6: "displacement", 7: "velocity"}  # IDEP in a SAC header
-
 
 def _parse_obspy(
     path: str | Path, form: str, channel: str | None = None, inventory: str | Path | None = None
@@ -633,12 +622,10 @@ def _parse_obspy(
         traces = [trace for trace in stream if channel is None or trace.id.endswith(channel)]
     except Exception as error:  # a damaged file may raise anything
         raise ValueError(f"{path}: obspy cannot read the file ({error}); download it again") from error
-    there = ", ".join(trace.id for trace in stream)
-    expected = f"one trace with column={channel!r}, found {len(traces)}"
-    expect(len(traces) == 1, path, expected, advice=f"the traces are {there}")
-    (trace,) = traces
+    advice = f"the traces are {', '.join(trace.id for trace in stream)}"
+    expect(len(traces) == 1, path, f"one trace with column={channel!r}, found {len(traces)}", advice=advice)
+    trace, lacking = traces[0], np.ma.count_masked(traces[0].data)
     advice = "an excitation needs all samples: cut the record, or fill the gaps in obspy"
-    lacking = np.ma.count_masked(trace.data)
     expect(not lacking, path, "all samples", f"{trace.id} without {lacking} samples", advice)
     if inventory is not None:
         try:
@@ -652,9 +639,8 @@ def _parse_obspy(
             ) from error
     got, advice = f"whole numbers, counts of the recorder {trace.id}", "give its StationXML file, inventory="
     expect(np.issubdtype(trace.data.dtype, np.floating), path, "accelerations", got, advice)
-    quantity = _NO_ACCELERATION.get(trace.stats.get("sac", {}).get("idep"))
-    got = f"{quantity} by the SAC header of {trace.id}"
-    expect(quantity is None, path, "acceleration", got, "differentiate it")
+    quantity = {6: "displacement", 7: "velocity"}.get(trace.stats.get("sac", {}).get("idep"))
+    expect(not quantity, path, "acceleration", f"{quantity} by the SAC header of {trace.id}", "differentiate it")
     rate = round(1.0 / trace.stats.delta)  # SAC has the step in single precision
     dt = 1.0 / rate if rate and abs(rate * trace.stats.delta - 1.0) < 1e-6 else trace.stats.delta
     unit = None if inventory is None else "m/s2"
