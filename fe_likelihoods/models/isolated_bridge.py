@@ -21,7 +21,7 @@ import numpy as np
 
 from ..signals.channels import Channel
 from ..signals.records import Record
-from ..signals.sampling import rest_samples, same_sampling, sample_window
+from ..signals.sampling import rest_samples, same_step, sample_window
 from .base import BuiltInModel, remark_on_range
 from .isolated_bridge_parts import ALL_CHANNELS, CHANNELS, Bearing, Damper, Pier, Rubber
 from .isolated_bridge_system import (
@@ -248,7 +248,8 @@ class IsolatedBridge(BuiltInModel):
             raise invalid("the same gamma for both bearings", given, "it is a constant of the friction law")
         if self.vertical is not None and (
             not isinstance(self.vertical, Record)
-            or not same_sampling(self.record.dt, self.record.n_steps, self.vertical.dt, self.vertical.n_steps)
+            or self.record.n_steps != self.vertical.n_steps
+            or not same_step(self.record.dt, self.vertical.dt)
         ):
             raise invalid(
                 f"a vertical Record of {self.record.n_steps} samples at {self.record.dt} s, like the horizontal one",

@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike
 from ..kernels.complex_modes import superpose_modes
 from ..signals.channels import Channel
 from ..signals.records import Record
-from ..signals.sampling import same_sampling, sample_window
+from ..signals.sampling import same_step, sample_window
 from ..signals.sdof import hold_integrals
 from ..simulation.model import SimulationFailed
 from .linear_structure_parts import LinearSystem, Parts
@@ -122,7 +122,7 @@ class LinearStructure(ExternalModel):
             raise ValueError(f"LinearStructure: expected Records of the support accelerations; got {supports!r}")
         first = supports[0]
         for support in supports[1:]:
-            if not same_sampling(first.dt, first.n_steps, support.dt, support.n_steps):
+            if first.n_steps != support.n_steps or not same_step(first.dt, support.dt):
                 raise ValueError(
                     f"LinearStructure: expected supports with the same step and length; got {first.n_steps} samples at "
                     f"{first.dt} s ({first.name}) and {support.n_steps} at {support.dt} s ({support.name}); use "

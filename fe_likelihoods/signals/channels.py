@@ -150,15 +150,13 @@ class Measurements:
         values.flags.writeable = False
         steps = [check_step(dt, "the measurements") for dt in _per_channel(self.dt, len(names), "time step")]
         starts = [_check_start(start) for start in _per_channel(self.start, len(names), "start")]
-        object.__setattr__(self, "channels", channels)
-        object.__setattr__(self, "dt", _single(steps))
-        object.__setattr__(self, "start", _single(starts))
-        object.__setattr__(self, "values", values)
         points = tuple(self.points) or (() if self.is_history else tuple(str(k + 1) for k in range(values.shape[1])))
         fits, got = len(points) in (0, values.shape[1]) and not (points and self.is_history), f"along {self.axis!r}"
         expected = f"a point for each of {values.shape[1]} samples along an axis other than time"
         expect(fits, "measurements", expected, f"{len(points)} points {got}")
-        object.__setattr__(self, "points", points)
+        fields = {"channels": channels, "dt": _single(steps), "start": _single(starts), "values": values}
+        for name, value in (fields | {"points": points}).items():
+            object.__setattr__(self, name, value)
 
     def __repr__(self) -> str:
         channels = ", ".join(f"{channel.name} [{channel.unit}]" for channel in self.channels)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from .channels import Measurements
 from .interpolation import Interpolation, interpolate, make_interpolation
-from .sampling import same_sampling, same_step
+from .sampling import same_step
 
 __all__ = ["Comparison", "compare_with", "measured_values"]
 
@@ -72,7 +72,7 @@ def compare_with(measurements: Measurements, dt: float, n_steps: int) -> NDArray
     places: list[Interpolation | None] = []
     for row, channel in enumerate(measurements.channels):
         step, start = measurements.steps[row], measurements.starts[row]
-        if start == 0.0 and same_sampling(dt, n_steps, step, measurements.n_steps):
+        if start == 0.0 and n_steps == measurements.n_steps and same_step(dt, step):
             places.append(None)
             continue
         times = measurements.times(channel.name)

@@ -162,14 +162,9 @@ def _channel_columns(channels: Sequence[Channel]) -> dict[str, list[str]]:
 
 
 def _attributes_text(attributes: dict) -> str:
-    def plain(value):
-        if isinstance(value, (np.ndarray, np.generic)):
-            return value.tolist()
-        raise TypeError(f"{type(value).__name__} {value!r}")
-
-    try:
-        return json.dumps(attributes, default=plain, allow_nan=False, sort_keys=True)
-    except (TypeError, ValueError) as error:
+    try:  # arrays become lists
+        return json.dumps(attributes, default=lambda array: array.tolist(), allow_nan=False, sort_keys=True)
+    except (TypeError, ValueError, AttributeError) as error:
         raise ValueError(f"attributes must be text, finite numbers, lists and dicts of them, got {error}") from None
 
 

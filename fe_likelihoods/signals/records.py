@@ -126,13 +126,11 @@ class Record:
         if self.duration < 2 * new_dt:
             raise ValueError(f"new step of {self.name!r} must fit twice in its {self.duration:g} s, got {new_dt:g} s")
         ratio = Fraction(exact).limit_denominator(_LARGEST_RATIO_TERM)
-        if ratio == 0 or ratio.numerator > _LARGEST_RATIO_TERM or abs(float(ratio) - exact) > 1e-9 * exact:
-            nearest = f"; the nearest such step is {self.dt / float(ratio)!r} s" if ratio else ""
-            raise ValueError(
-                f"the steps {self.dt!r} s of {self.name!r} and {new_dt!r} s must be in the ratio of integers up "
-                f"to {_LARGEST_RATIO_TERM}{nearest}"
-            )
         up, down = ratio.numerator, ratio.denominator
+        expected = f"steps in the ratio of integers up to {_LARGEST_RATIO_TERM}"
+        nearest = f"the nearest such step is {self.dt / float(ratio)!r} s" if ratio else ""
+        fits = 0 < up <= _LARGEST_RATIO_TERM and abs(float(ratio) - exact) <= 1e-9 * exact
+        expect(fits, self.name, expected, f"{self.dt!r} s and {new_dt!r} s", nearest)
         if up == down:
             return self
         n_steps = (self.n_steps - 1) * up // down + 1

@@ -16,7 +16,6 @@ __all__ = [
     "check_step",
     "expect",
     "rest_samples",
-    "same_sampling",
     "same_step",
     "sample_window",
 ]
@@ -82,11 +81,6 @@ def rest_samples(rest: float, dt: float) -> int:
 def same_step(dt: float, other_dt: float) -> bool:
     """Return whether two time steps [s] are equal within round-off."""
     return not abs(dt - other_dt) > _STEP_TOLERANCE * dt
-
-
-def same_sampling(dt: float, n_steps: int, other_dt: float, other_n_steps: int) -> bool:
-    """Return whether two series have the same number of samples and, within round-off, the same step [s]."""
-    return n_steps == other_n_steps and same_step(dt, other_dt)
 
 
 def sample_window(name: str, n_steps: int, dt: float, start: float, stop: float | None) -> slice:

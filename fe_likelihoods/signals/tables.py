@@ -283,16 +283,11 @@ def check_peaks(
     found = [float(np.abs(each).max()) for each in (values, values - values.mean())]
     for text, stated, printed in peaks:
         known = [stated] if stated else [name for name in UNITS if UNITS[name].dimension == "acceleration"]
-        ratios = [find_unit(each).factor / factor for each in known]
-        if not any(
-            abs(each - ratio * abs(float(printed))) <= digit + 0.505 * ratio * 10.0 ** -decimals_of(printed)
-            for each in found
-            for ratio in ratios
-        ):
-            raise ValueError(
-                f"{file}: the file states {text!r}, the samples have a peak of {found[0]:g} {unit}; the unit is "
-                f"wrong, or the file is damaged{advice}"
-            )
+        ratios = np.array([find_unit(each).factor / factor for each in known])
+        rounding = digit + 0.505 * ratios * 10.0 ** -decimals_of(printed)
+        if not any((np.abs(each - ratios * abs(float(printed))) <= rounding).any() for each in found):
+            got = f"the file states {text!r}, the samples have a peak of {found[0]:g} {unit}"
+            raise ValueError(f"{file}: {got}; the unit is wrong, or the file is damaged{advice}")
 
 
 # clock times ----------------------------------------------------------------------------------------------------------
@@ -722,13 +717,12 @@ def read_table(
     table = Table(file, bool(names), columns, numbers, title, statements, missing, clock, None, time_unit)
     for words, count in statements.counts:
         check_count(len(rows), count, f"{file}: {words!r}", f". {_SKIP}")
-    if time is None and not table.named and time_unit is not None and len(columns) > 1:
-        return table._replace(time=0)
-    if time is None:  # by the name of the column, else a clock
-        numbers = [k for k, column in enumerate(columns) if column.kind == "number" and table.named]
+    if time is None:  # by the name of the column, else a clock; without names the first one, if its unit is given
+        first = [0] if not names and time_unit is not None and len(columns) > 1 else []
+        numbers = [k for k, column in enumerate(columns) if column.kind == "number" and names]
         named = [k for form in (_TIME, _STAMP) for k in numbers if form.match(columns[k].name)]
         clocks = [k for k, column in enumerate(columns) if column.kind == "clock"]
-        return table._replace(time=next(iter(named + clocks), None))
+        return table._replace(time=next(iter(first + named + clocks), None))
     places = [k for k, column in enumerate(columns) if column.name == str(time) and column.kind != "text"]
     expected = f"one column of times with time={time!r}, found {len(places)}"
     expect(len(places) == 1, file, expected, advice=table.listing)
@@ -816,8 +810,8 @@ def _along_rows(lines: list[_Line], file: str) -> list[_Line]:
     rows = [*itertools.dropwhile(is_text, lines)]
     for number, cells in rows:
         width = len(rows[0][1])
-        where, wrong = f"{file}, line {number}", [cell for cell in cells if not _known(cell)]
-        expect(not wrong, where, "numbers below lines of text", repr("".join(wrong[:1])[:100]))
+        where, wrong = f"{file}, line {number}", next((cell for cell in cells if not _known(cell)), None)
+        expect(wrong is None, where, "numbers below lines of text", repr(str(wrong)[:100]))
         fits = len(cells) == width or (len(cells) < width and number == rows[-1][0])
         expect(fits, where, f"{width} numbers as in the first row", len(cells))
     return [(number, [cell]) for number, cells in rows for cell in cells]
@@ -846,10 +840,9 @@ def _announced(lines: list[_Line], file: str) -> tuple[list[_Line], list[str]] |
 def _logger_table(lines: list[_Line], file: str) -> tuple[list[_Line], list[str]]:
     """Header line, line of units and rows of a logger program's format, and what comments would state (a step).
 
-    Campbell Scientific TOA5 has four header lines: environment, names, units, processing (LoggerNet manual). A LabVIEW
-    file (.lvm) has tags and values up to ``***End_of_Header***``, twice, a line of names that begins with ``X_Value``,
-    and rows; with X_Columns "No" the cells of this column are empty, with "Multi" each channel has its own, and they
-    must agree (National Instruments, "Specification for the LabVIEW Measurement File"). Other lines stay.
+    Campbell Scientific TOA5 has four header lines: environment, names, units, processing (LoggerNet manual). LabVIEW
+    has tags up to ``***End_of_Header***``, twice, and names that begin with ``X_Value``, whose cells are empty with
+    X_Columns "No"; "Multi" has one per channel ("Specification for the LabVIEW Measurement File"). Other lines stay.
     """
     first = lines[0][1][0] if lines and lines[0][1] else ""
     if first == "TOA5" and len(lines) > 3:
@@ -869,10 +862,9 @@ def _logger_table(lines: list[_Line], file: str) -> tuple[list[_Line], list[str]
     labels = ["", *tags.get("Y_Unit_Label", []), *[""] * width]
     names = ["time [s]" if name == "X_Value" else name for name in header[:width]]
     units = ["s" if name == "X_Value" else label for name, label in zip(header[:width], labels, strict=False)]
-    for k, (line, cells) in enumerate(rows):
+    for _, cells in rows:
         # the text in the column of comments goes; numbers in it show that a row is damaged
-        if len(cells) == width + 1 and not any(map(str.isdigit, cells[-1])):
-            rows[k] = line, cells[:width]
+        del cells[width : width + (len(cells) == width + 1 and not any(map(str.isdigit, cells[-1])))]
     table = [(number, names), (number, [f"[{unit}]" if unit else "" for unit in units]), *rows]
     if columns != "No":
         return table, []
@@ -900,9 +892,9 @@ def _header(
         half = separator == "," and 2 * len(above) == width and not any("." in cell for cells in rows for cell in cells)
         short = len(above) == width - 1 > 1 and any(cells[-1] for cells in rows) and not along_rows
         wrong = rows and (half or short) and _is_text(above) and all(above)
-        expected, advice = f"a name for each of the {width} cells in a row", "in R with row.names = FALSE"
-        advice = f"write decimal points, or leave out the names of rows, {advice}. {_POINTS}"
-        expect(not wrong, f"{file}, line {number}", expected, len(above), advice)
+        advice = "write decimal points, or leave out the names of rows, in R with row.names = FALSE"
+        expected = f"a name for each of the {width} cells in a row"
+        expect(not wrong, f"{file}, line {number}", expected, len(above), f"{advice}. {_POINTS}")
     if along_rows:
         return [], [], _along_rows(lines, file)
     spare = width > 2 and not any(cells[-1] for _, cells in lines[first:] if len(cells) == width)
@@ -976,16 +968,14 @@ def _with_points(lines: list[_Line], separator: str, file: str) -> tuple[list[_L
         doubtful = [k for k, cell in enumerate(column) if _THOUSANDS.fullmatch(cell)]
         own = any("," in cell and _is_value(cell) and not _THOUSANDS.fullmatch(cell) for cell in column)
         alone = separator == "," and (".", ",") in left
-        wrong = doubtful and not own and (alone or any(re.fullmatch(r"[-+]?[1-9]\d{2}", cell) for cell in column))
-        got = ", ".join(
-            f"{column[k]!r}, which may have a separator of thousands or a decimal comma" for k in doubtful[:1]
-        )
-        where = f"{file}, line {rows[doubtful[0]][0]}" if doubtful else file
-        expect(not wrong, where, "a number", got, "write it without separators of thousands and with a decimal point")
+        wrong = not own and (alone or any(re.fullmatch(r"[-+]?[1-9]\d{2}", cell) for cell in column))
+        for k in doubtful[:wrong]:
+            got = f"{column[k]!r}, which may have a separator of thousands or a decimal comma"
+            advice = "write it without separators of thousands and with a decimal point"
+            expect(False, f"{file}, line {rows[k][0]}", "a number", got, advice)
     form, plain = _SPELLINGS[mark, group], str.maketrans({**dict.fromkeys(group), mark: "."})
-    rows = [
-        (number, [cell.translate(plain) if form.fullmatch(cell) else cell for cell in cells]) for number, cells in rows
-    ]
+    for _, cells in rows:
+        cells[:] = [cell.translate(plain) if form.fullmatch(cell) else cell for cell in cells]
     return rows, mark == ","
 
 
@@ -1057,10 +1047,8 @@ def _checked_missing(missing: Sequence[float | str] | None) -> tuple[float | str
     given = [each.strip() if isinstance(each, str) else each for each in np.atleast_1d(np.array(missing, dtype=object))]
     for each in given:
         text = isinstance(each, str) and each and not (_known(each) and any(map(str.isdigit, each)))
-        if not text and not (isinstance(each, Real) and math.isfinite(each)):
-            raise ValueError(
-                f"missing must be finite numbers and texts, such as (-9999, 'OL'), or () for none; got {missing!r}"
-            )
+        expected = "finite numbers and texts, such as (-9999, 'OL'), or () for none"
+        expect(text or (isinstance(each, Real) and math.isfinite(each)), "missing", expected, repr(missing))
     return tuple(given)
 
 

@@ -101,7 +101,7 @@ def test_texts_for_missing_samples(tmp_path, mark, place):
 @pytest.mark.parametrize("missing", [["9999"], ["1,5"], [" "], [None], ["10:32:07"]])
 def test_texts_that_stand_for_no_missing_sample_are_refused(tmp_path, missing):
     (tmp_path / "a.csv").write_text("time_s,acc_g\n0.00,1\n0.01,2\n")
-    with pytest.raises(ValueError, match="missing must be finite numbers and texts"):
+    with pytest.raises(ValueError, match="missing: expected finite numbers and texts"):
         read_record(tmp_path / "a.csv", missing=missing)
 
 

@@ -115,7 +115,7 @@ class TestResample:
 
     def test_refusals(self):
         for dt, message in (
-            (0.02 * np.sqrt(2), "ratio of integers up to 1000; the nearest such step is"),
+            (0.02 * np.sqrt(2), "ratio of integers up to 1000, got .*; the nearest such step is"),
             (1.5, "must fit twice"),
             (1e-7, "ratio of integers"),
             (0, "positive number of seconds"),
