@@ -162,10 +162,7 @@ def dimension_of(unit: str) -> str | None:
 def agree_on_unit(
     stated: str | None, given: str | None, dimension: str, file: str | Path, argument: str = "units"
 ) -> str:
-    """The canonical name of the unit that a file states or the caller gives, by an `argument` that a message names.
-
-    ValueError if both are None, they disagree, or a unit is unknown or of another dimension.
-    """
+    """The canonical name of the unit that a file states or the caller gives, by an `argument` that a message names."""
     names = [name for name in (stated, given) if name is not None]
     if not names:
         advice = f"give {argument}=, for instance {'g' if dimension == 'acceleration' else DIMENSIONS[dimension]!r}"
@@ -453,13 +450,10 @@ class Table(NamedTuple):
     # units and samples
 
     def stated_unit(self, place: int, dimension: str | None = None) -> str | None:
-        """The unit of a column as the file states it, in its name or below the header line, or None.
-
-        With a `dimension` other than force, the N at the end of a name such as ``acc_N`` is the direction north, and an
-        S is the direction south unless it is a time.
-        """
+        """The unit of a column of a `dimension`, if known, as its name or the line below it states it, or None."""
         column = self.columns[place]
         end, below = column.name[-2:], column.below or None
+        # N at the end of a name such as acc_N is the direction north, and S the direction south
         direction = dimension and ((end == "_N" and dimension != "force") or (end == "_S" and dimension != "time"))
         named = unit_in_name(column.name) if self.named and not direction else None
         if named is None or below is None:
@@ -468,10 +462,7 @@ class Table(NamedTuple):
         return agree_on_unit(named, below, dimension_of(below) or dimension_of(named), both)
 
     def text_unit(self, place: int, dimension: str, others: bool = False) -> str | None:
-        """The unit that comments or the text above the table state for a column of a dimension, or None.
-
-        With other units known (`others`), text that is no unit is ignored, except for counts.
-        """
+        """The unit that text above states for a column, or None; with `others` known, only a unit or counts."""
         for unit in self.stated.units:
             known = dimension_of(unit)
             alone = len(self.value_columns) == 1 and known != "time"
@@ -490,8 +481,7 @@ class Table(NamedTuple):
     ) -> list[tuple[NDArray[np.float64], str, str]]:
         """Samples of columns (n_rows,), units and dimensions, of columns' names, dimensions, units, words for messages.
 
-        Units are those on which file and caller agree; stated peaks are compared. Warns if a number for missing samples
-        is in none of the columns: the file may write it in another way.
+        Warns if a number for missing samples is in none of the columns: the file may write it in another way.
         """
         found, places, given = [], [self.place_of(name) for name, *_ in columns], self.missing or ()
         listed = [each for each in given if not isinstance(each, str)]
@@ -611,15 +601,11 @@ class Table(NamedTuple):
             where = f"{self.file}, line {self.lines[index + 1]}"
             expect(False, where, f"a uniform time step of about {usual:g} s", got, advice)
         tolerance /= increments.size
-        rate = round(1 / step) if 1 / step < 1e15 else 0
+        rate = round(1 / step) if 1 / step < 1e15 else 0  # a whole number of samples per second, within rounding
         return (1 / rate if rate and abs(1 / rate - step) < min(tolerance, 1e-4 * step) else step), tolerance
 
     def step(self, dt: float | None = None) -> float:
-        """The time step [s]: from the times, the comment ``dt = ... s`` and the argument, which must agree.
-
-        A whole number of samples per second is used where the mean step corresponds to it within the rounding of
-        printed times and a relative 1e-4.
-        """
+        """The time step [s]: from the times, the comment ``dt = ... s`` and the argument, which must agree."""
         step, tolerance = (None, 0.0) if self.time is None else self.uniform_step()
         known = [] if dt is None else [("the argument dt", dt)]
         known += [(repr(text), steps[0]) for text, steps, _ in self.stated.steps if len(steps) == 1]
@@ -645,8 +631,7 @@ class Table(NamedTuple):
     def start(self, step: float, zero: float | str = 0.0) -> float:
         """The time of the first row after `zero` [s or clock time]; a file without times begins at time zero.
 
-        With ``zero=0``, a start within the rounding of its printed digits from a whole number of steps is set to this
-        number; for another `zero`, within round-off.
+        It is a whole number of steps if it is one within the rounding of printed digits; with a `zero`, round-off.
         """
         column = None if self.time is None else self.columns[self.time]
         unit = 1.0 if column is None else self.unit_of_times
@@ -927,15 +912,12 @@ def _header(
 
 
 def _are_units(cells: Sequence[str]) -> bool:
-    """Whether a line below a header line has units: all cells are units, one is a unit of time, or all are in brackets.
-
-    Cells that are no known unit are refused when their column is read. A capital S may be the direction south.
-    """
+    """Whether a line below the names has units: all cells are units, one is a unit of time, or all have brackets."""
     given = [cell for cell in cells if cell]
     units = [cell.strip("[]() ") for cell in given if not _states_nothing(cell)]
-    dimensions = [None if unit == "S" else dimension_of(unit) for unit in units]
+    of_time = any(dimension_of(unit) == "time" for unit in units if unit != "S")  # which may be the direction south
     known = bool(units) and all(map(dimension_of, units))
-    return "time" in dimensions or known or all(cell[0] + cell[-1] in ("()", "[]") for cell in given)
+    return of_time or known or all(cell[0] + cell[-1] in ("()", "[]") for cell in given)
 
 
 def _states_nothing(cell: str) -> bool:
@@ -1073,19 +1055,18 @@ class UniformTimes(NamedTuple):
 
     def interpolate(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Values (n_steps,) at the uniform times, linear between known samples, NaN in gaps and beyond the last."""
-        values = values[self.kept]
-        known = np.flatnonzero(~np.isnan(values))
-        if known.size == 0:
+        known = ~np.isnan(values[self.kept])
+        values, times = values[self.kept][known], self.times[known]
+        if times.size == 0:
             return np.full(self.uniform.size, np.nan)
-        times = self.times[known]
         after = np.searchsorted(times, self.uniform).clip(0, times.size - 1)
         before = (after - 1).clip(0)
         ahead, behind = times[after] - self.uniform, self.uniform - times[before]
         nearest = np.where(np.abs(ahead) < np.abs(behind), after, before)
-        found = np.interp(self.uniform, times, values[known])
+        found = np.interp(self.uniform, times, values)
         apart = (ahead + behind > _GAP * self.usual) | (ahead < 0.0) | (behind < 0.0)
         near = np.minimum(np.abs(ahead), np.abs(behind)) <= _NEAR * self.usual
-        return np.where(apart, np.where(near, values[known][nearest], np.nan), found)
+        return np.where(apart, np.where(near, values[nearest], np.nan), found)
 
 
 def uniform_times(times: NDArray[np.float64], step: float | None, where: str) -> UniformTimes:
