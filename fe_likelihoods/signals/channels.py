@@ -50,13 +50,10 @@ class Channel:
     unit: str
 
     def __post_init__(self) -> None:
-        if not isinstance(self.name, str) or not self.name:
-            raise ValueError(f"a channel needs a name, got {self.name!r}")
-        if not isinstance(self.quantity, str) or self.dimension not in DIMENSIONS:
-            raise ValueError(
-                f"quantity of channel {self.name!r} must be one of {', '.join(DIMENSIONS)}, with or without words "
-                f"before it, got {self.quantity!r}"
-            )
+        expect(isinstance(self.name, str) and self.name, "Channel", "a name", repr(self.name))
+        known, where = isinstance(self.quantity, str) and self.dimension in DIMENSIONS, f"channel {self.name!r}"
+        expected = f"a quantity that is one of {', '.join(DIMENSIONS)}, with or without words before it"
+        expect(known, where, expected, repr(self.quantity))
         try:
             find_unit(self.unit, self.dimension)
         except ValueError as error:
@@ -207,10 +204,8 @@ class Measurements:
     def time(self) -> NDArray[np.float64]:
         """Times of the samples, shape (n_steps,) [s]; ValueError if they differ between channels (see `times`)."""
         if not self.simultaneous:
-            raise ValueError(
-                f"the channels {', '.join(channel.name for channel in self.channels)} have different times; call "
-                "times(name) for the times of one channel"
-            )
+            names = ", ".join(channel.name for channel in self.channels)
+            raise ValueError(f"the channels {names} have different times; call times(name) for one channel")
         return self.times(self.channels[0].name)
 
     def times(self, name: str) -> NDArray[np.float64]:
@@ -250,8 +245,7 @@ class Measurements:
         >>> measurements.select(["displacement"]).values.shape
         (1, 200)
         """
-        if isinstance(names, str):
-            raise ValueError(f"select takes a sequence of names, for instance [{names!r}]")
+        expect(not isinstance(names, str), "select", f"a sequence of names, for instance [{names!r}]")
         rows = [self._row(name) for name in names]
         each = (self.channels, self.steps, self.values, self.starts)
         channels, dt, values, start = (tuple(one[row] for row in rows) for one in each)
@@ -343,9 +337,9 @@ def _values_array(values: Any, names: Sequence[str]) -> NDArray[np.float64]:
             f"values must be real numbers, one row per channel: {error}; read tables by read_columns"
         ) from None
     longest = max((row.size for row in rows), default=0)
-    if len(rows) != len(names) or not longest or any(row.ndim != 1 for row in rows):
-        expected = f"values of shape (n_channels, n_steps) = ({len(names)}, n_steps)"
-        raise ValueError(f"expected {expected}, got {(len(rows), *(rows[0].shape if rows else ()))}")
+    fits = len(rows) == len(names) and longest and all(row.ndim == 1 for row in rows)
+    expected = f"values of shape (n_channels, n_steps) = ({len(names)}, n_steps)"
+    expect(fits, "Measurements", expected, (len(rows), *(rows[0].shape if rows else ())))
     return np.array([np.append(row, np.full(longest - row.size, np.nan)) for row in rows])
 
 
@@ -362,7 +356,5 @@ def _single(numbers: Sequence[float]) -> float | tuple[float, ...]:
 
 
 def _check_start(start: Any) -> float:
-    seconds = as_number(start)
-    if not math.isfinite(seconds):
-        raise ValueError(f"start of the measurements must be a finite number of seconds, got {start!r}")
-    return seconds
+    expect(math.isfinite(as_number(start)), "start of the measurements", "a finite number of seconds", repr(start))
+    return as_number(start)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from .channels import Measurements
 from .interpolation import Interpolation, interpolate, make_interpolation
-from .sampling import same_step
+from .sampling import expect, same_step
 
 __all__ = ["Comparison", "compare_with", "measured_values"]
 
@@ -78,12 +78,10 @@ def compare_with(measurements: Measurements, dt: float, n_steps: int) -> NDArray
         times = measurements.times(channel.name)
         there = np.isfinite(measurements.values[row])
         known = times[there]
-        if known[0] < -_LATEST * dt:
-            raise ValueError(
-                f"the samples of channel {channel.name!r} are from {known[0]:g} to {known[-1]:g} s, the response of "
-                f"the model is from 0 to {end:g} s; correct their start, or replace the samples before zero "
-                f"by NaN (in a TOML file missing = [[{known[0]:g}, {-0.5 * step:g}]])"
-            )
+        got = f"samples of channel {channel.name!r} from {known[0]:g} to {known[-1]:g} s"
+        advice = "correct their start, or replace the samples before zero by NaN (in a TOML file missing = "
+        advice += f"[[{known[0]:g}, {-0.5 * step:g}]])"
+        expect(known[0] >= -_LATEST * dt, "measurements", f"times of the response, 0 to {end:g} s", got, advice)
         # a missing sample may be outside the response: any place within serves
         places.append(make_interpolation(dt, n_steps, np.where(there, times, known[0])))
     if all(place is None for place in places) and not np.isnan(measurements.values).any():
@@ -96,9 +94,8 @@ def _check_end(measurements: Measurements, dt: float, n_steps: int) -> None:
     begin, end, last = min(measurements.starts), (n_steps - 1) * dt, measurements.end
     if begin > end:
         raise ValueError(
-            f"the response ends at {end:g} s, and the measurements begin at {begin:g} s; give the time in "
-            'their file at which the excitation begins, as zero=12.5 or zero="10:32:07" of read_columns (zero in a '
-            "TOML file)"
+            f"the response ends at {end:g} s, and the measurements begin at {begin:g} s; give the time in their file "
+            'at which the excitation begins, as zero=12.5 or zero="10:32:07" of read_columns (zero in a TOML file)'
         )
     if measurements.simultaneous and measurements.start == 0.0 and same_step(dt, measurements.dt):
         fits = measurements.n_steps == n_steps
@@ -107,13 +104,12 @@ def _check_end(measurements: Measurements, dt: float, n_steps: int) -> None:
         # others are filled with NaN, so only the channel whose rows end first states the end.
         stated = max(last, min(float(measurements.times(channel.name)[-1]) for channel in measurements.channels))
         fits = last <= end + _LATEST * dt and stated >= end - (1.0 + _LATEST) * max(dt, *measurements.steps)
-    if not fits:
-        raise ValueError(
-            f"the response has {n_steps} samples with a step of {dt} s and ends at {end:g} s, the measurements have "
-            f"{measurements.n_steps} with a step of {measurements.dt} s and end at {last:g} s; use the same part "
-            "of record and measurements (trim in Python, duration in a TOML file), correct the step, or fill times "
-            "that were not measured with NaN"
-        )
+    expected = f"{n_steps} samples with a step of {dt} s up to {end:g} s, as the response has"
+    got = f"{measurements.n_steps} with a step of {measurements.dt} s up to {last:g} s"
+    advice = (
+        "use the same part of record and measurements (trim in Python, duration in a TOML file), correct the step, "
+    )
+    expect(fits, "measurements", expected, got, advice + "or fill times that were not measured with NaN")
 
 
 def measured_values(measured: NDArray[np.float64] | Comparison) -> NDArray[np.float64]:

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .sampling import expect
+
 __all__ = ["relative_errors", "rrmse"]
 
 
@@ -42,15 +44,11 @@ def rrmse(
     0.1
     """
     predicted, measured = np.asarray(predicted, dtype=float), np.asarray(measured, dtype=float)
-    if predicted.shape != measured.shape or not measured.ndim:
-        raise ValueError(f"expected histories of one shape, (..., n_steps); got {predicted.shape} and {measured.shape}")
+    got = f"{predicted.shape} and {measured.shape}"
+    expect(predicted.shape == measured.shape and measured.ndim, "rrmse", "histories of one shape, (..., n_steps)", got)
     zero = np.flatnonzero(np.nansum(np.square(measured), axis=-1) == 0.0)
-    if zero.size:
-        rows = ", ".join(f"row {row}" if names is None else repr(names[row]) for row in zero)
-        raise ValueError(
-            f"an error relative to a measured history needs a history that is not zero; {rows} is zero at all samples: "
-            "leave it out"
-        )
+    rows = ", ".join(f"row {row}" if names is None else repr(names[row]) for row in zero)
+    expect(not rows, "rrmse", "measured histories that are not zero", f"{rows} is zero at all samples", "leave it out")
     unknown = (np.isnan(predicted) & ~np.isnan(measured)).any(axis=-1)
     return np.where(unknown, np.nan, relative_errors(predicted - measured, measured))[()]
 

@@ -121,9 +121,7 @@ def read_record(
         except ValueError as error:
             if Path(path).suffix.lower() in _TABLES:
                 raise
-            raise ValueError(
-                f"{error}. The file has no known format of ground motions and was read as a table"
-            ) from error
+            raise ValueError(f"{error}. It has no known format of ground motions and was read as a table") from error
         dt = units = None  # the table has them
     elif unused := ", ".join(name for name, option in options.items() if option is not None):
         raise ValueError(f"{path}: a file of format {form} states its times and samples; leave {unused} out")
@@ -136,9 +134,8 @@ def read_record(
     if series.times is not None:
         even = uniform_times(series.times, resample, file)
         if resample is None:
-            raise ValueError(
-                f"{file}: the samples are at uneven times; give their nominal step, resample={even.step:.6g}"
-            )
+            advice = f"give their nominal step, resample={even.step:.6g}"
+            raise ValueError(f"{file}: the samples are at uneven times; {advice}")
         if even.gaps.size:
             warnings.warn(
                 f"{file}: {even.note}; an excitation needs all samples, so the gaps are straight lines: compare with "
@@ -151,9 +148,8 @@ def read_record(
     elif resample is not None:
         raise ValueError(f"{file}: the samples have a uniform step; leave resample out")
     if dt is not None and not abs(dt - step) <= 1e-6 * step:
-        raise ValueError(
-            f"{file} states a step of {step:g} s but dt = {dt!r} was given; leave dt out, or correct the file"
-        )
+        advice = "leave dt out, or correct the file"
+        raise ValueError(f"{file} states a step of {step:g} s but dt = {dt!r} was given; {advice}")
     return Record(series.name or Path(path).stem, step, to_si(values, unit, "acceleration"), source)
 
 
@@ -258,8 +254,6 @@ def units_of(channels: Sequence[Channel], units: str | Sequence[str] | Mapping[s
     if units is None or isinstance(units, str):
         return [units] * len(names)
     given = [units.get(name) for name in names] if isinstance(units, Mapping) else list(units)
-    if len(given) != len(names) or set(units) - set(names if isinstance(units, Mapping) else units):
-        raise ValueError(
-            f"expected a unit for each of {', '.join(names)}, one for all, or units by name; got {units!r}"
-        )
+    known = len(given) == len(names) and not set(units) - set(names if isinstance(units, Mapping) else units)
+    expect(known, "units", f"a unit for each of {', '.join(names)}, one for all, or units by name", repr(units))
     return given

@@ -165,8 +165,7 @@ class Record:
         >>> Record("short motion", 0.01, [0.0, 0.5, -0.3]).scale(2.0).acceleration
         array([ 0. ,  1. , -0.6])
         """
-        if not math.isfinite(factor):
-            raise ValueError(f"scale factor of {self.name!r} must be a finite number, got {factor!r}")
+        expect(math.isfinite(factor), f"scale factor of {self.name!r}", "a finite number", repr(factor))
         note = f"scaled by {factor:g}"
         return Record(self.name, self.dt, factor * self.acceleration, self._source(note))
 
@@ -280,8 +279,8 @@ class DisplacementHistory:
         ``history.displacement[indices]`` of the result are the original points, exactly. ValueError if the limit is not
         a positive number.
         """
-        if not (math.isfinite(max_increment) and max_increment > 0):
-            raise ValueError(f"largest increment of {self.name!r} must be a positive length [m], got {max_increment!r}")
+        known, where = math.isfinite(max_increment) and max_increment > 0, f"largest increment of {self.name!r}"
+        expect(known, where, "a positive length [m]", repr(max_increment))
         # The factor keeps an increment of exactly n times the limit at n parts despite round-off.
         parts = np.ceil(np.abs(np.diff(self.displacement)) / max_increment * (1 - 1e-12))
         indices = np.concatenate([[0], np.cumsum(np.maximum(parts, 1).astype(np.intp))])

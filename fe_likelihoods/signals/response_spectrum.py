@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .sampling import expect
 from .sdof import respond
 
 __all__ = ["ResponseSpectrum", "response_spectrum"]
@@ -58,15 +59,11 @@ def response_spectrum(
     if periods is None:
         periods = np.geomspace(max(0.02, 2.0 * dt), max(10.0, 4.0 * dt), 120)
     periods = np.array(periods, dtype=float)
-    if periods.ndim != 1 or not periods.size or not np.all(np.isfinite(periods) & (periods > 0.0)):
-        raise ValueError(f"periods must be positive numbers of seconds in one dimension; got {periods}")
-    if periods.min() < _SHORTEST * dt:
-        raise ValueError(
-            f"periods must be at least {_SHORTEST * dt:g} s, {_SHORTEST:g} steps of the motion, because the motion has "
-            f"no information on shorter periods; got {periods.min():g} s"
-        )
-    if not 0.0 <= damping_ratio < 1.0:
-        raise ValueError(f"damping_ratio must be in [0, 1) (0.05 is 5 %); got {damping_ratio!r}")
+    known = periods.ndim == 1 and periods.size and np.all(np.isfinite(periods) & (periods > 0.0))
+    expect(known, "periods", "positive numbers of seconds in one dimension", periods)
+    expected = f"at least {_SHORTEST * dt:g} s, {_SHORTEST:g} steps of the motion, which has no information below"
+    expect(periods.min() >= _SHORTEST * dt, "periods", expected, f"{periods.min():g} s")
+    expect(0.0 <= damping_ratio < 1.0, "damping_ratio", "a number in [0, 1) (0.05 is 5 %)", repr(damping_ratio))
     frequencies = 2.0 * math.pi / periods
     displacement = np.empty(periods.size)
     for k, (period, omega) in enumerate(zip(2.0 * math.pi / frequencies, frequencies, strict=True)):

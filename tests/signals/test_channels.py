@@ -23,9 +23,9 @@ class TestChannel:
     @pytest.mark.parametrize(
         ("arguments", "message"),
         [
-            (("", "force", "N"), "needs a name"),
-            (("a", "loudness", "g"), "must be one of acceleration, .* got 'loudness'"),
-            (("a", "", "g"), "must be one of"),
+            (("", "force", "N"), "expected a name"),
+            (("a", "loudness", "g"), "one of acceleration, .* got 'loudness'"),
+            (("a", "", "g"), "one of"),
             (("a", "acceleration", "in"), "channel 'a': expected a unit of acceleration, got 'in'"),
             (("a", "force", "stone"), "channel 'a': unknown unit 'stone'"),
         ],

@@ -99,7 +99,7 @@ def test_steps_starts_and_ends_of_channels(tmp_path):
 def test_wrong_steps_and_starts_are_refused():
     with pytest.raises(ValueError, match="one time step, or one for each of 2 channels, got 3"):
         Measurements(CHANNELS, (0.1, 0.1, 0.1), np.ones((2, 4)))
-    with pytest.raises(ValueError, match="start of the measurements must be a finite number"):
+    with pytest.raises(ValueError, match="start of the measurements: expected a finite number"):
         Measurements(CHANNELS, 0.1, np.ones((2, 4)), start=np.nan)
     with pytest.raises(ValueError, match="positive number of seconds"):
         Measurements(CHANNELS, (0.1, -0.1), np.ones((2, 4)))
@@ -152,7 +152,7 @@ def test_measurements_outside_the_response_are_refused(model):
     good = sampled((0.01, 0.02))
     compare_with(good, DT, N_STEPS)
     early = Measurements(CHANNELS, 0.01, np.ones((2, 402)), start=-0.01)
-    with pytest.raises(ValueError, match="channel 'top' are from -0.01 to 4 s"):
+    with pytest.raises(ValueError, match="channel 'top' from -0.01 to 4 s"):
         FELikelihood(model, early)
     for wrong in (
         Measurements(CHANNELS, 0.005, np.ones((2, 401))),  # a wrong step

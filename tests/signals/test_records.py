@@ -60,7 +60,7 @@ class TestRecord:
 
     def test_scale(self):
         np.testing.assert_array_equal(Record("r", 0.02, [1, 2]).scale(-2).acceleration, [-2, -4])
-        with pytest.raises(ValueError, match="must be a finite number, got nan"):
+        with pytest.raises(ValueError, match="expected a finite number, got nan"):
             Record("r", 0.02, [1, 2]).scale(np.nan)
 
 
@@ -138,7 +138,7 @@ class TestDisplacementHistory:
         assert history.fingerprint == DisplacementHistory("other", [0.0, 1.0]).fingerprint
         assert history.fingerprint != DisplacementHistory("test", [0.0, 1.1]).fingerprint
         for bad in (0, -1, np.nan):
-            with pytest.raises(ValueError, match="must be a positive length"):
+            with pytest.raises(ValueError, match="expected a positive length"):
                 history.subdivide(bad)
         with pytest.raises(ValueError, match="the first is sample 1"):
             DisplacementHistory("test", [0.0, np.nan])

@@ -53,10 +53,10 @@ def test_peaks_are_those_of_a_much_finer_record(noise):
 @pytest.mark.parametrize(
     ("periods", "damping_ratio", "message"),
     [
-        ([0.0, 1.0], 0.05, "periods must be positive"),
-        ([], 0.05, "periods must be positive"),
+        ([0.0, 1.0], 0.05, "periods: expected positive"),
+        ([], 0.05, "periods: expected positive"),
         ([0.001], 0.05, r"at least 0.002 s, 0.1 steps of the motion"),
-        ([1.0], 1.0, r"damping_ratio must be in \[0, 1\) \(0.05 is 5 %\); got 1.0"),
+        ([1.0], 1.0, r"expected a number in \[0, 1\) \(0.05 is 5 %\), got 1.0"),
     ],
 )
 def test_refused(noise, periods, damping_ratio, message):
