@@ -135,15 +135,13 @@ class Measurements:
             raise ValueError(f"measurements need channels with different names, got {names}")
         values = _values_array(self.values, names)
         for row, step in np.argwhere(np.isinf(values))[:1]:
-            raise ValueError(
-                f"values must be finite, or NaN where a sample is missing: {np.isinf(values).sum()} are infinite, the "
-                f"first is sample {step} of channel {names[row]!r}; repair or cut the data"
-            )
-        if empty := [name for name, row in zip(names, values, strict=True) if np.isnan(row).all()]:
-            raise ValueError(
-                f"a channel needs at least one sample, all samples of {', '.join(map(repr, empty))} are missing (NaN); "
-                "leave these channels out (Measurements.select, or channels in a TOML file)"
-            )
+            got = f"{np.isinf(values).sum()} infinite ones, the first is sample {step} of channel {names[row]!r}"
+            expect(False, "Measurements", "finite values, or NaN where one is missing", got, "repair or cut the data")
+        empty = ", ".join(repr(name) for name, row in zip(names, values, strict=True) if np.isnan(row).all())
+        advice = "leave these channels out (Measurements.select, or channels in a TOML file)"
+        expect(
+            not empty, "Measurements", "a sample of each channel", f"all samples of {empty} are missing (NaN)", advice
+        )
         values.flags.writeable = False
         steps = [check_step(dt, "the measurements") for dt in _per_channel(self.dt, len(names), "time step")]
         starts = [_check_start(start) for start in _per_channel(self.start, len(names), "start")]

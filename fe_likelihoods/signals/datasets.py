@@ -129,9 +129,7 @@ def read_dataset(path: str | Path) -> Dataset:
     known = units == [DIMENSIONS["acceleration"], *(channel.si_unit for channel in channels)]
     expect(known, path, "SI units", units, "the file is damaged or was written by another program")
     if checksum != found:
-        raise ValueError(
-            f"{path}: the contents do not match their checksum; the file is damaged, make it or download it again"
-        )
+        raise ValueError(f"{path}: the contents do not match their checksum; make it or download it again")
     return Dataset(record, measurements, free)
 
 

@@ -1,8 +1,7 @@
 """Durations after which a record has reached given shares of its Arias intensity.
 
-A search for parameters is more robust if it starts with a short first part of the record and continues with longer
-parts: the misfit of a long record has many local minima, because response cycles that are out of phase by a whole
-period nearly fit. The first part must contain enough strong motion to identify the parameters.
+A search that continues with longer parts is more robust: the misfit of a long record has many local minima, because
+response cycles that are out of phase by a whole period nearly fit.
 """
 
 from collections.abc import Sequence

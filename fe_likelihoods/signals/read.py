@@ -226,10 +226,10 @@ def read_columns(
     if recognise(path) is not None:
         if isinstance(zero, str):
             raise ValueError(f"{path} has no clock times; give zero in seconds after its first sample, got {zero!r}")
-        if other := next((channel for channel in channels if channel.dimension != "acceleration"), None):
-            raise ValueError(
-                f"{path}: accelerations are read from files of this format, and the channel {other.name!r} is a "
-                f"{other.dimension}; leave it out, or write its samples to a CSV file"
+        for other in (channel for channel in channels if channel.dimension != "acceleration"):
+            advice = "leave it out, or write its samples to a CSV file"
+            expect(
+                False, path, "accelerations, as files of this format have", f"{other.dimension} {other.name!r}", advice
             )
         options = {"dt": dt, "time": time, "time_unit": time_unit, "skip": skip, "missing": missing}
         records = [read_record(path, column, unit, resample=resample, **options) for column, _, unit, _ in wanted]

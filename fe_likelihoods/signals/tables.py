@@ -136,9 +136,8 @@ def parse_number(field: str, where: str) -> float:
 def check_count(found: int, stated: str | float, where: str, advice: str = "") -> None:
     """ValueError if a file has another number of samples than it announces."""
     if found != float(stated):
-        raise ValueError(
-            f"{where} announces {stated!s:.20} samples, the file has {found}; it is truncated or damaged{advice}"
-        )
+        got = f"announces {stated!s:.20} samples, the file has {found}"
+        raise ValueError(f"{where} {got}; it is truncated or damaged{advice}")
 
 
 def decimals_of(field: str) -> int:
@@ -623,9 +622,8 @@ class Table(NamedTuple):
         for text, steps, error in self.stated.steps:
             if not any(abs(other - chosen) <= tolerance + (error + 1e-6) * chosen for other in steps):
                 advice = "correct one, or give skip= to leave out text that is about other samples"
-                raise ValueError(
-                    f"{self.file}: the step is {chosen} s by {first} but {steps[0]} s by {text!r}; {advice}"
-                )
+                stated = f"the step is {chosen} s by {first} but {steps[0]} s by {text!r}"
+                raise ValueError(f"{self.file}: {stated}; {advice}")
         return chosen
 
     def start(self, step: float, zero: float | str = 0.0) -> float:

@@ -174,7 +174,10 @@ def test_data_without_time_have_sections_of_their_own(path, text, section, given
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"channels": [Channel("top", "displacement", "mm")]}, "accelerations are read from files of this format, and"),
+        (
+            {"channels": [Channel("top", "displacement", "mm")]},
+            "accelerations, as files of this format have, got displacement 'top'",
+        ),
         ({"zero": "10:32:07"}, "has no clock times; give zero in seconds"),
         ({"dt": 0.01}, "states a step of 0.02 s but dt = 0.01 was given"),
         (

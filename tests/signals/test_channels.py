@@ -58,7 +58,7 @@ class TestMeasurements:
             ((TOP,), 0.1, np.ones((1, 0)), r"got \(1, 0\)"),
             ((TOP, DRIFT), 0.1, [[0, np.nan], [np.nan, np.nan]], "all samples of 'drift' are missing"),
             ((TOP,), 0.0, np.ones((1, 3)), "positive number of seconds, got 0.0"),
-            ((TOP, DRIFT), 0.1, [[0, 1], [2, np.inf]], "1 are infinite, the first is sample 1 of channel 'drift'"),
+            ((TOP, DRIFT), 0.1, [[0, 1], [2, np.inf]], "1 infinite ones, the first is sample 1 of channel 'drift'"),
         ],
     )
     def test_refusals(self, channels, dt, values, message):
