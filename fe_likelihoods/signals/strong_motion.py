@@ -338,8 +338,9 @@ def find_channels(path: str | Path, form: str, member: str | None = None) -> lis
         return [Found(None, Path(path).name, file, partial(_parse_obspy, path, form))]
     if form != "v2":
         text = decode_text(content).rstrip("\0\x1a")
-        alone = () if form == "geonet" else [Found(None, Path(path).name, file, partial(_SINGLE[form], text, file))]
-        return alone or _parse_geonet(text, file)
+        if form == "geonet":
+            return _parse_geonet(text, file)
+        return [Found(None, Path(path).name, file, partial(_SINGLE[form], text, file))]
     files = [(file, content)]
     if zipfile.is_zipfile(io.BytesIO(content)):
         files = list(dict.fromkeys(_unzip(content, file, file, [_MOST_FILES, _LARGEST_CONTENT])))
@@ -368,13 +369,12 @@ def _unzip(content: bytes, name: str, archive: str, left: list[int]) -> Iterator
         with zipfile.ZipFile(io.BytesIO(content)) as opened:
             infos = opened.infolist()
             left[:] = left[0] - len(infos), left[1] - sum(info.file_size for info in infos)
-            members = (
-                [] if min(left) < 0 else [(each.filename, opened.read(each)) for each in infos if not each.is_dir()]
-            )
+            fits = min(left) >= 0
+            members = [(each.filename, opened.read(each)) for each in infos if fits and not each.is_dir()]
     except Exception as error:  # a damaged archive may raise anything
         raise ValueError(f"{name}: the zip archive cannot be read ({error}); download it again") from error
     expected = f"at most {_MOST_FILES} files with {_LARGEST_CONTENT} bytes in all"
-    expect(min(left) >= 0, archive, expected, "more", "unpack the archive and read the files")
+    expect(fits, archive, expected, "more", "unpack the archive and read the files")
     for member, data in members:
         inner = f"{name}/{member}"
         yield from _unzip(data, inner, archive, left) if member.lower().endswith(".zip") else [(inner, data)]
