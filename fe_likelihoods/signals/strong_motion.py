@@ -412,9 +412,6 @@ def _parse_v2(block: Block) -> Series:
         return _parse_v1(block)
     index = next(i for i, line in enumerate(lines) if _CSMIP_DATA.match(line) or _COSMOS_DATA.match(line))
     line, where = lines[index], block.where(index)
-    counts = re.match(r"\s*raw", lines[0], re.IGNORECASE) or _V1_FIRST.match(lines[0])
-    advice = "counts of a recorder are not read: take V1 or V2"
-    expect(not counts, block.file, "acceleration in the form of V2", repr(lines[0].strip()), advice)
     if csmip := _CSMIP_DATA.match(line):
         units = _CSMIP_UNITS.search(line, csmip.end())
         expect(units, where, f"the unit of acceleration in {line.strip()!r}")
@@ -533,8 +530,6 @@ def _geonet_component(block: Block, place: int) -> tuple[str, Series, int]:
     resolution = 1.01 * scale * 10.0 ** -decimals_of(printed) + 0.505 * 10.0 ** -decimals_of(peak[1])
     _check_peak(np.abs(values).max(), abs(float(peak[1])), resolution, where)
     end = start + sum(math.ceil(count / _GEONET_FORM[0]) for count in counts)
-    expected = f"{sum(counts)} numbers up to line {end}"
-    expect(end <= len(lines), where, expected, advice="the file is truncated")
     site = re.search(r"^Site\s+(\S+)", head, re.MULTILINE)
     title = f"{site[1] if site else 'GeoNet'}, component {component[1]}"
     return component[1], Series(title, dt, "mm/s2", values), end

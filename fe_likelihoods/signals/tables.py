@@ -390,7 +390,7 @@ _SKIP = "If the text is about other samples, give skip= to leave it out"
 _CUT = "cut off the line if it is no row of samples"
 _TIME = re.compile(r"(elapsed |relative )?(t|(time|zeit|temps|tempo|tiempo)\d*)(\b|_)", re.IGNORECASE)
 _STAMP = re.compile(r"(timestamp|unix|epoch)(\b|_)", re.IGNORECASE)  # times if no other column has them
-_UNIX_EPOCH, _UNIX = ClockTime(datetime.date(1970, 1, 1).toordinal(), 0.0, 0, 0), (1e9, 4.2e9)  # [s], from 2001 to 2103
+_UNIX = (1e9, 4.2e9)  # times since 1970 of the years 2001 to 2103 [s]
 
 _Line = tuple[int, list[str]]  # its number and cells
 
@@ -636,11 +636,7 @@ class Table(NamedTuple):
         if isinstance(zero, str):  # what it does not state is as in the first row
             text, zero, first = zero, _parse_clock(zero, "zero"), self.clock
             if column is None or column.kind != "clock":
-                first, is_unix = _UNIX_EPOCH, column is not None and _UNIX[0] <= column.values[0] * unit < _UNIX[1]
-                advice = "a column of clock times; give zero in seconds"
-                advice = "date and time zone, as in '2019-07-06T03:19:53Z', for Unix times" if is_unix else advice
-                if not is_unix or zero.day is None or zero.zone is None:
-                    raise ValueError(f"{self.file}: zero={text!r} needs {advice}")
+                raise ValueError(f"{self.file}: zero={text!r} needs a column of clock times; give zero in seconds")
             for what, given, known in (("date", zero.day, first.day), ("time zone", zero.zone, first.zone)):
                 if given is not None and known is None:
                     advice = f"give zero={text!r} without one, as in the file"

@@ -29,15 +29,6 @@ def test_styles_that_are_refused(tmp_path, style):
         read_record(tmp_path / "a.txt", column=COLUMNS.get(style))
 
 
-def test_zero_as_clock_time_of_unix_times(path):
-    path.write_text(READ["Unix milliseconds"])  # begins at 10:32:07 UTC
-    for zero in ("2024-05-14T10:32:05Z", "14.05.2024 12:32:05+02:00", 1715682725.0):
-        assert read_columns(path, (TOP,), ("acc_g",), zero=zero).start == pytest.approx(2.0, abs=1e-6)
-    for zero in ("10:32:05", "2024-05-14T10:32:05"):
-        with pytest.raises(ValueError, match="zero='.*' needs date and time zone, as in .* for Unix times"):
-            read_columns(path, (TOP,), ("acc_g",), zero=zero)
-
-
 def test_a_unix_time_beside_an_elapsed_one(path):
     path.write_text("timestamp_ms,time_s,acc_g\n1715682727000,0.00,1\n1715682727020,0.02,2\n1715682727040,0.04,3\n")
     assert read_columns(path, (TOP,), ("acc_g",)).start == 0.0
