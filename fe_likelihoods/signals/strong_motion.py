@@ -530,6 +530,7 @@ def _geonet_component(block: Block, place: int) -> tuple[str, Series, int]:
     resolution = 1.01 * scale * 10.0 ** -decimals_of(printed) + 0.505 * 10.0 ** -decimals_of(peak[1])
     _check_peak(np.abs(values).max(), abs(float(peak[1])), resolution, where)
     end = start + sum(math.ceil(count / _GEONET_FORM[0]) for count in counts)
+    expect(end <= len(lines), where, f"{sum(counts)} numbers up to line {end}", advice="the file is truncated")
     site = re.search(r"^Site\s+(\S+)", head, re.MULTILINE)
     title = f"{site[1] if site else 'GeoNet'}, component {component[1]}"
     return component[1], Series(title, dt, "mm/s2", values), end

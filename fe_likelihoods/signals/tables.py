@@ -682,11 +682,8 @@ def read_table(
         if any(map(_known, cells)) or all(cell in marks or _is_missing(cell) for cell in cells):
             cells[:] = ["nan" if cell in marks else cell for cell in cells]
     along_rows = along_rows and not any("rows" in row for _, row in rows[:_LAST_LINES])
-    announced = None if along_rows or stated else _announced(rows, file)
-    if announced:
-        names, below, (rows, stated) = [], [], announced
-    else:
-        names, below, rows = _header(rows, separator, along_rows, file)
+    rows, stated = (None if along_rows or stated else _announced(rows, file)) or (rows, stated)
+    names, below, rows = _header(rows, separator, along_rows, file)
     expect(rows, file, "rows of numbers, found none")
     rows, commas = _with_points(rows, separator, file)
     columns, clock = _columns(names, below, rows, file, marks, labels)
