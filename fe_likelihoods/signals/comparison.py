@@ -28,14 +28,10 @@ class Comparison:
     places: tuple[Interpolation | None, ...]  # per channel; None if it has the times of the response
 
     @property
-    def interpolated(self) -> bool:
-        """Whether the response of a channel is evaluated between its samples."""
-        return any(place is not None and place.weights is not None for place in self.places)
-
-    @property
     def description(self) -> str:
-        """Interpolation, for fingerprints."""
-        return " interpolated by six points" if self.interpolated else ""
+        """Whether the response of a channel is evaluated between its samples, for fingerprints."""
+        between = any(place is not None and place.weights is not None for place in self.places)
+        return " interpolated by six points" if between else ""
 
     @cached_property
     def missing(self) -> NDArray[np.bool_]:

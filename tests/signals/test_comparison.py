@@ -140,7 +140,7 @@ def test_samples_at_times_of_the_response_are_compared_bit_by_bit(rng):
     gappy = FELikelihood(model, Measurements(model.channels, 0.01, gaps))
     x = np.array([1.1, 0.8, 0.05, 0.001][: likelihood.ndim])
     assert gappy.log_likelihood(x) == pytest.approx(likelihood.log_likelihood(x), rel=1e-13)
-    assert isinstance(likelihood.measured, Comparison) and not likelihood.measured.interpolated
+    assert isinstance(likelihood.measured, Comparison) and not likelihood.measured.description
     assert not isinstance(FELikelihood(model, fine).measured, Comparison)
     correlated = likelihood.with_noise(AutoregressiveNoise(model.channels))
     zeros = np.zeros(len(model.channels))
