@@ -21,7 +21,7 @@ from ..noise.sample_counts import count_samples
 from ..priors.points import as_rows, complete_repr
 from ..signals.channels import Measurements
 from ..signals.comparison import Comparison
-from ..signals.events import join_measurements
+from ..signals.events import events_of
 from ..simulation.model import Model, SimulationBatch, first_part
 from .inputs import check_model, check_noise, match_measurements
 from .simulator import Simulator
@@ -117,7 +117,9 @@ class FELikelihood(SumOfParts):
         cache: SimulationCache | str | os.PathLike | None = None,
     ) -> None:
         check_model(model)
-        measurements = match_measurements(model, join_measurements(model, measurements))
+        if isinstance(measurements, Mapping):  # of single events
+            measurements = events_of(model).join(measurements)
+        measurements = match_measurements(model, measurements)
         noise = GaussianNoise(model.channels) if noise is None else noise
         check_noise(model, noise)
         self.noise = noise_of_part(noise_under(noise, model), measurements)

@@ -18,7 +18,7 @@ from .channels import Channel, Measurements
 from .records import Record
 from .sampling import expect, rest_samples, same_step
 
-__all__ = ["EventWindow", "Events", "events_of", "find_events", "join_measurements", "motions_of"]
+__all__ = ["EventWindow", "Events", "events_of", "find_events", "motions_of"]
 
 
 class EventWindow(NamedTuple):
@@ -248,8 +248,3 @@ def events_of(model: Any) -> Events:
     advice = "leave out its lead, and put NaN where the measurements of the first event are not to be compared"
     expect(missing <= 1.000001 * model.dt, what, expected, f"{type(model).__name__} without {missing:g} s", advice)
     return events
-
-
-def join_measurements(model: Any, measurements: Measurements | Mapping[str, Measurements]) -> Measurements:
-    """Measurements over the excitation of a model; measurements of single events, given by name, are joined."""
-    return events_of(model).join(measurements) if isinstance(measurements, Mapping) else measurements
