@@ -39,13 +39,10 @@ from .by_value import Pickled
 from .faults import TransientReason
 from .worker import Died, Worker
 
-__all__ = ["LocalPool", "Outcome", "PoolExecutor", "Submitting", "Threads", "as_executor", "result_of", "settle"]
+__all__ = ["LocalPool", "PoolExecutor", "Submitting", "Threads", "as_executor", "result_of", "settle"]
 
 MAX_ATTEMPTS = 3
 _THREADS = ("OMP", "OPENBLAS", "MKL", "BLIS", "VECLIB_MAXIMUM", "NUMBA")
-
-Outcome = tuple[Any, str]
-"""Result and an empty reason, or None and the reason of a failure; mapped functions return this."""
 
 
 class Submitting:
@@ -244,9 +241,9 @@ class LocalPool(Submitting):
 def as_executor(pool: Any, model: Any = None) -> "LocalPool | PoolExecutor | None":
     """Executor for a pool, by the rule above; None for None.
 
-    Its ``map(function, items)`` returns a list. The functions must return an `Outcome`, also given for an item that
-    kills every process that runs it, if the pool survives. ValueError if `pool` is of no such kind, or its workers are
-    other processes and the model cannot be sent to them.
+    Its ``map(function, items)`` returns a list. The functions must return a result and an empty reason, or None and the
+    reason of a failure, as for an item that kills every process that runs it, if the pool survives. ValueError if
+    `pool` is of no such kind, or its workers are other processes and the model cannot be sent to them.
     """
     if pool is None or isinstance(pool, LocalPool | PoolExecutor):
         executor = pool
@@ -276,7 +273,7 @@ class PoolExecutor(Submitting):
         """Number of items that run at once; None if the pool does not say."""
         return workers_of(self.pool)
 
-    def submit_all(self, function: Callable[[Any], Outcome], items: Sequence[Any]) -> list[Future]:
+    def submit_all(self, function: Callable[[Any], Any], items: Sequence[Any]) -> list[Future]:
         """Futures as from `submit`, for several items; they have ended if the pool only has ``map``."""
         by_value = _ByValue(function)
         if self.other_processes:

@@ -54,7 +54,6 @@ __all__ = [
 
 _CLOCK_TICK = 2.0  # [s]; a file changed more recently may change again with the same modification time
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
-_TEMPORARY = getattr(os, "O_TMPFILE", 0)  # a file without a name
 _SYSTEM = ("/proc/", "/sys/", "/dev/", "/run/")
 _INSTALLED = ("/usr/", "/lib", "/etc/", "/bin/", "/opt/", "/memfd:", "/SYSV")
 _CACHES = {"__pycache__", ".cache", ".config"}  # written once per machine, by installed packages
@@ -178,7 +177,7 @@ class RunningSimulation:
 
     def opens(self, path: Any, mode: Any, flags: int) -> None:
         """A link in the own folder is replaced by a private file before it is opened for writing."""
-        if (path := _full(path)) is None or (_TEMPORARY and flags & _TEMPORARY == _TEMPORARY):
+        if (path := _full(path)) is None:
             return
         if not flags & _WRITING:
             self._reads(path)

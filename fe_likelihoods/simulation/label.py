@@ -45,7 +45,7 @@ _OF_CLASSES = set(
 _DATA = (int, float, complex, str, bytes, list, dict, set, np.ndarray)  # class attributes that running code may change
 _OF_SHELLS = {"_", "PWD", "OLDPWD", "SHLVL"}  # changes are irrelevant for simulations
 _PARTS = {"function", "class", "output", "statistic", "library", "python"}
-_first: dict[str, tuple[Any, str]] = {}  # first digests of values that running code changes, and the import they are of
+_first: dict[str, str] = {}  # first digests of values that simulations of this process have changed
 _sources: dict[str, tuple] = {}  # by name of a module: the module and its spec, digest of the source, words in it
 
 
@@ -62,7 +62,7 @@ class ModelLabel:
         by_user = is_of_user(getattr(statistic, "__module__", None) or type(statistic).__module__)
         self._statistic = statistic if by_user else None
         self.items = self._present(model)
-        self.items |= {name: _first[name][1] for name in self.changing}
+        self.items |= {name: _first[name] for name in self.changing}
         is_users = hasattr(model, "code_parts") or is_of_user(type(model).__module__)
         self.observes = is_users or self._statistic is not None
         self.opened = mapped() if self.observes else {}
@@ -90,14 +90,16 @@ class ModelLabel:
         return self._present(model) | digests_by_name(read_again(self.opened))
 
     def has_changed_itself(self, names: Iterable[str]) -> None:
-        """Record that simulations change some items; later labels of the same import keep their first digests."""
-        for name in self.items.keys() & set(names) - _PARTS - self.changing:
-            _first[name] = _import_of(name), self.items[name]
+        """Record that simulations change some items; later labels of this process keep their first digests.
+
+        After an edit, the source of the module is another item.
+        """
+        _first.update({name: self.items[name] for name in self.items.keys() & set(names) - _PARTS - self.changing})
 
     @property
     def changing(self) -> set[str]:
         """Names of items that simulations of this process have changed, such as a count of calls."""
-        return {name for name in self.items.keys() & _first.keys() if _first[name][0] is _import_of(name)}
+        return self.items.keys() & _first.keys()
 
     def _present(self, model: Any) -> dict[str, str]:
         parts: dict[str, Any] = dict(model.code_parts()) if hasattr(model, "code_parts") else {}
@@ -296,15 +298,6 @@ def _attribute(value: Any, name: str) -> Any:
         return object.__getattribute__(value, name)
     except (AttributeError, ValueError):  # an empty cell raises ValueError
         return None
-
-
-def _import_of(name: str) -> Any:
-    """What identifies the import of the module with a named item: its ``__spec__``, which a reload replaces."""
-    module = sys.modules.get(name)
-    while module is None and name:
-        name = name.rpartition(".")[0]
-        module = sys.modules.get(name)
-    return getattr(module, "__spec__", None)
 
 
 def _source(module: types.ModuleType) -> tuple[str, frozenset[str]]:
