@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Iterable
-from time import perf_counter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,14 +20,12 @@ __all__ = ["JudgedRun", "ModelCheck", "check_failures", "check_model", "check_re
 # effective, below which the interval between the 5 % and 95 % quantiles of n samples, which holds a further sample with
 # the probability 0.9 (n - 1) / (n + 1), loses as much as a tail of it: 0.85; with 57 it is 0.87
 FEW_SAMPLES = 36.0
-LARGEST_TEST = 0.05  # of step and mesh: share of the simulations of the run, below which it is made
 
 
 class ModelCheck(NamedTuple):
     """What `check_model` has found, causes first."""
 
     findings: tuple[Finding, ...]
-    seconds: float  # per simulation [s]
     fits: tuple[Fit, ...]  # measurements beside the draws of the prior that were simulated
 
 
@@ -69,7 +66,7 @@ def check_model(posterior: Posterior) -> ModelCheck:
     >>> [finding.kind for finding in checked.findings if finding.severity == "wrong"]
     ['A sign may be wrong']
     """
-    found, fits, seconds, likelihood = list[Finding](), list[Fit](), 0.0, posterior.likelihood
+    found, fits, likelihood = list[Finding](), list[Fit](), posterior.likelihood
     mean, draws = posterior.prior.mean(), draws_to_compare(posterior)
     for key, part, columns in data_sets_of(posterior):
         theta = mean[columns][: len(part.model.parameter_names)]
@@ -78,16 +75,15 @@ def check_model(posterior: Posterior) -> ModelCheck:
             reason = batch.reasons[0]
             raise ValueError(f"the simulation at the mean of the prior has failed: {reason}; check model, priors")
         fits += compare(part, draws[:, columns], key)
-        start = perf_counter()  # generators of workers have moved on meanwhile
+        # generators of workers have moved on meanwhile
         chance = check_chance(part.model, theta, batch.response[0], part.simulator.pool)
-        seconds += (perf_counter() - start) / (2 if part.simulator.pool is None else 1)
         # where responses differ by chance, other differences say nothing
         found += chance or check_motion(part.model, theta, batch.response[0])
     found += _check_inputs(likelihood, fits)
     report, attempts = posterior.report(), sum(part.simulator.failures.outcomes for part, _ in likelihood.parts())
     rows = tuple(Failure(*each, "") for each in Counter(report["failure_reasons"]).most_common(1))
     found += check_failures(Failures(rows, report["failure_count"], attempts))
-    return ModelCheck(in_order(found), seconds, tuple(fits))
+    return ModelCheck(in_order(found), tuple(fits))
 
 
 def check_result(sampler: Any, posterior: Any = None, *, discard: int = 0) -> Judgement:
@@ -169,7 +165,7 @@ def _check_inputs(likelihood: Any, fits: Iterable[Fit]) -> list[Finding]:
 def _check_steps(run: FinishedRun) -> tuple[list[Finding], dict[str, str]]:
     """The error of step and mesh at the centre of the samples, and what was tested.
 
-    This takes a simulation for each parameter and more; where they are many and take long, it is not tested.
+    This takes a simulation for each parameter and more; more than a twentieth of the run's that take long are not made.
     """
     if run.prior is None or run.is_inconclusive:
         return [], {}
@@ -178,7 +174,7 @@ def _check_steps(run: FinishedRun) -> tuple[list[Finding], dict[str, str]]:
     seconds = report["seconds"] / max(report["simulations"], 1)
     if run.n_modes > 1:
         return [], {STEP: "not tested: the samples have several modes, which have no common standard deviation"}
-    if needed > LARGEST_TEST * report["simulations"] and needed * seconds > SECONDS:
+    if needed > TAIL * report["simulations"] and needed * seconds > SECONDS:
         return [], {STEP: f"not tested: the test takes about {needed} simulations of {seconds:.2g} s"}
     return halve_steps(run.posterior, run.centre, run.samples.std(axis=0))
 

@@ -5,7 +5,7 @@ them; what is missing is empty or NaN here, and the report leaves it out.
 """
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any, NamedTuple
 
@@ -38,7 +38,6 @@ class FinishedRun(NamedTuple):
     sd_error: np.ndarray  # (ndim,) the same of the standard deviation
     effective_sample_size: float  # independent samples with the same error of the mean, the smallest
     autocorrelation_time: float  # the largest, of emcee's own sampler [iterations]; else NaN
-    truth: np.ndarray  # (ndim,), NaN where none is known
     discard: int  # iterations left out at the beginning of the chain
     tempered: bool
     verdict: Verdict | None
@@ -73,14 +72,12 @@ def read_run(
     posterior: Any = None,
     *,
     names: Sequence[str] | None = None,
-    truth: Mapping[str, float] | Sequence[float] | None = None,
     discard: int = 0,
 ) -> FinishedRun:
     """Read a finished run of this project or of emcee; `discard` as in `emcee.EnsembleSampler.get_chain`.
 
-    By default the posterior is the sampler's log-density. Names are for a posterior without them; `truth` has true
-    values of synthetic data, in the units of the samples. ValueError if the sampler has no chain, or names, true values
-    or the posterior do not match it.
+    By default the posterior is the sampler's log-density. Names are for a posterior without them. ValueError if
+    the sampler has no chain, or names or the posterior do not match it.
     """
     if not isinstance(sampler, EnsembleSampler):
         raise ValueError(
@@ -96,15 +93,11 @@ def read_run(
     described = getattr(posterior, "parameters", None) if names is None else None
     known = names or getattr(posterior, "parameter_names", None) or [f"x{i}" for i in range(samples.shape[1])]
     parameters = tuple(Parameter(str(name)) for name in known) if described is None else tuple(described)
-    labels = [each.name for each in parameters]
     if len(parameters) != samples.shape[1]:
         raise ValueError(
             f"the chain has {samples.shape[1]} parameters, but the posterior or names= has {len(parameters)} "
-            f"({', '.join(labels)}): give the posterior that was sampled"
+            f"({', '.join(each.name for each in parameters)}): give the posterior that was sampled"
         )
-    true = truth if isinstance(truth, Mapping) else {} if truth is None else dict(zip(labels, truth, strict=False))
-    if set(true) - set(labels) or not (isinstance(truth, Mapping | None) or np.shape(truth) == (len(labels),)):
-        raise ValueError(f"truth must have values of parameters ({', '.join(labels)}), or one for each; got {truth!r}")
     tempered, verdict = hasattr(sampler, "ladder") and bool(sampler.ladder), None
     with suppress(ValueError):  # a file may hold no verdict
         verdict = sampler.verdict if tempered else None
@@ -117,7 +110,6 @@ def read_run(
         parameters,
         samples,
         *_errors(sampler, samples, tempered, discard),
-        np.array([float(true.get(name, np.nan)) for name in labels]),
         discard,
         tempered,
         verdict,
@@ -171,7 +163,6 @@ class ParameterRow(NamedTuple):
     median: float
     high: float  # 95 % quantile
     nominal: float
-    truth: float
 
     @property
     def cv(self) -> float:
@@ -184,7 +175,7 @@ def rows_of(run: FinishedRun) -> list[ParameterRow]:
     rows, moments = [], moments_of(run).T
     priors = [("", np.nan, np.nan, -np.inf, np.inf)] * len(moments)
     priors = priors if run.prior is None else [each[1:] for each in run.prior.table()[1]]
-    for parameter, (family, *of_prior), numbers, truth in zip(run.parameters, priors, moments, run.truth, strict=True):
+    for parameter, (family, *of_prior), numbers in zip(run.parameters, priors, moments, strict=True):
         mean, prior_sd, lower, upper = (float(each) for each in parameter.shown(of_prior))
         family = family.split("(")[0]
         text = f"{family}, mean {mean:.4g}, sd {prior_sd:.3g}" if family else ""
@@ -193,7 +184,7 @@ def rows_of(run: FinishedRun) -> list[ParameterRow]:
         elif family:
             bounds = (("above", lower), ("below", upper))
             text += "".join(f", {side} {bound:.4g}" for side, bound in bounds if np.isfinite(bound))
-        shown = (float(each) for each in parameter.shown([*numbers, parameter.nominal, truth]))
+        shown = (float(each) for each in parameter.shown([*numbers, parameter.nominal]))
         unit = parameter.label.removeprefix(parameter.name).strip()
         rows.append(ParameterRow(parameter.name, parameter.label, unit, text, prior_sd, *shown))
     return rows

@@ -19,7 +19,6 @@ __all__ = ["Screened", "check_data", "check_phases", "check_sensors", "check_ste
 # No horizontal ground acceleration above 2.8 g was recorded (Tsukidate 2011); responses leave room for impacts.
 LARGEST_PEAKS = {"motion": (3.0, "g"), "acceleration": (20.0, "g"), "displacement": (10.0, "m")}
 SHORT_STEP = 1e-3  # [s]: accelerations below the top are then right to about 4 %
-MOST_PLACES = 3  # that a finding lists; the line for the TOML file has all
 REAL_PHASES = 10.0  # [deg]; 0 of 7200 right shapes (errors to 0.1); those named: real parts with a MAC of 0.96 to 0.997
 
 LEAVE_OUT, SUBTRACT = "Leave these samples out", "Subtract it, unless the structure did move so"
@@ -153,8 +152,8 @@ def check_sensors(screened: Iterable[Screened]) -> list[Finding]:
     for each in screened:
         kind, text, do = FAULTS[each.kind]
         places = [first if first == last else f"{first} to {last}" for first, last in each.missing]
-        more = f" and at {len(places) - MOST_PLACES} more" if len(places) > MOST_PLACES else ""
-        words = f"at {', '.join(places[:MOST_PLACES])} s{more}" if places else f"{each.size:.2f}"
+        more = f" and at {len(places[3:])} more" if places[3:] else ""  # the line for the TOML file has all
+        words = f"at {', '.join(places[:3])} s{more}" if places else f"{each.size:.2f}"
         if each.baseline:
             ends = each.baseline[:: max(len(each.baseline) - 1, 1)]
             words = f"{' to '.join(f'{value:.3g}' for _, value in ends)} {each.unit}".rstrip()

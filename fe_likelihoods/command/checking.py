@@ -54,7 +54,8 @@ def _say_data(problem: Problem, say: Callable[[str], None]) -> None:
 
 
 def _say_simulation(problem: Problem, checked: ModelCheck, say: Callable[[str], None]) -> None:
-    say(f"One simulation takes {checked.seconds:.2g} s")
+    report = problem.posterior.report()
+    say(f"One simulation takes {report['seconds'] / report['simulations']:.2g} s")
     mean = problem.posterior.prior.mean()[None]
     for part, columns in problem.posterior.likelihood.parts():
         theta, measured = mean[:, columns[: len(part.model.parameter_names)]], part.measurements

@@ -21,7 +21,6 @@ __all__ = [
     "names_of_values",
     "residual_sentences",
     "summary_sentences",
-    "verdict_sentences",
 ]
 
 
@@ -125,19 +124,6 @@ def _worth(run: FinishedRun) -> str:
             "ones; a Markov chain gives no verdict of its own, and no evidence."
         )
     return "The chain is too short to say how many independent samples it is worth."
-
-
-def verdict_sentences(run: FinishedRun, rows: list[ParameterRow]) -> list[str]:
-    """The verdict of the sampler in its own words, and how many true values are in their intervals."""
-    sentences = [] if run.verdict is None else [f"Verdict of the sampler: {run.verdict}"]
-    known = [row for row in rows if np.isfinite(row.truth)]
-    if known and not run.is_inconclusive:
-        inside = sum(row.low <= row.truth <= row.high for row in known)
-        sentences.append(
-            f"{inside} of {len(known)} true values are within their 90 % intervals. (Nine in ten are to be expected if "
-            "model and noise are right for the data.)"
-        )
-    return sentences
 
 
 def evidence(run: FinishedRun) -> list[str]:

@@ -91,17 +91,13 @@ def draw_posterior(run: FinishedRun) -> list[Picture]:
     """Prior and posterior of each parameter, and samples of all pairs."""
     described = run.posterior if hasattr(run.posterior, "parameters") else SimpleNamespace(parameter_names=run.names)
     samples, drawn = drawn_samples(run)
-    options = {
-        "posterior": described,
-        "truths": run.truth if np.isfinite(run.truth).any() else None,
-    }
     return [
         _picture(
             "What the data have changed",
             "Where the posterior is as wide as the prior, the data say nothing about the parameter. Where it leans "
             "against the end of the prior, the prior decides.",
             f"Prior and posterior density of {', '.join(run.names)}.",
-            lambda: plot_marginals(samples, **options),
+            lambda: plot_marginals(samples, posterior=described),
         ),
         _picture(
             "Pairs of parameters",
@@ -109,7 +105,7 @@ def draw_posterior(run: FinishedRun) -> list[Picture]:
             "Separate clouds: separate explanations of the data. Values outside of a panel are written at its edge. "
             + drawn,
             f"Posterior samples of each parameter and each pair of {', '.join(run.names)}.",
-            lambda: plot_corner(samples, **options),
+            lambda: plot_corner(samples, posterior=described),
         ),
     ]
 

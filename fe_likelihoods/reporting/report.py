@@ -22,7 +22,6 @@ from .contents import (
     evidence,
     residual_sentences,
     summary_sentences,
-    verdict_sentences,
 )
 from .origin import fingerprints, how_to_repeat, sampler_settings, versions
 from .other_events import EventPredictions, OtherEvent, as_events, describe_event
@@ -46,7 +45,6 @@ def report(
     *,
     title: str = "",
     names: Sequence[str] | None = None,
-    truth: Mapping[str, float] | Sequence[float] | None = None,
     measured: Measurements | Mapping[str, Measurements] | None = None,
     events: Mapping[str, Prediction | EventPredictions | SimulationFailed] | None = None,
     discard: int = 0,
@@ -74,8 +72,6 @@ def report(
         Title of the page. Default: the name of the model.
     names : sequence of str, optional
         Names of the parameters, for a log-density that has none.
-    truth : mapping of str to float, or sequence of float, optional
-        True values of synthetic data, in the units of the samples.
     measured : Measurements, or mapping of str to Measurements, optional
         Measurements to draw with the predictions, by the title of the prediction or the name of the event.
     events : mapping of str to Prediction, to mapping of str to Prediction, or to SimulationFailed, optional
@@ -96,7 +92,7 @@ def report(
     Raises
     ------
     ValueError
-        If the sampler has no chain, or names, true values, the posterior or the prediction do not fit; nothing is
+        If the sampler has no chain, or names, the posterior or the prediction do not fit; nothing is
         simulated or written then.
 
     Examples
@@ -105,7 +101,7 @@ def report(
     >>> path.name
     'report.html'
     """
-    run = read_run(sampler, posterior, names=names, truth=truth, discard=discard)
+    run = read_run(sampler, posterior, names=names, discard=discard)
     return write_page(Path(out), run, prediction, title=title, measured=measured, events=events, repeat=repeat)
 
 
@@ -159,7 +155,6 @@ def gather(
         "data": sets,
         "rows": rows,
         "factor": judgement.width_factor,
-        "has_truth": bool(np.isfinite(run.truth).any()),
         "has_nominal": any(np.isfinite(row.nominal) for row in rows),
         "evidence": evidence(run),
         "fits": fits,
@@ -173,7 +168,7 @@ def gather(
         "event_pictures": [draw_event(each) for each in events],
         "score_pictures": draw_scores_of_events(events),
         "residuals": [] if run.is_inconclusive else residual_sentences(fits),
-        "verdict": verdict_sentences(run, rows),
+        "verdict": "" if run.verdict is None else f"Verdict of the sampler: {run.verdict}",
         "inconclusive": run.is_inconclusive,
         "failures": failed,
         "cost": cost(run),

@@ -195,7 +195,7 @@ def test_a_run_without_a_result_leads_to_no_conclusion():
     posterior = posterior_of([1.0, 0.8])
     chain = emcee.EnsembleSampler(24, 3, posterior, vectorize=True)
     chain.run_mcmc([1.0, 0.8, 0.002] * (1.0 + 0.01 * np.random.default_rng(1).standard_normal((24, 3))), 10)
-    finished = read_run(chain, posterior, truth=[5.0, 5.0, 5.0])
+    finished = read_run(chain, posterior)
     contents = gather(finished)
     titles = notes_of(contents).keys()
     assert titles.isdisjoint({"Not informed by the data", "The errors are correlated"})

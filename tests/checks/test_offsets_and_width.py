@@ -88,7 +88,7 @@ def test_one_event_says_by_which_factor_its_errors_are_too_small_for_another_one
     nan = float("nan")
 
     def row(name, mean, sd):
-        return ParameterRow(name, name, "", "", 1.0, mean, nan, sd, nan, 0.0, 1.0, 2.0, nan, nan)
+        return ParameterRow(name, name, "", "", 1.0, mean, nan, sd, nan, 0.0, 1.0, 2.0, nan)
 
     (found,) = check_other_events([row("frequency", 4.0, 0.002), row("damping", 0.1, 0.01), row("share", 0.8, 0.01)])
     expected = {
