@@ -47,6 +47,9 @@ FRESH_SHARE = 0.75
 MOST_COMPONENTS = 8
 # Share of a proposal's weight that is spread evenly over its components, so that small components receive draws too.
 EVEN_SHARE = 0.25
+# Factor on the volume of the components of a fit to a bent population, or to several modes: a fit to few points leaves
+# out the thin ends of an arm, whose draws the next fit would need (counts are in `docs/theory/recycling`).
+WIDER_VOLUME = 2.0
 # Components added to a proposal for parts of the target that it does not explain (`samplers.proposals.basins`), and the
 # smallest share of the draws for each.
 MOST_BASINS, BASIN_SHARE = 3, 0.1
@@ -142,7 +145,7 @@ def recycle(
 
         # fit a proposal
         mixture = fit_mixture(points.coords, coarse_weights(log_weights), MOST_COMPONENTS, bounds)
-        mixture = _with_even_share(mixture, EVEN_SHARE)
+        mixture = _with_even_share(_widened(mixture), EVEN_SHARE)
         most = max(most, len(mixture.weights))
         target = max(least, POINTS_PER_COMPONENT * (ndim + 1.0) * most) if most > 1 else least
         finished, basins = beta == 1.0 and effective >= n, None
@@ -336,6 +339,14 @@ def _stopped_at(points: WeightedPoints, beta: float, of_stages: float, inherited
     log_evidence = float(log_mean_weight(log_weights) + np.log(n))
     variance = max(1.0 / effective - 1.0 / n, 0.0) + inherited + tail_variance(log_weights)
     return StoppedEarly(known, log_evidence, float(np.sqrt(variance)), beta, of_stages)
+
+
+def _widened(mixture: Mixture) -> Mixture:
+    """The mixture with wider components, unless it is one component without shears."""
+    if len(mixture.weights) == 1 and not mixture.shears:
+        return mixture
+    factor = WIDER_VOLUME ** (1.0 / mixture.means.shape[1])
+    return mixture._replace(roots=factor * mixture.roots, inverses=mixture.inverses / factor)
 
 
 def _with_even_share(mixture: Mixture, share: float) -> Mixture:
