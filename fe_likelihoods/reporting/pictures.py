@@ -181,6 +181,9 @@ def draw_run(run: FinishedRun) -> list[Picture]:
     """What the sampler did, with its tempering stages."""
     if not run.tempered:
         return []
+    if len(run.sampler.ladder) == 1:  # of a guide
+        caption = "The effective sample size of the draws should reach the number of walkers, the log-evidence settle."
+        return [_picture("What the sampler did", caption, "Rounds of the guide.", lambda: plot_run(run.sampler))]
     return [
         _picture(
             "What the sampler did",

@@ -296,9 +296,9 @@ def plot_run(sampler: Any) -> "Figure":
 
     From above: the exponent beta and the acceptance of each stage, if there are several; the effective sample size and
     the number of distinct points; the log-evidence with two standard errors, after each round of a guide and each
-    stage; and the log-probability of the walkers at beta = 1, as median and 90 % range. The log-probability of a
-    converged run has no trend. The idea is from the run plot of dynesty (Speagle 2020, Monthly Notices of the Royal
-    Astronomical Society 493(3), doi:10.1093/mnras/staa278).
+    stage; and the log-probability of the walkers at beta = 1, as median and 90 % range, if there are several steps. In
+    a converged run it has no trend. The idea is from the run plot of dynesty (Speagle 2020, Monthly Notices of the
+    Royal Astronomical Society 493(3), doi:10.1093/mnras/staa278).
 
     `sampler` is a tempered sampler that has run; ValueError if it has no stages.
 
@@ -315,8 +315,10 @@ def plot_run(sampler: Any) -> "Figure":
         )
     stages, rounds = sampler.ladder, sampler.rounds
     several = len(stages) > 1  # a guide that is enough has a single stage, the result of its rounds
-    size = {"figsize": (7.5, 7.6 + 2.0 * several), "layout": "constrained"}
-    figure, (*ladder, points, evidence, chain) = plt.subplots(3 + several, 1, **size)
+    steps = np.arange(1, sampler.iteration + 1)
+    n = 2 + several + (len(steps) > 1)
+    figure, panels = plt.subplots(n, 1, figsize=(7.5, 2.2 * n + 1.0), layout="constrained")
+    ladder, (points, evidence, *chain) = panels[:several], panels[several:]
     title = f"{sampler.evaluations} evaluations"
     if stages[-1].beta == 1.0:
         title += f", log Z = {sampler.log_evidence:.2f} ± {sampler.log_evidence_error:.2g}"
@@ -347,14 +349,13 @@ def plot_run(sampler: Any) -> "Figure":
     points.set(ylim=(0.0, 1.3 * points.get_ylim()[1]), ylabel="number of points")
     evidence.set(xlabel="evaluations of the log-probability", ylabel="log-evidence so far")
     evidence.ticklabel_format(axis="y", useOffset=False)
-    chain.set(xlabel="step at beta = 1", ylabel="log-probability")
-    if sampler.iteration > 0:
+    for axes in chain:
         levels = np.quantile(np.asarray(sampler.get_log_prob(), dtype=float), [0.05, 0.5, 0.95], axis=1)
-        steps = np.arange(1, sampler.iteration + 1)
-        chain.fill_between(steps, levels[0], levels[2], color=BLUE, alpha=0.3, linewidth=0.0)
-        chain.plot(steps, levels[1], "o-", color=BLUE, markersize=3, label="median and 90 % of the walkers")
-        chain.xaxis.get_major_locator().set_params(integer=True)
-    for axes in (*ladder, points, evidence, chain):
+        axes.set(xlabel="step at beta = 1", ylabel="log-probability")
+        axes.fill_between(steps, levels[0], levels[2], color=BLUE, alpha=0.3, linewidth=0.0)
+        axes.plot(steps, levels[1], "o-", color=BLUE, markersize=3, label="median and 90 % of the walkers")
+        axes.xaxis.get_major_locator().set_params(integer=True)
+    for axes in panels:
         axes.grid(alpha=0.25)
         if axes.get_legend_handles_labels()[0]:
             axes.legend(frameon=False, fontsize="small", ncols=3)

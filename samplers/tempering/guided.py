@@ -139,7 +139,8 @@ def draw_rounds(
     pooled = None
 
     def tick(phase: str) -> tuple[Population, GuideTick]:
-        return population, GuideTick(phase, budget.simulations, size, guide.expected_simulations)
+        made = guide.simulations if phase == "search" else budget.simulations
+        return population, GuideTick(phase, made, size, guide.expected_simulations)
 
     def asked(steps: Generator | None, phase: str) -> Generator[tuple[Population, Any], Any, None]:
         answer, steps = None, (iter(()) if steps is None else steps)
