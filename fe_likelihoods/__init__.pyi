@@ -59,7 +59,7 @@ from .priors.priors import Prior
 from .reporting.report import report
 from .signals.alignment import align
 from .signals.channels import Channel, Measurements
-from .signals.error_measures import rrmse
+from .signals.comparison import rrmse
 from .signals.events import Events
 from .signals.read import read_columns, read_record
 from .signals.records import DisplacementHistory, Record

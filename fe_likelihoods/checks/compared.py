@@ -16,7 +16,7 @@ from ..likelihood.posterior import Posterior
 from ..noise.marginal import sampled_noise
 from ..noise.residuals import ResidualChecks, residual_checks
 from ..signals.channels import Channel, Measurements
-from ..signals.error_measures import relative_errors
+from ..signals.comparison import relative_errors
 from ..signals.events import find_events
 from ..simulation.faults import ChangedModel
 from ..simulation.model import SimulationFailed

@@ -9,7 +9,7 @@ from scipy.special import chdtrc
 from ..noise.residuals import ResidualChecks
 from ..priors.between_events import spread_of
 from ..signals.channels import Channel
-from ..signals.error_measures import relative_errors
+from ..signals.comparison import relative_errors
 from ..text_tables import listed
 from .compared import MOST_DRAWS, Fit, checks_of
 from .faults import EXPLAINED, find_faults, finding_of, supports_apart

@@ -8,7 +8,7 @@ from ..checks.compared import data_sets_of, draws_to_compare
 from ..checks.faults import FAULTS
 from ..checks.finding import labelled
 from ..checks.result import ModelCheck, check_model
-from ..signals.error_measures import rrmse
+from ..signals.comparison import rrmse
 from ..text_tables import text_table
 from .job import Job, read_job
 from .listing import describe

@@ -19,8 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..signals.comparison import Comparison
-from ..signals.durations import growing_durations
-from ..signals.records import DisplacementHistory
+from ..signals.records import DisplacementHistory, growing_durations
 from .archive import Archive
 from .data_sets import DataSets
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..signals.error_measures import relative_errors
+from ..signals.comparison import relative_errors
 from ..units import from_si
 from .style import BLUE, ORANGE, add_figure_legend, channel_label, marker_of, new_figure
 

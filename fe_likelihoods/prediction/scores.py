@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from scipy.special import ndtr
 
 from ..signals.channels import Channel
-from ..signals.error_measures import rrmse
+from ..signals.comparison import rrmse
 from ..text_tables import text_table
 from ..units import from_si
 

@@ -18,8 +18,9 @@ from ..units import from_si
 from .response_spectrum import ResponseSpectrum, response_spectrum
 from .sampling import array_digest, check_samples, check_step, expect, rest_samples, same_step, sample_window
 
-__all__ = ["DisplacementHistory", "Record", "SubdividedHistory"]
+__all__ = ["DisplacementHistory", "Record", "SubdividedHistory", "growing_durations"]
 
+_APART = 1.3  # smallest ratio of successive durations
 _LARGEST_RATIO_TERM = 1000  # of the ratio of steps in `Record.resample`; the filter length grows with it
 
 
@@ -286,3 +287,21 @@ class DisplacementHistory:
         indices = np.concatenate([[0], np.cumsum(np.maximum(parts, 1).astype(np.intp))])
         displacement = np.interp(np.arange(indices[-1] + 1), indices, self.displacement)
         return SubdividedHistory(replace(self, displacement=displacement), indices)
+
+
+def growing_durations(acceleration: NDArray[np.float64], dt: float, shares: Sequence[float]) -> tuple[float, ...]:
+    """Durations [s] after which increasing shares of the Arias intensity have passed, and the full duration.
+
+    Accelerations are (n_channels, n_steps) and not all zero; channels have equal weight. Durations that are not 1.3
+    times shorter than the next one are left out. The misfit of a long record has many local minima, since cycles that
+    are out of phase by a period nearly fit.
+    """
+    rows = acceleration[np.abs(acceleration).max(axis=1) > 0.0]
+    rows = rows / np.abs(rows).max(axis=1, keepdims=True)  # so that squares do not overflow
+    passed = np.cumsum(rows * rows, axis=1)
+    passed = (passed / passed[:, -1:]).mean(axis=0)
+    durations = [(rows.shape[1] - 1) * dt]
+    for index in np.searchsorted(passed, shares)[::-1]:
+        if index > 0 and index * dt * _APART <= durations[0]:
+            durations.insert(0, float(index * dt))
+    return tuple(durations)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fe_likelihoods.signals.durations import growing_durations
+from fe_likelihoods.signals.records import growing_durations
 
 ALTERNATING, PULSE, FIRST = np.tile([1.0, -1.0], 500), np.zeros(100), np.zeros(100)
 PULSE[40] = FIRST[0] = 1.0
