@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..units import from_si
-from .response_spectrum import ResponseSpectrum, response_spectrum
 from .sampling import array_digest, check_samples, check_step, expect, rest_samples, same_step, sample_window
+from .sdof import ResponseSpectrum, spectrum_of
 
 __all__ = ["DisplacementHistory", "Record", "SubdividedHistory", "growing_durations"]
 
@@ -218,7 +218,7 @@ class Record:
         >>> spectrum.pseudo_acceleration.shape
         (3,)
         """
-        return response_spectrum(self.acceleration, self.dt, periods, damping_ratio)
+        return spectrum_of(self.acceleration, self.dt, periods, damping_ratio)
 
     def _source(self, note: str) -> str:
         return f"{self.source}; {note}" if self.source else note

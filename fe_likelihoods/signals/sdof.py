@@ -1,4 +1,4 @@
-r"""Exact response of a linear single-degree-of-freedom oscillator to a base acceleration.
+r"""Exact response of a linear oscillator with one degree of freedom to a base acceleration, and response spectra.
 
 The displacement :math:`u` of a mass relative to its base, carried by a spring and a dashpot, satisfies
 
@@ -13,6 +13,11 @@ samples has a closed form without time-stepping error (Nigam & Jennings 1969). W
           \dot u = \frac{\mathrm{Im}(\lambda q)}{\omega_d}, \qquad \omega_d = \omega \sqrt{1 - \zeta^2} .
 
 See ``docs/theory/time_integration.rst``.
+
+References
+----------
+N. C. Nigam, P. C. Jennings (1969), Calculation of response spectra from strong-motion earthquake records, Bulletin of
+the Seismological Society of America 59(2), 909-922.
 """
 
 import cmath
@@ -20,8 +25,14 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["OscillatorResponse", "hold_integrals", "respond", "response_slopes"]
+from .sampling import expect
+
+__all__ = ["OscillatorResponse", "ResponseSpectrum", "hold_integrals", "respond", "response_slopes", "spectrum_of"]
+
+_INSTANTS = 40  # instants per period at which the response is evaluated
+_SHORTEST = 0.1  # shortest period, in steps of the motion
 
 
 class OscillatorResponse(NamedTuple):
@@ -116,3 +127,54 @@ def response_slopes(
         forces = d_viscous * v + 2.0 * damping_ratio * angular_frequency * d_v
         found.append(OscillatorResponse(d_u, d_v, -forces - d_stiffness * u - angular_frequency**2 * d_u))
     return found[0], found[1]
+
+
+class ResponseSpectrum(NamedTuple):
+    r"""Peak responses of oscillators with one damping ratio.
+
+    Attributes
+    ----------
+    periods : ndarray, shape (n_periods,)
+        Undamped periods [s].
+    damping_ratio : float
+        Fraction of critical damping [-].
+    displacement : ndarray, shape (n_periods,)
+        Largest displacement relative to the ground, SD [m].
+    pseudo_velocity : ndarray, shape (n_periods,)
+        Pseudo-velocity, :math:`\omega` SD [m/s].
+    pseudo_acceleration : ndarray, shape (n_periods,)
+        Pseudo-acceleration, :math:`\omega^2` SD [m/s²]. Multiplied by the mass, it is the largest spring force.
+    """
+
+    periods: NDArray[np.float64]
+    damping_ratio: float
+    displacement: NDArray[np.float64]
+    pseudo_velocity: NDArray[np.float64]
+    pseudo_acceleration: NDArray[np.float64]
+
+
+def spectrum_of(
+    acceleration: NDArray[np.float64], dt: float, periods: ArrayLike | None, damping_ratio: float
+) -> ResponseSpectrum:
+    r"""The elastic response spectrum of a ground acceleration (n_steps,) [m/s²]; see `Record.spectrum`.
+
+    A peak between two of 40 or more instants per period is underestimated by less than :math:`1 - \cos(\pi / 40) = 0.3
+    \,\%` of the oscillating part. One period of free vibration after the motion is followed, which may have the peak.
+    """
+    if periods is None:
+        periods = np.geomspace(max(0.02, 2.0 * dt), max(10.0, 4.0 * dt), 120)
+    periods = np.array(periods, dtype=float)
+    known = periods.ndim == 1 and periods.size and np.all(np.isfinite(periods) & (periods > 0.0))
+    expect(known, "periods", "positive numbers of seconds in one dimension", periods)
+    expected = f"at least {_SHORTEST * dt:g} s, {_SHORTEST:g} steps of the motion, which has no information below"
+    expect(periods.min() >= _SHORTEST * dt, "periods", expected, f"{periods.min():g} s")
+    expect(0.0 <= damping_ratio < 1.0, "damping_ratio", "a number in [0, 1) (0.05 is 5 %)", repr(damping_ratio))
+    frequencies = 2.0 * math.pi / periods
+    displacement = np.empty(periods.size)
+    for k, (period, omega) in enumerate(zip(2.0 * math.pi / frequencies, frequencies, strict=True)):
+        parts, rest = max(1, math.ceil(_INSTANTS * dt / period)), math.ceil(period / dt) + 1
+        samples = np.concatenate([acceleration, np.zeros(rest)])  # and one period of free vibration
+        finer = np.interp(np.arange((samples.size - 1) * parts + 1) / parts, np.arange(samples.size), samples)
+        displacement[k] = np.abs(respond(finer, dt / parts, omega, damping_ratio).displacement).max()
+    velocity = frequencies * displacement
+    return ResponseSpectrum(periods, float(damping_ratio), displacement, velocity, frequencies * velocity)

@@ -429,9 +429,8 @@ class Table(NamedTuple):
     @property
     def listing(self) -> str:
         """The columns, for messages."""
-        if self.named:
-            return f"the columns are {', '.join(column.name for column in self.columns)}"
-        return f"the columns have no names: give a number from 1 to {len(self.columns)}. {_POINTS}"
+        names = ", ".join(column.name for column in self.columns)
+        return f"the columns are {names}" + ("" if self.named else f", without a header line. {_POINTS}")
 
     def place_of(self, name: int | str | None) -> int:
         """The place of the named column of values, or of the only one."""

@@ -222,7 +222,7 @@ def test_arguments_proposed_for_a_table_without_a_header_line_work(tmp_path, wid
     np.testing.assert_array_equal(records[1].acceleration, values.ravel() * G0)
     measured = read_columns(path, [TOP], [width], "g", dt=0.01)
     np.testing.assert_array_equal(measured.values[0], values[:, -1] * G0)
-    with pytest.raises(ValueError, match=f"give a number from 1 to {width}"):
+    with pytest.raises(ValueError, match=f", {width}, without a header line"):
         read_record(path, units="g", dt=0.01, column=width + 1)
 
 
