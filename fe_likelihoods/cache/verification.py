@@ -132,12 +132,10 @@ class Trust:
 
     def due(self, kind: str, n: int) -> int:
         """Number of rows to verify when n rows are used."""
+        first = 0 if kind in self.used else 1 if self.used else FIRST_ROWS  # one where other rows of the code agreed
         before = self.used.get(kind, 0)
-        # the second: others of the same code were verified
-        first = 0 if kind in self.used else 1 if self.used else FIRST_ROWS
         self.used[kind] = before + n
-        hundreds = [max(0, each) // ROWS_PER_VERIFICATION for each in (before, before + n)]
-        return first + hundreds[1] - hundreds[0]
+        return first + (max(0, before + n) // ROWS_PER_VERIFICATION - max(0, before) // ROWS_PER_VERIFICATION)
 
 
 class Simulated(NamedTuple):

@@ -411,9 +411,6 @@ class Observed:
         self.__qualname__ = getattr(function, "__qualname__", type(function).__qualname__)  # for messages
         self._known: Opened = {}
 
-    def __repr__(self) -> str:
-        return repr(self.function)
-
     def __reduce__(self) -> tuple:
         alone, simulation = self._alone, running_simulation()
         if alone is None:
