@@ -12,6 +12,7 @@ notebook functions work. The worker imports this library, installed packages and
 User code has no version. This library is represented by a digest of its files, installed packages by their versions.
 """
 
+import dis
 import functools
 import importlib.machinery
 import importlib.metadata
@@ -238,17 +239,27 @@ class _Pickler(cloudpickle.Pickler):
 
 @functools.lru_cache(maxsize=4096)
 def names_in(code: types.CodeType) -> frozenset[str]:
-    """Names in a code object and in the code objects inside it, also of modules in its import statements."""
-    inner = [constant for constant in code.co_consts if isinstance(constant, types.CodeType)]
-    return frozenset(code.co_names).union(*map(names_in, inner))
+    """Names in a code object and in the code objects inside it."""
+    return frozenset(code.co_names).union(*map(names_in, _inner(code)))
+
+
+@functools.lru_cache(maxsize=4096)
+def _imported_in(code: types.CodeType) -> frozenset[str]:
+    """Modules of import statements in the code, without the dots of relative ones."""
+    own = {step.argval for step in dis.get_instructions(code) if step.opname == "IMPORT_NAME"}
+    return frozenset(own).union(*map(_imported_in, _inner(code)))
+
+
+def _inner(code: types.CodeType) -> list[types.CodeType]:
+    return [constant for constant in code.co_consts if isinstance(constant, types.CodeType)]
 
 
 def _possible_modules(code: types.CodeType, package: str) -> list[str]:
     """Full names of modules that the code of a package may import."""
-    names, parts = names_in(code), package.split(".")
-    packages = [".".join(parts[:n]) for n in range(1, len(parts) + 1)]
-    found = names | {f"{each}.{name}".rstrip(".") for each in packages for name in names}
-    return sorted(found | {f"{each}.{name}" for each in found & sys.modules.keys() for name in names})
+    imported, parts = _imported_in(code), package.split(".")
+    packages = [".".join(parts[:n]) for n in range(1, len(parts) + 1)] if imported else []
+    found = imported | {f"{each}.{name}".rstrip(".") for each in packages for name in imported}
+    return sorted(found | {f"{each}.{name}" for each in found & sys.modules.keys() for name in names_in(code)})
 
 
 class _Namespace(NamedTuple):
