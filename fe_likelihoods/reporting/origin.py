@@ -76,6 +76,8 @@ def how_to_repeat(run: FinishedRun) -> str:
     sampler = run.sampler
     name, package = type(sampler).__name__, "samplers" if hasattr(sampler, "settings") else "emcee"
     arguments = [str(sampler.nwalkers), "posterior.ndim", "posterior"]
+    # of a function of the user's own, whose values only the user can write down
+    arguments += [f"{key}={key}" for key in ("args", "kwargs") if getattr(sampler.log_prob_fn, key, None)]
     if getattr(sampler, "vectorize", False):
         arguments.append("vectorize=True")
     if package == "emcee":

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..checks.result import JudgedRun, judge_run
-from ..checks.run import FinishedRun, read_run
+from ..checks.run import FinishedRun, moments_of, read_run
 from ..information.identifiability import of_samples
 from ..prediction.prediction import Prediction
 from ..signals.channels import Measurements
@@ -155,6 +155,7 @@ def gather(
         "data": sets,
         "rows": rows,
         "factor": judgement.width_factor,
+        "signed": not np.array_equal(moments_of(run)[0], run.samples.mean(axis=0)),
         "has_nominal": any(np.isfinite(row.nominal) for row in rows),
         "evidence": evidence(run),
         "fits": fits,

@@ -187,16 +187,18 @@ def test_moments_are_those_of_the_more_accurate_sample(rng):
 @pytest.mark.slow
 def test_samplers_without_a_ladder_and_functions_without_data_are_reported(tmp_path):
     target = Gaussian(ndim=2)
-    sampler = emcee.EnsembleSampler(20, 2, target, vectorize=True)
+    sampler = emcee.EnsembleSampler(20, 2, lambda x, factor: factor * target(x), vectorize=True, args=(1.0,))
     sampler.run_mcmc(0.7 + 0.1 * np.random.default_rng(3).standard_normal((20, 2)), 60)
     page = page_of(report(sampler, out=tmp_path / "a.html", discard=10))
     assert [row[0] for row in page.tables[0][1:]] == ["x0", "x1"]
     assert "gives no evidence" in page.text and "function of the user's own" in page.text
+    assert "EnsembleSampler(20, posterior.ndim, posterior, args=args, vectorize=True)" in page.text
     assert "The chain is short" in page.notes
     unnamed = page_of(report(sampler, lambda x: 0.0, out=tmp_path / "b.html", names=["a", "b"]))
     assert [row[0] for row in unnamed.tables[0][1:]] == ["a", "b"]
     tempered = run(Gaussian(ndim=2), TMCMCSampler)
     other = page_of(report(tempered, out=tmp_path / "c.html"))
+    assert "and the residuals" not in other.text + page.text
     assert f"{tempered.log_evidence:.2f} ±" in other.text and other.notes.keys().isdisjoint({"No verdict"})
 
 
