@@ -360,14 +360,10 @@ def _read(backend: Backend) -> dict[str, Any]:
 
 
 def _parsed(stored: dict[str, Any]) -> tuple[AnnealingResult, Verdict | None]:
-    check, founders, parents, verdict = (stored.get(name) for name in ("check", "founders", "parents", "verdict"))
-    result = AnnealingResult(
-        tuple(Stage(*values) for values in stored.get("ladder", ())),
-        None if check is None else EvidenceCheck(*check),
-        None if founders is None else np.array(founders),
-        None if parents is None else np.array(parents),
-    )
-    if verdict is None:
+    makers = {"check": EvidenceCheck._make, "founders": np.array, "parents": np.array}
+    known = {name: make(stored[name]) for name, make in makers.items() if stored.get(name) is not None}
+    result = AnnealingResult(tuple(map(Stage._make, stored.get("ladder", ()))), **known)
+    if (verdict := stored.get("verdict")) is None:
         return result, None
     status, reasons, *others, findings = verdict
     return result, Verdict(status, tuple(reasons), *others, tuple(Finding(*each) for each in findings))

@@ -35,6 +35,7 @@ __all__ = [
     "describe_early_stop",
     "independent_points",
     "judge",
+    "with_finding",
 ]
 
 LONGEST_REASON = 200  # characters
@@ -212,6 +213,15 @@ def judge(
         _sample(result, nwalkers),
         tuple(found),
     )
+
+
+def with_finding(verdict: Verdict, finding: Finding) -> Verdict:
+    """A verdict with a further finding."""
+    if finding in verdict.findings:
+        return verdict
+    status = STATUSES[max(STATUSES.index(verdict.status), SEVERITIES.index(finding.severity))]
+    reasons, findings = (finding.message.rstrip("."), *verdict.reasons), (*verdict.findings, finding)
+    return verdict._replace(status=status, reasons=reasons, findings=findings)
 
 
 def _sample(result: AnnealingResult, nwalkers: int) -> str:

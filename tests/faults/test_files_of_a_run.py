@@ -87,6 +87,9 @@ def test_a_record_that_is_cut_anywhere(whole, chain, share, tmp_path):
     if sampler.iteration == STEPS:  # the chain is whole, and the record has lost some of its points
         go_on(sampler)
         assert sampler.iteration == STEPS
+        lost = share < 1.0
+        assert any("has lost" in reason for reason in sampler.verdict.reasons) == lost
+        assert sampler.verdict.status != "converged" or not lost
         return
     go_on(sampler)
     assert outcome(sampler) == expected
