@@ -1,12 +1,11 @@
 """Names of emcee, imported without `scipy.stats`, which takes as long to import as all else that a sampler needs.
 
-Only the module of emcee's KDEMove imports it; here that module gets a function that imports it when it is called.
+Only the module of emcee's KDEMove imports it: that module is loaded when the first KDEMove is made.
 """
 
-import builtins
 import sys
-from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
-from types import ModuleType, SimpleNamespace
+from importlib import import_module
+from types import ModuleType
 from typing import Any
 
 __all__ = [
@@ -25,44 +24,26 @@ __all__ = [
     "walkers_independent",
 ]
 
-
-def _gaussian_kde(*arguments: Any, **options: Any) -> Any:
-    from scipy.stats import gaussian_kde
-
-    return gaussian_kde(*arguments, **options)
+_KDE = "emcee.moves.kde"
 
 
-def _import(name: str, *arguments: Any) -> Any:
-    late = SimpleNamespace(gaussian_kde=_gaussian_kde)
-    return late if name == "scipy.stats" else builtins.__import__(name, *arguments)
+class _KDEMove:
+    """Makes an `emcee.moves.KDEMove`."""
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> Any:
+        if sys.modules.get(_KDE) is _late:
+            del sys.modules[_KDE]
+        return import_module(_KDE).KDEMove(*args, **kwargs)
 
 
-class _Loader(SourceFileLoader):
-    """Loads a module whose own imports are those of `_import`."""
+_late = ModuleType(_KDE)
+_late.KDEMove = _KDEMove
+if "emcee.moves" not in sys.modules:
+    sys.modules[_KDE] = _late
 
-    def exec_module(self, module: ModuleType) -> None:
-        module.__dict__["__builtins__"] = vars(builtins) | {"__import__": _import}
-        super().exec_module(module)
-
-
-class _Finder:
-    """Finds the module of KDEMove, and leaves all others to the other finders."""
-
-    @staticmethod
-    def find_spec(name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
-        spec = PathFinder.find_spec(name, path) if name == "emcee.moves.kde" else None
-        if spec is not None and isinstance(spec.loader, SourceFileLoader):
-            spec.loader = _Loader(name, spec.loader.path)
-        return spec
-
-
-sys.meta_path.insert(0, _Finder)
-try:
-    from emcee import EnsembleSampler, State
-    from emcee.backends import Backend, HDFBackend
-    from emcee.ensemble import ndarray_to_list_of_dicts, walkers_independent
-    from emcee.model import Model
-    from emcee.moves import DEMove, DESnookerMove, MHMove, Move, RedBlueMove
-    from emcee.pbar import get_progress_bar
-finally:
-    sys.meta_path.remove(_Finder)
+from emcee import EnsembleSampler, State  # noqa: E402
+from emcee.backends import Backend, HDFBackend  # noqa: E402
+from emcee.ensemble import ndarray_to_list_of_dicts, walkers_independent  # noqa: E402
+from emcee.model import Model  # noqa: E402
+from emcee.moves import DEMove, DESnookerMove, MHMove, Move, RedBlueMove  # noqa: E402
+from emcee.pbar import get_progress_bar  # noqa: E402
