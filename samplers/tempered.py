@@ -31,11 +31,17 @@ from .evaluation.asynchronous import AsynchronousEvaluator, check_asynchronous
 from .evaluation.evaluator import Evaluator, unpack
 from .evaluation.user_target import Target
 from .evaluation.values import most_common_reasons
-from .finding import CARE, Finding
 from .interrupts import deferred_interrupts, interrupts_end_the_run
 from .judgement.checks import check_end, check_likelihood, check_prior
 from .judgement.failures import KEPT_POINTS, judged_failures
-from .judgement.verdict import CONVERGED, describe_early_stop, independent_points, judge, with_finding
+from .judgement.verdict import (
+    CONVERGED,
+    describe_early_stop,
+    independent_points,
+    judge,
+    lost_simulations,
+    with_lost_record,
+)
 from .moves.population_moves import GuideMove, RandomWalkMove, describe, with_fast_sweeps, without_unfitted
 from .record import BudgetExhausted, EvaluatedBatch, Incomplete, RunStart, as_limit
 from .reporting.progress import Progress
@@ -165,8 +171,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._chain = Chain(self.backend)
         self._result, self._verdict = self._chain.result, self._chain.verdict
         self._must_compare = reopened or self.backend.iteration > 0
-        is_stored = self._verdict is not None and self._record.path is not None
-        self._lost = self._verdict.simulations - self._record.simulations if is_stored else 0.0
+        known = np.inf if self._record.path is None else self._record.simulations
+        self._lost = lost_simulations(self._verdict, known)
         check_moves(self._moves, given.chains)
         self._fast = target.fast_parameters if pool is None or vectorize else ()
         followed = with_fast_sweeps(self._moves, self._fast, ndim, given.fast_sweeps)
@@ -422,12 +428,9 @@ class TemperedSampler(RunResults, EnsembleSampler):
             numbers = self.nwalkers, self.ndim, self.simulations
             others = self._record.of_guides, self._near, tuple(self._target.names)
             self._verdict = judge(self._result, *numbers, missing, failed, *others)
-        elif self._record.start is not None:  # an annealing that could not be made again
+        else:  # an annealing that could not be made again
             self._verdict = self._verdict._replace(simulations=self.simulations)
-        if self._lost >= 1.0:
-            text = f"The record of the run has lost {self._lost:.0f} simulations: failures among them are not judged."
-            action = "The chain is whole; repeat the run in new files if simulations fail."
-            self._verdict = with_finding(self._verdict, Finding("The record is incomplete", CARE, text, action))
+        self._verdict = with_lost_record(self._verdict, self._lost)
         self._chain.result, self._chain.verdict = self._result, self._verdict
         self._chain.write()
 

@@ -89,7 +89,10 @@ def test_a_record_that_is_cut_anywhere(whole, chain, share, tmp_path):
         assert sampler.iteration == STEPS
         lost = share < 1.0
         assert any("has lost" in reason for reason in sampler.verdict.reasons) == lost
+        sampler._record.close()
+        again = go_on(make(path, kind))
         assert sampler.verdict.status != "converged" or not lost
+        assert again.verdict == sampler.verdict
         return
     go_on(sampler)
     assert outcome(sampler) == expected
