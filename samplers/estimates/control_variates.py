@@ -46,13 +46,6 @@ class SignedSample(NamedTuple):
     log_evidence: float
     log_evidence_error: float
 
-    def __repr__(self) -> str:
-        m, ndim = self.coords.shape
-        return (
-            f"<SignedSample of {m} points, {ndim} parameters, log-evidence {self.log_evidence:.3f} +- "
-            f"{self.log_evidence_error:.3f}>"
-        )
-
     def draw(self, n: int = 4000, seed: int = 0) -> np.ndarray:
         """Draws (n, ndim) of the known densities for figures: smooth, since they are many, and not simulated."""
         known = (self.rounds == 0) & (self.weights > 0.0)

@@ -26,7 +26,6 @@ __all__ = [
     "log_mixture",
     "mixture_at_draws",
     "pool_rounds",
-    "round_shares",
     "tail_growth",
     "tail_shape",
     "tail_variance",
@@ -186,17 +185,6 @@ class PooledRounds(NamedTuple):
     log_evidence_error: float
     effective_sample_size: float
     pareto_shape: float  # `tail_shape` of the weights
-
-
-def round_shares(sizes: Sequence[int], effective_shares: Sequence[float]) -> np.ndarray:
-    """Share of each round in the evidence, with sum 1, from numbers of draws and effective shares per round.
-
-    The last effective share is used only if there is one round.
-    """
-    lagged = [effective_shares[0], *effective_shares[:-1]]
-    # a round after a round without a single effective draw still counts as one point
-    shares = np.maximum(np.asarray(sizes) * np.asarray(lagged), 1.0)
-    return shares / shares.sum()
 
 
 def tail_shape(log_weights: np.ndarray) -> float:

@@ -19,7 +19,6 @@ __all__ = [
     "doubt_recycling",
     "find_unreached_part",
     "grown",
-    "hopeless",
     "is_even",
     "is_reliable",
 ]
@@ -117,19 +116,12 @@ def grown(pooled: PooledRounds, before: KnownDensity | None, latest: KnownDensit
 
 
 def all_impossible(rounds: Sequence[Round]) -> bool:
-    """Whether no draw has a finite log-probability."""
-    return all(np.max(r.log_weights) == -np.inf for r in rounds)
-
-
-def hopeless(rounds: Sequence[Round]) -> str:
-    """Why the guide is given up, which is that two rounds have no possible draw; empty if it is not.
+    """Whether no draw has a finite log-probability: the guide is given up after two such rounds.
 
     A small effective share is no reason: of 4 runs of a tested column, 3 had less than 5 % in 4 rounds, and all ended
     with 16 % and more, and the right evidence.
     """
-    if len(rounds) >= 2 and all_impossible(rounds):
-        return f"none of their first {sum(len(r.coords) for r in rounds)} has a finite log-probability"
-    return ""
+    return all(np.max(r.log_weights) == -np.inf for r in rounds)
 
 
 def describe_rounds(last: Round, pooled: PooledRounds, made: int) -> str:

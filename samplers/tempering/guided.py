@@ -39,7 +39,6 @@ from ..judgement.rounds import (
     describe_rounds,
     find_unreached_part,
     grown,
-    hopeless,
     is_even,
     is_reliable,
 )
@@ -211,7 +210,8 @@ def _outcome(rounds: Sequence[Round], pooled: PooledRounds, size: int) -> Rounds
     if enough and is_reliable(rounds) and is_even(pooled):
         light = tails_are_light([r for r in rounds if r.effective_share >= RELIABLE_SHARE])
         return RoundsOfGuide("", (find_unreached_part(LIGHT_TAILS, CARE),) if light else (), pooled, rounds)
-    if reason := hopeless(rounds):
+    if len(rounds) >= 2 and all_impossible(rounds):
+        reason = f"none of their first {len(pooled.coords)} has a finite log-probability"
         return RoundsOfGuide(reason, (), pooled, rounds)
     usable = enough and last.effective_share >= USABLE_SHARE and pooled.pareto_shape < LARGEST_SHAPE
     if len(rounds) < (PATIENT_ROUNDS if usable and is_even(pooled) else MOST_ROUNDS):

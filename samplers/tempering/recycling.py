@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..estimates.importance import EvidenceCheck, draw_inside, evidence_from_weights, round_shares, tail_variance
+from ..estimates.importance import EvidenceCheck, draw_inside, evidence_from_weights, tail_variance
 from ..estimates.weights import coarse_weights, effective_sample_size, log_mean_weight, normalised_weights
 from ..judgement.rounds import doubt_recycling
 from ..proposals.basins import find_basins, with_components
@@ -274,9 +274,11 @@ def _result(drawn: Sequence[_Drawn], beta: float) -> tuple[np.ndarray, np.ndarra
     """Points, records and log-weights of complete rounds, as in `Recycled`."""
     parts = [draws.pending.arrived_part() for draws in drawn]
     log_weights = [draws.log_weights(beta) for draws in drawn]
-    sizes = [draws.made for draws in drawn]
-    shares = round_shares(sizes, [effective_sample_size(w) / n for w, n in zip(log_weights, sizes, strict=True)])
-    scaled = [w + np.log(share / n) for w, share, n in zip(log_weights, shares, sizes, strict=True)]
+    sizes = np.array([draws.made for draws in drawn])
+    effective = [effective_sample_size(w) / n for w, n in zip(log_weights, sizes, strict=True)]
+    # each round counts by the effective share of the one before it, which its own weights do not determine
+    shares = np.maximum(sizes * [effective[0], *effective[:-1]], 1.0)
+    scaled = [w + x for w, x in zip(log_weights, np.log(shares / shares.sum() / sizes), strict=True)]
     return np.concatenate([c for c, _ in parts]), np.concatenate([r for _, r in parts]), np.concatenate(scaled)
 
 
