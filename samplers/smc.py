@@ -25,7 +25,7 @@ class SMCSampler(TemperedSampler):
     ----------
     nwalkers, ndim, log_prob_fn, ..., log_prior_fn, log_likelihood_fn, guide, max_simulations, seed
         As in `samplers.tempered.TemperedSampler`, in the same order. By default `moves` is
-        `samplers.moves.population_moves.MixtureMove`: two kernels from a mixture fitted to every stage.
+        `samplers.moves.population_moves.MixtureMove`: three kernels from a mixture fitted to every stage.
     recycle : bool, optional
         Anneal by recycling every evaluated point (`samplers.tempering.recycling`), and by moves if the result cannot be
         trusted. Default: True with 150 walkers or more, unless `moves` or a setting of annealing by moves is given

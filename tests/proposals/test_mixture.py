@@ -114,7 +114,7 @@ def overlapping(rng, n):
     return rng.standard_normal((n, 2)), lambda x: stats.norm.logpdf(x).sum(axis=1), None, mixture
 
 
-@pytest.mark.parametrize("kernel", ["draw_independence", "draw_local_walk"])
+@pytest.mark.parametrize("kernel", ["draw_independence", "draw_local_walk", "draw_differences"])
 @pytest.mark.parametrize(("target", "n"), [(curved, 40_000), (corner, 20_000), (overlapping, 40_000)])
 def test_each_kernel_keeps_the_target(kernel, target, n, rng):
     """Exact draws remain exact, even if the proposal was fitted to other points."""
