@@ -49,7 +49,7 @@ class Elements(NamedTuple):
     initial_flexibility: np.ndarray  # (3,) f11, f12, f22 of the virgin section
     tolerance: float  # largest work of the last compatibility correction [J]
     state: np.ndarray  # (n_elements, HEAD + PER_SECTION n_points)
-    work: np.ndarray  # (2, HEAD + PER_SECTION n_points) scratch
+    work: np.ndarray  # (HEAD + PER_SECTION n_points,) scratch
 
 
 @kernel
@@ -59,13 +59,14 @@ def _invert(f11, f12, f13, f22, f23, f33):
     c12 = f13 * f23 - f12 * f33
     c13 = f12 * f23 - f13 * f22
     d = f11 * c11 + f12 * c12 + f13 * c13
+    r = 1.0 / d
     return (
-        c11 / d,
-        c12 / d,
-        c13 / d,
-        (f11 * f33 - f13 * f13) / d,
-        (f12 * f13 - f11 * f23) / d,
-        (f11 * f22 - f12 * f12) / d,
+        c11 * r,
+        c12 * r,
+        c13 * r,
+        (f11 * f33 - f13 * f13) * r,
+        (f12 * f13 - f11 * f23) * r,
+        (f11 * f22 - f12 * f12) * r,
     )
 
 
@@ -90,11 +91,11 @@ def initialise(element, elements):
 
 
 @kernel(inline=True)
-def advance(v1, v2, v3, element, elements, sections):
+def advance(v1, v2, v3, element, elements, sections, linear):
     """Bring row `element` of the state to the basic deformations (v1, v2, v3), in place; return whether it converged.
 
-    v1 is the elongation [m], v2 and v3 are rotations of the two ends against the chord [rad]. On failure the row is
-    unchanged.
+    v1 is the elongation [m], v2 and v3 are rotations of the two ends against the chord [rad]. If `linear`, sections
+    follow their last tangent, without an evaluation of fibers. On failure the row has the last state that was reached.
     """
     points, tributary, state, work = elements.points, elements.tributary, elements.state, elements.work
     initial_flexibility = elements.initial_flexibility
@@ -106,51 +107,49 @@ def advance(v1, v2, v3, element, elements, sections):
     if math.sqrt(rest1 * rest1 + rest2 * rest2 + rest3 * rest3) <= 2.2e-16:
         return True
     i11, i12, i22 = initial_flexibility[0], initial_flexibility[1], initial_flexibility[2]
-    for k in range(n_state):
-        work[0, k] = state[element, k]  # the last state that was reached
     part1, part2, part3 = rest1, rest2, rest3
     scheme = 0
     subdivision = 0
     passes = 0
     rises, last_error = 0, math.inf
     for k in range(n_state):
-        work[1, k] = work[0, k]
+        work[k] = state[element, k]
     target1, target2, target3 = v1, v2, v3
-    work[1, 0] += work[1, 3] * part1 + work[1, 4] * part2 + work[1, 5] * part3
-    work[1, 1] += work[1, 4] * part1 + work[1, 6] * part2 + work[1, 7] * part3
-    work[1, 2] += work[1, 5] * part1 + work[1, 7] * part2 + work[1, 8] * part3
+    work[0] += work[3] * part1 + work[4] * part2 + work[5] * part3
+    work[1] += work[4] * part1 + work[6] * part2 + work[7] * part3
+    work[2] += work[5] * part1 + work[7] * part2 + work[8] * part3
     # Each turn of this loop is one pass over the sections. Schemes and subdivisions share the loop, so that the inlined
     # code of the section appears once.
     for _ in range(MAX_ATTEMPTS):
         use_initial = scheme == 1 or (scheme == 2 and passes == 0)
-        q1, q2, q3 = work[1, 0], work[1, 1], work[1, 2]
+        q1, q2, q3 = work[0], work[1], work[2]
         f11 = f12 = f13 = f22 = f23 = f33 = 0.0
         r1, r2, r3 = target1, target2, target3
         for m in range(n_points):
             xi, w = points[m], tributary[element, m]
             k = HEAD + PER_SECTION * m
-            a, b, c = work[1, k + 2], work[1, k + 3], work[1, k + 4]
+            a, b, c = work[k + 2], work[k + 3], work[k + 4]
             if use_initial:
                 a, b, c = i11, i12, i22
             section_n = q1
             section_m = (xi - 1.0) * q2 + xi * q3
-            dn = section_n - work[1, k + 5]
-            dm = section_m - work[1, k + 6]
-            e0 = work[1, k] + a * dn + b * dm
-            kappa = work[1, k + 1] + b * dn + c * dm
-            n, moment, k_axial, k_coupling, k_bending = forces(e0, kappa, element * n_points + m, sections)
-            if use_initial:
-                a, b, c = i11, i12, i22
-            else:
-                d = k_axial * k_bending - k_coupling * k_coupling
-                a, b, c = k_bending / d, -k_coupling / d, k_axial / d
-            work[1, k] = e0
-            work[1, k + 1] = kappa
-            work[1, k + 2] = a
-            work[1, k + 3] = b
-            work[1, k + 4] = c
-            work[1, k + 5] = n
-            work[1, k + 6] = moment
+            dn = section_n - work[k + 5]
+            dm = section_m - work[k + 6]
+            e0 = work[k] + a * dn + b * dm
+            kappa = work[k + 1] + b * dn + c * dm
+            n, moment = section_n, section_m
+            if not linear:
+                n, moment, k_axial, k_coupling, k_bending = forces(e0, kappa, element * n_points + m, sections)
+                if not use_initial:
+                    d = 1.0 / (k_axial * k_bending - k_coupling * k_coupling)
+                    a, b, c = k_bending * d, -k_coupling * d, k_axial * d
+            work[k] = e0
+            work[k + 1] = kappa
+            work[k + 2] = a
+            work[k + 3] = b
+            work[k + 4] = c
+            work[k + 5] = n
+            work[k + 6] = moment
             dn = section_n - n
             dm = section_m - moment
             g0 = (e0 + a * dn + b * dm) * w
@@ -168,27 +167,25 @@ def advance(v1, v2, v3, element, elements, sections):
         d1 = k11 * r1 + k12 * r2 + k13 * r3
         d2 = k12 * r1 + k22 * r2 + k23 * r3
         d3 = k13 * r1 + k23 * r2 + k33 * r3
-        work[1, 0] = q1 + d1
-        work[1, 1] = q2 + d2
-        work[1, 2] = q3 + d3
+        work[0] = q1 + d1
+        work[1] = q2 + d2
+        work[2] = q3 + d3
         error = abs(r1 * d1 + r2 * d2 + r3 * d3)
         passes += 1
         if error > 10.0 * last_error:
             rises += 1
         last_error = error
         if error < elements.tolerance:
-            work[1, 3], work[1, 4], work[1, 5] = k11, k12, k13
-            work[1, 6], work[1, 7], work[1, 8] = k22, k23, k33
-            work[1, 9], work[1, 10], work[1, 11] = target1, target2, target3
+            work[3], work[4], work[5] = k11, k12, k13
+            work[6], work[7], work[8] = k22, k23, k33
+            work[9], work[10], work[11] = target1, target2, target3
             rest1 -= part1
             rest2 -= part2
             rest3 -= part3
-            if subdivision == 0:  # this part was all that remained
-                for k in range(n_state):
-                    state[element, k] = work[1, k]
-                return True
             for k in range(n_state):
-                work[0, k] = work[1, k]
+                state[element, k] = work[k]
+            if subdivision == 0:  # this part was all that remained
+                return True
             part1, part2, part3 = rest1, rest2, rest3
             scheme, subdivision = 0, 0
         else:
@@ -206,12 +203,12 @@ def advance(v1, v2, v3, element, elements, sections):
         # The next attempt starts from the last state that was reached.
         passes, rises, last_error = 0, 0, math.inf
         for k in range(n_state):
-            work[1, k] = work[0, k]
+            work[k] = state[element, k]
         if subdivision == 0:
             target1, target2, target3 = v1, v2, v3
         else:
-            target1, target2, target3 = work[0, 9] + part1, work[0, 10] + part2, work[0, 11] + part3
-        work[1, 0] += work[1, 3] * part1 + work[1, 4] * part2 + work[1, 5] * part3
-        work[1, 1] += work[1, 4] * part1 + work[1, 6] * part2 + work[1, 7] * part3
-        work[1, 2] += work[1, 5] * part1 + work[1, 7] * part2 + work[1, 8] * part3
+            target1, target2, target3 = work[9] + part1, work[10] + part2, work[11] + part3
+        work[0] += work[3] * part1 + work[4] * part2 + work[5] * part3
+        work[1] += work[4] * part1 + work[6] * part2 + work[7] * part3
+        work[2] += work[5] * part1 + work[7] * part2 + work[8] * part3
     return False

@@ -36,7 +36,7 @@ LARGEST_AXIAL_STRAIN = 0.2
 """An element that becomes longer or shorter by more than this share of its length has failed."""
 
 N_VECTORS = 13
-N_MATRICES = 5
+N_MATRICES = 4
 
 
 class Column(NamedTuple):
@@ -128,7 +128,7 @@ def allocate(
             initial_flexibility=np.zeros(3),
             tolerance=float(element_tolerance),
             state=np.zeros((n_elements, n_state)),
-            work=np.zeros((2, n_state)),
+            work=np.zeros(n_state),
         ),
         state_before=np.zeros((n_elements, n_state)),
         vectors=np.zeros((N_VECTORS, 3 * n_elements)),
@@ -166,15 +166,15 @@ def initialise_column(column):
     u, load = column.vectors[4], column.vectors[3]
     for i in range(u.shape[0]):
         u[i] = load[i] = 0.0
-    assemble(u, column, column.vectors[5], column.matrices[2])
+    assemble(u, column, column.vectors[5], column.matrices[2], False)
 
 
 @kernel(inline=True)
-def assemble(u, column, force, stiffness):
+def assemble(u, column, force, stiffness, linear):
     """Write the restoring forces (n,) and the tangent (n, n) at the displacements `u` (n,); False if an element fails.
 
-    An element that has become a fifth longer or shorter counts as failed, whatever its force. Without this limit a
-    crushed column could reach equilibrium on its bars alone at half its length.
+    If `linear`, all sections follow their last tangents. An element that has become a fifth longer or shorter counts as
+    failed, whatever its force: otherwise a crushed column could reach equilibrium on its bars at half its length.
     """
     n = u.shape[0]
     state = column.elements.state
@@ -193,7 +193,7 @@ def assemble(u, column, force, stiffness):
         chord = deformations(dux, duy, theta_i, u[j + 2], column.length, column.corotational)
         if not abs(chord.elongation) < LARGEST_AXIAL_STRAIN * column.length:
             return False
-        if not advance(chord.elongation, chord.theta_i, chord.theta_j, e, column.elements, column.sections):
+        if not advance(chord.elongation, chord.theta_i, chord.theta_j, e, column.elements, column.sections, linear):
             return False
         add_to_stiffness(first, state[e], chord, column.corotational, force, stiffness)
     return True

@@ -35,29 +35,18 @@ def copy_matrix(a, b):
 
 @kernel
 def solve_banded(a, b):
-    """Overwrite `b` (n,) with the solution x of a x = b, and the lower half of the symmetric `a` (n, n)."""
+    """Overwrite `b` (n,) with the solution x of a x = b, and the upper half of the symmetric `a` (n, n)."""
     n = b.shape[0]
     for j in range(n):
-        low = max(0, j - HALF_BANDWIDTH)
-        d = a[j, j]
-        for k in range(low, j):
-            d -= a[j, k] * a[j, k] * a[k, k]
-        a[j, j] = d
         high = min(n, j + HALF_BANDWIDTH + 1)
+        inverse = 1.0 / a[j, j]
         for i in range(j + 1, high):
-            v = a[i, j]
-            for k in range(max(0, i - HALF_BANDWIDTH), j):
-                v -= a[i, k] * a[j, k] * a[k, k]
-            a[i, j] = v / d
-    for i in range(n):
-        v = b[i]
-        for k in range(max(0, i - HALF_BANDWIDTH), i):
-            v -= a[i, k] * b[k]
-        b[i] = v
-    for i in range(n):
-        b[i] /= a[i, i]
-    for i in range(n - 1, -1, -1):
-        v = b[i]
-        for k in range(i + 1, min(n, i + HALF_BANDWIDTH + 1)):
-            v -= a[k, i] * b[k]
-        b[i] = v
+            factor = a[j, i] * inverse
+            b[i] -= factor * b[j]
+            for k in range(i, high):
+                a[i, k] -= factor * a[j, k]
+    for j in range(n - 1, -1, -1):
+        v = b[j]
+        for i in range(j + 1, min(n, j + HALF_BANDWIDTH + 1)):
+            v -= a[j, i] * b[i]
+        b[j] = v / a[j, j]

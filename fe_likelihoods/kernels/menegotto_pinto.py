@@ -50,11 +50,12 @@ def _fit_root(r, ea, eb, es, r_min):
     OpenSees, which computed the stress histories of the tests.
     """
     alpha = 0.01
+    upper = _fit_residual(1.0 - alpha, r, ea, eb, es)
     for _ in range(60):
-        if _fit_residual(alpha, r, ea, eb, es) * _fit_residual(1.0 - alpha, r, ea, eb, es) <= 0.0:
+        if _fit_residual(alpha, r, ea, eb, es) * upper <= 0.0:
             break
         alpha *= 0.5
-    upper = _fit_residual(1.0 - alpha, r, ea, eb, es)
+        upper = _fit_residual(1.0 - alpha, r, ea, eb, es)
     a = min(r_min / r, 0.999999)
     for _ in range(200):
         if _fit_residual(a, r, ea, eb, es) * upper < 0.0 and a > 0.0:

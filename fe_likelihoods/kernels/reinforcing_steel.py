@@ -126,25 +126,16 @@ def virgin_stress_tangent(eps, e0, ep, f0):
     For ``|eps| < VIRGIN_LIMIT`` the truncated series of ln(1+eps) and (1+q^10)^-0.1 are exact to round-off. They need
     neither a logarithm nor a power, so that a section can evaluate its bars side by side (SIMD).
     """
-    x = -0.125
-    x = eps * x + 1.0 / 7.0
-    x = eps * x - 1.0 / 6.0
-    x = eps * x + 0.2
-    x = eps * x - 0.25
-    x = eps * x + 1.0 / 3.0
-    x = eps * x - 0.5
-    x = eps * (eps * x + 1.0)
-    q = (e0 - ep) * x / f0
+    e2 = eps * eps
+    x = (1.0 / 5.0 - 1.0 / 6.0 * eps) + e2 * (1.0 / 7.0 - 0.125 * eps)
+    x = eps * ((1.0 - 0.5 * eps) + e2 * (1.0 / 3.0 - 0.25 * eps) + e2 * e2 * x)
+    q = (e0 - ep) / f0 * x
     q2 = q * q
     q4 = q2 * q2
     u = q4 * q4 * q2
-    root = 0.0207967375
-    root = root * u - 0.02446675
-    root = root * u + 0.0298375
-    root = root * u - 0.0385
-    root = root * u + 0.055
-    root = root * u - 0.1
-    root = (root * u + 1.0) * (e0 - ep)
+    u2 = u * u
+    root = (0.0298375 - 0.02446675 * u) + 0.0207967375 * u2
+    root = ((1.0 - 0.1 * u) + u2 * (0.055 - 0.0385 * u) + u2 * u2 * root) * (e0 - ep)
     natural_stress = x * (root + ep)
     natural_modulus = root / (1.0 + u) + ep
     inverse = 1.0 / (1.0 + eps)

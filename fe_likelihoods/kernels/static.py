@@ -136,7 +136,7 @@ def equilibrate(column, position, load, imposed, increment, held, tolerance, max
         for i in range(n):
             u[i] += du[i]
             norm += du[i] * du[i]
-        if not math.isfinite(norm) or not assemble(u, column, force, stiffness):
+        if not math.isfinite(norm) or not assemble(u, column, force, stiffness, False):
             break
         least = min(least, math.sqrt(norm))
         if least < tolerance:

@@ -28,7 +28,7 @@ def single(element_tolerance=1e-12, **options):
 def advance(column, v):
     """Bring the element to the basic deformations `v`; return whether it converged, Q, and K as a matrix."""
     u = np.array([v[1] * column.length, v[0], v[2] - v[1]])
-    converged = frame.assemble(u, column, np.zeros(3), np.zeros((3, 3)))
+    converged = frame.assemble(u, column, np.zeros(3), np.zeros((3, 3)), False)
     row = column.elements.state[0]
     return converged, row[:3].copy(), symmetric(row[3:9])
 
@@ -68,7 +68,7 @@ def test_elastic_cantilever_is_closed_form(n_elements, n_points):
     load[-3:-1] = p, axial
     position = Position(np.zeros(n), np.zeros(n), np.zeros((n, n)))
     u = position.u
-    assert frame.assemble(u, column, position.force, position.stiffness)
+    assert frame.assemble(u, column, position.force, position.stiffness, False)
     assert equilibrate(column, position, load, -1, 0.0, -1, 1e-18, 20) < 1e-18
     trapezoidal = 1.0 + 1.0 / (2.0 * n_elements**2) if n_points == 2 else 1.0
     assert u[-3] == pytest.approx(p * h**3 / (3 * ei) * trapezoidal, rel=1e-8)
