@@ -121,8 +121,8 @@ class Record:
         self.count, self.is_complete = 0, False
         self.failed: list[tuple[np.ndarray, str]] = []
         self.counted: list[tuple[np.ndarray, str]] = []
-        # log-probability, blobs (1, ...) or None, and reason of failure, empty without one, of each point
-        self._known: dict[bytes, tuple[float, np.ndarray | None, str]] = {}
+        # log-probability, blobs (1, ...) or None, reason of failure, empty without one, and batch of each point
+        self._known: dict[bytes, tuple[float, np.ndarray | None, str, int]] = {}
         self.simulated: set[bytes] = set()  # keys of the points
         self._arrays: dict[str, list[list[np.ndarray]]] = {}
 
@@ -138,11 +138,16 @@ class Record:
     def values(self, coords: np.ndarray) -> EvaluatedBatch:
         """Values of points (n, ndim) that have been evaluated; those without blobs beside others get blobs of zeros."""
         found = [self._known[row.tobytes()] for row in np.ascontiguousarray(coords)]
-        blobs = next((np.zeros_like(blobs) for _, blobs, _ in found if blobs is not None), None)
+        blobs = next((np.zeros_like(blobs) for _, blobs, *_ in found if blobs is not None), None)
         if blobs is not None:
-            blobs = np.concatenate([blobs if own is None else own for _, own, _ in found])
-        reasons = {row: reason for row, (*_, reason) in enumerate(found) if reason}
+            blobs = np.concatenate([blobs if own is None else own for _, own, *_ in found])
+        reasons = {row: reason for row, (*_, reason, _) in enumerate(found) if reason}
         return EvaluatedBatch(coords, np.array([each[0] for each in found]), blobs, reasons)
+
+    def parts(self, coords: np.ndarray) -> list[np.ndarray]:
+        """Points (n, ndim) that have been evaluated, divided where another batch begins, as they were observed."""
+        batches = [self._known[row.tobytes()][3] for row in np.ascontiguousarray(coords)]
+        return np.split(coords, np.flatnonzero(np.diff(batches)) + 1)
 
     @deferred_interrupts()
     def evaluated(self, batch: EvaluatedBatch) -> None:
@@ -153,10 +158,10 @@ class Record:
             self._enter(batch)
 
     def _enter(self, batch: EvaluatedBatch) -> None:
-        coords, blobs = np.ascontiguousarray(batch.coords), batch.blobs
+        coords, blobs, number = np.ascontiguousarray(batch.coords), batch.blobs, self.count
         for row, (point, log_prob) in enumerate(zip(coords, batch.log_prob.tolist(), strict=True)):
             own = None if blobs is None else blobs[row : row + 1]
-            self._known.setdefault(point.tobytes(), (log_prob, own, batch.reasons.get(row, "")))
+            self._known.setdefault(point.tobytes(), (log_prob, own, batch.reasons.get(row, ""), number))
         self.simulated.update(self.keys(coords))
         self.count += len(coords)
         for row, reason in batch.reasons.items():
@@ -174,7 +179,7 @@ class Record:
 
     def drop_old_points(self, most: int) -> None:
         """Forget points of a record in memory before the latest `most`: a long chain needs none of them."""
-        if self.path is None and len(self._known) > 2 * most:
+        if self.path is None and len(self._known) > most + most // 2:
             self._known = dict(list(self._known.items())[-most:])
 
     # ------------------------------------------------------------------ simulations

@@ -91,36 +91,36 @@ class Evaluator:
             raise BudgetExhausted
         log_prior, asked, known = self._look_up(coords)
         new = coords[asked[~known]]
-        for part in (coords[asked[known]], new):
-            if observe is not None and len(part) > 0:
+        if observe is not None:
+            for part in filter(len, (*self.record.parts(coords[asked[known]]), new)):
                 observe(part)
         if len(new) > 0:
-            self._make(new, whole=not known.any())
+            results, noted = [], time.perf_counter()
+            self.count(len(new))
+            try:
+                with interrupts_end_the_run():
+                    for answer in self.target.answers(new, self.pool):
+                        if self.target.vectorize:
+                            results = answer  # of all points
+                            break
+                        results.append(answer)
+                        self.count(0, 1)
+                        if time.perf_counter() - noted > SECONDS_BETWEEN_NOTES:
+                            self._enter_successes(new, results)
+                            noted = time.perf_counter()
+            except BaseException:  # Ctrl-C, or a pool that cannot go on
+                self._enter_successes(new, results)
+                raise
+            self.count(0, self.running)
+            self._settle(new, results, whole=not known.any())
         self.evaluations += len(asked)
         return then(coords, self._records(coords, log_prior, asked))
 
-    def _make(self, coords: np.ndarray, whole: bool) -> None:
-        """Evaluate points (n, ndim), a `whole` batch or a part of it; RuntimeError for many failures.
+    def _settle(self, coords: np.ndarray, results: Any, whole: bool) -> None:
+        """Enter what the record does not know of a `whole` batch, or of a part of it; RuntimeError for many failures.
 
         Failures are entered when all values have arrived, since they may yet end the run.
         """
-        results, noted = [], time.perf_counter()
-        self.count(len(coords))
-        try:
-            with interrupts_end_the_run():
-                for answer in self.target.answers(coords, self.pool):
-                    if self.target.vectorize:
-                        results = answer  # of all points
-                        break
-                    results.append(answer)
-                    self.count(0, 1)
-                    if time.perf_counter() - noted > SECONDS_BETWEEN_NOTES:
-                        self._enter_successes(coords, results)
-                        noted = time.perf_counter()
-        except BaseException:  # Ctrl-C, or a pool that cannot go on
-            self._enter_successes(coords, results)
-            raise
-        self.count(0, self.running)
         batch, before = self.as_batch(coords, results), self.record.knows(coords)
         rest = batch.rows(np.flatnonzero(~before))
         counts = len(self.record.failed) + np.count_nonzero(rest.failed), self.record.count + len(rest.coords)
