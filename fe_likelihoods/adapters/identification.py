@@ -1,5 +1,6 @@
 """Modal data of other people's identification: tables, MATLAB files, and results of programs such as pyOMA2."""
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -73,7 +74,12 @@ def read_modal_data(
         raise ValueError(f"read_modal_data: expected a path, or a result with Fn and Phi; got {type(source).__name__}")
     options = {"description": Path(source).name} | options
     if Path(source).suffix.lower() != ".mat":
-        return read_mode_table(source, sensors, unit, options)
+        try:
+            return read_mode_table(source, sensors, unit, options)
+        except ValueError as error:
+            if not re.search(r"expected a number.*\d *[ij]'", str(error)):
+                raise
+            raise ValueError(f"{error}: give ModalData the real_shapes of complex numbers") from None
     content, names = read_matlab(source), dict(variables or {})
     wanted = {"frequencies"} <= set(names) <= {"frequencies", "shapes", "damping"}
     if not wanted or not set(names.values()) <= set(content):

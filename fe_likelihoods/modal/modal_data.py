@@ -312,9 +312,9 @@ def read_mode_table(path: str | Path, sensors: Sequence[str], unit: str | None, 
         lines["damping"] = _si(table, at["damping"], "dimensionless", "1")
     day = table.columns[at["set"]] if "set" in at else None
     lines["set"] = 0 if day is None else day.cells if day.kind == "text" else day.values
-    lines["mode"] = table.columns[at["mode"]].values if "mode" in at else 1.0 + np.arange(len(lines))
-    unknown = "mode" not in at and lines["set"].nunique() > 1  # which mode has an identification missed?
-    if unknown or lines.duplicated(["set", "mode"]).any() or (lines["mode"] % 1 != 0).any():
+    counted = 1.0 + np.arange(len(lines)) if lines["set"].nunique() == 1 else np.nan  # which mode was missed?
+    lines["mode"] = table.columns[at["mode"]].values if "mode" in at else counted
+    if lines.duplicated(["set", "mode"]).any() or (lines["mode"] % 1 != 0).any():
         raise ValueError(
             f"{table.file}: expected a line for each mode, with different whole numbers in the column of modes; got "
             f"{lines['mode'].tolist()}: several identifications need a column 'set' with their numbers, and a column "
@@ -351,7 +351,8 @@ def _sensor_columns(table: Table, others: Sequence[int], sensors: Sequence[str])
     if not sensors and (doubtful or len(units) > 1):
         raise ValueError(
             f"{table.file}: some of the columns {', '.join(columns)} may be no components of real shapes (other units, "
-            "a name as of a phase or a quality): give those that are sensors, sensors=[...] (columns in a TOML file)"
+            "a name as of a phase or a quality): give those that are sensors, sensors=[...] (columns in a TOML file); "
+            "of complex shapes, give ModalData the real_shapes"
         )
     return [columns[name] for name in sensors or columns]
 

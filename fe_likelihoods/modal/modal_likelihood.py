@@ -283,11 +283,12 @@ class PredictedModes(NamedTuple):
         return np.quantile(drawn, [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=(0, 1))
 
     def rows(self) -> list[list[str]]:
-        """The table as texts: number, measured frequency, median of the computed one, `interval`, median MAC."""
-        rows, (low, high) = [["mode", "measured [Hz]", "computed [Hz]", "5 %", "95 %", "MAC"]], self.interval()
+        """The table as texts: number, measured frequency, median of the computed one, `interval`, median MAC, pairs."""
+        rows, (low, high) = [["mode", "measured [Hz]", "computed [Hz]", "5 %", "95 %", "MAC", "pair"]], self.interval()
         for k, number in enumerate(self.data.mode_numbers):
             values = [self.data.mean_frequencies[k], np.median(self.frequencies[:, k]), low[k], high[k]]
-            rows.append([str(number), *(f"{x:.4g}" for x in values), f"{np.median(self.assurance[:, k]):.3f}"])
+            pairs = " or ".join(map(str, np.unique(self.numbers[:, k])))  # several: the pairing changes
+            rows.append([str(number), *(f"{x:.4g}" for x in values), f"{np.median(self.assurance[:, k]):.3f}", pairs])
         return rows
 
     def __str__(self) -> str:

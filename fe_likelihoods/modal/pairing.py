@@ -162,14 +162,9 @@ class PairedModes(_Containing):
         self._warmer = data.temperatures - _REFERENCE if has_slope else np.zeros(data.n_sets)
         self.channels = tuple(Channel(f"mode {number}", "dimensionless", "1") for number in data.mode_numbers)
         self.n_steps = data.n_sets * (1 + data.n_sensors)
-        sets = [f" of set {k + 1}" if data.n_sets > 1 else "" for k in range(data.n_sets)]
-        points = [f"{what}{end}" for end in sets for what in ("frequency", *data.sensors)]
         text = " of ".join(filter(None, ["natural frequencies and mode shapes", data.description]))
-        values, axis = (
-            self._joined(self._there.astype(float), data.known_shapes),
-            "frequency, then components of the shape",
-        )
-        self.measurements = Measurements(self.channels, self.dt, values, text, axis=axis, points=points)
+        values, axis = self._joined(self._there.astype(float), data.known_shapes), "frequency, then shape"
+        self.measurements = Measurements(self.channels, self.dt, values, text, axis=axis)
 
     def __repr__(self) -> str:
         arrays = map(array_digest, (self._whitening, self._warmer))
