@@ -127,7 +127,7 @@ class PairedModes(_Containing):
     """
 
     of_response = True  # as a statistic
-    dt, axis = 1.0, "frequency, then components of the shape"
+    dt = 1.0
 
     def __init__(self, model: Model, data: ModalData) -> None:
         super().__init__(model, jacobian=self._differentiate)
