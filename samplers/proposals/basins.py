@@ -45,8 +45,9 @@ LONGEST_STEP = 1.5
 AGREEING = 1.0
 # Covariance of a new component over A^-1, and its scale around the highest point over the scale of its neighbour.
 WIDER, FEW_POINTS_SCALE = 1.2, 0.7
-# Largest share of one basin, and of all basins together: an estimated mass may be far too large.
-LARGEST_SHARE, LARGEST_SHARE_OF_ALL = 0.25, 0.5
+# Largest number of basins; smallest and largest share of one, and of all together: an estimated mass may be far too
+# large.
+MOST, SMALLEST_SHARE, LARGEST_SHARE, LARGEST_SHARE_OF_ALL = 3, 0.1, 0.25, 0.5
 # Logarithms are rounded to 1 / 4096, so that a constant added to all of them changes nothing.
 GRID = 4096.0
 # Relative size of what keeps systems of equations regular.
@@ -85,32 +86,25 @@ def with_components(mixture: Mixture, found: Mixture | None) -> Mixture:
     )
 
 
-def find_basins(
-    mixture: Mixture,
-    coords: np.ndarray,
-    log_target: np.ndarray,
-    most: int = 3,
-    share: float = 0.1,
-    least_mass: float = 0.0,
-) -> Mixture | None:
+def find_basins(mixture: Mixture, coords: np.ndarray, log_target: np.ndarray) -> Mixture | None:
     """Components for parts of the target that a mixture, fitted to points (n, ndim), does not cover; None without any.
 
-    `log_target` (n,) is scaled so that the integral of the target is about 1; -inf is allowed. There are at most `most`
-    components, in the component space of the mixture, each with the weight `share` or more: up to 0.25 for a basin with
-    a larger estimated mass. Their total weight, at most 0.5, is the share of draws that they should receive. Components
-    whose estimated mass is below `least_mass` are left out.
+    `log_target` (n,) is scaled so that the integral of the target is about 1; -inf is allowed. There are at most three
+    components, in the component space of the mixture, each with the weight 0.1 or more: up to 0.25 for a basin with a
+    larger estimated mass. Their total weight, at most 0.5, is the share of draws that they should receive.
     """
     ndim, variance = coords.shape[1], mixture.dof / (mixture.dof - 2.0)
     kept = np.flatnonzero(log_target > log_target.max() - DEPTH * ndim)
     target = np.round(log_target[kept] * GRID) / GRID
     if mixture.bounds is not None:
         target = target - log_abs_det_jacobian(mixture.bounds, coords[kept])
-    found = _basins_of_points(mixture, to_component_space(mixture, coords[kept]), target, most)
-    found = [(k, basin) for k, basin in found if math.exp(min(basin.log_mass, 0.0)) >= least_mass]
+    found = _basins_of_points(mixture, to_component_space(mixture, coords[kept]), target)
     if not found:
         return None
-    found = sorted(found, key=lambda item: -item[1].log_mass)[:most]
-    shares = np.array([max(share, min(math.exp(min(basin.log_mass, 0.0)), LARGEST_SHARE)) for _, basin in found])
+    found = sorted(found, key=lambda item: -item[1].log_mass)
+    shares = np.array(
+        [max(SMALLEST_SHARE, min(math.exp(min(basin.log_mass, 0.0)), LARGEST_SHARE)) for _, basin in found]
+    )
     shares *= min(1.0, LARGEST_SHARE_OF_ALL / shares.sum())
     roots = np.array([mixture.roots[k] @ basin.root / math.sqrt(variance) for k, basin in found])
     return mixture._replace(
@@ -121,7 +115,7 @@ def find_basins(
     )
 
 
-def _basins_of_points(mixture: Mixture, points: np.ndarray, target: np.ndarray, most: int) -> list[tuple[int, _Basin]]:
+def _basins_of_points(mixture: Mixture, points: np.ndarray, target: np.ndarray) -> list[tuple[int, _Basin]]:
     """Basins among points (n, d) of the component space, each with the component whose coordinates it is given in."""
     ndim = points.shape[1]
     owner = log_components(mixture, points).argmax(axis=1)
@@ -143,7 +137,7 @@ def _basins_of_points(mixture: Mixture, points: np.ndarray, target: np.ndarray, 
         level = quadratic.at(standard[rows]) - log_volume + SIGNIFICANT + SPREADS * error
         explained[rows] = np.maximum(explained[rows], level)
     left = target > explained
-    for _ in range(most):
+    for _ in range(MOST):
         if not left.any():
             break
         k = owner[left][np.argmax(target[left])]

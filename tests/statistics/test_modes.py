@@ -63,7 +63,7 @@ def test_the_narrow_mode_is_kept(seed):
 
 def test_without_components_for_basins_it_is_lost(monkeypatch):
     """Negative control: the target is one that the plain mixture gets wrong."""
-    monkeypatch.setattr(recycling, "MOST_BASINS", 0)
+    monkeypatch.setattr(recycling, "find_basins", lambda *points: None)
     sampler, share = run(2)
     assert share < 0.05 and sampler.log_evidence == pytest.approx(np.log(0.5), abs=0.1)
 
@@ -76,11 +76,12 @@ def test_moves_keep_the_narrow_mode():
     assert share == pytest.approx(0.5, abs=0.15)
 
 
-@pytest.mark.parametrize(("rounds", "found"), [(4, True), (0, False)])
-def test_a_mode_that_is_met_at_the_end_is_explored(rounds, found, monkeypatch):
+@pytest.mark.parametrize(("explores", "found"), [(True, True), (False, False)])
+def test_a_mode_that_is_met_at_the_end_is_explored(explores, found, monkeypatch):
     """One draw of the last round before the check hits the flank of the narrow mode."""
     monkeypatch.setattr(anneal, "first_draws", lambda size: size)
     monkeypatch.setattr(recycling, "search_draws", lambda size: 0)
-    monkeypatch.setattr(recycling, "MOST_BASIN_ROUNDS", rounds)
+    if not explores:
+        monkeypatch.setattr(recycling, "find_basins", lambda *points: None)
     result = analytic_runs.run(analytic_runs.Cell("two", 100.0, "SMC", 500), 4, 1, {})
     assert (min(result["shares"]) > 0.15) == found
