@@ -8,16 +8,15 @@ of the coefficients, the statistics of the mean residual are, with the bilinear 
 
     S(m) = S(r_0) + 2 sum_k m_k B(r_0, P_k) + sum_kl m_k m_l B(P_k, P_l).
 
-The variances v_k enter through the expected likelihood. With the slopes f = d log L / dS at the mode, log L is nearly
-quadratic in the coefficients, with the gradient g and the Hessian -H, H_kl = -2 sum_a f_a B_a(P_k, P_l), so that by the
-method of Laplace log E L = log L(S(m)) + sum_k [v_k g_k^2 / (1 + H_kk v_k) - log(1 + H_kk v_k)] / 2.
+The emulated likelihood is the one of this mean. The variances of the process are not used: a likelihood that is
+expected over them needs as many simulations, with equal errors, in all problems of ``benchmarks few_simulations``.
 
 Reference: Higdon, Gattiker, Williams & Rightley (2008), J. Am. Stat. Assoc. 103(482), doi:10.1198/016214507000000888.
 """
 
 import numpy as np
 
-from .gaussian_process import fit_process, left_out_errors, predict
+from .gaussian_process import fit_process, predict
 from .target import ResponseTarget
 
 __all__ = ["ResponseEmulator"]
@@ -25,12 +24,6 @@ __all__ = ["ResponseEmulator"]
 _MAX_COMPONENTS = 60
 _NEGLIGIBLE_VARIANCE = 1e-3  # of the left-out components together, per run, in units of the noise variance
 _SMALLEST_SHARE = 1e-10  # of the leading component
-# Factor by which variances are widened at most. One length scale per input underestimates errors where the response has
-# a kink, so the largest error of a left-out run is made the one of m normal variables, sqrt(2 log m) deviations.
-_WIDEST = 9.0
-# In log-likelihood, at most. Without it, draws for a cyclic test had promised 20 to 130 more than at the mean, and
-# simulations gave what the mean had said.
-_LARGEST_GAIN = 3.0
 
 
 class ResponseEmulator:
@@ -75,12 +68,7 @@ class ResponseEmulator:
         importance = np.minimum(1.0, values[:k] / values[0] * 1e3)
         log_scales = None if earlier is None else earlier.process.log_scales
         self.process = fit_process(self._inputs(archive.coords[rows]), self._coefficients, importance, log_scales)
-        self._left_out, variances = left_out_errors(self.process)
-        largest = (np.square(self._left_out) / np.maximum(variances, np.finfo(float).tiny)).max(axis=0)
-        self._widening = np.clip(largest / (2.0 * np.log(n)), 1.0, _WIDEST)
         self._forms = archive.forms(histories)
-        self._gradient = 2.0 * self._forms[1:, 0] @ slopes
-        self._hessian = 2.0 * self._forms[1:, 1:] @ slopes
 
     def _inputs(self, coords: np.ndarray) -> np.ndarray:
         return (self.target.scaled(coords)[:, : len(self._centre)] - self._centre) @ self._whitening
@@ -90,14 +78,9 @@ class ResponseEmulator:
         return np.square(self._inputs(coords)).sum(axis=1)
 
     def log_likelihood(self, coords: np.ndarray) -> np.ndarray:
-        """Logarithm (n,) of the expected likelihood at coordinates (n, ndim), given the emulator's uncertainty."""
-        mean, variance = predict(self.process, self._inputs(coords))
-        variance = variance * self._widening
-        curved = 1.0 + variance * np.maximum(-np.diagonal(self._hessian), 0.0)
-        gradient = self._gradient + mean @ self._hessian
-        gain = 0.5 * (variance * np.square(gradient) / curved - np.log(curved)).sum(axis=1)
-        noise = coords[:, self.target.n_structural :]
-        return self.target.log_likelihood(self._at(mean), noise) + np.minimum(gain, _LARGEST_GAIN)
+        """Logarithm (n,) of the emulated likelihood at coordinates (n, ndim)."""
+        statistics = self._at(predict(self.process, self._inputs(coords)))
+        return self.target.log_likelihood(statistics, coords[:, self.target.n_structural :])
 
     def _at(self, mean: np.ndarray) -> np.ndarray:
         """Statistics (n, n_numbers) at coefficients (n, k)."""
@@ -110,4 +93,4 @@ class ResponseEmulator:
 
     def left_out_statistics(self) -> tuple[np.ndarray, np.ndarray]:
         """Statistics (m, n_numbers) of training runs, predicted from the other runs, and their true statistics."""
-        return self._at(self._coefficients - self._left_out), self._at(self._coefficients)
+        return self._at(self._coefficients - self.process.left_out), self._at(self._coefficients)

@@ -17,21 +17,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, qr, solve_triangular
 
-__all__ = ["GaussianProcess", "fit_process", "left_out_errors", "predict", "predict_mean"]
+__all__ = ["GaussianProcess", "fit_process", "predict"]
 
 _NUGGETS = 10.0 ** np.array([-9.0, -7.0, -5.0, -3.0, -1.0, 1.0])
 _LOG_SCALES = -2.0, 4.0  # bounds of the logarithms of the length scales, in units of the inputs, and of the shape
 _TINY = 1e-300
-
-
-class _Level(NamedTuple):
-    """Outputs with the same nugget, and what their variance needs: products with a root are quicker than solutions."""
-
-    outputs: np.ndarray
-    nugget: float
-    root: np.ndarray  # inverse of the Cholesky factor of the covariance
-    solved: np.ndarray  # the inverse of the covariance times the basis of the linear part
-    gram: tuple
 
 
 class GaussianProcess(NamedTuple):
@@ -41,8 +31,7 @@ class GaussianProcess(NamedTuple):
     log_scales: np.ndarray  # logarithms of the length scales and of the shape (d + 1,)
     linear: np.ndarray  # coefficients of the linear part (1 + d, k)
     weights: np.ndarray  # of the covariances with the training inputs (m, k)
-    variances: np.ndarray  # s_k^2 (k,)
-    levels: tuple[_Level, ...]  # groups of outputs with equal nugget, for the variance
+    left_out: np.ndarray  # errors (m, k) of the training outputs as predicted from the other training points
 
 
 def _basis(inputs: np.ndarray) -> np.ndarray:
@@ -117,46 +106,21 @@ def fit_process(
         log_scales = minimize(loss, log_scales, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
     nuggets = _NUGGETS[_restricted(log_scales, *fixed)[0].argmin(axis=0)]
     covariance = _covariance(inputs, inputs, log_scales)
-    linear, weights = np.empty((d + 1, outputs.shape[1])), np.empty_like(outputs)
-    variances, levels = np.empty(outputs.shape[1]), []
+    linear, weights, left_out = np.empty((d + 1, outputs.shape[1])), np.empty_like(outputs), np.empty_like(outputs)
     for nugget in np.unique(nuggets):
         members = np.flatnonzero(nuggets == nugget)
         factor = cho_factor(covariance + nugget * np.eye(m), lower=True)
         solved = cho_solve(factor, basis)
         gram = cho_factor(basis.T @ solved)
         linear[:, members] = cho_solve(gram, solved.T @ outputs[:, members])
-        rest = outputs[:, members] - basis @ linear[:, members]
-        weights[:, members] = cho_solve(factor, rest)
-        variances[members] = (rest * weights[:, members]).sum(axis=0) / (m - d - 1)
-        levels.append(_Level(members, float(nugget), solve_triangular(factor[0], np.eye(m), lower=True), solved, gram))
-    return GaussianProcess(inputs, log_scales, linear, weights, variances, tuple(levels))
+        weights[:, members] = cho_solve(factor, outputs[:, members] - basis @ linear[:, members])
+        # with P the inverse of the covariance after the linear part is projected out, the errors are (P y)_i / P_ii
+        inverse = np.square(solve_triangular(factor[0], np.eye(m), lower=True)).sum(axis=0)
+        inverse -= (solved * cho_solve(gram, solved.T).T).sum(axis=1)
+        left_out[:, members] = weights[:, members] / np.maximum(inverse, _TINY)[:, None]
+    return GaussianProcess(inputs, log_scales, linear, weights, left_out)
 
 
-def predict(process: GaussianProcess, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and variance (n, k) of the outputs; the variance includes nugget and uncertainty of the linear part."""
-    covariance, basis = _covariance(inputs, process.inputs, process.log_scales), _basis(inputs)
-    mean = basis @ process.linear + covariance @ process.weights
-    variance = np.empty_like(mean)
-    for members, nugget, root, solved, gram in process.levels:
-        gap = basis - covariance @ solved
-        unknown = (gap * cho_solve(gram, gap.T).T).sum(axis=1) - np.square(covariance @ root.T).sum(axis=1)
-        variance[:, members] = np.maximum(1.0 + unknown, 0.0)[:, None] + nugget
-    return mean, variance * process.variances
-
-
-def predict_mean(process: GaussianProcess, inputs: np.ndarray) -> np.ndarray:
-    """Mean (n, k) of the outputs at inputs (n, d), without the variance, which takes most of the time of `predict`."""
+def predict(process: GaussianProcess, inputs: np.ndarray) -> np.ndarray:
+    """Means (n, k) of the outputs at inputs (n, d)."""
     return _basis(inputs) @ process.linear + _covariance(inputs, process.inputs, process.log_scales) @ process.weights
-
-
-def left_out_errors(process: GaussianProcess) -> tuple[np.ndarray, np.ndarray]:
-    """Error (m, k) of every training output as predicted from the other training points, and its variance.
-
-    With P the inverse of the covariance after the linear part has been projected out, they are (P y)_i / P_ii and
-    s^2 / P_ii.
-    """
-    diagonal = np.empty_like(process.weights)
-    for members, _, root, solved, gram in process.levels:
-        inverse = np.square(root).sum(axis=0) - (solved * cho_solve(gram, solved.T).T).sum(axis=1)
-        diagonal[:, members] = np.maximum(inverse, _TINY)[:, None]
-    return process.weights / diagonal, process.variances / diagonal

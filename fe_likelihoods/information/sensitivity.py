@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ..emulation.gaussian_process import fit_process, left_out_errors, predict_mean
+from ..emulation.gaussian_process import fit_process, predict
 from ..likelihood.posterior import Posterior
 from ..prediction.quantities import Quantity, evaluator
 from ..priors.distributions import Distribution
@@ -180,7 +180,7 @@ def sensitivity(
         part = fit_process(inputs[kept], outputs[kept], np.ones(len(sd)), process.log_scales, iterations=0)
         without.append(_indices(known, designs[0], part))
     errors = np.hypot(np.sqrt(FOLDS - 1) * np.std(without, axis=0), np.std(found, axis=0, ddof=1) / np.sqrt(DESIGNS))
-    unexplained = np.square(left_out_errors(process)[0]).mean(axis=0)
+    unexplained = np.square(process.left_out).mean(axis=0)
     errors = np.hypot(errors, unexplained[:, None])  # this part of the variance may belong to any parameter
     first, total = found.mean(axis=0)
     return Sensitivity(
@@ -225,7 +225,7 @@ def _indices(prior: Prior, draws: np.ndarray, process: Any) -> np.ndarray:
     first, second = draws[:, :d], draws[:, d:]
 
     def emulated(u: np.ndarray) -> np.ndarray:
-        return predict_mean(process, _inputs(prior, prior.transform(u))).T
+        return predict(process, _inputs(prior, prior.transform(u))).T
 
     mixed = []
     for i in range(d):

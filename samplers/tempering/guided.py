@@ -164,8 +164,8 @@ def draw_rounds(
             outcome = _outcome(rounds, pooled, size)
         if refused or budget.refused:  # a search that was cut short goes on first, if the limit is raised
             return _stopped(rounds, pooled, guide)
-        # with the last round as well, a guide with a known density may learn that the posterior is larger
-        if outcome is not None and (outcome.reason or guide.known_density is None):
+        # with the last round as well, a guide whose known density describes the posterior may learn that this is larger
+        if outcome is not None and (outcome.reason or guide.known_density is None or not is_reliable(rounds)):
             return _with_signed(outcome)
         yield from asked(guide.refine(latest.coords, latest.records["log_prob"], session), f"after round {len(rounds)}")
         if outcome is not None:

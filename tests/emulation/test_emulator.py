@@ -5,7 +5,6 @@ import pytest
 
 from fe_likelihoods import HalfNormal, LogNormal, TruncatedNormal, Uniform
 from fe_likelihoods.emulation.emulator import ResponseEmulator
-from fe_likelihoods.emulation.gaussian_process import predict
 from fe_likelihoods.emulation.target import SCALES, ResponseTarget, at_once
 
 from .problems import vibration
@@ -69,22 +68,3 @@ def test_a_line_is_straight_in_scaled_parameters(scale, damping):
     np.testing.assert_allclose(scaled - scaled[0], shares[:, None] * (scaled[2] - scaled[0]), atol=1e-9)
     np.testing.assert_allclose(target.line(first, last, shares)[[0, 2]], [first, last], atol=1e-6)
     assert (np.diff(target.in_scale(scale).scaled(np.outer(np.linspace(-6.0, 3.0, 9), [1.0, 1.0])), axis=0) > 0.0).all()
-
-
-def test_uncertainty_enters_through_the_expected_likelihood():
-    """Against a Monte Carlo average over the coefficients, with variances as large as the noise variances."""
-    target, emulator = emulator_of(vibration("white", damping=TruncatedNormal(1.0, 1.0)))
-    emulator.process = emulator.process._replace(variances=emulator.process.variances * 1e8)
-    noise = target.fit_noise(target.archive.statistics[0]).coords
-    offsets = np.array([[0.0, 0.0], [0.02, 0.0], [0.05, 0.2], [-0.08, 0.1]])
-    structural = structural_coordinates(target, AT[None]) + SCALE * offsets
-    coords = np.concatenate([structural, np.tile(noise, (4, 1))], axis=1)
-    mean, variance = predict(emulator.process, emulator._inputs(structural))
-    gains = []
-    for k, expected in enumerate(emulator.log_likelihood(coords)):
-        draws = mean[k] + np.sqrt(variance[k]) * np.random.default_rng(5).standard_normal((100_000, mean.shape[1]))
-        values = target.log_likelihood(emulator._at(draws), np.tile(noise, (len(draws), 1)))
-        average = np.log(np.mean(np.exp(values - values.max()))) + values.max()
-        gains.append(average - target.log_likelihood(emulator._at(mean[k : k + 1]), noise[None])[0])
-        assert expected == pytest.approx(average, abs=0.02)
-    assert min(gains) < -1.0 and max(gains) > 1.0

@@ -193,7 +193,7 @@ def test_a_long_ridge_is_followed_to_the_bounds_of_its_prior(seed):
 
 
 @pytest.mark.parametrize(
-    ("simulated", "emulated", "refused"),
+    ("simulated", "emulated", "doubted"),
     [
         ([0.0, -1.0, -20.0], [0.1, -1.5, -np.inf], False),  # improbable runs need not be emulated
         ([0.0, -1.0, -2.0], [0.0, -1.0, -np.inf], True),
@@ -202,13 +202,13 @@ def test_a_long_ridge_is_followed_to_the_bounds_of_its_prior(seed):
         ([0.0, -1.0, -2.0], [-3.0, -4.0, -5.0], False),  # an uncertain emulator
     ],
 )
-def test_a_posterior_that_excludes_probable_simulations_is_refused(simulated, emulated, refused):
+def test_a_posterior_that_excludes_probable_simulations_is_doubted(simulated, emulated, doubted):
     found = check_excluded_runs(np.array(simulated), np.array(emulated))
-    assert [each.severity for each in found] == ["wrong"] * refused
+    assert [each.severity for each in found] == ["care"] * doubted
     assert all("ends of a ridge" in each.text for each in found)
 
 
-def test_a_rough_response_is_refused_too(rng):
+def test_a_rough_response_is_doubted_too(rng):
     """Its log-densities scatter around the emulated ones everywhere, and not only at the ends."""
     emulated = -rng.uniform(0.0, 3.0, 60)
     (found,) = check_excluded_runs(emulated + 2.0 * rng.standard_normal(60), emulated)
