@@ -183,7 +183,7 @@ def _stacked(blobs: list, dtype: Any, name: str) -> np.ndarray:
 
 def _holds(kept: Any, given: Any) -> bool:
     """Whether an item of an array, as Python's value, is what was given; a float may have fewer digits."""
-    given = given.tolist() if isinstance(given, np.ndarray | np.generic) else given
+    kept, given = (each.tolist() if isinstance(each, np.ndarray | np.generic) else each for each in (kept, given))
     if isinstance(given, list | tuple):
         return all(map(_holds, kept if isinstance(kept, list | tuple) else [kept], given))
     if isinstance(given, float | complex) and isinstance(kept, float | complex):
