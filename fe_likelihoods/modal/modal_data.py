@@ -264,7 +264,7 @@ def _checked_shapes(given: Any, sensors: Sequence[str], known: np.ndarray) -> np
             "ModalData: shapes must be real; take the real parts after a rotation by the mean phase, "
             "real_shapes(shapes)[0], and look at the scatter of the phases, real_shapes(shapes)[1]"
         )
-    shapes = shapes.real.astype(float)
+    shapes = (shapes.real if np.iscomplexobj(shapes) else shapes).astype(float)
     shapes = shapes[None] if shapes.ndim == 2 else shapes
     if shapes.shape != shape:
         turned = shapes.shape == (shape[0], shape[2], shape[1])

@@ -39,8 +39,9 @@ MOST_OBJECTS = 1_000_000  # in one value; further objects are left out
 _PLAIN = (type(None), bool, int, float, complex, str, bytes, bytearray, type(...), type(NotImplemented))
 _WRAPPERS = (staticmethod, classmethod, property, types.CellType, type(functools.lru_cache(len)))
 _WRAPPED = ("__wrapped__", "fget", "fset", "fdel", "cell_contents")
-_OF_CLASSES = set(
-    "__slotnames__ _abc_impl __dict__ __weakref__ __module__ __qualname__ __firstlineno__ __static_attributes__".split()
+_OF_CLASSES = set(  # the last three are annotations, from Python 3.14 on
+    "__slotnames__ _abc_impl __dict__ __weakref__ __module__ __qualname__ __firstlineno__ __static_attributes__ "
+    "__annotate_func__ __annotations_cache__ __classdictcell__".split()
 )
 _DATA = (int, float, complex, str, bytes, list, dict, set, np.ndarray)  # class attributes that running code may change
 _OF_SHELLS = {"_", "PWD", "OLDPWD", "SHLVL"}  # changes are irrelevant for simulations
