@@ -7,20 +7,22 @@ from typing import Any
 
 import numpy as np
 
+from ..text_tables import listed
 from .compared import MOST_DRAWS
 from .faults import BETTER, FACTOR, FLOOR, Fault, finding_of
-from .finding import CARE, HALF, Finding
+from .finding import CARE, HALF, NOTE, TAIL, Finding, percent
 
 __all__ = ["check_modes", "squares_of_modes"]
 
 
 def check_modes(fit: Any) -> list[Finding]:
-    """Faults, and modes without a counterpart, that a `ModalFit` shows at draws of the prior."""
+    """Faults and modes without a counterpart at draws of the prior of a `ModalFit`; pairs that change in samples."""
+    pairs = [] if fit.samples is None else _check_pairs(fit.samples)
     if fit.draws is None:
-        return []
+        return pairs
     found = [finding_of(each, fit.title, error="of frequencies") for each in _unit(fit.draws)]
     of_sensor = [finding_of(each, fit.title, error="of shapes") for each in _faults_of_sensors(fit.draws)]
-    return found + (of_sensor or _check_shapes(fit.draws))
+    return found + (of_sensor or _check_shapes(fit.draws)) + pairs
 
 
 def _unit(modes: Any) -> list[Fault]:
@@ -63,6 +65,19 @@ def _check_shapes(modes: Any) -> list[Finding]:
         text = f"No computed mode resembles the measured mode {_number(modes, k)}: its best MAC is {resembling[k]:.2f}."
         action = f"Leave it out, data.select({others}) or modes = {others} in a TOML file; or compute more modes."
         found.append(Finding("A mode has no counterpart", CARE, text, action, {"mac": float(resembling[k])}, "data"))
+    return found
+
+
+def _check_pairs(modes: Any) -> list[Finding]:
+    """Measured modes that are different computed modes in the posterior, which no result has to suffer from."""
+    found = []
+    for k, column in enumerate(modes.numbers.T):
+        numbers, counts = np.unique(column, return_counts=True)
+        if counts.max() < (1.0 - TAIL) * len(column):
+            shares = listed([f"{each} ({percent(n / len(column))})" for each, n in zip(numbers, counts, strict=True)])
+            text = f"The measured mode {_number(modes, k)} is paired with different computed modes: {shares}."
+            action = "Parameters may have several regions; more sensors tell the shapes apart."
+            found.append(Finding("The pairing of modes changes", NOTE, text, action))
     return found
 
 
