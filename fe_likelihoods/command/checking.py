@@ -1,6 +1,7 @@
 """What the command ``check`` does: read everything, simulate a few times, draw the picture."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from datetime import datetime, timedelta
 from pathlib import Path
 
@@ -43,8 +44,7 @@ def _say_data(problem: Problem, say: Callable[[str], None]) -> None:
     if record is not None:
         say(f"Record: {record}" + (f"\n  from {record.source}" if record.source else ""))
     for part, _ in posterior.likelihood.parts():
-        say("Measurements:")
-        say(str(part.model.data) if part.is_modal else "\n".join(describe(part.measurements)))
+        say("Measurements:\n" + (str(part.model.data) if part.is_modal else "\n".join(describe(part.measurements))))
     rows = [("parameter", "prior mean", "standard deviation", "")]
     for parameter in posterior.parameters:
         mean, sd = (parameter.shown(value) for value in posterior.prior.distributions[parameter.name].moments)
@@ -54,9 +54,8 @@ def _say_data(problem: Problem, say: Callable[[str], None]) -> None:
 
 
 def _say_simulation(problem: Problem, checked: ModelCheck, say: Callable[[str], None]) -> None:
-    report = problem.posterior.report()
+    report, mean = problem.posterior.report(), problem.posterior.prior.mean()[None]
     say(f"One simulation takes {report['seconds'] / report['simulations']:.2g} s")
-    mean = problem.posterior.prior.mean()[None]
     for part, columns in problem.posterior.likelihood.parts():
         theta, measured = mean[:, columns[: len(part.model.parameter_names)]], part.measurements
         if part.is_modal:
@@ -81,11 +80,10 @@ def _zero_of(job: Job, problem: Problem, checked: ModelCheck) -> str:
     if not isinstance(zero, str):
         return f"In [measurements], if the clocks differ: zero = {round(zero + shift, 6)!r}"
     day = "" if "-" in zero else "2000-01-01 "
-    try:
+    with suppress(ValueError):  # another way to write a date
         moved = datetime.fromisoformat(day + zero) + timedelta(seconds=shift)
-    except ValueError:  # another way to write a date
-        return ""
-    return f'In [measurements], if the clocks differ: zero = "{moved.isoformat(" ")[len(day) :]}"'
+        return f'In [measurements], if the clocks differ: zero = "{moved.isoformat(" ")[len(day) :]}"'
+    return ""
 
 
 def _draw(problem: Problem, checked: ModelCheck, picture: Path) -> list[Path]:
@@ -95,9 +93,8 @@ def _draw(problem: Problem, checked: ModelCheck, picture: Path) -> list[Path]:
     from ..prediction.propagation import propagate
     from ..reporting.pictures import save_picture
 
-    posterior, files = problem.posterior, []
-    most, modes = max(len(fit.draws) for fit in checked.fits), {fit.title: fit.modal for fit in checked.fits}
-    points = draws_to_compare(posterior)[:most]  # as many as were simulated
+    posterior, files, modes = problem.posterior, [], {fit.title: fit.modal for fit in checked.fits}
+    points = draws_to_compare(posterior)[: max(len(fit.draws) for fit in checked.fits)]  # as many as were simulated
     for key, part, columns in data_sets_of(posterior):
         measured = part.measurements
         if part.is_modal:

@@ -51,8 +51,6 @@ def write_samples(folder: Path, run: FinishedRun, samplers: Sequence[Any], predi
     found = arviz.rhat(data)
     found = found["posterior"] if "posterior" in getattr(found, "children", {}) else found
     worst, name = max((float(each), name) for name, each in found.data_vars.items())
-    evidences = ", ".join(f"{each.log_evidence:.2f} +- {each.log_evidence_error:.2g}" for each in samplers)
-    return (
-        f"{len(samplers)} independent runs: r_hat at most {worst:.3f} ({name}; above 1.01 they differ), log-evidences "
-        f"{evidences}"
-    )
+    values = ", ".join(f"{each.log_evidence:.2f} +- {each.log_evidence_error:.2g}" for each in samplers)
+    agree = f"r_hat at most {worst:.3f} ({name}; above 1.01 they differ)"
+    return f"{len(samplers)} independent runs: {agree}, log-evidences {values}"

@@ -57,9 +57,7 @@ class Motion(Table):
     """``[record]``, the base motion."""
 
     file: Any = key("text", "Base acceleration: CSV, Excel, a data set (.h5), or a format of `read_record`")
-    column: Any = key(
-        "text or whole number", "Column of a CSV file or workbook, component (GeoNet), channel or file (V2)"
-    )
+    column: Any = key("text or whole number", "Column (CSV, workbook), component (GeoNet), channel or file (V2)")
     units: Any = key("text", "Unit of the acceleration, if the file does not state it")
     missing: Any = key("list of number or text", "What stands for missing samples in other columns")
     scale: Any = key("number", "Factor by which the record is multiplied; -1 for a reversed sensor")
@@ -143,10 +141,7 @@ class Sampler(Section):
 
     kind: Any = key("one of smc, tmcmc", "Sampler", "smc")
     walkers: Any = key("whole number >= 1", "Number of walkers", 500)
-    steps: Any = key(
-        "whole number >= 1",
-        "Stored steps at beta = 1 of all walkers: 4, or 1 with a guide, whose draws are the first step",
-    )
+    steps: Any = key("whole number >= 1", "Stored steps at beta = 1: 4, or 1 with a guide, whose draws are the first")
     seed: Any = key("whole number >= 0", "Seed", 1)
     chains: Any = key("whole number >= 1", "Independent runs with successive seeds; the report is of the first", 1)
     guide: Any = key("yes or no", "Find the posterior from the responses, with hundreds of simulations", False)
