@@ -311,9 +311,7 @@ class ResponseGuide(Guide):
         if effective_sample_size(latest) >= _EVEN * len(latest) or len(log_weights) < 2.0 * enough:
             return None
         weights = normalised_weights(tempered(log_weights, enough))
-        fitted = fit_mixture(self._target.coordinates(parameters), weights, len(self._regions))
-        wider = np.sqrt(_WIDENED)
-        return fitted._replace(roots=wider * fitted.roots, inverses=fitted.inverses / wider)
+        return fit_mixture(self._target.coordinates(parameters), weights, len(self._regions)).widened(np.sqrt(_WIDENED))
 
     def _wide_mixture(self) -> Mixture:
         weights = normalised_weights(np.array([region.log_evidence for region in self._regions]))

@@ -81,6 +81,10 @@ class Mixture(NamedTuple):
         """Scale matrices of the components, shape (K, ndim, ndim)."""
         return self.roots @ self.roots.transpose(0, 2, 1)
 
+    def widened(self, factor: float) -> "Mixture":
+        """The same mixture with the standard deviations of all components times a factor."""
+        return self._replace(roots=factor * self.roots, inverses=self.inverses / factor)
+
 
 def _distances(mixture: Mixture, coords: np.ndarray) -> np.ndarray:
     """Squared Mahalanobis distances (n, K)."""

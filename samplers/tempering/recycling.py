@@ -341,8 +341,7 @@ def _widened(mixture: Mixture) -> Mixture:
     """The mixture with wider components, unless it is one component without shears."""
     if len(mixture.weights) == 1 and not mixture.shears:
         return mixture
-    factor = WIDER_VOLUME ** (1.0 / mixture.means.shape[1])
-    return mixture._replace(roots=factor * mixture.roots, inverses=mixture.inverses / factor)
+    return mixture.widened(WIDER_VOLUME ** (1.0 / mixture.means.shape[1]))
 
 
 def _with_even_share(mixture: Mixture, share: float) -> Mixture:
