@@ -1,13 +1,10 @@
 """The chain of a run: what emcee's backend writes, and what is stored beside it.
 
-In an HDF5 file, the group of the chain has the attribute ``run``, the dataset ``tempering`` (JSON: ladder, check of the
-evidence, verdict), and the group ``restart``: the population at beta = 1, or the state from which a reset chain
-continues.
-
-emcee opens the file for each step and writes in place. A kill then leaves half of a step, and HDF5 refuses the file
-while another program has it open. So during a call a backend works on a copy in memory, which takes the place of the
-file about every second and at the end, in one step: a reader always finds a whole chain. The attribute ``checksum`` of
-a chain tells whether something else has changed it.
+In an HDF5 file, the group of the chain has the attribute ``run``, the dataset ``tempering`` (JSON: ladder, check,
+verdict), and the group ``restart``: the state at beta = 1 from which a chain without steps continues. emcee writes in
+place, so a kill leaves half of a step, and HDF5 refuses a file that another program has open. So during a call a
+backend works on a copy in memory, which takes the place of the file about every second and at the end; its attribute
+``checksum`` tells whether something else has changed it.
 """
 
 import io
@@ -46,9 +43,8 @@ OF_EVERY_CHAIN = {"version", "nwalkers", "ndim", "has_blobs", "iteration", "chai
 
 
 class WholeFile:
-    """Takes the place of the method ``open`` of an emcee `HDFBackend`, through which all its methods use the file.
-
-    It is a context in which they use a copy in memory. A copy that cannot be written stays.
+    """Takes the place of the method ``open`` of an emcee `HDFBackend`: a context in which all its methods use a copy in
+    memory. A copy that cannot be written stays.
     """
 
     def __init__(self, backend: HDFBackend):
@@ -162,10 +158,8 @@ def _checksum(group: h5py.Group) -> int:
 
 
 def run_of_file(backend: HDFBackend) -> str | None:
-    """The run that the file of a backend belongs to; the empty string for a chain without a run.
-
-    It is "damaged" for a chain that cannot be read completely, or is not as it was stored. It is None if there is no
-    file, the file is empty, or it has no chain with this name, or an incomplete one that never had a step.
+    """The run that the file of a backend belongs to: empty for a chain without a run, "damaged" for one that is not as
+    it was stored, None without a file or chain, or for one that never had a step.
     """
     if not os.path.exists(backend.filename) or os.path.getsize(backend.filename) == 0:
         return None
@@ -196,10 +190,8 @@ def check_storable(dtype: np.dtype) -> None:
 
 
 def open_record(backend: Backend | None, nwalkers: int, ndim: int, slow: Sequence[int]) -> Record:
-    """The record of the run in a backend's file; the HDF5 file is made if it is missing or damaged.
-
-    Without a file that can be written, the record is kept in memory. `slow` are indices of the parameters that a
-    simulation depends on.
+    """The record of the run in a backend's file, which is made if it is missing or damaged; in memory without a file
+    that can be written. `slow` are indices of the parameters that a simulation depends on.
     """
     if not isinstance(backend, HDFBackend) or backend.read_only:
         return Record(slow=slow)
@@ -237,9 +229,7 @@ def open_record(backend: Backend | None, nwalkers: int, ndim: int, slow: Sequenc
 
 class Chain:
     """Data stored with the chain of an initialised backend: `result` and `verdict` (empty, None: nothing) of a `run`.
-
-    `provisional`: the only step is the estimate of a run that the limit of simulations ended, and is replaced when the
-    run continues.
+    The step of a `provisional` chain is the estimate of a run that the limit ended, and is replaced later.
     """
 
     def __init__(self, backend: Backend):

@@ -64,10 +64,8 @@ def raise_if_interrupted(before: int) -> None:
 
 @contextlib.contextmanager
 def interrupts_end_the_run() -> Iterator[None]:
-    """Context in which Ctrl-C raises KeyboardInterrupt in the main thread, whichever handler of SIGINT is set.
-
-    A handler that raises something else, as `dask_jobqueue` sets one, is still called. One that returns has dealt with
-    Ctrl-C: the run goes on. SIGINT that is ignored stays ignored. The handler is put back at the end.
+    """Context in which Ctrl-C raises KeyboardInterrupt in the main thread, whichever handler of SIGINT is set. A
+    handler that raises something else, as `dask_jobqueue` sets one, is called; one that returns has dealt with Ctrl-C.
     """
     handler = signal.getsignal(signal.SIGINT)
     is_ours = isinstance(handler, _RaisesKeyboardInterrupt)
@@ -101,11 +99,9 @@ def deferred_interrupts() -> Iterator[None]:
 
 
 def raise_if_it_ends_the_run(error: BaseException, before: BaseException | None = None) -> None:
-    """Raise what must not become a failed evaluation, even if it is the cause or context of `error`.
-
-    That is KeyboardInterrupt, SystemExit (in a worker process it is a failed evaluation), and an error whose attribute
-    ``ends_run`` is true. `before` is ``sys.exception()`` at the call of the function: what is handled there is the
-    context of its errors, but no cause of them.
+    """Raise what must not become a failed evaluation: an error with ``ends_run``, KeyboardInterrupt and, but for
+    workers, SystemExit, even as cause or context of `error`. What was handled `before` (``sys.exception()`` at the call
+    of the function) is no cause.
     """
     if getattr(error, "ends_run", False):
         raise error
@@ -160,10 +156,8 @@ class Ended(NamedTuple):
 
 
 class SentFunction:
-    """A function for a pool, in threads of this process or in other processes.
-
-    It returns KeyboardInterrupt and SystemExit as `Ended`. If they were raised, threads and processes of
-    `multiprocessing.pool` and workers of dask would end, and their point would be waited for or evaluated again.
+    """A function for a pool, which returns KeyboardInterrupt and SystemExit as `Ended`: raised, they would end threads
+    and processes of `multiprocessing.pool` and workers of dask, and their point would be waited for.
     """
 
     def __init__(self, function: Callable[[Any], Any]) -> None:

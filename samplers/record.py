@@ -1,15 +1,13 @@
 """The record of a run: all values of the user's function, in one file that is only appended to.
 
-A run is a deterministic function of its start, its settings and these values. A killed run is therefore repeated from
-its start: every point in the record is looked up, and nothing is evaluated twice. Counts, failures and the limit of
-simulations are computed from the record; an evaluation needs a simulation unless only fast parameters differ from an
-evaluated point.
+A run is a deterministic function of its start, its settings and these values, so a killed run is repeated from its
+start, and nothing is evaluated twice. Counts, failures and the limit of simulations follow from the record; points that
+differ only in fast parameters share a simulation.
 
-The file is a sequence of blocks: kind, length, two CRC-32, a text (JSON) and arrays in NumPy's format. There are three
-kinds: the start of the annealing (``RUN``), points that were evaluated with their log-probabilities, blobs and reasons
-of failure (``EVAL``), and arrays under a key (``MEMO``): simulations of a guide, or the order in which points of an
-asynchronous run arrived. A kill can leave only the last block incomplete, and an incomplete block is dropped. Without a
-path, everything is kept in memory.
+The file is a sequence of blocks: kind, length, two CRC-32, a text (JSON) and arrays in NumPy's format. Kinds are the
+start of the annealing (``RUN``), evaluated points with log-probabilities, blobs and reasons of failure (``EVAL``), and
+arrays under a key (``MEMO``): simulations of a guide, or the order in which points arrived. A kill can leave only the
+last block incomplete, which is dropped.
 """
 
 import io
@@ -100,11 +98,9 @@ class RunStart(NamedTuple):
 class Record:
     """Evaluations and remembered arrays of a run, in a file that is written and locked from `begin` or `open` on.
 
-    `slow` are indices of the parameters that a simulation depends on. `failed` are points with reasons, in order, and
-    `counted` those whose failures the function counts itself. `is_complete`: the run reached beta = 1 before, so
-    nothing new may be asked for. Simulations are compared with a `limit` (None: no limit); a limit only ends a run, and
-    one that is continued with a larger limit repeats the same steps, and continues. `refused` says whether `fits` has
-    refused simulations to the `guide` in use.
+    `slow` are indices of the parameters that a simulation depends on, `failed` points with reasons, `counted` those
+    whose failures the function counts itself; with `is_complete`, the run reached beta = 1 before, so nothing new may
+    be asked for.
     """
 
     limit: float | None = None
@@ -207,9 +203,8 @@ class Record:
         return np.inf if self.limit is None else max(self.limit - self.simulations, 0.0)
 
     def fits(self, simulations: float, remember: Remember) -> bool:
-        """Whether this number of further simulations by the guide fits; `refused` notes a refusal.
-
-        Simulations that the guide repeats cost nothing, and always fit: `remember` is the memory of this annealing.
+        """Whether this number of further simulations by the guide fits; `refused` notes a refusal. What `remember`
+        knows of this annealing costs nothing, and always fits.
         """
         if remember(OF_GUIDES) is None:
             self.refused = self.refused or simulations > self.remaining + ROUNDING
@@ -240,10 +235,9 @@ class Record:
     # ------------------------------------------------------------------ arrays under a key
 
     def remembering(self) -> Remember:
-        """A function ``remember(key, compute)`` for a run that is made from its start, now or again.
-
-        It returns the arrays that ``compute()`` returns, or those that it returned when the run was made before. For
-        equal keys, the arrays that were stored first are returned first. Without `compute`, None instead of new arrays.
+        """A function ``remember(key, compute)`` for a run that is made from its start: arrays that ``compute()``
+        returns, or has returned when the run was made before, the first ones first. Without `compute`, None instead of
+        new arrays.
         """
         used: Counter[str] = Counter()
 

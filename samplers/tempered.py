@@ -1,15 +1,11 @@
 """An emcee sampler that anneals draws of the prior to the posterior before it samples.
 
-`TemperedSampler` is an `emcee.EnsembleSampler`. Its ``sample`` first carries a population of prior draws to beta = 1
-(`samplers.tempering.anneal`). Then emcee's own loop continues at beta = 1. So the chain contains states of the
-posterior only, and everything that emcee does with a chain works unchanged.
-
-Each walker carries (log_prob, log_prior, blobs) as the blobs of an emcee State, whose log_prob is the tempered density.
-Therefore any emcee move works below beta = 1, and a change of beta needs no evaluation.
-
-Private attributes of emcee that are used, ``_random``, ``_moves``, ``_weights`` and ``_previous_state``, are pinned by
-`tests.contract.test_emcee_contract`. The user's function is evaluated by `samplers.evaluation.evaluator.Evaluator`, its
-values are kept by `samplers.record.Record`, and ladder and verdict are stored by `samplers.chain.Chain`.
+`TemperedSampler` is an `emcee.EnsembleSampler` whose ``sample`` first carries prior draws to beta = 1
+(`samplers.tempering.anneal`). Then emcee's own loop continues, so the chain contains states of the posterior only, and
+everything that emcee does with a chain works unchanged. Each walker carries (log_prob, log_prior, blobs) as the blobs
+of an emcee State, whose log_prob is the tempered density: any emcee move works below beta = 1, and a change of beta
+needs no evaluation. Private attributes of emcee in use, ``_random``, ``_moves``, ``_weights`` and ``_previous_state``,
+are pinned by `tests.contract.test_emcee_contract`.
 """
 
 import copy

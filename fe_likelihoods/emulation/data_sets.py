@@ -45,11 +45,9 @@ class _DataSet(NamedTuple):
 
 
 class DataSets:
-    """All data sets of an `FELikelihood` or a `JointLikelihood`.
-
-    `measured` are the values (n_channels, n_samples) [SI], `statistic` is that of the residuals, `differentiable` says
-    whether all models know their derivatives, and `together` is how many runs have their responses in memory at once.
-    ValueError for statistics that are not quadratic in the residuals, or a noise whose level depends on the response.
+    """All data sets of a likelihood: values `measured` (n_channels, n_samples) [SI] and the `statistic` of all
+    residuals; ValueError if that is not quadratic. `differentiable`: all models know derivatives; `together`: runs
+    whose responses are in memory at once.
     """
 
     def __init__(self, likelihood: Any) -> None:
@@ -94,10 +92,8 @@ class DataSets:
         )
 
     def simulate(self, thetas: np.ndarray) -> list[np.ndarray]:
-        """Residuals (n, n_channels, n_samples), statistics (n, n_numbers) and reasons of failures, a list in JSON.
-
-        A point that fails in one model is not simulated by the later ones; its residuals and statistics are NaN.
-        Residuals are rounded to single precision.
+        """Residuals (n, n_channels, n_samples) in single precision, statistics (n, n_numbers) and reasons of failures,
+        a list in JSON. A point that fails in one model, with NaN, is not simulated by the later ones.
         """
         reasons = [""] * len(thetas)
         residuals = np.zeros((len(thetas), *self.measured.shape), np.float32)

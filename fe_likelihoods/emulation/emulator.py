@@ -28,12 +28,12 @@ _SMALLEST_SHARE = 1e-10  # of the leading component
 
 
 class ResponseEmulator:
-    """Predicts statistics of responses near rows (m,) of the archive's runs, at least d + 4.
+    """Predicts statistics of responses near rows (m,) of the archive's runs, at least d + 4; LinAlgError if these do
+    not span the parameters.
 
-    `target` has the scale of its inputs. Centre (d,) and covariance (d, d) are about the mean and covariance of the
-    posterior in structural coordinates, for whitening; `slopes` (n_numbers,) are the derivatives of the log-likelihood
-    by the statistics at the mode, in whose metric components are in units of the noise. The search for length scales
-    starts at those of an `earlier` fit. LinAlgError if the runs do not span the parameters.
+    `target` has the scale of its inputs, centre (d,) and covariance (d, d) whiten them, and `slopes` (n_numbers,),
+    derivatives of the log-likelihood by the statistics, are the metric in which components are in units of the noise;
+    an `earlier` fit gives first length scales.
     """
 
     def __init__(

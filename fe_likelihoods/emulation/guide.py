@@ -233,10 +233,8 @@ class ResponseGuide(Guide):
     def _emulate(self, random: np.random.RandomState) -> None:
         """Fit emulators to all runs, and the emulated posterior.
 
-        Emulators are of logarithms or reciprocals if these predict left-out runs clearly better than parameters. A
-        ridge of equal products is straight in logarithms, and flexibilities of springs add; others are often closer
-        to linear in parameters. The few runs of a first fit cannot always tell: on a ridge that was emulated in
-        parameters to the end, rounds grew along it by a part each, and 2 of 20 were wrong.
+        Emulators are of logarithms or reciprocals if these predict left-out runs clearly better than parameters: the
+        few runs of a first fit cannot always tell, and of 20 ridges emulated in parameters to the end, 2 were wrong.
         """
         fits = []
         for scale in SCALES if self._regions else ():

@@ -130,9 +130,9 @@ class Jacobians:
 class Climb:
     """Levenberg-Marquardt from one start on a part of the record, where the prior is centred at `centre`.
 
-    `known` has where every ascent on this part has arrived, by its number; one that would end where a higher one goes
-    leaves it. Ends are different where one coordinate differs by `apart` prior standard deviations. On the `whole`
-    record, a step of a standard deviation is simulated along every axis of the Laplace approximation at the end.
+    `known` has where every ascent on this part has arrived, by its number; ends are different where one coordinate
+    differs by `apart`. On the `whole` record, a step of a standard deviation is simulated along every axis of the
+    Laplace approximation at the end.
     """
 
     target: ResponseTarget
@@ -145,9 +145,7 @@ class Climb:
 
     def run(self, start: np.ndarray, steps: np.ndarray | None, tolerance: float) -> Requests:
         """Returns the number of the ascent that it joins, its own at an end of its own, -1 if it fails or is given up.
-
-        It stops when less than `tolerance` of log-density is still to gain. `steps` from the start give the first
-        derivatives.
+        `steps` from the start give the first derivatives; less than `tolerance` of log-density is left to gain.
         """
         found = self._heights(start[None], (yield start[None]), None)
         if not found:
@@ -321,10 +319,8 @@ class Climb:
         return None
 
     def _connected(self) -> Requests:
-        """Number of the ascent that a line without a valley leads to from nearly the same height; None if none.
-
-        Without lines, searches on ridges find three to eight modes where one is. A lower ascent that goes on is no end:
-        from a saddle, lines without a valley lead up to two modes.
+        """Number of the ascent that a line without a valley leads to from nearly the same height; None if none. Without
+        lines, searches on ridges find three to eight modes where one is; a lower ascent that goes on is no end.
         """
         here = self._here
         for number, end in list(self.known.items()):

@@ -124,10 +124,9 @@ class ModeSearch(NamedTuple):
 
 
 def laplace(target: ResponseTarget, end: Ascent) -> Mode:
-    """Laplace approximation at the end of an ascent, over structural and noise coordinates together.
-
-    The residuals are taken as linear in the structural coordinates, so that nothing is simulated. The Hessian of the
-    log-density is computed by central differences with steps of 1/3 standard deviation.
+    """Laplace approximation at the end of an ascent, over structural and noise coordinates together, by central
+    differences of a third of a standard deviation. Residuals are taken as linear in the structural coordinates, so that
+    nothing is simulated.
     """
     noise = max(end.noise, target.fit_noise(end.statistics), key=lambda fit: fit.log_density)
     d, at = target.n_structural, np.concatenate([end.coords, noise.coords])
@@ -177,9 +176,7 @@ class _Part(NamedTuple):
 
 class Search:
     """Search from starts (n, n_structural) [standard normal coordinates], on growing parts of the record if possible.
-
-    `session` is a `GuideSession`, `spent` are the simulations so far. Ascents leave less than a `tolerance` of
-    log-density to gain.
+    `spent` are the simulations so far; ascents leave less than a `tolerance` of log-density to gain.
     """
 
     def __init__(self, target: ResponseTarget, starts: np.ndarray, session: Any, tolerance: float = TOLERANCE) -> None:
@@ -197,10 +194,9 @@ class Search:
     def run(self, starts: int) -> Steps:
         """Returns a `ModeSearch`; yields functions that simulate, and is sent their results, and None after each batch.
 
-        As many `starts` begin. Further ones follow until as many have reached a mode (ascents that are given up may
-        have been on their way to another one; on a growing record most are, and some follow once where fewer than half
-        have), and while many are alone in one. If all fail on the first part, which may be too short for the model,
-        they begin on the whole record.
+        As many `starts` begin, and further ones until as many have reached a mode (on a growing record, where most are
+        given up, half of them, once), and while many are alone in one; on the whole record if all fail on the first
+        part.
         """
         begin, following, finished = 0, starts, True
         while True:
@@ -326,10 +322,8 @@ def expected_simulations(starts: int, n_structural: int) -> float:
 
 
 def draw_starts(target: ResponseTarget, n: int, random: Any) -> np.ndarray:
-    """Starts (m, n_structural) in standard normal coordinates, of which a search begins with the first n.
-
-    These are the median of the prior, then a Latin hypercube: every parameter has one start in each of n - 1 intervals
-    of equal prior probability, in random order. A larger one of further starts follows; none for n = 1.
+    """Starts (m, n_structural) in standard normal coordinates, of which a search begins with the first n: the median of
+    the prior, and a Latin hypercube of n - 1. A larger one of further starts follows; none for n = 1.
     """
     d = target.n_structural
     blocks = [np.zeros((1, d))]

@@ -69,10 +69,9 @@ def at_once(steps: Steps) -> Any:
 
 
 class ResponseTarget:
-    """A posterior in standard normal coordinates, first the structural ones, and its `archive` of simulations.
-
-    ValueError as for its `data`, a `DataSets`. `unchecked` is not empty until the model's derivatives have been
-    compared with a difference, and is shared with `shortened` targets.
+    """A posterior in standard normal coordinates, first the structural ones, and its `archive` of simulations;
+    ValueError as for its `data`. `unchecked` is not empty until the model's derivatives have been compared with a
+    difference.
     """
 
     def __init__(self, posterior: Any) -> None:
@@ -93,10 +92,8 @@ class ResponseTarget:
             self._noise_volume = float(at_median - self.log_prior(np.zeros(self.n_noise)))
 
     def shortened(self, shares: Sequence[float]) -> list["ResponseTarget"]:
-        """The same posterior for the first parts of the record, the shortest first; none if the model has no ``first``.
-
-        The shares are of the Arias intensity, at which the parts end. There are none of a static test, in which no
-        errors of a period add up to a phase: in four tested columns, parts cost two to four times the simulations.
+        """The same posterior for the first parts of the record, up to shares of the Arias intensity; none if the model
+        has no ``first``, or of a static test, in which no errors of a period add up to a phase.
         """
         likelihood, parts = self.posterior.likelihood, []
         model = getattr(likelihood, "model", None)
@@ -143,9 +140,8 @@ class ResponseTarget:
         return np.where(np.isinf(coords), np.copysign(_AT_BOUND, coords), coords)
 
     def with_volume(self, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Coordinates (n, ndim) of parameters, and the logarithm (n,) of their volume over the parameters' volume.
-
-        The log-density of parameters minus this is the one of the coordinates. It is -inf outside the prior's support.
+        """Coordinates (n, ndim) of parameters, and the logarithm (n,) of their volume over the parameters' volume: the
+        log-density of parameters minus that of the coordinates; -inf outside the prior's support.
         """
         coords, log_prior = self.coordinates(parameters), np.atleast_1d(self._prior.logpdf(parameters))
         inside = np.isfinite(coords).all(axis=1) & np.isfinite(log_prior)
@@ -165,11 +161,9 @@ class ResponseTarget:
         return other
 
     def scaled(self, coords: np.ndarray) -> np.ndarray:
-        """Structural parameters, their logarithms or reciprocals, and noise coordinates, at coordinates (n, >= d).
-
-        A product of parameters, such as a stiffness E I, is linear in logarithms. Displacements of springs in series
-        are linear in reciprocals, whose sign is changed so that they increase with the parameter. Responses are smooth
-        functions of these, but not of the coordinates, which go to infinity as a parameter goes to a prior bound.
+        """Structural parameters, their logarithms or negative reciprocals, and noise coordinates, at coordinates (n, >=
+        d). Products, as E I, are linear in logarithms, springs in series in reciprocals, and responses smooth functions
+        of these, unlike of coordinates near a bound.
         """
         parameters = self.structural_parameters(coords[:, : self.n_structural])
         positive = np.where(self._power < 1, np.maximum(parameters, _SMALLEST), 1.0)
@@ -217,8 +211,8 @@ class ResponseTarget:
     def run(self, coords: np.ndarray, remember: Remember = nothing_stored, thetas: np.ndarray | None = None) -> Steps:
         """Simulate structural coordinates (n, n_structural), whose parameters are `thetas` if given; returns `Runs`.
 
-        Yields what is to be called, and is sent the result, so that no search stands between a sampler and a model.
-        Residuals are rounded to single precision, in which they are stored, so that a resumed run is the same.
+        Yields what is to be called, so that no search stands between a sampler and a model; residuals are rounded to
+        single precision, so that a resumed run is the same.
         """
         if thetas is None:
             self._simulated.update(row.tobytes() for row in coords)
@@ -237,9 +231,8 @@ class ResponseTarget:
         return Runs(*map(np.concatenate, zip(*parts, strict=True)))
 
     def derivatives(self, coords: np.ndarray, remember: Remember = nothing_stored) -> Steps:
-        """Derivatives of residuals by coordinates (n, n_structural), as numbers (n, n_structural) in the archive.
-
-        They are the model's own derivatives times those of the parameters by the coordinates. Yields as `run`.
+        """Derivatives of residuals by coordinates (n, n_structural), as numbers (n, n_structural) in the archive, from
+        the model's own. Yields as `run`.
         """
         thetas, steps = self.structural_parameters(coords), _STEP * np.eye(self.n_structural)
         (found,) = yield from self._stored("slopes of residuals", self.data.derivatives, thetas, remember)

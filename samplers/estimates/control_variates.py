@@ -108,10 +108,8 @@ class SignedSample(NamedTuple):
 def signed_sample(rounds: Sequence[Round], pooled: PooledRounds) -> SignedSample | None:
     """The signed sample of all rounds with a known density, from all draws `pooled`; None if there is none.
 
-    Rounds, as `add_round` returns them, are independent estimates. Each counts with the inverse of the mean square of
-    its differences, an expectation that the draws of all rounds give: few draws may have small differences by chance,
-    as where none of them failed. Rounds without a possible draw, or without a draw where the known density is positive,
-    are left out.
+    Each round, as `add_round` returns it, counts with the inverse of the mean square of its differences, which the
+    draws of all rounds give: few draws may have small differences by chance.
     """
     used = [k for k, r in enumerate(rounds) if r.known is not None and _meets_known(r)]
     if not used:
@@ -154,10 +152,8 @@ def _log_mean_squares(rounds: Sequence[Round], known_at: dict[int, np.ndarray], 
 
 
 def unreached_share(log_density: Callable[[np.ndarray], np.ndarray], latest: KnownDensity | None) -> float:
-    """Probability under a known density, if there is one, of the points that draws of an earlier one hardly reach.
-
-    A guide may learn late that the posterior is larger. Few draws of its earlier density then have all but equal
-    weights, and say nothing of the part that is missing.
+    """Probability under a known density, if there is one, of the points that draws of an earlier one hardly reach: a
+    guide may learn late that the posterior is larger, and the weights of its draws do not show it.
     """
     if latest is None:
         return 0.0

@@ -188,11 +188,8 @@ class PooledRounds(NamedTuple):
 
 
 def tail_shape(log_weights: np.ndarray) -> float:
-    """Pareto shape of the largest weights, from log-weights (n,), if they contribute to the mean; 0 if they do not.
-
-    If a guide describes the posterior nearly exactly, its weights are equal except for small errors, whose shape says
-    nothing about the mean. The shape is used only if the largest weights exceed the next weight, in total, by at least
-    5 % of the sum over all weights.
+    """Pareto shape of the largest weights, from log-weights (n,); 0 if they exceed the next one, in total, by less than
+    5 % of the sum: nearly equal weights have errors whose shape says nothing about the mean.
     """
     shape = pareto_shape(log_weights)
     if not np.isfinite(shape):
@@ -204,12 +201,9 @@ def tail_shape(log_weights: np.ndarray) -> float:
 
 
 def tail_growth(rounds: Sequence[Round], part: float = 0.5) -> tuple[float, float]:
-    """Slope of the log-weights over minus the log-posterior, among a `part` of the draws, and the error of the slope.
-
-    The part has the lowest posterior. The slope is positive if the proposal has lighter tails than the posterior
-    (``docs/theory/guided``); errors of a proposal, and jumps of a likelihood, do not make it positive on average. It is
-    (0, inf) for fewer than 8 draws in the part. The error is the standard error times a factor above 1 for few draws: 4
-    errors are exceeded with the same probability for any number.
+    """Slope of the log-weights over minus the log-posterior, among the `part` of the draws with the lowest posterior,
+    and its error times a factor for few draws; (0, inf) for fewer than 8. It is positive if a proposal has lighter
+    tails than the posterior (``docs/theory/guided``).
     """
     log_prob = np.concatenate([r.records["log_prob"] for r in rounds])
     log_weights = np.concatenate([r.log_weights for r in rounds])
@@ -274,12 +268,12 @@ def mixture_at_draws(rounds: Sequence[Round]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def pool_rounds(rounds: Sequence[Round]) -> PooledRounds:
-    """Combine one or more rounds, as `add_round` returns them (``docs/theory/guided``).
+    """Combine rounds, as `add_round` returns them: each draw is weighted by the mixture of all densities
+    (``docs/theory/guided``).
 
-    Each draw is weighted by the mixture of all densities, so that expectations do not suffer from a part that one round
-    missed. But a density that was fitted to earlier draws is large there, so the sum of these weights is too small, in
-    the logarithm by .03 to .17 for mixtures fitted to 100 to 300 draws. The evidence is therefore the mean of the
-    rounds' own estimates, with the effective share of each density from the draws of all rounds.
+    These weights are too small where a density was fitted to earlier draws (their log-sum by .03 to .17), so the
+    evidence is the mean of the rounds' own estimates, with the effective share of each density from the draws of all
+    rounds.
     """
     coords, records = np.concatenate([r.coords for r in rounds]), np.concatenate([r.records for r in rounds])
     log_prob, mixture = mixture_at_draws(rounds)

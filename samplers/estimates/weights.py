@@ -64,10 +64,9 @@ def log_mean_weight(log_weights: np.ndarray) -> float:
 
 
 class EvidenceError:
-    """Standard error of the log-evidence, accumulated during one run (Chan & Lai 2013; ``docs/theory/tempering``).
-
-    Points are grouped by their founder. Once fewer founders than `min_founder_share` times `n_points` are left, the
-    sums are closed, as independent of later ones, and every point becomes a founder.
+    """Standard error of the log-evidence, accumulated during one run (Chan & Lai 2013; ``docs/theory/tempering``). Once
+    fewer founders than `min_founder_share` times `n_points` are left, the sums are closed, and every point becomes a
+    founder.
     """
 
     def __init__(self, n_points: int, min_founder_share: float = 0.1):

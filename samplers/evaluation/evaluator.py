@@ -24,11 +24,9 @@ SECONDS_BETWEEN_NOTES = 0.05
 
 
 class Evaluator:
-    """A posterior density that is evaluated and recorded.
-
-    Evaluated points are structured arrays with the fields log_prob, log_prior and, if there are any, blobs.
-    `evaluations` counts the points that were asked for. A function `observer` is called when the number of points that
-    are `done` or `running` changes.
+    """A posterior density that is evaluated and recorded: points become structured arrays with the fields log_prob,
+    log_prior and, if there are any, blobs. An `observer` is called when the number of points that are `done` or
+    `running` changes.
     """
 
     asynchronous = False

@@ -20,10 +20,8 @@ logger = logging.getLogger(__name__)
 
 
 class Target:
-    """`log_prior`, values and `sample_prior` of arrays of points, from the arguments of a sampler.
-
-    `function` is the log-posterior or the log-likelihood, and `name` says which. ValueError for functions that cannot
-    be sampled. A sampler sets `parameter_names` as emcee has them; None: functions take arrays.
+    """`log_prior`, values and `sample_prior` of arrays of points, from the arguments of a sampler; ValueError for
+    functions that cannot be sampled. `parameter_names` are as emcee has them; None: functions take arrays.
     """
 
     parameter_names: Mapping[str, Any] | None = None

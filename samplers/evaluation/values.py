@@ -1,10 +1,8 @@
 """Arrays of log-densities and blobs from what a user's function returns, or an error that says what is wrong.
 
 emcee's conventions hold: one number per point, or a sequence of the number and blobs. Unlike in emcee, a point fails by
-NaN, and anything that is not a number is refused with an explanation. Blobs that are numbers are stored as floats, and
-all others as Python objects, unless the user declares another type: so the type does not depend on the values of the
-first points. A value that the type cannot hold is refused: text is never cut, and a number never cut or rounded. The
-exception is a float that the user declares with fewer digits, such as ``blobs_dtype=numpy.float32``.
+NaN; blobs that are numbers are floats, all others Python objects, unless the user declares a type, and a value that it
+cannot hold is refused: text and numbers are never cut, except floats of fewer declared digits.
 """
 
 import copy
@@ -38,11 +36,8 @@ class Failed:
 
 
 class Caught:
-    """A function that returns `Failed` instead of raising; it can be sent to a worker if the function can.
-
-    Its method ``fault(point)``, or the method of the object of a method, says why a fault of the infrastructure (a
-    killed process, a full disk) prevented the evaluation of a point: in this process, the records of workers are not
-    seen. KeyboardInterrupt, SystemExit in this process, and exceptions whose attribute ``ends_run`` is true are raised.
+    """A function that returns `Failed` instead of raising; it can be sent to a worker if the function can. Its method
+    ``fault(point)``, or its object's, says in this process why a fault of the infrastructure prevented an evaluation.
     """
 
     def __init__(self, function: Callable, args: Sequence | None, kwargs: Mapping[str, Any] | None, vectorize: bool):
@@ -75,11 +70,8 @@ class Caught:
 
 
 def outcomes(results: Any, n: int, blobs_dtype: Any, name: str) -> tuple[np.ndarray, np.ndarray | None, dict[int, str]]:
-    """Log-densities (n,), blobs (n, ...) or None, and reasons of failures by row, of what a function has returned.
-
-    `results` are n numbers, or n sequences (number, blob, ...). A point fails by an exception or a fault (`Caught`), by
-    NaN, or if a pool lost every process that evaluated it. Its log-density is NaN; its blobs are zero or empty.
-    ValueError if there are not `n` results, one is not a number or is +inf, or `blobs_dtype` cannot hold a blob.
+    """Log-densities (n,), NaN where one failed; blobs or None, and reasons of failures by row, from what a function has
+    returned for n points. ValueError if these are no numbers, or blobs of `dtype`.
     """
     if hasattr(results, "__array__"):
         results = np.asarray(results)

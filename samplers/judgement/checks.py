@@ -1,8 +1,5 @@
-"""What is found about runs that ended without an error but whose result may be wrong.
-
-Collapsed populations, and evidences or shares that disagree. Each check is a function of stages and arrays that returns
-a list of findings. How often each speaks in wrong runs and in right ones is
-in ``docs/results``.
+"""What is found about runs that ended without an error but whose result may be wrong: collapsed populations, and
+evidences or shares that disagree. How often each check speaks in wrong runs and in right ones is in ``docs/results``.
 """
 
 from collections.abc import Callable, Sequence
@@ -129,9 +126,7 @@ def check_evidence(
     log_evidence: float, error: float, check: EvidenceCheck | None, share_error: Callable[[], float]
 ) -> list[Finding]:
     """Findings if the two estimates of the evidence disagree, or if its error is large; limits from 1916 known runs.
-
-    A `check` with even weights that is higher than the stages has found what the stages have lost. `share_error()` is
-    the largest standard error of the share of a mode, which is asked for only where it may be large.
+    `share_error()` is the largest standard error of the share of a mode, asked for only where it may be large.
     """
     found, believed = [], check is not None and check.reliable
     difference = 0.0 if check is None else abs(log_evidence - check.log_evidence)

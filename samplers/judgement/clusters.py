@@ -1,16 +1,13 @@
 """Modes of a finished run: clusters of its final points, with shares and their errors.
 
-Two components of a mixture fitted to the final points belong to the same mode if the mixture density along the straight
-line between their means does not fall below a fifth of its lower end value, which for two equal Gaussian components is
-a distance of about 4 standard deviations; components in between connect other components. The share of a mode is the
-probability that a point belongs to one of its components, averaged over the chain. A mode without points is not found.
+Two components of a mixture fitted to the final points belong to one mode if the density on the line between their means
+does not fall below a fifth of its lower end, which for two equal Gaussian components is a distance of about 4 standard
+deviations.
 
-Where moves rarely cross between modes, the shares keep the errors of all resamplings, which founders of the last few do
-not show. If no point crosses, n weights of the stages give the log-evidence the variance S / n, a mode with the share p
-S / (p n), and the share itself p (1 - p) S / n: sqrt(p (1 - p)) times the error of the log-evidence, at most 1. In 245
-runs of SMC with several modes the shares were off by .22 (root mean square), which this states as .19 and the founders
-as .05; in 134 of TMCMC by .10, stated as .13 and .03. Where points cross in the moves after the last resampling, their
-part of this error is the correlation of memberships before and after these moves.
+Where moves rarely cross between modes, shares keep the errors of all resamplings, which founders of the last few do not
+show: sqrt(p (1 - p)) times the error of the log-evidence, at most 1, times the correlation of memberships before and
+after the moves of the last stage. In 245 runs of SMC the shares were off by .22 (root mean square), which this states
+as .19 and the founders as .05; in 134 of TMCMC by .10, stated as .13 and .03.
 """
 
 from typing import NamedTuple
@@ -52,9 +49,8 @@ def find_clusters(
 ) -> tuple[Cluster, ...]:
     """Modes of a chain (nsteps, nwalkers, ndim), the largest first, with shares whose sum is 1.
 
-    `founders` (nwalkers,) are the founder of each walker (`samplers.estimates.genealogy`), and `parents` those by the
-    last resampling alone; `error` is `samplers.reports.AnnealingResult.error_by_resampling`. By `lost`,
-    shares differ from those of weighted draws.
+    `founders` and `parents` (nwalkers,) are those of the walkers over all and the last resampling, `error` is
+    ``AnnealingResult.error_by_resampling``, and by `lost` shares differ from those of weighted draws.
     """
     flat = chain.reshape(-1, chain.shape[2])
     belongs = find_members(chain)

@@ -114,11 +114,9 @@ def failures_near(samples: np.ndarray, failed: np.ndarray, succeeded: np.ndarray
 
 
 def judged_failures(evaluated: Any, final_coords: np.ndarray, target: Any) -> NearFailures:
-    """Failures in the region of a run's final points (n, ndim), on which the verdict depends.
-
-    The latest 20 000 of the `evaluated` points (`samplers.record.EvaluatedBatch`) are compared in the parameters that
-    a simulation depends on. If the `target` counts failures by itself, all values of -inf are failures, except outside
-    its support.
+    """Failures in the region of a run's final points (n, ndim), among the latest 20 000 of the `evaluated` points, by
+    the parameters that a simulation depends on. If the `target` counts failures by itself, all -inf are failures,
+    except outside its support.
     """
     coords, log_prob = evaluated.coords[-KEPT_POINTS:], evaluated.log_prob[-KEPT_POINTS:]
     failed, impossible = np.isnan(log_prob), log_prob == -np.inf

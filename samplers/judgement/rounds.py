@@ -93,10 +93,8 @@ def is_reliable(rounds: Sequence[Round]) -> bool:
 
 
 def is_even(pooled: PooledRounds) -> bool:
-    """Whether the pooled result does not depend on a few weights.
-
-    The early rounds of a poor guide have heavy-tailed weights but a small share in the result, for which the error of
-    the log-evidence accounts. So it is enough that the shape permits a useful mean.
+    """Whether the pooled result does not depend on a few weights: that the shape permits a useful mean is enough, since
+    early rounds of a poor guide have heavy-tailed weights but a small share.
     """
     n, share = len(pooled.log_weights), pooled.effective_sample_size / len(pooled.log_weights)
     even = pooled.pareto_shape < LARGEST_SHAPE or (n < FEW_DRAWS and share >= SHORT_TAIL_SHARE)

@@ -247,10 +247,8 @@ def _sample(result: AnnealingResult, nwalkers: int) -> str:
 
 
 def independent_points(result: AnnealingResult, coords: np.ndarray) -> float:
-    """Effective sample size of the walkers (n, ndim) when beta = 1 was reached.
-
-    For walkers resampled from weighted draws and not moved, the effective sample size of the weights. Otherwise the
-    squared ratio of standard deviation to standard error of the mean, for the worst parameter, at most n.
+    """Effective sample size of the walkers (n, ndim) when beta = 1 was reached: of the weights that they were resampled
+    by, or the squared ratio of standard deviation to error of the mean, for the worst parameter, at most n.
     """
     if result.weighted is not None and result.weighted.points:
         return result.weighted.effective_sample_size
@@ -260,9 +258,8 @@ def independent_points(result: AnnealingResult, coords: np.ndarray) -> float:
 
 
 def describe_early_stop(verdict: Verdict, limit: float | None, result: AnnealingResult, made: int, missing: int) -> str:
-    """The warning when a call ends early: `made` steps at beta = 1 were made, `missing` steps were not.
-
-    What the annealing has warned of before is not repeated.
+    """The warning when a call ends early: `made` steps at beta = 1 were made, `missing` steps were not. What the
+    annealing has warned of before is not repeated.
     """
     warned = [each.message.rstrip(".") for each in result.findings]
     verdict = verdict._replace(reasons=tuple(reason for reason in verdict.reasons if reason not in warned))

@@ -1,10 +1,9 @@
 """Mutation kernels in the form of emcee moves, which also adapt to the population.
 
-Their method ``calibrate(coords, weights, inside, mixture)`` is called once per stage with the points of the previous
-stage, their weights at the new beta, a function that returns which points lie in the support of the prior, and a
-mixture if one is known. Proposals are
-for all walkers at once, and fitted in units of the weighted standard deviations, so that very different magnitudes of
-parameters (2e-4 s and 3e10 Pa) cause no numerical problem. Acceptances are derived in ``docs/theory/tempering``.
+Their ``calibrate(coords, weights, inside, mixture)`` gets the points of the previous stage once per stage, their
+weights at the new beta, which points lie in the support of the prior, and a known mixture. Proposals are fitted in
+units of the weighted standard deviations, so that very different magnitudes (2e-4 s and 3e10 Pa) cause no numerical
+problem. Acceptances are derived in ``docs/theory/tempering``.
 """
 
 import math
@@ -92,10 +91,8 @@ class _FittedMove(MHMove):
 
 
 def without_unfitted(moves: Sequence[Move]) -> list[Move]:
-    """The moves, with emcee's differential evolution instead of those that are not fitted.
-
-    They belong to an annealing that is not made again. A fit to the points that it moves would make tails too light:
-    heavy tails kept 0.94 of their variance; differential evolution takes its steps from the other half of the walkers.
+    """The moves, with emcee's differential evolution instead of those of an annealing that is not made again: a fit to
+    the points that it moves would make tails too light (heavy tails kept .94 of their variance).
     """
     inner = (getattr(move, "move", move) for move in moves)
     return [move if getattr(each, "is_fitted", True) else DEMove() for move, each in zip(moves, inner, strict=True)]
@@ -334,10 +331,8 @@ class GuideMove(MHMove):
 
 
 class WithFastSweeps(MHMove):
-    """A move, followed by random-walk steps (`sweeps`) of the whole ensemble in the fast parameters (`indices`).
-
-    The covariance of the walk is conditional on the other parameters. The reported acceptance is that of the move
-    alone. ``tune`` adapts the scale of the walk.
+    """A move, followed by random-walk steps (`sweeps`) of the whole ensemble in the fast parameters (`indices`), with
+    their covariance given the others. The reported acceptance is the move's.
     """
 
     # optimal in two dimensions; it is 0.44 in one dimension and 0.23 in many: Gelman, Roberts & Gilks (1996), Efficient

@@ -89,9 +89,8 @@ def with_components(mixture: Mixture, found: Mixture | None) -> Mixture:
 def find_basins(mixture: Mixture, coords: np.ndarray, log_target: np.ndarray) -> Mixture | None:
     """Components for parts of the target that a mixture, fitted to points (n, ndim), does not cover; None without any.
 
-    `log_target` (n,) is scaled so that the integral of the target is about 1; -inf is allowed. There are at most three
-    components, in the component space of the mixture, each with the weight 0.1 or more: up to 0.25 for a basin with a
-    larger estimated mass. Their total weight, at most 0.5, is the share of draws that they should receive.
+    `log_target` (n,) is scaled so that the integral of the target is about 1; the weights of the at most three
+    components are the shares of draws that they should receive, at most 0.5 in all.
     """
     ndim, variance = coords.shape[1], mixture.dof / (mixture.dof - 2.0)
     kept = np.flatnonzero(log_target > log_target.max() - DEPTH * ndim)

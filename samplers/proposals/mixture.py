@@ -168,10 +168,8 @@ def draw(mixture: Mixture, n: int, random: np.random.RandomState) -> np.ndarray:
 def fit_mixture(
     coords: np.ndarray, weights: np.ndarray, max_components: int = 6, bounds: SupportBounds | None = None
 ) -> Mixture:
-    """Fit a mixture to points (n, ndim) with weights (n,) of sum 1; the Bayesian information criterion chooses.
-
-    Components are added by splits as long as the criterion improves. Then fewer degrees of freedom are tried for
-    heavier tails, and so are shears and a transformation that removes `bounds` near the population.
+    """Fit a mixture to points (n, ndim) with weights (n,) of sum 1. The Bayesian information criterion chooses
+    components, degrees of freedom, shears, and a transformation that removes `bounds` near the population.
     """
     mixture, criterion = _fit_with_shears(coords, weights, max_components)
     near = None if bounds is None else near_bounds(bounds, coords, weights)
@@ -186,9 +184,7 @@ def fit_mixture(
 
 def fit_normals(coords: np.ndarray, effective: float, start: Mixture | None = None) -> Mixture:
     """Fit a mixture of normal distributions to points (n, ndim) of equal weight, accurately enough for a density.
-
-    `effective` is the number of independent points. The number of components minimises the Bayesian information
-    criterion; with a `start`, it is the number of its components, from which the fit starts.
+    `effective` points are independent; a fit from a `start` keeps its number of components.
     """
     weights = np.full(len(coords), 1.0 / len(coords))
     if start is not None:
@@ -309,10 +305,8 @@ def _criterion(count: int, ndim: int, effective: float, log_likelihood: float) -
 
 
 def _splits(mixture: Mixture, white: np.ndarray, weights: np.ndarray) -> list[np.ndarray]:
-    """Starting assignments (n, K + 1) with one more component: each component is split in two, along two directions.
-
-    The component's points have their smallest and largest fourth moments there: groups of similar size, or a small
-    group, show (invariant coordinate selection: Tyler et al. 2009, J. R. Stat. Soc. B 71(3),
+    """Starting assignments (n, K + 1) with one more component: each component is split in two, along the directions of
+    smallest and largest fourth moments (invariant coordinate selection: Tyler et al. 2009, J. R. Stat. Soc. B 71(3),
     doi:10.1111/j.1467-9868.2009.00706.x).
     """
     owner = log_responsibilities(mixture, white).argmax(axis=1)

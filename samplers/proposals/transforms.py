@@ -50,10 +50,8 @@ class SupportBounds(NamedTuple):
 
 
 def find_support_bounds(inside: Callable[[np.ndarray], np.ndarray], coords: np.ndarray) -> SupportBounds:
-    """Find the bounds of the support from points (n, ndim) in it, such as draws of the prior.
-
-    `inside` is a function (m, ndim) -> (m,), called about 85 times. Each finite bound lies at most one bisection step
-    outside the support, never inside it.
+    """Find the bounds of the support from points (n, ndim) in it, by about 85 calls of `inside`, (m, ndim) -> (m,).
+    Each finite bound lies at most one bisection step outside the support, never inside it.
     """
     ndim = coords.shape[1]
     span = np.ptp(coords, axis=0)
@@ -122,10 +120,8 @@ def _bounded_parameters(bounds: SupportBounds) -> list[tuple[int, float, float, 
 
 
 def to_unbounded(bounds: SupportBounds, coords: np.ndarray) -> np.ndarray:
-    """Transform points (n, ndim) to the whole real line.
-
-    ``log(exp((x - low) / span) - 1)`` for a lower bound, likewise for an upper bound, and the logit between two bounds.
-    Points on or beyond a bound are mapped to zero; `log_abs_det_jacobian` is -inf for them.
+    """Transform points (n, ndim) to the whole real line: ``log(exp((x - low) / span) - 1)`` for a lower bound, likewise
+    for an upper bound, the logit between two. Points on or beyond a bound become zero.
     """
     coords = coords.copy()
     for j, sign, low, high, span in _bounded_parameters(bounds):

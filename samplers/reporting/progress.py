@@ -74,12 +74,9 @@ def _count(search: GuideTick) -> str:
 
 
 class Progress:
-    """Shows a run in a bar: a context manager that observes an `Evaluator`.
-
-    `bar` has the arguments ``progress`` and ``progress_kwargs`` of `emcee.EnsembleSampler.sample`. The posterior
-    `function` may have ``when_simulated(callback)``, which announces simulations as they end by ``callback(number)``,
-    and what they wait for by ``callback(0, text)``. The bar counts "evaluations"; any other `unit` is counted by
-    `step`, up to a `total`.
+    """Shows a run in a bar: a context manager that observes an `Evaluator`, with `bar` as emcee's arguments
+    ``progress`` and ``progress_kwargs``. The bar counts "evaluations", which ``function.when_simulated`` may announce,
+    or `step` another `unit` up to a `total`.
     """
 
     def __init__(

@@ -1,15 +1,10 @@
 """Annealing from draws of the prior to beta = 1: which path to take, and what to do if it fails.
 
-guided rounds (`samplers.tempering.guided`)
-    With a guide, its weighted draws replace the annealing. If they are not usable, the run ends with a verdict that
-    says so: annealing from the prior takes ten times the simulations, which is for the user to decide.
-recycling (`samplers.tempering.recycling`)
-    Its weighted draws are resampled to as many points as there are walkers, which are moved only if they are not
-    independent draws already. If the result is not reliable, moves start again from the draws of the prior.
-moves (`samplers.tempering.smc_moves`)
-    Sequential Monte Carlo, and a check of the evidence.
-
-A limit of simulations ends any path that exceeds it: the known points are weighted by the posterior and resampled.
+With a guide, its weighted draws replace the annealing; if they are not usable, the run ends with a verdict that says
+so, since annealing takes ten times the simulations, which is for the user to decide. Recycling's weighted draws are
+resampled to the walkers, which are moved unless they are independent already; if they are not reliable, moves start
+again from the draws of the prior. A limit of simulations ends any path: the known points are weighted by the posterior
+and resampled.
 """
 
 import logging
@@ -96,10 +91,8 @@ def check_population(
     visited: VisitedPoints,
     log_evidence: float,
 ) -> tuple[EvidenceCheck, list[Finding]]:
-    """Evidence, and findings about the shares of the posterior's parts, by fresh draws of a mixture fitted to the final
-    points.
-
-    `visited` are the points of all stages, whose `log_evidence` is given. There are as many draws as final points.
+    """Evidence, and findings about shares of the posterior's parts, by as many fresh draws as final points, of a
+    mixture fitted to these. `visited` are the points of all stages, whose `log_evidence` is given.
     """
     coords, n = population.coords, len(population.coords)
     mixture = fit_mixture(coords, np.full(n, 1.0 / n), bounds=find_support_bounds(density.inside, coords))

@@ -1,13 +1,10 @@
 """Start from a guide: rounds of draws that are evaluated, weighted and used to refine the guide.
 
-The density of a round is fixed before its draws are made, and each draw is weighted by this density
-(`samplers.estimates.importance`). The rounds end with a *reliable* round: fresh draws with a good effective share and
-Pareto shape. All rounds together must then have an effective sample size as large as the number of walkers, and their
-draws must reach all of the posterior that the guide knows by then.
-
-A part of the posterior that a guide never proposes is not seen by its draws. Guides with a share of the prior in their
-density can find it; other guides depend on their search (`findings`). Constants without a reference were chosen by
-trials on posteriors with known answers.
+The density of a round is fixed before its draws are made, and each draw is weighted by it. The rounds end with a
+*reliable* round: fresh draws with a good effective share and Pareto shape; all rounds together must then have an
+effective sample size as large as the number of walkers, and reach all of the posterior that the guide knows by then. A
+part that a guide never proposes is not seen: guides with a share of the prior can find it, others depend on their
+search.
 """
 
 from collections.abc import Callable, Generator, Sequence
@@ -75,11 +72,9 @@ def lend(guide: Guide, random: np.random.RandomState, remember: Callable, budget
 
 
 class RoundsOfGuide(NamedTuple):
-    """Result of `draw_rounds`: all draws `pooled`, their rounds, and the signed sample where its means are better.
-
-    `reason` says why the draws cannot be used, `findings` what they have not reached. `stopped`: the limit of
-    simulations ended the rounds. `unreached` is the share of the guide's latest known density that the draws hardly
-    reach, by which the evidence may be too small.
+    """Result of `draw_rounds`: all draws `pooled`, `rounds`, the signed sample where its means are better; `reason`
+    says why the draws cannot be used, `findings` what they have not reached. `unreached` is the share of the latest
+    known density that they hardly reach.
     """
 
     reason: str
@@ -127,9 +122,8 @@ def draw_rounds(
 ) -> Generator[tuple[Population, Report], None, RoundsOfGuide]:
     """Let the guide search, then draw, evaluate and refine until a fresh round is reliable.
 
-    `population` are draws of the prior, as many as there are walkers, which are not evaluated. Yields them with the
-    effective sample size of all rounds so far, and a tick of the progress bar, a round, or a function of the guide's
-    search, whose result is sent back.
+    Yields the `population`, draws of the prior that are not evaluated, with a tick of the progress bar, a round, or a
+    function of the guide's search, whose result is sent back.
     """
     guide, session, budget = guidance
     session = session._replace(weighted=lambda: None if pooled is None else (pooled.coords, pooled.log_weights))

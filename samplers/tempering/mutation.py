@@ -1,13 +1,10 @@
 """Mutation at a fixed beta: moves of the ensemble, and the rule that ends them.
 
-Resampling copies points, and the moves separate the copies. Moving stops once the population is nearly uncorrelated
-with its resampled start (`StartCorrelation`).
-
-Chains of transitional Markov chain Monte Carlo grow from the resampled points instead. The first points of a chain have
-made few steps, and the leaders of long chains have large weights, so the new points have a bias, which decreases with
-the steps that every chain makes before its points count (burn-in). If many points are copies, the next fit and the next
-weights see too few distinct points: with 100 walkers and 12 parameters, the means were wrong by 1 to 6 standard
-deviations. So all points are swept together afterwards. Without a burn-in, the algorithm is as published.
+Moving stops once the population is nearly uncorrelated with its resampled start (`StartCorrelation`). In chains of
+transitional Markov chain Monte Carlo, the leaders of long chains have large weights, so their first points have a bias,
+which decreases with steps before points count (burn-in). With many copies, the next fit sees too few distinct points
+(100 walkers, 12 parameters: means wrong by 1 to 6 standard deviations), so all points are swept together afterwards;
+without a burn-in, the algorithm is as published.
 """
 
 from collections.abc import Generator, Sequence
@@ -235,8 +232,8 @@ def grow_chains(
 ) -> Generator[tuple[Population, Sweep], None, Mutated]:
     """Grow a chain from each distinct point (leader), one step per copy of it, after ``settings.burn_in`` steps of all.
 
-    The first step moves all chains together, later ones those that are long enough. With a burn-in, sweeps over all
-    points follow if these are still correlated with the resampled points. `ancestors` (n,) are equal for copies.
+    `ancestors` (n,) are equal for copies; with a burn-in, sweeps over all points follow if these are still correlated
+    with the resampled points.
     """
     beta, coords, records = population.beta, population.coords, population.records
     model, schedule, settings = _tempered_model(kernel, beta), kernel.schedule, kernel.settings

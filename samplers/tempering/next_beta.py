@@ -10,11 +10,9 @@ BISECTIONS = 20
 
 
 def next_beta(log_likelihood: np.ndarray, beta: float, target: float, base: np.ndarray | None = None) -> float:
-    """Largest next exponent in (beta, 1] whose incremental weights keep the effective sample size at `target`.
-
-    The target is multiplied by the share of finite log-likelihoods (n,), but not with log-weights `base` (n,) at
-    `beta`. The bisection uses a fixed dyadic grid, so that rounding errors do not change the exponent. ValueError if no
-    log-likelihood is finite, or all are so low that rounding errors exceed 1, as penalties of -1e300 are.
+    """Largest next exponent in (beta, 1] whose incremental weights keep the effective sample size at `target`, times
+    the share of finite log-likelihoods (n,) if there are no log-weights `base` (n,) at `beta`. ValueError if none is
+    finite, or all are so low that rounding errors exceed 1.
     """
     top = np.max(log_likelihood)
     if top < LOWEST:

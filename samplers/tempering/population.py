@@ -28,12 +28,8 @@ class Population(NamedTuple):
 
 
 class PendingPoints:
-    """Points (n, ndim) that were submitted together for evaluation, and their known records; some may still be running.
-
-    Points that have arrived may shape further proposals, but only complete batches may become part of the result: if
-    evaluation times depend on the parameters, the first arrivals are not a fair sample of the proposal. `refused`: the
-    limit of simulations refused further points. `arrived` (n,) bool are the points with all records: of a synchronous
-    density all, else at first those outside the support of the prior.
+    """Points (n, ndim) that were submitted together for evaluation, and their known records; only those `arrived` (n,)
+    shape proposals, and only complete batches become part of a result. `refused`: the limit refused further points.
     """
 
     def __init__(
@@ -76,9 +72,7 @@ def check_size(nwalkers: int, ndim: int) -> None:
 
 class StoppedEarly(Exception):
     """The limit of simulations has ended an annealing at `beta`; the known points have log-weights at beta = 1.
-
-    `of_stages` is the part of the log-evidence that was already reported. `guided`: the points are draws of a guide;
-    `why` the run ended.
+    `of_stages` of the log-evidence was already reported, `guided` points are draws of a guide; `why` the run ended.
     """
 
     def __init__(

@@ -1,14 +1,11 @@
 """Recycling: adaptive multiple importance sampling (AMIS) from the prior to the posterior (``docs/theory/recycling``).
 
-All points evaluated so far are weighted by the tempered target over the mixture of all densities that they were drawn
-from. Each round chooses the next beta, fits a mixture to the weighted points, and adds draws from it.
-
-Beta is increased only when the draws made at it have an effective sample size of three quarters of the target: among
-many old points some have large weights by chance, and if the likelihood is rough, annealing that follows these points
-ends in a local mode. Points that a proposal was fitted to weigh too little, and a small mode can vanish, so the result
-consists only of draws made at beta = 1, each weighted by its own proposal. Constants without a reference were chosen by
-trials on posteriors with known answers. The *efficiency* of a round is the effective sample size of its fresh draws
-divided by their number.
+All points are weighted by the tempered target over the mixture of all densities that they were drawn from; each round
+chooses the next beta, fits a mixture, and adds draws from it. Beta is increased only when the draws made at it have an
+effective sample size of three quarters of the target: annealing that follows few old points of large weight ends in a
+local mode. The result consists only of draws made at beta = 1, each weighted by its own proposal. Constants without a
+reference were chosen by trials on posteriors with known answers. The *efficiency* of a round is the effective share of
+its fresh draws.
 """
 
 from collections.abc import Generator, Sequence
@@ -65,12 +62,9 @@ LARGEST_SHARE_KEPT = 0.9
 
 
 class Recycled(NamedTuple):
-    """Result of recycling: the draws made at beta = 1 with those of the check, their records and log-weights (n,).
-
-    `reason` says why the result is not reliable; empty if it is. Each draw is weighted by the mixture of its round,
-    which was not fitted to it. `log_evidence` and its error use all points except the draws of the check. `proposal` is
-    the mixture of the check. `independent` says whether as many points as walkers, resampled from the draws, are as
-    good as independent draws of the posterior.
+    """Result of recycling: draws made at beta = 1 with those of the check, and log-weights (n,) over the density of
+    their round. `reason` says why it is not reliable, `independent` whether walkers resampled from it are independent
+    draws.
     """
 
     reason: str
@@ -88,11 +82,10 @@ class Recycled(NamedTuple):
 def recycle(
     pending: PendingPoints, n: int, density: Density, random: np.random.RandomState
 ) -> Generator[tuple[Population, Report], None, Recycled]:
-    """Anneal draws of the prior to beta = 1 by adaptive importance sampling.
+    """Anneal draws of the prior to beta = 1 by adaptive importance sampling, to the effective sample size `n`.
 
-    `n` is the wanted effective sample size at beta = 1 and the number of draws for the check. Yields all
-    weighted points with a `Stage` for each beta below 1 before its draws are made, then a `Sweep`. Raises StoppedEarly
-    at the limit of simulations.
+    Yields all weighted points with a `Stage` for each beta below 1 before its draws are made, then a `Sweep`; raises
+    StoppedEarly at the limit of simulations.
     """
     first, ndim = pending.coords.shape
     left, enlarged, explored = float(search_draws(n)), 1.0, False  # draws that search for narrow modes
@@ -196,10 +189,8 @@ def recycle(
 
 
 class WeightedPoints:
-    """All arrived points (n, ndim), their records, and the log-mixture over all densities they were drawn from.
-
-    The mixture counts every submitted draw. While some are running, the sum of the weights is therefore smaller than
-    the evidence.
+    """All arrived points (n, ndim), their records, and the log-mixture over all densities they were drawn from. It
+    counts every submitted draw, so while some are running, the sum of the weights is smaller than the evidence.
     """
 
     def __init__(self, pending: PendingPoints):

@@ -29,11 +29,10 @@ __all__ = ["anneal_by_moves"]
 def anneal_by_moves(
     population: Population, n: int, kernel: Kernel
 ) -> Generator[tuple[Population, Stage | Sweep | Finding], None, tuple[Population, list[Stage]]]:
-    """Carry evaluated draws of the prior to beta = 1; points that are evaluated here are added to the visited ones.
+    """Carry evaluated draws of the prior, as many or more than the `n` points of later stages, to beta = 1.
 
-    There may be more draws than the `n` points of later stages, to which they are resampled. Yields the points as they
-    are now with a report. Returns the points at beta = 1 and all stages. Raises StoppedEarly at the limit of
-    simulations.
+    Yields the points as they are now with a report, and returns the points at beta = 1 and all stages; raises
+    StoppedEarly at the limit of simulations.
     """
     (m, ndim), (density, random, schedule, settings, visited) = population.coords.shape, kernel
     target, stages, error = float(n), [], EvidenceError(m)
