@@ -6,11 +6,6 @@ from .checks.screening import check_data
 from .column_damage.damage import damage, limit_states
 from .column_damage.measures import damage_measures, damage_outputs
 from .column_damage.park_ang import park_ang_constants
-from .events.hierarchical_posterior import HierarchicalPosterior, Varying
-from .events.hierarchy_result import Hierarchy
-from .events.ratios import EventRatios
-from .events.stiffness_loss import stiffness_loss
-from .events.stored_posterior import StoredPosterior
 from .information.identifiability import identifiability
 from .information.sensitivity import sensitivity
 from .information.sensors import rank_sensors
@@ -44,6 +39,11 @@ from .plots.predictions import plot_bands, plot_fragility
 from .plots.scores import plot_scores
 from .plots.sensors import plot_ranking
 from .plots.structures import plot_hysteresis, plot_section, plot_sensors
+from .population.hierarchical_posterior import HierarchicalPosterior, Varying
+from .population.hierarchy_result import Hierarchy
+from .population.ratios import EventRatios
+from .population.stiffness_loss import stiffness_loss
+from .population.stored_posterior import StoredPosterior
 from .prediction.averaging import average_predictions
 from .prediction.fragility import fragility
 from .prediction.held_out import leave_one_out

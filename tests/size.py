@@ -23,7 +23,7 @@ ROOMS = {
     "models": 5200,
     "kernels": 3400,
     "prediction": 3300,
-    "events": 1700,
+    "population": 1700,
     "information": 1000,
     "column_damage": 600,
     "checks": 1600,

@@ -21,7 +21,7 @@ ORDER = {
         ("column_damage", "information"),
         ("prediction",),
         ("modal",),
-        ("events", "models"),
+        ("models", "population"),
         ("checks",),
         ("likelihood",),
         ("emulation",),

@@ -10,7 +10,7 @@ import numpy as np
 from ..checks.finding import warn
 from ..checks.screening import check_phases
 from ..modal.modal_data import ModalData, read_mode_table, real_shapes
-from ..signals.tables import agree_on_unit
+from ..signals.text_files import agree_on_unit
 from ..units import to_si
 
 __all__ = ["read_matlab", "read_modal_data"]

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..checks.finding import labelled
-from ..events.ratios import EventRatios
+from ..population.ratios import EventRatios
 from ..prediction.prediction import Prediction
 from ..prediction.reliability import Exceedance, check_level, estimate, outcomes, warn_of_missing_error
 from ..priors.distributions import Distribution

@@ -17,7 +17,8 @@ from ..signals.channels import Channel, Measurements
 from ..signals.datasets import read_dataset
 from ..signals.read import read_columns
 from ..signals.strong_motion import find_channels, recognise
-from ..signals.tables import dimension_of, read_table
+from ..signals.tables import read_table
+from ..signals.text_files import dimension_of
 from ..text_tables import number, text_table
 from ..units import from_si
 from .job import HDF5

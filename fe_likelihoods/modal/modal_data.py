@@ -10,7 +10,8 @@ import numpy as np
 
 from ..models.base import digest
 from ..signals.sampling import array_digest
-from ..signals.tables import Column, Table, agree_on_unit, read_table
+from ..signals.tables import Column, Table, read_table
+from ..signals.text_files import agree_on_unit
 from ..text_tables import text_table
 from ..units import to_si
 

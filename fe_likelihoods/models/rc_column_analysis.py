@@ -70,8 +70,8 @@ class PreparedColumn(NamedTuple):
             instants = np.arange((loading.n_steps - 1) * model.analysis.substeps + 1) / model.analysis.substeps
             acceleration = np.interp(instants, np.arange(loading.n_steps), loading.acceleration)
             return cls(acceleration, np.arange(0, len(instants), model.analysis.substeps), outputs)
-        finer = loading.subdivide(model.analysis.max_increment or model.height / 5000.0)
-        return cls(np.asarray(finer.history.displacement), np.asarray(finer.indices), outputs)
+        finer, kept = loading.subdivide(model.analysis.max_increment or model.height / 5000.0)
+        return cls(finer.displacement, kept, outputs)
 
 
 def check_loading(loading: object, height: float) -> None:

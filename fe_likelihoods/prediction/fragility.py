@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import special
 
-from ..events.ratios import EventRatios
+from ..population.ratios import EventRatios
 from ..text_tables import number, text_table
 from .prediction import Prediction
 from .reliability import Estimate, Exceedance, check_level, estimate, inputs

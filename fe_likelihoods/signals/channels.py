@@ -139,9 +139,8 @@ class Measurements:
             expect(False, "Measurements", "finite values, or NaN where one is missing", got, "repair or cut the data")
         empty = ", ".join(repr(name) for name, row in zip(names, values, strict=True) if np.isnan(row).all())
         advice = "leave these channels out (Measurements.select, or channels in a TOML file)"
-        expect(
-            not empty, "Measurements", "a sample of each channel", f"all samples of {empty} are missing (NaN)", advice
-        )
+        got = f"all samples of {empty} are missing (NaN)"
+        expect(not empty, "Measurements", "a sample of each channel", got, advice)
         values.flags.writeable = False
         steps = [check_step(dt, "the measurements") for dt in _per_channel(self.dt, len(names), "time step")]
         starts = [_check_start(start) for start in _per_channel(self.start, len(names), "start")]
@@ -331,9 +330,8 @@ def _values_array(values: Any, names: Sequence[str]) -> NDArray[np.float64]:
             raise TypeError("got complex ones; give the real part if it is the data")
         rows = [row.astype(np.float64).filled(np.nan) for row in rows]
     except (TypeError, ValueError) as error:
-        raise ValueError(
-            f"values must be real numbers, one row per channel: {error}; read tables by read_columns"
-        ) from None
+        text = f"values must be real numbers, one row per channel: {error}; read tables by read_columns"
+        raise ValueError(text) from None
     longest = max((row.size for row in rows), default=0)
     fits = len(rows) == len(names) and longest and all(row.ndim == 1 for row in rows)
     expected = f"values of shape (n_channels, n_steps) = ({len(names)}, n_steps)"

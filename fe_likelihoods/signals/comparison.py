@@ -103,10 +103,8 @@ def _check_end(measurements: Measurements, dt: float, n_steps: int) -> None:
         fits = last <= end + _LATEST * dt and stated >= end - (1.0 + _LATEST) * max(dt, *measurements.steps)
     expected = f"{n_steps} samples with a step of {dt} s up to {end:g} s, as the response has"
     got = f"{measurements.n_steps} with a step of {measurements.dt} s up to {last:g} s"
-    advice = (
-        "use the same part of record and measurements (trim in Python, duration in a TOML file), correct the step, "
-    )
-    expect(fits, "measurements", expected, got, advice + "or fill times that were not measured with NaN")
+    advice = "use the same part of record and measurements (trim in Python, duration in a TOML file), correct the step,"
+    expect(fits, "measurements", expected, got, f"{advice} or fill times that were not measured with NaN")
 
 
 def measured_values(measured: NDArray[np.float64] | Comparison) -> NDArray[np.float64]:

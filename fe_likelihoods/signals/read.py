@@ -12,10 +12,12 @@ import numpy as np
 
 from ..units import to_si
 from .channels import Channel, Measurements
+from .interpolation import uniform_times
 from .records import Record
 from .sampling import expect
 from .strong_motion import OF_OBSPY, Series, read_series, recognise
-from .tables import WORKBOOKS, agree_on_unit, read_table, uniform_times
+from .tables import read_table
+from .text_files import WORKBOOKS, agree_on_unit
 
 __all__ = ["read_columns", "read_record", "units_of"]
 
@@ -227,10 +229,8 @@ def read_columns(
         if isinstance(zero, str):
             raise ValueError(f"{path} has no clock times; give zero in seconds after its first sample, got {zero!r}")
         for other in (channel for channel in channels if channel.dimension != "acceleration"):
-            advice = "leave it out, or write its samples to a CSV file"
-            expect(
-                False, path, "accelerations, as files of this format have", f"{other.dimension} {other.name!r}", advice
-            )
+            got, advice = f"{other.dimension} {other.name!r}", "leave it out, or write its samples to a CSV file"
+            expect(False, path, "accelerations, as files of this format have", got, advice)
         options = {"dt": dt, "time": time, "time_unit": time_unit, "skip": skip, "missing": missing}
         records = [read_record(path, column, unit, resample=resample, **options) for column, _, unit, _ in wanted]
         labels = [f"{channel.name} is {record.name}" for channel, record in zip(channels, records, strict=True)]

@@ -9,7 +9,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +17,7 @@ from ..units import from_si
 from .sampling import array_digest, check_samples, check_step, expect, rest_samples, same_step, sample_window
 from .sdof import ResponseSpectrum, spectrum_of
 
-__all__ = ["DisplacementHistory", "Record", "SubdividedHistory", "growing_durations"]
+__all__ = ["DisplacementHistory", "Record", "growing_durations"]
 
 _APART = 1.3  # smallest ratio of successive durations
 _LARGEST_RATIO_TERM = 1000  # of the ratio of steps in `Record.resample`; the filter length grows with it
@@ -224,13 +223,6 @@ class Record:
         return f"{self.source}; {note}" if self.source else note
 
 
-class SubdividedHistory(NamedTuple):
-    """A refined displacement history, and the indices (n_steps,) of the original points in it."""
-
-    history: "DisplacementHistory"
-    indices: NDArray[np.intp]
-
-
 @dataclass(frozen=True, eq=False)
 class DisplacementHistory:
     """A displacement imposed step by step at the top of a laboratory specimen. It has steps but no time.
@@ -274,11 +266,11 @@ class DisplacementHistory:
         """Hex digest (BLAKE2b, 128 bits) of the displacements. Name and source are not included."""
         return array_digest(self.displacement)
 
-    def subdivide(self, max_increment: float) -> SubdividedHistory:
-        """Insert points on straight lines so that no increment exceeds `max_increment` [m].
+    def subdivide(self, max_increment: float) -> tuple["DisplacementHistory", NDArray[np.intp]]:
+        """Insert points on straight lines so that no increment exceeds `max_increment` [m]; the indices of old points.
 
-        ``history.displacement[indices]`` of the result are the original points, exactly. ValueError if the limit is not
-        a positive number.
+        The displacements of the result at these indices (n_steps,) are the given ones, exactly. ValueError if the limit
+        is not a positive number.
         """
         known, where = math.isfinite(max_increment) and max_increment > 0, f"largest increment of {self.name!r}"
         expect(known, where, "a positive length [m]", repr(max_increment))
@@ -286,7 +278,7 @@ class DisplacementHistory:
         parts = np.ceil(np.abs(np.diff(self.displacement)) / max_increment * (1 - 1e-12))
         indices = np.concatenate([[0], np.cumsum(np.maximum(parts, 1).astype(np.intp))])
         displacement = np.interp(np.arange(indices[-1] + 1), indices, self.displacement)
-        return SubdividedHistory(replace(self, displacement=displacement), indices)
+        return replace(self, displacement=displacement), indices
 
 
 def growing_durations(acceleration: NDArray[np.float64], dt: float, shares: Sequence[float]) -> tuple[float, ...]:

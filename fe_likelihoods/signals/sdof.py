@@ -75,13 +75,8 @@ def respond(
     # q_{k+1} = decay q_k - dt (constant - slope) a_k - dt slope a_{k+1}
     numerator = [-dt * slope, -dt * (constant - slope)]
     state, _ = lfilter(numerator, [1.0, -decay], base_acceleration, zi=[-numerator[0] * base_acceleration[0]])
-    relative_displacement = state.imag / damped_frequency
-    relative_velocity = (eigenvalue * state).imag / damped_frequency
-    return OscillatorResponse(
-        relative_displacement,
-        relative_velocity,
-        -2.0 * damping_ratio * angular_frequency * relative_velocity - angular_frequency**2 * relative_displacement,
-    )
+    u, v = state.imag / damped_frequency, (eigenvalue * state).imag / damped_frequency
+    return OscillatorResponse(u, v, -2.0 * damping_ratio * angular_frequency * v - angular_frequency**2 * u)
 
 
 def response_slopes(

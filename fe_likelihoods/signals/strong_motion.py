@@ -39,7 +39,8 @@ from numpy.typing import NDArray
 
 from ..units import to_si
 from .sampling import expect
-from .tables import (
+from .tables import is_clock
+from .text_files import (
     LINE_END,
     NUMBER,
     WORKBOOKS,
@@ -48,7 +49,6 @@ from .tables import (
     check_peaks,
     decimals_of,
     decode_text,
-    is_clock,
     is_number,
     number_cells,
     parse_number,
@@ -241,10 +241,8 @@ class Block(NamedTuple):
 
 def _check_peak(found: float, stated: float, tolerance: float, where: str) -> None:
     """ValueError if the stated peak is not the peak of the samples."""
-    advice = "the file is damaged, or of another form than the one that is read here"
-    expect(
-        abs(found - stated) <= tolerance, where, f"the peak of {stated:g} that the header states", f"{found:g}", advice
-    )
+    expected, advice = f"the peak of {stated:g} that the header states", "the file is damaged, or of another form"
+    expect(abs(found - stated) <= tolerance, where, expected, f"{found:g}", advice)
 
 
 def _check_step(dt: float, where: str, stated: str | None = None) -> float:
@@ -563,11 +561,8 @@ def _parse_knet(text: str, file: str) -> Series:
     names = ("Station Code", "Sampling Freq(Hz)", "Duration Time(s)", "Dir", "Scale Factor", "Max Acc (gal)")
     station, frequency, duration, direction, factor, peak = _stated(header, names, file, "a K-NET")
     rate = parse_number(re.sub(r"\s*hz$", "", frequency, flags=re.IGNORECASE), f"{file}, Sampling Freq")
-    scale, expected = (
-        _KNET_SCALE.match(factor),
-        "a positive sampling frequency and a scale factor such as '3920(gal)/6182761'",
-    )
-    expect(scale and float(scale[2]) > 0.0 and rate > 0.0, file, expected, f"{rate:g} and {factor!r}")
+    scale, known = _KNET_SCALE.match(factor), "a positive frequency and a scale factor such as '3920(gal)/6182761'"
+    expect(scale and float(scale[2]) > 0.0 and rate > 0.0, file, known, f"{rate:g} and {factor!r}")
     counts = _samples_below(lines, _KNET_TEXT, file)
     count = _whole(rate * parse_number(duration, f"{file}, Duration Time"), file, "samples")
     check_count(counts.size, count, f"{file}: frequency times duration")

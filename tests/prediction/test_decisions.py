@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from fe_likelihoods.events.hierarchical_posterior import HierarchicalPosterior, Varying
-from fe_likelihoods.events.hierarchy_result import Hierarchy
-from fe_likelihoods.events.ratios import EventRatios
-from fe_likelihoods.events.stored_posterior import StoredPosterior
 from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.likelihood.posterior import Posterior
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.noise.gaussian import GaussianNoise
+from fe_likelihoods.population.hierarchical_posterior import HierarchicalPosterior, Varying
+from fe_likelihoods.population.hierarchy_result import Hierarchy
+from fe_likelihoods.population.ratios import EventRatios
+from fe_likelihoods.population.stored_posterior import StoredPosterior
 from fe_likelihoods.prediction.fragility import fragility
 from fe_likelihoods.prediction.model_error import model_error
 from fe_likelihoods.prediction.new_event import event_ratios, predict_new_event
