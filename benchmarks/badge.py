@@ -16,7 +16,6 @@ import warnings
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -49,7 +48,6 @@ from .targets import SHARED
 __all__ = ["STRUCTURES", "Deck", "badge", "best_mode", "posterior_of"]
 
 _FOLDER = SHARED / "measured"
-_MEMBERS = ("CHAN{:d}.V2", "CHAN{:02d}.V2", "CHAN{:03d}.V2", "chan{:03d}.v2")
 _PRIOR = {
     "frequency": Uniform(0.5, 10.0),
     "damping": Uniform(0.005, 0.8),
@@ -81,7 +79,7 @@ class Deck:
         parts = BridgeDeck(*names) if len(names) == 1 else BridgeDeck(names[1], names[0], names[2])
         for path in sorted(_FOLDER.rglob(self.files)):
             numbers = (*self.inputs, *self.outputs, self.wrong)
-            found = {number: _channel(path, number) for number in numbers}
+            found = {number: read_record(path, number) for number in numbers}
             strong = np.cumsum(found[self.outputs[0]].acceleration ** 2)
             step, end = found[self.inputs[0]].dt, min((each.n_steps - 1) * each.dt for each in found.values())
             begin, late = (step * np.searchsorted(strong, share * strong[-1]) for share in (0.02, 0.98))
@@ -205,16 +203,6 @@ def _judge(event: _Event) -> tuple[Judgement, np.ndarray]:
         measured = posterior.likelihood.measurements
         found = (*check_fit(posterior, samples), *check_data(measured, list(event.model.supports)))
     return judge(found), samples.mean(axis=0)[: len(event.model.parameter_names)]
-
-
-def _channel(path: Path, number: int) -> Record:
-    reason: ValueError | None = None
-    for member in _MEMBERS:
-        try:
-            return read_record(path, number, member=member.format(number))
-        except ValueError as error:
-            reason = error
-    raise ValueError(f"{path.name}: no channel {number}: {reason}")
 
 
 def _later(values: np.ndarray, steps: int) -> np.ndarray:
