@@ -65,15 +65,6 @@ class RunResults:
         return self._result.ladder
 
     @property
-    def ended_at(self) -> float | None:
-        """Exponent beta at which the limit of simulations ended the annealing; None if it did not end it.
-
-        The last stage of `ladder` then has all points known at that time, weighted for beta = 1.
-        """
-        weighted = self._result.weighted
-        return None if weighted is None or weighted.beta >= 1.0 else weighted.beta
-
-    @property
     def log_evidence(self) -> float:
         """Log-evidence: `log_evidence_ladder` or `log_evidence_check`, whichever has the smaller error.
 

@@ -145,10 +145,7 @@ def evidence(run: FinishedRun) -> list[str]:
         return [*lines, text if check.reliable else f"{text} Its weights are too uneven to confirm anything."]
     if sampler.rounds:
         return [*lines, f"It is the mean weight of {sum(each.draws for each in sampler.rounds)} draws of a guide."]
-    why = ""
-    if sampler.ended_at is not None:
-        why = f", because the limit of simulations ended the run at beta = {sampler.ended_at:.3g}"
-    return [*lines, f"It was not checked by independent draws{why}."]
+    return [*lines, "It was not checked by independent draws."]
 
 
 def residual_sentences(fits: Sequence[Fit]) -> list[str]:

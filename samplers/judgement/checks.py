@@ -1,8 +1,8 @@
-"""What is found about runs that ended without an error but whose result may be wrong: collapsed populations, and
-evidences or shares that disagree. How often each check speaks in wrong runs and in right ones is in ``docs/results``.
+"""What is found about runs that ended without an error but whose result may be wrong: evidences or shares that
+disagree. How often each check speaks in wrong runs and in right ones is in ``docs/results``.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 
@@ -11,24 +11,20 @@ from ..estimates.importance import EvidenceCheck
 from ..estimates.weights import normalised_weights
 from ..finding import CARE, WRONG, Finding
 from ..proposals.mixture import Mixture, log_responsibilities
-from ..reports import AnnealingResult, Stage
+from ..reports import AnnealingResult
 from .clusters import find_clusters
 
 __all__ = [
     "LOST",
     "OF_MEAN",
     "OF_SHARES",
-    "check_annealing",
     "check_end",
     "check_evidence",
     "check_likelihood",
     "check_prior",
     "check_shares",
-    "check_stages",
 ]
 
-# runs with right answers ended with correlations of up to 0.8, TMCMC as published with 0.98 and more
-HIGH_CORRELATION = 0.9
 # Differences of the two log-evidences, and standard errors, from 1619 right and 297 wrong runs (docs/results).
 # The limits are soft: with one of the 33 targets left out they wander from 0.8 to 1.5 and from 0.3 to 0.45.
 WRONG_DIFFERENCE, LARGE_DIFFERENCE = 1.0, 0.8
@@ -91,35 +87,6 @@ def check_prior(coords: np.ndarray, log_prior: np.ndarray) -> list[Finding]:
         f"{log_volume:+.2g}."
     )
     return [Finding("The prior is not normalised", CARE, text, "Return -log(volume) inside the bounds instead of 0.")]
-
-
-def check_stages(stages: Sequence[Stage], nwalkers: int, ndim: int) -> list[Finding]:
-    """A finding if the last stage is collapsed, and no earlier stage was.
-
-    Collapsed: the distinct points that survived the resampling are fewer than 2 % of the walkers, or too few to span
-    the parameters.
-    """
-    *earlier, stage = stages
-    fewest = max(ndim + 2, nwalkers // 50)
-    if stage.distinct_ancestors >= fewest or any(each.distinct_ancestors < fewest for each in earlier):
-        return []
-    text = (
-        f"Collapse at stage {len(stages)} (beta = {stage.beta:.3g}): only {stage.distinct_ancestors} distinct points "
-        f"of {nwalkers} survived the resampling."
-    )
-    action = "Use more walkers, more moves or a larger ess_ratio."
-    return [Finding("The walkers have collapsed", WRONG, text, action)]
-
-
-def check_annealing(beta: float, correlation: float) -> list[Finding]:
-    """A finding if the largest correlation of the final population with its resampled start is above 0.9."""
-    if correlation <= HIGH_CORRELATION:
-        return []
-    text = (
-        f"The moves at beta = {beta:.3g} were too short: particles are still correlated ({correlation:.2f}) with their "
-        "resampled start, so copies have not separated, and modes keep the weights that the resampling gave them."
-    )
-    return [Finding("The moves were too short", CARE, text, "Use more moves (max_moves, burn_in) or longer ones.")]
 
 
 def check_evidence(

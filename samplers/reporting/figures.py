@@ -322,8 +322,6 @@ def plot_run(sampler: Any) -> "Figure":
     title = f"{sampler.evaluations} evaluations"
     if stages[-1].beta == 1.0:
         title += f", log Z = {sampler.log_evidence:.2f} ± {sampler.log_evidence_error:.2g}"
-    if sampler.ended_at is not None:
-        title += f", ended by the limit of simulations at beta = {sampler.ended_at:.3g}"
     figure.suptitle(title, fontsize="medium")
     table = np.array([(s.evaluations, *s[:3], s.distinct_ancestors, *s[5:7]) for s in stages]).T
     made, beta, ess, share, distinct, increments, errors = table

@@ -122,7 +122,7 @@ def _by_recycling(
     if found.independent:  # sweeps would cost evaluations and improve nothing
         for move in schedule.mixtures:
             move.expect_independence()
-        moved = Mutated(population, effective / len(found.coords), 0, 0.0)
+        moved = Mutated(population, effective / len(found.coords), 0)
     else:
         moved = yield from move_together(population, kernel)
     increment, error = found.log_evidence - found.log_evidence_below_one, found.log_evidence_error

@@ -93,16 +93,11 @@ class MoveSchedule(NamedTuple):
 
 
 class Mutated(NamedTuple):
-    """A population after its moves at one beta, with the acceptance over all sweeps and their number.
-
-    `correlation` is the largest one left with the resampled population; `stopped`: the limit of simulations ended the
-    moves.
-    """
+    """A population after its moves at one beta, and whether the limit of simulations `stopped` them."""
 
     population: Population
-    acceptance: float
-    moves: int
-    correlation: float
+    acceptance: float  # over all sweeps
+    moves: int  # number of sweeps
     stopped: bool = False
 
 
@@ -217,14 +212,13 @@ def move_together(
         try:
             state, accepted = move.propose(model, state)
         except BudgetExhausted:
-            share, left = (np.mean(acceptance), correlation.values[-1]) if acceptance else (0.0, 1.0)
-            return Mutated(population, float(share), made + len(acceptance), left, True)
+            return Mutated(population, float(np.mean(acceptance or 0.0)), made + len(acceptance), True)
         move.tune(state, accepted)
         correlation.update(state.coords, state.blobs)
         acceptance.append(float(np.mean(accepted)))
         population = population._replace(coords=state.coords, records=state.blobs)
         yield population, Sweep(acceptance[-1])
-    return Mutated(population, float(np.mean(acceptance)), made + len(acceptance), correlation.values[-1])
+    return Mutated(population, float(np.mean(acceptance)), made + len(acceptance))
 
 
 def grow_chains(
@@ -253,7 +247,7 @@ def grow_chains(
         try:
             state, accepted = move.propose(model, state)
         except BudgetExhausted:
-            return Mutated(population, accepted_steps / max(steps, 1), 0, 1.0, True)
+            return Mutated(population, accepted_steps / max(steps, 1), 0, True)
         move.tune(state, accepted)
         chains.coords[growing], chains.log_prob[growing] = state.coords, state.log_prob
         chains.blobs[growing] = state.blobs
@@ -263,8 +257,8 @@ def grow_chains(
         accepted_steps, steps = accepted_steps + int(np.sum(accepted)), steps + len(growing)
         yield population, Sweep(float(np.mean(accepted)))
     correlation.update(coords, records)
-    grown = Mutated(population, accepted_steps / steps, settings.burn_in + 1, correlation.values[-1])
-    if settings.burn_in == 0 or grown.correlation < settings.max_correlation:
+    grown = Mutated(population, accepted_steps / steps, settings.burn_in + 1)
+    if settings.burn_in == 0 or correlation.values[-1] < settings.max_correlation:
         return grown
     schedule.follow(ancestors)
     return (yield from move_together(population, kernel, grown.moves, correlation))

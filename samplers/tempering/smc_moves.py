@@ -16,8 +16,6 @@ from ..estimates.weights import (
     log_mean_weight,
     normalised_weights,
 )
-from ..finding import Finding
-from ..judgement.checks import check_annealing, check_stages
 from ..reports import Stage, Sweep
 from .mutation import Kernel, grow_chains, move_together
 from .next_beta import next_beta
@@ -28,13 +26,13 @@ __all__ = ["anneal_by_moves"]
 
 def anneal_by_moves(
     population: Population, n: int, kernel: Kernel
-) -> Generator[tuple[Population, Stage | Sweep | Finding], None, tuple[Population, list[Stage]]]:
+) -> Generator[tuple[Population, Stage | Sweep], None, tuple[Population, list[Stage]]]:
     """Carry evaluated draws of the prior, as many or more than the `n` points of later stages, to beta = 1.
 
     Yields the points as they are now with a report, and returns the points at beta = 1 and all stages; raises
     StoppedEarly at the limit of simulations.
     """
-    (m, ndim), (density, random, schedule, settings, visited) = population.coords.shape, kernel
+    m, (density, random, schedule, settings, visited) = len(population.coords), kernel
     target, stages, error = float(n), [], EvidenceError(m)
     while population.beta < 1.0:
         log_likelihood = population.records["log_prob"] - population.records["log_prior"]
@@ -74,8 +72,6 @@ def anneal_by_moves(
             raise stop_at(population, log_evidence, standard_error, log_evidence - increment)
         stages.append(Stage(beta, ess, moved.acceptance, moved.moves, distinct, increment, standard_error))
         yield population, stages[-1]
-        yield from ((population, finding) for finding in check_stages(stages, n, ndim))
-    yield from ((population, finding) for finding in check_annealing(population.beta, moved.correlation))
     return population, stages
 
 

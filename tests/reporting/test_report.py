@@ -114,17 +114,12 @@ def test_the_table_has_every_parameter_in_the_units_of_a_reader(page, vibrating)
     assert rows["damping"][1].startswith("TruncatedNormal, mean 1.00") and rows["damping"][1].endswith(", above 0")
 
 
-def test_a_run_that_the_limit_ended_shows_the_exponent_that_it_reached():
+def test_a_run_that_the_limit_ended_was_not_checked():
     posterior = vibration()
-    with pytest.warns(SamplingWarning, match="ended the run"):
+    with pytest.warns(SamplingWarning, match="ended the run at beta"):
         sampler = run(posterior, max_simulations=200)
-    assert sampler.ended_at is not None and sampler.ended_at < 1.0 == sampler.ladder[-1].beta
-    text = " ".join(evidence(read_run(sampler, posterior)))
-    assert "limit of simulations ended the run at beta" in text
-    figure = plot_run(sampler)
-    assert "ended by the limit" in figure.get_suptitle()
-    plt.close(figure)
-    assert run(vibration(), walkers=20, steps=1).ended_at is None
+    assert "not checked" in " ".join(evidence(read_run(sampler, posterior)))
+    plt.close(plot_run(sampler))
 
 
 def test_what_a_reader_has_to_know_is_said(page, vibrating):
