@@ -360,9 +360,8 @@ def _parsed(stored: dict[str, Any]) -> tuple[AnnealingResult, Verdict | None]:
 
 
 def _cut_chain(backend: Backend, steps: int, accepted: np.ndarray) -> None:
-    """Set a chain's number of steps and its counts of accepted proposals (nwalkers,).
-
-    What an interrupted step or allocation has left, from which emcee's backends cannot grow, is removed.
+    """Set a chain's number of steps and its counts of accepted proposals (nwalkers,), without what an interrupted step
+    or allocation has left, from which emcee's backends cannot grow.
     """
     if isinstance(backend, HDFBackend):
         with backend.open("a") as file:

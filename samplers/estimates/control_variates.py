@@ -135,9 +135,8 @@ def signed_sample(rounds: Sequence[Round], pooled: PooledRounds) -> SignedSample
 
 
 def _log_mean_squares(rounds: Sequence[Round], known_at: dict[int, np.ndarray], log_evidence: float) -> np.ndarray:
-    """Logarithms (k,) of the mean squares of the differences that draws of some of the rounds have.
-
-    `known_at` are the log-densities (n,) that these rounds, by their numbers, know at all draws.
+    """Logarithms (k,) of the mean squares of the differences that draws of some of the rounds have, whose log-densities
+    (n,) at all draws are `known_at`, by their numbers.
     """
     densities = np.concatenate([r.log_densities for r in rounds])
     log_prob, mixture = mixture_at_draws(rounds)

@@ -103,10 +103,9 @@ def draw_inside(
 
 
 def evidence_from_weights(log_weights: np.ndarray, made: int) -> EvidenceCheck:
-    """Evidence from the log-weights (n,) of the draws inside the support, out of `made` draws.
-
-    The error is from the sample variance or, if it is larger, from the variance of log-normal weights with the spread
-    of the larger half (``docs/theory/evidence``): n draws rarely contain the largest weights of a rough likelihood.
+    """Evidence from the log-weights (n,) of the draws inside the support, out of `made` draws. Its error is from their
+    variance or, if larger, from log-normal weights with the spread of the larger half: n draws rarely contain the
+    largest weights of a rough likelihood.
     """
     full = np.full(made, -np.inf)
     full[: len(log_weights)] = log_weights
@@ -230,10 +229,8 @@ def tails_are_light(rounds: Sequence[Round]) -> bool:
 
 
 def tail_variance(log_weights: np.ndarray) -> float:
-    """Variance of the log-evidence due to weights larger than all drawn ones, from log-weights (n,).
-
-    The mean excess over the largest normalised weight, by the Pareto shape, is taken as a standard error, up to 1;
-    infinite for a shape of 1 or more, or an effective sample size below 5 (``docs/theory/guided``).
+    """Variance of the log-evidence due to weights larger than all drawn ones: the mean excess over the largest, by the
+    Pareto shape, is a standard error, up to 1; infinite for a shape of 1 or an effective size below 5.
     """
     shape = tail_shape(log_weights)
     shape = SHAPE_OF_FEW if shape == np.inf else shape

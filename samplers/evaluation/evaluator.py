@@ -115,9 +115,8 @@ class Evaluator:
         return then(coords, self._records(coords, log_prior, asked))
 
     def _settle(self, coords: np.ndarray, results: Any, whole: bool) -> None:
-        """Enter what the record does not know of a `whole` batch, or of a part of it; RuntimeError for many failures.
-
-        Failures are entered when all values have arrived, since they may yet end the run.
+        """Enter what the record does not know of a `whole` batch, or of a part of it; failures are entered when all
+        values have arrived, since many of them end the run by a RuntimeError.
         """
         batch, before = self.as_batch(coords, results), self.record.knows(coords)
         rest = batch.rows(np.flatnonzero(~before))
@@ -157,7 +156,6 @@ class Evaluator:
 
     def check_failures(self, batch: EvaluatedBatch, count: int, total: int, whole: bool) -> None:
         """Raise RuntimeError if `count` of `total` evaluations with the latest `batch` have failed, and these are many.
-
         Failures may be quicker than successes, so running points count in the total, and only a `whole` batch may not
         fail as a whole.
         """

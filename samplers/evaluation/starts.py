@@ -19,10 +19,9 @@ SEED = 20_131  # separate random numbers, so that the test changes no run
 
 
 def not_of_the_prior(coords: np.ndarray, log_prior: Callable[[np.ndarray], np.ndarray]) -> str:
-    """Why points (n, ndim) cannot be draws of a density (m, ndim) -> (m,), normalised or not; empty if they can.
-
-    Each half makes steps that are differences between points in the other half; signed ranks compare the distances from
-    the mean of the other half before and after.
+    """Why points (n, ndim) cannot be draws of a density (m, ndim) -> (m,), normalised or not; empty if they can. Each
+    half makes steps by differences of the other half, and signed ranks compare distances from its mean before and
+    after.
     """
     (n, ndim), random = coords.shape, np.random.RandomState(SEED)
     if n < FEWEST_POINTS:

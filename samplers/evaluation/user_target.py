@@ -109,9 +109,8 @@ class Target:
         return found if isinstance(found, Mapping) else {}
 
     def may_be_positive(self, coords: np.ndarray) -> np.ndarray:
-        """Whether points (n, ndim) may have a positive density, (n,) bool, by the method `possible` of the function.
-
-        It knows this without a simulation; True if unknown.
+        """Whether points (n, ndim) may have a positive density, (n,) bool, by the method `possible` of the function,
+        which knows this without a simulation; True if unknown.
         """
         possible = getattr(self.function, "possible", None)
         unknown = np.ones(len(coords), dtype=bool)

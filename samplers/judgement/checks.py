@@ -45,10 +45,8 @@ LOST, OF_SHARES, OF_MEAN = "A mode may be lost", "difference of shares", "differ
 
 
 def check_likelihood(log_prob: np.ndarray, log_prior: np.ndarray) -> list[Finding]:
-    """A finding if the log-likelihood has one value at all points (n,) that a run begins with: it tells nothing.
-
-    Beside -inf, one value may be the likelihood of uniform errors, which is right: the finding is not severe; for a
-    value of 0, an indicator, there is none.
+    """A finding if the log-likelihood has one value at all points (n,) that a run begins with: it tells nothing. Beside
+    -inf, one value may be right, of uniform errors, which is not severe; a value of 0 is an indicator.
     """
     known = np.isfinite(log_prob)
     if np.count_nonzero(known) < 2:
@@ -148,10 +146,8 @@ def check_end(result: AnnealingResult, coords: np.ndarray) -> list[Finding]:
 def check_shares(
     mixture: Mixture, points: np.ndarray, founders: np.ndarray, coords: np.ndarray, log_weights: np.ndarray
 ) -> list[Finding]:
-    """A finding if a part of the posterior has different shares among final points (n, ndim) and weighted draws (m,
-    ndim).
-
-    The parts are the components of the `mixture` of the draws, which also covers points of earlier stages.
+    """A finding if a component of the `mixture` of the draws has different shares among final points (n, ndim) and
+    weighted draws (m, ndim), which cover points of earlier stages too.
     """
     if len(mixture.weights) == 1 or not np.any(log_weights > -np.inf):
         return []

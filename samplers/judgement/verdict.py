@@ -175,10 +175,8 @@ def judge(
     near: NearFailures | None = None,
     names: Sequence[str] = (),
 ) -> Verdict:
-    """Judge an annealing that has reached beta = 1.
-
-    `searched` is the part of the `simulations` made by the guide for its search; `missing_steps` at beta = 1 were not
-    allowed by the limit; `failures` says how many evaluations failed; `names` name the parameters.
+    """Judge an annealing that has reached beta = 1. `searched` of the `simulations` are of the guide's search,
+    `missing_steps` at beta = 1 were not allowed by the limit, `failures` says how many evaluations failed.
     """
     stage = result.ladder[-1]
     found = [*result.findings, *(() if near is None else check_failed_region(near))]

@@ -181,13 +181,10 @@ class MixtureMove(_FittedMove):
     def calibrate(
         self, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None, mixture: Mixture | None = None
     ) -> None:
-        """Fit the mixture to points (n, ndim) with normalised weights (n,), or take a given `mixture`.
-
-        The next sweep uses the independence kernel. The bounds of the support are determined at the first call only.
-
-        A mixture that was fitted to the points that it moves gives them a wrong spread for many sweeps: a point that
-        has widened the mixture is replaced too easily. So in 15 dimensions or more, each tenth of the points is moved
-        by a fit to the others, if `follow` says which walker descends from which point.
+        """Fit the mixture to points (n, ndim) with normalised weights (n,), or take a given `mixture`; the bounds of
+        the support are found at the first call. From 15 dimensions on, each tenth of the points is moved by a fit to
+        the others, if `follow` says which walker descends from which: a point that has widened a mixture is replaced
+        too easily.
         """
         self.is_fitted = True
         if inside is not None and self._bounds is None:
@@ -206,19 +203,16 @@ class MixtureMove(_FittedMove):
         self._part = ancestors % PARTS
 
     def cover_basins(self, coords: np.ndarray, log_target: np.ndarray) -> None:
-        """Add components for parts of the target that the fitted mixture does not cover.
-
-        `coords` (n, ndim) are points, also from earlier stages; `log_target` (n,) is scaled so that its integral is 1.
+        """Add components for parts of the target that the mixture does not cover, from points (n, ndim), also of
+        earlier stages, and the `log_target` (n,) there, scaled so that its integral is 1.
         """
         found = find_basins(self._mixture, coords, log_target)
         self._mixture = with_components(self._mixture, found)
         self._mixtures = [with_components(mixture, found) for mixture in self._mixtures]
 
     def expect_independence(self) -> None:
-        """Prefer the independence kernel, without a first sweep that shows its acceptance.
-
-        For points that are already independent draws of the target, from the same mixture. A resumed run then needs no
-        state of the move.
+        """Prefer the independence kernel, without a first sweep: the points are independent draws from the same
+        mixture.
         """
         self._current, self._independence_accepted = 0, True
 

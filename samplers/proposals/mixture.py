@@ -196,9 +196,8 @@ def fit_normals(coords: np.ndarray, effective: float, start: Mixture | None = No
 
 
 def leave_out(mixture: Mixture, coords: np.ndarray, weights: np.ndarray, parts: np.ndarray) -> list[Mixture]:
-    """Mixtures fitted without one part of the points each: one step of the fit, from a fit to all points (n, ndim).
-
-    `weights` (n,) have sum 1; `parts` (n,) are the numbers of the parts, from 0.
+    """Mixtures fitted without one part of the points each, by one step from a fit to all points (n, ndim) with weights
+    (n,) of sum 1; `parts` (n,) are numbered from 0.
     """
     points = to_component_space(mixture, coords)
     responsibilities = np.exp(log_responsibilities(mixture, coords))
@@ -281,9 +280,8 @@ def _unwhitened(mixture: Mixture, mean: np.ndarray, root: np.ndarray) -> Mixture
 def _with_heavier_tails(
     best: Mixture, best_criterion: float, white: np.ndarray, weights: np.ndarray, effective: float
 ) -> tuple[Mixture, float]:
-    """Lower the fitted degrees of freedom as long as the criterion, with one more parameter, improves.
-
-    Several components may have represented the tails of one component, so a single component is tried too.
+    """Lower the fitted degrees of freedom as long as the criterion improves, also with a single component, whose tails
+    several may have represented.
     """
     penalty = math.log(max(effective, 2.0))
     for dof in HEAVIER:

@@ -92,9 +92,8 @@ def find_support_bounds(inside: Callable[[np.ndarray], np.ndarray], coords: np.n
 
 
 def near_bounds(bounds: SupportBounds, coords: np.ndarray, weights: np.ndarray) -> SupportBounds:
-    """Keep the bounds within four standard deviations from the mean of a weighted population (n, ndim), (n,).
-
-    The scale of a single bound is the variance of the parameter divided by the distance between mean and bound.
+    """Keep the bounds within four standard deviations from the mean of a weighted population (n, ndim), (n,). The scale
+    of a single one is the variance of the parameter over the distance between mean and bound.
     """
     mean = weights @ coords
     reach = NEAR * np.sqrt(weights @ (coords - mean) ** 2)
@@ -210,9 +209,8 @@ def invert_shears(shears: Sequence[Shear], coords: np.ndarray) -> np.ndarray:
 
 def find_shears(coords: np.ndarray, weights: np.ndarray) -> tuple[Shear, ...]:
     """Find at most 2 ndim shears that remove the curvature of weighted points (n, ndim), the most curved pair first.
-
-    The squared source must explain a tenth of the target variance that the linear term leaves, and improve the Bayesian
-    information criterion, whose penalty includes the number of pairs that were searched.
+    Each must explain a tenth of the variance that the linear term leaves, and improve the Bayesian information
+    criterion for the pairs that were searched.
     """
     effective = 1.0 / (weights @ weights)
     ndim = coords.shape[1]

@@ -8,7 +8,7 @@ and resampled.
 """
 
 import logging
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator
 
 import numpy as np
 
@@ -67,21 +67,16 @@ def anneal(
                 kernel.visited.add(coords, records)
             coords, records = start.arrived_part()
             population = population._replace(coords=coords, records=records)
-            yield from _check_moves(*(yield from anneal_by_moves(population, size, kernel)), kernel)
+            population, stages = yield from anneal_by_moves(population, size, kernel)
+            log_evidence = sum(stage.log_evidence_increment for stage in stages)
+            try:
+                check, found = check_population(population, *kernel[:2], kernel.visited, log_evidence)
+            except BudgetExhausted:
+                yield population, Weighted(0, population.effective_sample_size, float("-inf"), ended=LIMIT)
+                return
+            yield from ((population, each) for each in (check, *found))
     except StoppedEarly as stop:
         yield from _finish_early(stop, size, random, 0.0 if guidance is None else guidance.budget.of_guides)
-
-
-def _check_moves(population: Population, stages: Sequence[Stage], kernel: Kernel) -> Steps:
-    """The evidence check after annealing by moves, and findings."""
-    log_evidence = sum(stage.log_evidence_increment for stage in stages)
-    try:
-        check, found = check_population(population, *kernel[:2], kernel.visited, log_evidence)
-    except BudgetExhausted:
-        yield population, Weighted(0, population.effective_sample_size, float("-inf"), ended=LIMIT)
-        return
-    yield population, check
-    yield from ((population, each) for each in found)
 
 
 def check_population(
@@ -164,7 +159,7 @@ def _from_guide(
         why = f"The rounds of the guide ended, because {found.reason}," if found.reason else LIMIT
         points = (pooled.coords, pooled.records, pooled.effective_sample_size, (), pooled.log_weights) if pooled else ()
         points = Population(1.0, *(points or (np.empty((0, 0)), np.empty(0), 0.0, (), np.empty(0))))
-        raise StoppedEarly(points, *(found.evidence if pooled else (-np.inf, np.inf)), 1.0, guided=True, why=why)
+        raise StoppedEarly(points, *(found.evidence if pooled else (-np.inf, np.inf)), guided=True, why=why)
     resampled, distinct = _resampled(pooled.coords, pooled.records, pooled.log_weights, size, random)
     schedule.calibrate(pooled.coords, coarse_weights(pooled.log_weights), density.inside)
     ess, share = pooled.effective_sample_size, found.rounds[-1].effective_share
@@ -174,8 +169,7 @@ def _from_guide(
 
 def _finish_early(stop: StoppedEarly, size: int, random: np.random.RandomState, searched: float) -> Steps:
     """Resample the known points to `size` points at beta = 1; `searched`: simulations made by guides."""
-    population = stop.population
-    log_weights = population.log_weights
+    population, log_weights = stop.population, stop.population.log_weights
     if len(log_weights) == 0 or np.max(log_weights) == -np.inf:
         search = f", besides {searched:.0f} simulations of the search by the guide" if searched > 0.0 else ""
         advice = f", or {WHERE_TO_LOOK}" if len(log_weights) > 0 else ""
@@ -184,9 +178,9 @@ def _finish_early(stop: StoppedEarly, size: int, random: np.random.RandomState, 
             f"of which has a finite log-probability{search}: there is nothing to report. Call run_mcmc again with a "
             f"larger limit (the simulations made so far are kept){advice}"
         )
-    effective, known = stop.effective_sample_size, len(log_weights)
+    effective, known, beta = population.effective_sample_size, len(log_weights), population.beta
     population, distinct = _resampled(population.coords, population.records, log_weights, size, random)
     population = population._replace(effective_sample_size=effective)
-    yield population, Weighted(known, effective, pareto_shape(log_weights), stop.beta, stop.why, stop.guided)
+    yield population, Weighted(known, effective, pareto_shape(log_weights), beta, stop.why, stop.guided)
     increment = stop.log_evidence - stop.of_stages
     yield population, Stage(1.0, effective, effective / known, 0, distinct, increment, stop.error)

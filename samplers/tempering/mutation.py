@@ -46,10 +46,9 @@ def needs_many_walkers(moves: Any) -> bool:
 
 
 def check_moves(moves: Sequence[Move], chains: str) -> None:
-    """Raise ValueError for moves that cannot move chains from leaders (setting `chains`), or do not keep the target.
-
-    ``emcee.moves.DESnookerMove`` (3.1.6 and earlier) has the exponent (ndim - 1) / 2 instead of ndim - 1 (ter Braak &
-    Vrugt 2008, doi:10.1007/s11222-008-9104-9).
+    """Raise ValueError for moves that cannot move chains from leaders (setting `chains`), and for
+    ``emcee.moves.DESnookerMove``, whose exponent (3.1.6) is half of ndim - 1 (ter Braak & Vrugt 2008,
+    doi:10.1007/s11222-008-9104-9).
     """
     if any(type(move) is DESnookerMove for move in moves):
         raise ValueError(
@@ -157,10 +156,8 @@ def _tempered_model(kernel: Kernel, beta: float) -> Model:
 
 
 class StartCorrelation:
-    """Correlation over the walkers between points (n, ndim) after resampling and their values after each sweep.
-
-    `values`: after each sweep, the largest one over all parameters and the log-likelihood, on which the next weights
-    depend.
+    """Correlation over the walkers between points (n, ndim) after resampling and after each sweep: `values` are the
+    largest over all parameters and the log-likelihood, on which the next weights depend.
     """
 
     def __init__(self, coords: np.ndarray, records: np.ndarray):
@@ -198,9 +195,7 @@ def move_together(
     population: Population, kernel: Kernel, made: int = 0, correlation: StartCorrelation | None = None
 ) -> Generator[tuple[Population, Sweep], None, Mutated]:
     """Move equally weighted points equally often, until they are nearly uncorrelated with their start; yields each
-    sweep.
-
-    Chains may have `made` moves before, with a `correlation`.
+    sweep. Chains may have `made` moves before, with a `correlation`.
     """
     beta, records = population.beta, population.records
     model = _tempered_model(kernel, beta)

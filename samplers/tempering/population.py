@@ -71,8 +71,8 @@ def check_size(nwalkers: int, ndim: int) -> None:
 
 
 class StoppedEarly(Exception):
-    """The limit of simulations has ended an annealing at `beta`; the known points have log-weights at beta = 1.
-    `of_stages` of the log-evidence was already reported, `guided` points are draws of a guide; `why` the run ended.
+    """The limit of simulations has ended an annealing; the known points have log-weights at beta = 1. `of_stages` of
+    the log-evidence was reported before, `guided` points are draws of a guide; `why` the run ended.
     """
 
     def __init__(
@@ -80,42 +80,31 @@ class StoppedEarly(Exception):
         population: Population,
         log_evidence: float,
         error: float,
-        beta: float,
         of_stages: float = 0.0,
         guided: bool = False,
         why: str = LIMIT,
     ):
         super().__init__(why)
-        self.population, self.log_evidence, self.error, self.beta = population, log_evidence, error, beta
+        self.population, self.log_evidence, self.error = population, log_evidence, error
         self.of_stages, self.guided, self.why = of_stages, guided, why
 
-    @property
-    def effective_sample_size(self) -> float:
-        """Effective sample size at beta = 1, where copies of a point count as one point."""
-        return effective_sample_size(_of_distinct_points(self.population.coords, self.population.log_weights))
 
+def stop_at(population: Population, log_evidence: float, variance: float, of_stages: float = 0.0) -> StoppedEarly:
+    """The error to be raised: points with log-weights at beta = 1, or equally weighted at `population.beta`.
 
-def _of_distinct_points(coords: np.ndarray, log_weights: np.ndarray) -> np.ndarray:
-    """Log-weights of the distinct points among (n, ndim); the weights of copies are added."""
-    distinct, owner = np.unique(coords, axis=0, return_inverse=True)
-    total = np.full(len(distinct), -np.inf)
-    np.logaddexp.at(total, owner.reshape(-1), log_weights)
-    return total
-
-
-def stop_at(population: Population, log_evidence: float, error: float, of_stages: float = 0.0) -> StoppedEarly:
-    """The error to be raised: equally weighted points at `population.beta`, weighted by the posterior.
-
-    `log_evidence` and `error` belong to the beta of the points; `of_stages` was already reported.
+    `log_evidence` and its `variance` are what the points had before these weights; `of_stages` was already reported.
     """
-    records = population.records
-    alive = records["log_prob"] > -np.inf
-    ratio = np.where(alive, records["log_prob"], 0.0) - np.where(alive, records["log_prior"], 0.0)
-    log_weights = np.where(alive, (1.0 - population.beta) * ratio, -np.inf)
-    population = population._replace(log_weights=log_weights)
-    if not alive.any():
-        return StoppedEarly(population, float("-inf"), float("inf"), population.beta, of_stages)
-    distinct = _of_distinct_points(population.coords, log_weights)
-    variance = error**2 + 1.0 / effective_sample_size(distinct) - 1.0 / len(distinct) + tail_variance(distinct)
-    total = log_evidence + log_mean_weight(log_weights)
-    return StoppedEarly(population, total, float(np.sqrt(variance)), population.beta, of_stages)
+    coords, log_weights, records = population.coords, population.log_weights, population.records
+    if log_weights is None:
+        alive = records["log_prob"] > -np.inf
+        ratio = np.where(alive, records["log_prob"], 0.0) - np.where(alive, records["log_prior"], 0.0)
+        log_weights = np.where(alive, (1.0 - population.beta) * ratio, -np.inf)
+    unique, owner = np.unique(coords, axis=0, return_inverse=True)
+    distinct = np.full(len(unique), -np.inf)  # the weights of copies are added
+    np.logaddexp.at(distinct, owner.reshape(-1), log_weights)
+    effective = effective_sample_size(distinct)
+    population = population._replace(log_weights=log_weights, effective_sample_size=effective)
+    if effective == 0.0:
+        return StoppedEarly(population, float("-inf"), float("inf"), of_stages)
+    variance = max(variance + 1.0 / effective - 1.0 / len(distinct), 0.0) + tail_variance(distinct)
+    return StoppedEarly(population, log_evidence + log_mean_weight(log_weights), float(np.sqrt(variance)), of_stages)

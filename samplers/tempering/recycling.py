@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..estimates.importance import EvidenceCheck, draw_inside, evidence_from_weights, tail_variance
+from ..estimates.importance import EvidenceCheck, draw_inside, evidence_from_weights
 from ..estimates.weights import coarse_weights, effective_sample_size, log_mean_weight, normalised_weights
 from ..judgement.rounds import doubt_recycling
 from ..proposals.basins import find_basins, with_components
@@ -22,9 +22,9 @@ from ..proposals.transforms import find_support_bounds
 from ..reports import Report, Stage, Sweep
 from .mutation import tempered_log_prob
 from .next_beta import next_beta
-from .population import Density, PendingPoints, Population, StoppedEarly, stop_at
+from .population import Density, PendingPoints, Population, stop_at
 
-__all__ = ["Recycled", "first_draws", "most_running", "recycle", "search_draws", "smallest_target", "submit_start"]
+__all__ = ["Recycled", "first_draws", "recycle", "search_draws", "submit_start"]
 
 # Wanted effective sample size at each beta (the target), as a share of the number of starting points. A small target
 # allows large steps of beta; the fresh draws of a round then restore the effective sample size.
@@ -89,7 +89,9 @@ def recycle(
     """
     first, ndim = pending.coords.shape
     left, enlarged, explored = float(search_draws(n)), 1.0, False  # draws that search for narrow modes
-    target = least = smallest_target(n, ndim)
+    numbers = ndim * (ndim + 3) / 2.0  # of a mean and a covariance
+    of_numbers = min(POINTS_PER_NUMBER * numbers, LARGEST_SHARE_KEPT * n)
+    target = least = max(TARGET_SHARE * n, POINTS_PER_DIMENSION * (ndim + 1.0), of_numbers)
     points, bounds = WeightedPoints(pending), find_support_bounds(density.inside, pending.coords)
     beta, efficiencies, increments, checks, most = 0.0, [], [], 0, 1
     drawn: list[_Drawn] = []  # at the present beta
@@ -134,7 +136,9 @@ def recycle(
 
         # fit a proposal
         mixture = fit_mixture(points.coords, coarse_weights(log_weights), MOST_COMPONENTS, bounds)
-        mixture = _with_even_share(_widened(mixture), EVEN_SHARE)
+        if len(mixture.weights) > 1 or mixture.shears:
+            mixture = mixture.widened(WIDER_VOLUME ** (1.0 / ndim))
+        mixture = _with_even_share(mixture, EVEN_SHARE)
         most = max(most, len(mixture.weights))
         target = max(least, POINTS_PER_COMPONENT * (ndim + 1.0) * most) if most > 1 else least
         finished, basins = beta == 1.0 and effective >= n, None
@@ -159,7 +163,9 @@ def recycle(
             points.update()
             if (few := len(pending.coords)) > 0:
                 points.add(mixture, made * few / len(new), pending)
-            raise _stopped_at(points, beta, sum(increments), inherited)
+            log_weights = points.log_weights(1.0)
+            known = Population(beta, points.coords, points.records, 0.0, (), log_weights)
+            raise stop_at(known, np.log(len(log_weights)), inherited, sum(increments))
         checking = finished and not exploring
         density.wait(0 if checking else most_running(density, len(new)))
         if exploring:
@@ -176,7 +182,10 @@ def recycle(
             log_evidence, error = _evidence(points.log_weights(beta), inherited)
         reason = doubt_recycling(check, log_evidence, beta, efficiencies)
         # draws that contradict a fit also improve it: check again, as long as that is cheap
-        independent = checking and not reason and _suffice(drawn, n)
+        independent = checking and not reason
+        if independent:  # are `n` points resampled from the draws as good as independent draws of the posterior?
+            weights = normalised_weights(_result(drawn, 1.0)[2])
+            independent = bool(np.minimum(n * weights, 1.0).sum() >= ENOUGH_DISTINCT * n)
         ends = independent or checks == MOST_CHECKS if checking else bool(reason)
         if ends:
             if not checking:
@@ -267,12 +276,6 @@ def _result(drawn: Sequence[_Drawn], beta: float) -> tuple[np.ndarray, np.ndarra
     return np.concatenate([c for c, _ in parts]), np.concatenate([r for _, r in parts]), np.concatenate(scaled)
 
 
-def _suffice(drawn: Sequence[_Drawn], size: int) -> bool:
-    """Whether `size` points resampled from the draws at beta = 1 are as good as independent draws of the posterior."""
-    weights = normalised_weights(_result(drawn, 1.0)[2])
-    return bool(np.minimum(size * weights, 1.0).sum() >= ENOUGH_DISTINCT * size)
-
-
 def _evidence(log_weights: np.ndarray, inherited: float) -> tuple[float, float]:
     """Log-evidence from the weights of all points, and its standard error; `inherited`: variance of earlier choices."""
     n, effective = len(log_weights), effective_sample_size(log_weights)
@@ -293,13 +296,6 @@ def submit_start(coords: np.ndarray, density: Density, whole: bool = False) -> P
     return pending
 
 
-def smallest_target(size: int, ndim: int) -> float:
-    """Wanted effective sample size of each beta with one component, for a number of starting points."""
-    numbers = ndim * (ndim + 3) / 2.0  # of a mean and a covariance
-    of_numbers = min(POINTS_PER_NUMBER * numbers, LARGEST_SHARE_KEPT * size)
-    return max(TARGET_SHARE * size, POINTS_PER_DIMENSION * (ndim + 1.0), of_numbers)
-
-
 def first_draws(size: int) -> int:
     """Number of draws of the prior that a run starts from, for a number of walkers."""
     return max(size, LEAST_DRAWS if size >= FEWEST_TO_SEARCH else 0)
@@ -316,23 +312,6 @@ def most_running(density: Density, submitted: int) -> int:
     Half the points that were submitted last must have arrived: fewer would improve a proposal too little.
     """
     return min(density.workers, submitted // 2)
-
-
-def _stopped_at(points: WeightedPoints, beta: float, of_stages: float, inherited: float) -> StoppedEarly:
-    """All points, weighted by the posterior over the mixture of their densities, at the limit of simulations."""
-    log_weights = points.log_weights(1.0)
-    n, effective = len(log_weights), effective_sample_size(log_weights)
-    known = Population(1.0, points.coords, points.records, effective, (), log_weights)
-    log_evidence = float(log_mean_weight(log_weights) + np.log(n))
-    variance = max(1.0 / effective - 1.0 / n, 0.0) + inherited + tail_variance(log_weights)
-    return StoppedEarly(known, log_evidence, float(np.sqrt(variance)), beta, of_stages)
-
-
-def _widened(mixture: Mixture) -> Mixture:
-    """The mixture with wider components, unless it is one component without shears."""
-    if len(mixture.weights) == 1 and not mixture.shears:
-        return mixture
-    return mixture.widened(WIDER_VOLUME ** (1.0 / mixture.means.shape[1]))
 
 
 def _with_even_share(mixture: Mixture, share: float) -> Mixture:

@@ -69,7 +69,7 @@ def anneal_by_moves(
             moved = yield from move_together(population, kernel)
         population = moved.population
         if moved.stopped:
-            raise stop_at(population, log_evidence, standard_error, log_evidence - increment)
+            raise stop_at(population, log_evidence, standard_error**2, log_evidence - increment)
         stages.append(Stage(beta, ess, moved.acceptance, moved.moves, distinct, increment, standard_error))
         yield population, stages[-1]
     return population, stages
