@@ -44,11 +44,12 @@ class RunResults:
         return max(len(self._record.counted), since)
 
     @property
-    def _failure_reasons(self) -> str:
-        """The most frequent reasons of failed simulations, or else of failed evaluations; empty without failures."""
-        if self._failed_simulations:
-            return self._target.failure_reasons
-        return most_common_reasons(reason for _, reason in self._record.failed)
+    def _failed(self) -> tuple[str, str]:
+        """How many simulations, or else evaluations, failed, and the most frequent reasons; empty without failures."""
+        if simulations := self._failed_simulations:
+            return f"{simulations} of {self.simulations:.0f} simulations", self._target.failure_reasons
+        reasons = most_common_reasons(reason for _, reason in self._record.failed)
+        return f"{self.failure_count} of {self.evaluations} evaluations" if self.failure_count else "", reasons
 
     @property
     def failures(self) -> list[dict]:

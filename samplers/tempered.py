@@ -416,14 +416,11 @@ class TemperedSampler(RunResults, EnsembleSampler):
     def _judge(self, missing: int, coords: np.ndarray) -> None:
         """Store the verdict on an annealing by this object, or keep the verdict of the backend."""
         if self._result.independent_points is not None or self._verdict is None:
-            failed = f"{self.failure_count} of {self.evaluations} evaluations" if self.failure_count else ""
-            if simulations := self._failed_simulations:
-                failed = f"{simulations} of {self.simulations:.0f} simulations"
             latest = self._record.latest(KEPT_POINTS)
             self._near = None if latest is None else judged_failures(latest, coords, self._target)
             numbers = self.nwalkers, self.ndim, self.simulations
             others = self._record.of_guides, self._near, tuple(self._target.names)
-            self._verdict = judge(self._result, *numbers, missing, failed, *others)
+            self._verdict = judge(self._result, *numbers, missing, self._failed[0], *others)
         else:  # an annealing that could not be made again
             self._verdict = self._verdict._replace(simulations=self.simulations)
         self._verdict = with_lost_record(self._verdict, self._lost)

@@ -109,7 +109,13 @@ class AsynchronousEvaluator(Evaluator):
         points = self._points(self._running)
         key = f"arrived of {hashlib.blake2b(points.tobytes(), digest_size=16).hexdigest()}"
         by_batch: dict[int, list[int]] = {}
-        for number in self.remember(key, lambda: [self._gather(most)])[0].tolist():
+
+        def gather() -> list[np.ndarray]:
+            while len(self._futures) > most:
+                self._collect()
+            return [np.array(sorted(self._running.keys() - self._futures.keys()), dtype=np.int64)]
+
+        for number in self.remember(key, gather)[0].tolist():
             by_batch.setdefault(id(self._running[number][0]), []).append(number)
         for numbers in by_batch.values():
             self._arrive(numbers)
@@ -117,12 +123,6 @@ class AsynchronousEvaluator(Evaluator):
     def _points(self, numbers: Iterable[int]) -> np.ndarray:
         """Running points (m, ndim) by their numbers."""
         return np.array([pending.coords[row] for pending, row in map(self._running.__getitem__, numbers)])
-
-    def _gather(self, most: int) -> np.ndarray:
-        """Numbers (m,) of the points that have arrived when `most` other points are running."""
-        while len(self._futures) > most:
-            self._collect()
-        return np.array(sorted(self._running.keys() - self._futures.keys()), dtype=np.int64)
 
     @interrupts_end_the_run()
     def _collect(self, wait: bool = True) -> None:

@@ -142,13 +142,9 @@ class Verdict(_Stored):
             shares = ", ".join(f"{mode.share:.2f} +- {mode.share_error:.2g}" for mode in self.modes)
             found = f"{len(self.modes)} modes with shares {shares}"
         run, (log_evidence, error) = self._run, self._run._result.evidence
-        failed = f"{run.failure_count} of {run.evaluations} evaluations failed"
-        if simulations := run._failed_simulations:
-            failed = f"{simulations} simulations failed"
-        elif not run.failure_count:
-            failed = "no failed evaluations"
-        if reasons := run._failure_reasons:
-            failed += f" ({shorten(reasons, LONGEST_REASON)})"
+        failed, reasons = run._failed
+        failed = f"{failed} failed" if failed else "no failed evaluations"
+        failed += f" ({shorten(reasons, LONGEST_REASON)})" if reasons else ""
         return (
             f"{self.status.capitalize()}: {found}; log-evidence {log_evidence:.2f} +- {error:.2g}; effective sample "
             f"size {self.effective_sample_size:.0f}; {failed}."

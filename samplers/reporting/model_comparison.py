@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import expit, logsumexp, ndtri
 
-from .summary import aligned, log_posterior_of, verdict_summary_of
+from .summary import aligned, is_tempered, log_posterior_of
 
 __all__ = ["ModelComparison", "compare_models"]
 
@@ -113,7 +113,9 @@ def compare_models(models: Mapping[str, Any]) -> ModelComparison:
         odds_error[k] = math.hypot(error[k], *(share * np.delete(error, k)))
     reach = ndtri(0.975) * odds_error
     shares = probability, expit(odds - reach), expit(odds + reach)
-    return ModelComparison(names, log_evidence, error, *shares, tuple(map(verdict_summary_of, models.values())))
+    known = [is_tempered(model) and model.ladder and model.iteration for model in models.values()]
+    said = (model.verdict.summary if has else "" for model, has in zip(models.values(), known, strict=True))
+    return ModelComparison(names, log_evidence, error, *shares, tuple(said))
 
 
 def _evidence(name: str, model: Any) -> tuple[float, float]:

@@ -15,7 +15,6 @@ __all__ = [
     "log_posterior_of",
     "names_of_parameters",
     "summary",
-    "verdict_summary_of",
 ]
 
 
@@ -27,13 +26,6 @@ def is_tempered(sampler: Any) -> bool:
 def log_posterior_of(sampler: Any) -> Any:
     """The user's function in a sampler (emcee wraps it); None for an object that is no sampler."""
     return getattr(getattr(sampler, "log_prob_fn", None), "f", None)
-
-
-def verdict_summary_of(sampler: Any) -> str:
-    """``sampler.verdict.summary``; empty for a pair of numbers, emcee's own sampler, or a sampler without a chain."""
-    if not (is_tempered(sampler) and sampler.ladder and sampler.iteration):
-        return ""
-    return sampler.verdict.summary
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> list[str]:

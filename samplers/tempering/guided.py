@@ -153,7 +153,8 @@ def draw_rounds(
             rounds = add_round(rounds, latest)
             pooled = pool_rounds(rounds)
             population = population._replace(effective_sample_size=pooled.effective_sample_size)
-            yield population, _report(latest, pooled)
+            shares = len(latest.coords), latest.effective_share, latest.pareto_shape
+            yield population, GuidedRound(*shares, *pooled[3:6])
             yield tick(f"round {len(rounds)}")
             outcome = _outcome(rounds, pooled, size)
         if refused or budget.refused:  # a search that was cut short goes on first, if the limit is raised
@@ -190,12 +191,6 @@ def _with_signed(outcome: RoundsOfGuide) -> RoundsOfGuide:
         relative = np.square(found.expectation().error) / np.maximum(variance, np.finfo(float).tiny)
         found = found if np.mean(relative) < 1.0 / pooled.effective_sample_size else None
     return outcome._replace(signed=found)
-
-
-def _report(last: Round, pooled: PooledRounds) -> GuidedRound:
-    """The report of a round, with all rounds before it."""
-    numbers = pooled.log_evidence, pooled.log_evidence_error, pooled.effective_sample_size
-    return GuidedRound(len(last.coords), last.effective_share, last.pareto_shape, *numbers)
 
 
 def _outcome(rounds: Sequence[Round], pooled: PooledRounds, size: int) -> RoundsOfGuide | None:
