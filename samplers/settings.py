@@ -13,7 +13,7 @@ import numpy as np
 from .emcee_names import Backend
 from .resampling import RESAMPLING
 
-__all__ = ["MOVES", "Settings", "as_whole_number", "check_arguments", "check_names", "most_moves"]
+__all__ = ["MOVES", "Settings", "as_whole_number", "check_arguments", "check_names"]
 
 # settings of annealing by moves that every sampler has
 MOVES = ("resampling", "min_moves", "max_moves", "max_correlation", "fast_sweeps", "max_failure_share")
@@ -44,7 +44,7 @@ class Settings:
         Scheme of `samplers.resampling`.
     min_moves, max_moves : int
         Smallest and largest number of ensemble sweeps per stage; equal for a fixed number. The default of `max_moves`
-        belongs to 20 parameters or fewer; samplers add 3 for each further parameter (`most_moves`).
+        belongs to 20 parameters or fewer; samplers add 3 for each further parameter.
     max_correlation : float
         Between `min_moves` and `max_moves`, moving stops once the correlations of all parameters and the log-likelihood
         with their values after the resampling are below this value, or decrease no further.
@@ -124,13 +124,6 @@ class Settings:
     def target(self, last_target: float, n_walkers: int) -> float:
         """Wanted effective sample size of a stage, from the previous target (n_walkers before the first stage)."""
         return max(self.ess_ratio * (n_walkers if self.ess_rule == "constant" else last_target), self.ess_floor)
-
-
-def most_moves(ndim: int) -> int:
-    """Default of `max_moves`: with 40 normal parameters, 7 sweeps leave means off by 0.57 standard deviations, 60 by
-    0.04.
-    """
-    return Settings.max_moves + 3 * max(ndim - 20, 0)
 
 
 def check_names(sampler: str, names: Collection[str], given: Collection[str], arguments: Collection[str]) -> None:

@@ -43,7 +43,7 @@ from .record import BudgetExhausted, EvaluatedBatch, Incomplete, RunStart, as_li
 from .reporting.progress import Progress
 from .reports import AnnealingResult, Report, Stage, warn
 from .results import RunResults
-from .settings import Settings, as_whole_number, check_arguments, check_names, most_moves
+from .settings import Settings, as_whole_number, check_arguments, check_names
 from .tempering.anneal import anneal
 from .tempering.guide import Guide, check_guide
 from .tempering.guided import Guidance, lend
@@ -146,7 +146,9 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self.log_prior_fn = target.log_prior_fn
         check_size(nwalkers, ndim)
         settings, moves = self._chosen(settings, moves, nwalkers)
-        self.settings = given = Settings(**{"max_moves": most_moves(ndim)} | settings)
+        # with 40 normal parameters, 7 sweeps leave means off by 0.57 standard deviations, 60 by 0.04
+        most_moves = Settings.max_moves + 3 * max(ndim - 20, 0)
+        self.settings = given = Settings(**{"max_moves": most_moves} | settings)
         self._given_guide, self._guide = guide, None
         self._guided: np.ndarray | None = None  # the walkers (nwalkers, ndim) as the draws of the guide have left them
         if guide is not None:

@@ -68,7 +68,50 @@ class EmulatedPosterior:
 
     def __init__(self, target: ResponseTarget, regions: Sequence[Region], random: np.random.RandomState) -> None:
         self._target, self.regions = target, list(regions)
-        self._adapt(random)
+        wide, size = self._around_runs(), min(_POOL, _NUMBERS // target.ndim)
+        scaled = []
+        for region in self.regions:
+            around = student_mixture(np.ones(1), [region.centre], [region.covariance], np.inf)
+            moved = target.scaled(region.centre + np.concatenate([around.roots[0].T, -around.roots[0].T]))
+            steps = 0.5 * (moved[: target.ndim] - moved[target.ndim :])
+            centre = target.scaled(region.centre[None])[0]
+            scaled.append(region._replace(centre=centre, covariance=steps.T @ steps))
+        given, own = self.regions, 1.0 - sum(share for _, share in wide)
+
+        def mixture(regions: Sequence[Region]) -> Mixture:
+            shares = normalised_weights(np.array([region.log_evidence for region in regions]))
+            covariances = [1.1 * region.covariance for region in regions]
+            freedom, centres = max(_FREEDOM, target.ndim), [region.centre for region in regions]
+            return student_mixture(0.9 * shares + 0.1 / len(shares), centres, covariances, freedom)
+
+        for _ in range(_ROUNDS):
+            points, coords, log_weights = self._propose([(mixture(scaled), own), *wide], _DRAWS, random)
+            self.regions = scaled
+            scaled, self.regions = self._moments(points, coords, log_weights, 1.5), given
+            if effective_sample_size(log_weights) > _SETTLED * _DRAWS:
+                break
+        parts = [(mixture(scaled), own), *wide]
+        points, self._pool, log_weights = self._propose(parts, size, random)
+        effective = effective_sample_size(log_weights)
+        for _ in range(3):
+            if effective >= _CURVED * size:
+                break
+            rows = np.argsort(-log_weights)[:_FITTED]
+            weights = tempered(log_weights[rows], 1.5 * _ENOUGH_PER_DIMENSION * target.ndim)
+            fitted = fit_mixture(points[rows], normalised_weights(weights), _COMPONENTS)
+            both = [(fitted, 0.7), *((each, 0.3 * share) for each, share in parts)]
+            proposed = self._propose(both, size, random)
+            if effective_sample_size(proposed[2]) <= effective:
+                break
+            points, self._pool, log_weights = proposed
+            effective = effective_sample_size(log_weights)
+        if not np.any(log_weights > -np.inf):
+            raise np.linalg.LinAlgError("the emulated posterior has no density")
+        self._pool[log_weights == -np.inf] = 0.0  # outside the support of the prior, coordinates are infinite
+        self.regions = self._moments(self._pool, self._pool, log_weights, 0.0)
+        self._weights = normalised_weights(log_weights)
+        self.log_evidence, self.effective_share = log_mean_weight(log_weights), effective / size
+        self.log_evidence_error = float(np.sqrt(max(1.0 / effective - 1.0 / size, 0.0)))
 
     def log_density(self, coords: np.ndarray) -> np.ndarray:
         """Logarithm of prior times emulated likelihood (n,) at coordinates (n, ndim); not normalised."""
@@ -113,52 +156,6 @@ class EmulatedPosterior:
                 region = region._replace(centre=centre, covariance=(apart * weights[:, None]).T @ apart)
             updated.append(region)
         return updated
-
-    def _adapt(self, random: np.random.RandomState) -> None:
-        wide, size, target = self._around_runs(), min(_POOL, _NUMBERS // self._target.ndim), self._target
-        scaled = []
-        for region in self.regions:
-            around = student_mixture(np.ones(1), [region.centre], [region.covariance], np.inf)
-            moved = target.scaled(region.centre + np.concatenate([around.roots[0].T, -around.roots[0].T]))
-            steps = 0.5 * (moved[: target.ndim] - moved[target.ndim :])
-            centre = target.scaled(region.centre[None])[0]
-            scaled.append(region._replace(centre=centre, covariance=steps.T @ steps))
-        given, own = self.regions, 1.0 - sum(share for _, share in wide)
-
-        def mixture(regions: Sequence[Region]) -> Mixture:
-            shares = normalised_weights(np.array([region.log_evidence for region in regions]))
-            covariances = [1.1 * region.covariance for region in regions]
-            freedom, centres = max(_FREEDOM, target.ndim), [region.centre for region in regions]
-            return student_mixture(0.9 * shares + 0.1 / len(shares), centres, covariances, freedom)
-
-        for _ in range(_ROUNDS):
-            points, coords, log_weights = self._propose([(mixture(scaled), own), *wide], _DRAWS, random)
-            self.regions = scaled
-            scaled, self.regions = self._moments(points, coords, log_weights, 1.5), given
-            if effective_sample_size(log_weights) > _SETTLED * _DRAWS:
-                break
-        parts = [(mixture(scaled), own), *wide]
-        points, self._pool, log_weights = self._propose(parts, size, random)
-        effective = effective_sample_size(log_weights)
-        for _ in range(3):
-            if effective >= _CURVED * size:
-                break
-            rows = np.argsort(-log_weights)[:_FITTED]
-            weights = tempered(log_weights[rows], 1.5 * _ENOUGH_PER_DIMENSION * target.ndim)
-            fitted = fit_mixture(points[rows], normalised_weights(weights), _COMPONENTS)
-            both = [(fitted, 0.7), *((each, 0.3 * share) for each, share in parts)]
-            proposed = self._propose(both, size, random)
-            if effective_sample_size(proposed[2]) <= effective:
-                break
-            points, self._pool, log_weights = proposed
-            effective = effective_sample_size(log_weights)
-        if not np.any(log_weights > -np.inf):
-            raise np.linalg.LinAlgError("the emulated posterior has no density")
-        self._pool[log_weights == -np.inf] = 0.0  # outside the support of the prior, coordinates are infinite
-        self.regions = self._moments(self._pool, self._pool, log_weights, 0.0)
-        self._weights = normalised_weights(log_weights)
-        self.log_evidence, self.effective_share = log_mean_weight(log_weights), effective / size
-        self.log_evidence_error = float(np.sqrt(max(1.0 / effective - 1.0 / size, 0.0)))
 
     def _propose(
         self, parts: Sequence[tuple[Mixture, float]], n: int, random: np.random.RandomState

@@ -128,12 +128,6 @@ class ResponseTarget:
         """Structural parameters (n, n_structural) at coordinates (n, n_structural)."""
         return self.parameters(np.pad(coords, ((0, 0), (0, self.n_noise))))[:, : self.n_structural]
 
-    def _noise_parameters(self, coords: np.ndarray) -> np.ndarray:
-        """Noise parameters (n, n_noise) at coordinates (n, n_noise)."""
-        if not self.n_noise:
-            return coords
-        return self.parameters(np.pad(coords, ((0, 0), (self.n_structural, 0))))[:, self.n_structural :]
-
     def coordinates(self, parameters: np.ndarray) -> np.ndarray:
         """Coordinates (n, ndim) of parameters (n, ndim), finite also where these were rounded to a bound."""
         coords = self._prior.to_normal(parameters)
@@ -255,7 +249,9 @@ class ResponseTarget:
 
     def log_likelihood(self, statistics: np.ndarray, coords: np.ndarray) -> np.ndarray:
         """Log-likelihood (n,) of statistics (n, n_numbers) at coordinates (n, n_noise) of the noise parameters."""
-        return self.data.log_likelihood(statistics, self._noise_parameters(coords))
+        if self.n_noise:
+            coords = self.parameters(np.pad(coords, ((0, 0), (self.n_structural, 0))))[:, self.n_structural :]
+        return self.data.log_likelihood(statistics, coords)
 
     def fit_noise(self, statistics: np.ndarray, start: np.ndarray | None = None) -> NoiseFit:
         """Noise parameters that fit statistics (n_numbers,) best: nothing is simulated.
