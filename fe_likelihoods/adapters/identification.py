@@ -31,8 +31,8 @@ def read_modal_data(
     source : path, or result of an identification
         * A CSV file, a text file or a workbook with a header line and a line for each mode: a column ``frequency`` with
           its unit, such as ``frequency_Hz``; optional columns ``mode`` (its number), ``damping``, ``frequency_std``,
-          ``temperature`` [°C] and ``set`` or ``date`` (the identification, where there are several). All other columns
-          of numbers are sensors. German names are read too, and French, Italian and Spanish ones of the frequency.
+          ``temperature`` [°C], and ``set``, or ``date`` and ``time`` (the identification, where there are several). All
+          other columns of numbers are sensors. German names are read too; French, Italian, Spanish ones of frequency.
         * Frequencies alone with a line for each identification: ``f1_Hz``, ``f2_Hz``, ... and ``temperature``.
         * A MATLAB file (``.mat``, up to version 7.2) with the `variables`, the modes in the columns of the shapes.
         * An algorithm of pyOMA2 or its result, after the choice of the modes: ``Fn``, ``Phi``, ``Xi``, ``Fn_std``.

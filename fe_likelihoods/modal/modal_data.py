@@ -27,10 +27,11 @@ _KINDS = {
     "deviation": r"(f|fn|freq|frequency)[ _]std",
     "damping": r"damping|d[äa]e?mpfung|zeta|xi",
     "temperature": r"temp\.?|temp[eé]ratur[ea]?|t[ _]?(°c|degc|[\[(]?c[\])]?)|.*[\[(](°c|degc)[\])]",  # not a T alone
-    "set": r"set|identification|date|datum|messung",
-    "mode": r"mode([ _]no\.?)?|nr\.?|no\.?",
+    "set": r"set|identification|messung",
+    "time": r"date|datum|fecha|(date[ _]?)?time|timestamp|zeit(stempel|punkt)?|uhrzeit|heure|hora",
+    "mode": r"(eigen)?(mode|modus|modo|form)n?[ _-]?(no\.?|nr\.?|number|nummer|#)?|nr\.?|no\.?",
 }
-_NO_SENSOR = re.compile(r"\b(re|im|real|imag|mag|phase|angle|mac|mpc|order|std|sd|cv|period|factor)\b|[|<∠]", re.I)
+_NO_SENSOR = r"\b(re(al)?|im(ag)?|mag|phase|angle|mac|mpc|order|\w*ordnung|poles|index|std|sd|cv|period|factor)\b|[|<∠]"
 _OF_MODE = re.compile(r"(?:fn?|freq|frequency|frequenz)[ _]?(\d+)(?:_hz)?\s*(?:[\[(].*)?", re.I)  # a column for each
 
 
@@ -293,7 +294,7 @@ def read_mode_table(path: str | Path, sensors: Sequence[str], unit: str | None, 
     kinds = ["" if column.name in sensors else _kind(column.name) for column in table.columns]
     at = {kind: kinds.index(kind) for kind in _KINDS if kind in kinds}
     of_modes = {k: match for k, each in enumerate(table.columns) if (match := _OF_MODE.fullmatch(each.name))}
-    if not ("frequency" in at or of_modes) or max(map(kinds.count, at), default=0) > 1:
+    if not ("frequency" in at or of_modes) or max(map(kinds.count, at.keys() - {"time"}), default=0) > 1:
         raise ValueError(
             f"{table.file}: expected one column of frequencies, such as frequency_Hz, and at most one of "
             f"{', '.join(_KINDS)}; the columns are {', '.join(column.name for column in table.columns)}"
@@ -303,7 +304,8 @@ def read_mode_table(path: str | Path, sensors: Sequence[str], unit: str | None, 
     if "frequency" not in at:  # a line for each identification
         frequencies = np.stack([_in_hertz(table, place, unit) for place in of_modes], axis=1)
         return ModalData(frequencies, mode_numbers=[int(each[1]) for each in of_modes.values()], **found | options)
-    columns = _sensor_columns(table, [k for k, kind in enumerate(kinds) if not kind], sensors)
+    others = [k for k, kind in enumerate(kinds) if not kind and (k or table.columns[k].name)]  # 0: names of the rows
+    columns = _sensor_columns(table, others, sensors)
     lines = pd.concat([lines, pd.DataFrame({k: column.values for k, column in enumerate(columns)})], axis=1)
     lines["frequency"] = _in_hertz(table, at["frequency"], unit)
     if "deviation" in at:  # the mean square of several identifications
@@ -311,8 +313,9 @@ def read_mode_table(path: str | Path, sensors: Sequence[str], unit: str | None, 
         lines["square"] = np.square(_si(table, at["deviation"], "frequency", usual) / lines["frequency"])
     if "damping" in at:
         lines["damping"] = _si(table, at["damping"], "dimensionless", "1")
-    day = table.columns[at["set"]] if "set" in at else None
-    lines["set"] = 0 if day is None else day.cells if day.kind == "text" else day.values
+    days = [table.columns[k] for k, kind in enumerate(kinds) if kind == ("set" if "set" in at else "time")]
+    cells = [each.values if each.kind == "number" else each.cells for each in days]
+    lines["set"] = pd.factorize(np.array([*map(repr, zip(*cells, strict=True))]))[0] if days else 0
     counted = 1.0 + np.arange(len(lines)) if lines["set"].nunique() == 1 else np.nan  # which mode was missed?
     lines["mode"] = table.columns[at["mode"]].values if "mode" in at else counted
     if lines.duplicated(["set", "mode"]).any() or (lines["mode"] % 1 != 0).any():
@@ -348,7 +351,7 @@ def _sensor_columns(table: Table, others: Sequence[int], sensors: Sequence[str])
     if unknown := [name for name in sensors if name not in columns]:
         raise ValueError(f"{table.file}: no columns {', '.join(unknown)}; the sensors are {', '.join(columns)}")
     units = {table.stated_unit(k, "dimensionless") for k in others if table.columns[k].name in columns}
-    doubtful = any(_NO_SENSOR.search(name.replace("_", " ")) for name in columns)
+    doubtful = any(re.search(_NO_SENSOR, name.replace("_", " "), re.I) for name in columns)
     if not sensors and (doubtful or len(units) > 1):
         raise ValueError(
             f"{table.file}: some of the columns {', '.join(columns)} may be no components of real shapes (other units, "

@@ -260,7 +260,8 @@ class Prediction:
         if self.ratios is not None:
             noise = f"of measured values, by the ratios of {len(self.ratios.values)} events"
         noise += "" if self.from_state == "virgin" else f", from_state={self.from_state!r}"
-        title = "Prediction" if self.dt is None else "Prediction of histories"
+        along = "of histories" if self.data is None else f"along {self.data.axis!r}"
+        title = "Prediction" if self.dt is None else f"Prediction {along}"
         size = f"effective sample size {self.effective_sample_size:.0f}"
         lines = [f"{title}: {self.n_samples} samples, {noise}; {size}"]
         if self.ratios is not None:
@@ -273,11 +274,12 @@ class Prediction:
         lines += labelled(self.findings)
         known = [(c.name, c.unit, find_unit(c.unit, c.dimension).factor) for c in self.channels]
         if self.dt is not None:
-            rows = [("channel", "unit", "largest mean", "at [s]", "its sd", "mean sd")]
+            rows = [("channel", "unit", "largest mean", "at" if self.data else "at [s]", "its sd", "mean sd")]
             for (name, unit, factor), mean, sd in zip(known, self.mean, self.sd, strict=True):
                 at = int(np.argmax(np.abs(mean)))
-                numbers = mean[at] / factor, at * self.dt, sd[at] / factor, sd.mean() / factor
-                rows.append((name, unit, *map(number, numbers)))
+                place = f"{self.data.points[at]}" if self.data else number(at * self.dt)
+                largest, *others = (number(each / factor) for each in (mean[at], sd[at], sd.mean()))
+                rows.append((name, unit, largest, place, *others))
         elif self.mean.size > _MOST_ROWS:
             lines.append(f"{self.mean.size} values of shape {self.mean.shape}: mean, sd and quantiles are attributes")
             return "\n".join(lines)

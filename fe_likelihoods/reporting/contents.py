@@ -96,7 +96,8 @@ def _finding(rows: list[ParameterRow], fits: Sequence[Fit]) -> str:
         ratio, best = min(known)
         found = f"The data inform {best} most: its standard deviation is {100.0 * ratio:.2g} % of its prior value"
     errors = [(each.before, each.after) for fit in fits for each in fit.channels]
-    assured = [f"{low:.3f} to {high:.3f}" for low, high in map(_assurance, fits) if np.isfinite(low)]
+    ends = [[f"{each:.3f}" for each in pair] for pair in map(_assurance, fits) if np.isfinite(pair).all()]
+    assured = [" to ".join(dict.fromkeys(each)) for each in ends]
     if assured:
         fit = f"the MAC of the measured modes is {' and '.join(assured)}"
         found = f"{found}; {fit}" if found else f"T{fit[1:]}"

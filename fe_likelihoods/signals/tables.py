@@ -47,11 +47,13 @@ from .text_files import (
 __all__ = ["Column", "Table", "is_clock", "read_table", "unit_in_name"]
 
 # clock times ----------------------------------------------------------------------------------------------------------
-# 03:19:53.010, 2019-07-06T03:19:53.010Z or 06.07.2019 03:19:53 PM, and dates: the year is first, or last after points.
+# 03:19:53.010, 2019-07-06T03:19:53.010Z or 06.07.2019 03:19 PM, and dates: the year is first, or last after points.
+# Without a date, 03:19 may be minutes and seconds.
 
 _DATE = r"(?P<first>\d{1,4})(?P<mark>[-/.])(?P<month>\d{1,2})(?P=mark)(?P<last>\d{1,4})"
 _AFTER = r"(?:[ \u00a0\u202f]?(?:([AP])\.?M\.?|(Z|UTC|[-+]\d{2}:?\d{2})))?"
-_CLOCK = re.compile(rf"(?:{_DATE}(?:T| +))?(\d{{1,2}}):([0-5]\d):([0-5]\d)(?:[.,](\d+))?{_AFTER}", re.IGNORECASE)
+_TIME_OF_DAY = r"(\d{1,2}):([0-5]\d)(?::([0-5]\d)(?:[.,](\d+))?)?"
+_CLOCK = re.compile(rf"(?:{_DATE}(?:T| +)|(?=\d+:\d+:)){_TIME_OF_DAY}{_AFTER}", re.IGNORECASE)
 _DAY_ONLY = re.compile(_DATE)
 # Letters of day, month, year, hour and second in English, German, French, Spanish and Italian, each part once or more
 _DATE_FORMAT = re.compile(
@@ -91,7 +93,7 @@ def _parse_clock(cell: str, where: str) -> ClockTime:
     hours = int(hour) % 12 + 12 * (half in ("P", "p")) if half else int(hour)
     if zone is not None:  # minutes of a time zone such as +02:00; Z and UTC are zero
         zone = 0 if zone.upper() in ("Z", "UTC") else int(f"{zone[0]}1") * (60 * int(zone[1:3]) + int(zone[-2:]))
-    seconds = float(f"{_HOUR * hours + 60 * int(minute) + int(second)}.{fraction or 0}")
+    seconds = float(f"{_HOUR * hours + 60 * int(minute) + int(second or 0)}.{fraction or 0}")
     year, day, number = found["first"], found["last"], None
     if year is not None:
         certain = len(year) == 4 or (found["mark"] == "." and len(day) == 4)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fe_likelihoods import Channel, FELikelihood, Posterior, Uniform, to_si
+from fe_likelihoods import Channel, FELikelihood, Posterior, Uniform, propagate, to_si
 from fe_likelihoods.modal.load_cases import LoadTest, read_load_test
 
 CHANNELS = Channel("midspan", "displacement", "mm"), Channel("bottom", "strain", "microstrain")
@@ -24,6 +24,8 @@ def test_the_posterior_of_a_flexibility_is_normal():
     x = mean + np.array([0.0, 1.0, -2.0]) / np.sqrt(precision)
     logs = posterior(x[:, None])
     np.testing.assert_allclose(logs - logs[0], [0.0, -0.5, -2.0], atol=1e-9)
+    printed = str(propagate(posterior, x[:, None], progress=False))
+    assert "Prediction along 'load case'" in printed and "four trucks" in printed and "[s]" not in printed
 
 
 @pytest.mark.parametrize(

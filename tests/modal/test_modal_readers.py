@@ -40,6 +40,9 @@ def test_a_table_has_a_line_for_each_mode(tmp_path):
         ("Fréquence (Hz),a,b,c", "1,1,2,3", "3,-2,-1,2"),
         ("f [Hz],a,b,c,remark", "1,1,2,3,good", "3,-2,-1,2,poor"),
         ("Mode,omega [rad/s],zeta [%],a,b,c", "1,6.283185307179586,1,1,2,3", "2,18.84955592153876,1,-2,-1,2"),
+        ("time,f [Hz],a,b,c", "2021-01-01 08:00,1,1,2,3", "2021-01-01 08:00,3,-2,-1,2"),
+        (",Mode number,f [Hz],a,b,c", "first,1,1,1,2,3", "second,2,3,-2,-1,2"),  # names of the rows
+        ("Modennummer;f [Hz];a;b;c", "1;1,0;1;2;3", "2;3,0;-2;-1;2"),
     ],
 )
 def test_other_layouts_of_a_table(lines, tmp_path):
@@ -84,6 +87,7 @@ def test_errors_and_what_is_no_sensor(tmp_path):
         ("mode,f_Hz,a", "first bending,2.0,0.5", "whole numbers in the column of modes"),
         ("frequency_Hz,omega_rad/s,a", "1.0,6.3,1", "one column of frequencies"),
         ("f_Hz,error_Hz,a", "1.0,0.1,1", "other units"),
+        ("Ordnung,f_Hz,a", "12,1.0,1", "give those that are sensors"),  # of the mode, or of the identified system
     ],
 )
 def test_columns_that_are_no_modes_are_refused(head, row, text, tmp_path):
@@ -113,6 +117,17 @@ def test_a_table_of_several_identifications(tmp_path):
     assert data.n_sets == 2 and data.frequencies.tolist() == [[1.0, 3.0], [1.1, 3.1]]
     missed = read_modal_data(written(tmp_path, head, "1,1,1.0,1,2", "1,2,3.0,1,-1", "2,2,3.1,1,-1"))
     assert np.isnan(missed.frequencies[1, 0]) and missed.has_shape.tolist() == [[True, True], [False, True]]
+    for head, stamp in (
+        ("timestamp", "2021-01-01 {:02}:00"),
+        ("Zeit", "01.01.2021 {:02}:00"),
+        ("date,time", "2021-01-01,{:02}:00:00"),
+        ("set,time", "{},2021-01-01 08:00"),
+    ):
+        lines = f"{stamp},1,1.0,1,2", f"{stamp},2,3.0,1,-1"
+        rows = [line.format(hour) for hour in (9, 10, 11) for line in lines]
+        data = read_modal_data(written(tmp_path, f"{head},mode,frequency_Hz,a,b", *rows[:-1]))
+        assert data.sensors == ("a", "b") and data.frequencies[:2].tolist() == [[1.0, 3.0], [1.0, 3.0]]
+        assert np.isnan(data.frequencies[2, 1])  # missed at 11:00
     with pytest.raises(ValueError, match="a column 'set'"):
         read_modal_data(written(tmp_path, "mode,frequency_Hz,a,b", "1,1.0,1,2", "1,1.1,1,2"))
     lines = "1,1.0,1,2", "1,3.0,1,-1", "2,3.1,1,-1"  # the second identification has missed mode 1
@@ -125,7 +140,8 @@ def test_a_table_of_days(tmp_path):
     days = "date,temperature_C,f1_Hz,f3_Hz", "2021-01-02,5,1.0,3.0", "2021-02-01,12,0.99,"
     modes = "date,mode,f_Hz,T_C", "2021-01-02,1,1.0,5", "2021-01-02,3,3.0,5", "2021-02-01,1,0.99,12"
     german = "Datum;Temperatur [°C];f1 [Hz];f3 [Hz]", "02.01.2021;5;1,00;3,00", "01.02.2021;12;0,99;"
-    for lines in (days, modes, german):
+    minutes = "time,temperature_C,f1_Hz,f3_Hz", "2021-01-02 08:00,5,1.0,3.0", "2021-02-01 09:30,12,0.99,"
+    for lines in (days, modes, german, minutes):
         data = read_modal_data(written(tmp_path, *lines))
         np.testing.assert_array_equal(data.frequencies, [[1.0, 3.0], [0.99, np.nan]])
         assert data.temperatures.tolist() == [5.0, 12.0] and data.mode_numbers == (1, 3)

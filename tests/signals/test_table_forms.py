@@ -94,6 +94,8 @@ def test_clock_times_begin_at_the_zero_of_the_record(path):
     assert read_columns(path, (TOP,), ("acc_g",), zero="2019-12-31T23:59:59").start == 2.0
     with pytest.raises(ValueError, match="the times have no time zone; give zero='2020-01-01T00:00:00Z' without one"):
         read_columns(path, (TOP,), ("acc_g",), zero="2020-01-01T00:00:00Z")
+    path.write_text("Time,acc_g\n2020-01-01 08:00,1\n2020-01-01 08:10,2\n")  # minutes, with a date
+    assert read_columns(path, (TOP,), ("acc_g",), zero="2020-01-01 07:50").start == 600.0
     path.write_text("Time,acc_g\n2020-01-01T00:00:01+02:00,1\n2020-01-01T00:00:02+02:00,2\n")
     for zero in ("2020-01-01T00:00:00", "2019-12-31T22:00:00Z", "2019-12-31 17:00:00-0500"):
         assert read_columns(path, (TOP,), ("acc_g",), zero=zero).start == 1.0
@@ -119,6 +121,7 @@ def test_clock_times_begin_at_the_zero_of_the_record(path):
         ("13:00:00 PM,1\n13:00:01 PM,2\n", "line 2: .* hours from 1 to 12, got '13:00:00 PM'"),
         ("0:00:00 AM,1\n0:00:01 AM,2\n", "line 2: .* hours from 1 to 12, got '0:00:00 AM'"),
         ("11:59:59 AM,1\n12:00:00,2\n", "expected AM or PM in all clock times or in none"),
+        ("03:19,1\n03:20,2\n", "line 2: expected a number, or a clock time such as"),  # or minutes and seconds
         ("99:00:00,1\n99:00:01,2\n", "line 2: .*hours from 0 to 23, got '99:00:00'"),
     ],
 )
