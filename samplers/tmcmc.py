@@ -28,25 +28,12 @@ class TMCMCSampler(TemperedSampler):
     nwalkers, ndim, log_prob_fn, ..., log_prior_fn, log_likelihood_fn, guide, max_simulations, seed
         As in `samplers.tempered.TemperedSampler`, in the same order. By default `moves` is
         `samplers.moves.population_moves.MixtureMove`.
-    ess_ratio : float, default 0.5
-        Wanted effective sample size of each stage, relative to the walkers: 1 / (1 + c²) for a coefficient of variation
-        c of the weights.
     chains : {"leaders", "equal"}
-        With "leaders", the default, a chain grows from each distinct resampled point, one step per copy of it. With
-        "equal", every resampled point is moved equally often, in one batch, which keeps a pool busy. It is the default
-        with moves of emcee that need many walkers, such as the stretch move.
+        As in `samplers.settings.Settings`. By default "leaders", but "equal" with moves of emcee that need many
+        walkers, such as the stretch move; "equal" moves all points in one batch, which keeps a pool busy.
     burn_in : int, default 4
         Steps of a chain before its points count; with "leaders" only. With 0, the algorithm is as published.
-    min_moves : int, default 2
-        Smallest number of ensemble sweeps per stage. With "leaders", sweeps are made only if the chains have left the
-        points correlated with the resampled points.
-    max_moves : int, default 7
-        Largest number of these sweeps; equal to `min_moves` for a fixed number. By default 3 more for each parameter
-        beyond 20.
-    max_correlation : float, default 0.15
-        Between `min_moves` and `max_moves`, moving stops once the correlation with the resampled points is below this
-        value.
-    resampling, fast_sweeps, max_failure_share
+    ess_ratio, resampling, min_moves, max_moves, max_correlation, fast_sweeps, max_failure_share
         As in `samplers.settings.Settings`.
 
     Raises

@@ -140,21 +140,13 @@ class MixtureMove(_FittedMove):
     """Three kernels from one Student t mixture fitted to the stage; each sweep chooses one kernel at random.
 
     independence
-        Draws from the mixture (`samplers.proposals.mixture`). They cross between modes, and replace most of the
-        ensemble when the mixture fits well. Half of all sweeps use this kernel, or 80 % while its acceptance is above
-        a half. A draw outside the support of the prior is repeated before it is evaluated: the
-        proposal is the mixture truncated to the support.
+        Draws from the mixture, truncated to the support of the prior, which cross between modes. The first sweep after
+        each calibration uses this kernel, as half of all sweeps do, or 80 % while its acceptance is above a half.
     local walk
-        Random walk with the covariance of one component. The component is drawn from the responsibilities of the
-        components for the current point; the acceptance contains the ratio of its responsibilities after and before the
-        step, which makes the kernel reversible.
+        Random walk with the covariance of one component, drawn from the responsibilities for the current point.
     differences
-        Differential evolution: a step along the difference of two points from the previous stage, drawn by their
-        weights. One step in ten is the whole difference, which leads from mode to mode. The two points come from the
-        stage that the move was calibrated on, so a step does not depend on the ensemble that is being moved.
-
-    The first sweep after each calibration uses the independence kernel. The scales of the last two kernels are adapted
-    by ``tune``.
+        Differential evolution: a step along the difference of two points of the stage that the move was calibrated on,
+        drawn by their weights. One step in ten is the whole difference, which leads from mode to mode.
 
     References
     ----------
