@@ -1,16 +1,8 @@
 """Emulator of the response near a mode: principal components of simulated residuals, a Gaussian process for each.
 
-The residual, measured minus response, at structural parameters u is r(u) = r_0 + sum_k c_k(w) P_k, with the mean r_0 of
-the training residuals, their principal components P_k in units of the noise, and coefficients c_k that a Gaussian
-process predicts from the whitened parameters w (`fe_likelihoods.emulation.gaussian_process`). A response is a smooth
-function of the parameters even where its misfit, summed over thousands of samples, is narrow and curved. With means m_k
-of the coefficients, the statistics of the mean residual are, with the bilinear form B of the statistics,
-
-    S(m) = S(r_0) + 2 sum_k m_k B(r_0, P_k) + sum_kl m_k m_l B(P_k, P_l).
-
-The emulated likelihood is the one of this mean. The variances of the process are not used: in 12 runs on four problems
-of ``benchmarks few_simulations``, a likelihood that is expected over them needed as many simulations in the mean, with
-equal evidences. Where a response jumps by the noise, it excluded fewer of the simulations that were made.
+A response is a smooth function of the parameters even where its misfit, summed over thousands of samples, is narrow and
+curved. The emulated likelihood is the one of its mean, in closed form (``docs/theory/guided``, which also says why
+variances of the process are not used).
 
 Reference: Higdon, Gattiker, Williams & Rightley (2008), J. Am. Stat. Assoc. 103(482), doi:10.1198/016214507000000888.
 """

@@ -1,16 +1,9 @@
-"""A guide to the posterior: draws near it, and their density, from few simulations.
+"""A guide to the posterior: draws near it, and their density, from few simulations (``docs/theory/guided``).
 
-`ResponseGuide` has the methods that a sampler of the package `samplers` expects of a guide. Its draws come from
-
-    q = (1 - a - b - c) q_e + a q_t + b prior + c q_w,
-
-the emulated posterior q_e (`fe_likelihoods.emulation.density`), a wide t mixture q_t around the modes, and the prior.
-q_t and the prior bound the weights posterior / q where the emulator is wrong or does not reach. Before there are enough
-runs for an emulator, q_e is absent. Every simulation, including the search for modes, trains the emulators. Where the
-response has jumps, no smooth emulator describes it: after a round with uneven weights, a share c comes from a mixture
-q_w fitted to all weighted draws.
-
-The equations are on the page ``docs/theory/guided.rst``.
+Draws come from the emulated posterior q_e (absent before there are enough runs), and, which bounds weights where the
+emulator is wrong or does not reach, from a wide t mixture q_t around the modes and the prior. Every simulation,
+including the search, trains the emulators. Where the response has jumps, no smooth emulator describes it: after a round
+with uneven weights, a share comes from a mixture q_w fitted to all weighted draws.
 """
 
 import copy

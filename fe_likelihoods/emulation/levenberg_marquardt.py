@@ -1,13 +1,6 @@
 """Levenberg-Marquardt on the responses: ascents to modes, run side by side, with derivatives from all their runs.
 
-The log-density in the coordinates of `fe_likelihoods.emulation.target` is log L(S(r)) - z.z / 2 with residuals r that
-enter the log-likelihood through quadratic statistics S. With J = dr/dz and f = d log L / dS at the noise parameters
-that fit best, its gradient and its Gauss-Newton Hessian are::
-
-    g = 2 sum_a f_a B_a(J, r) - z,        H = -2 sum_a f_a B_a(J, J) + 1,
-
-where B_a is the bilinear form of S_a. A step solves (H + lambda diag H) dz = g (Levenberg 1944, Quarterly of Applied
-Mathematics 2, 164-168; Marquardt 1963, Journal of the Society for Industrial and Applied Mathematics 11, 431-441).
+Gradient, Gauss-Newton Hessian and step in standard normal coordinates are on the page ``docs/theory/guided``.
 """
 
 from collections.abc import Generator

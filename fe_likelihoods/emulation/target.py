@@ -1,12 +1,7 @@
 """The posterior as modes and emulators need it: standard normal coordinates, responses, statistics, noise.
 
 In the coordinates z of `Prior.from_normal` the prior is the standard normal, so bounds need no attention, the prior is
-part of the least squares (its residuals are z), and every parameter has the same scale. The density of the posterior in
-these coordinates is
-
-    log p(z) = log phi(z) + log L(S(y - R(z)), eta(z)),
-
-with the response R at the structural parameters, the statistics S of the residuals, and the noise parameters eta.
+part of the least squares (its residuals are z), and every parameter has the same scale.
 """
 
 import copy
