@@ -18,7 +18,7 @@ import numpy as np
 from ..checks.finding import labelled
 from ..population.ratios import EventRatios
 from ..prediction.prediction import Prediction
-from ..prediction.reliability import Exceedance, check_level, estimate, outcomes, warn_of_missing_error
+from ..prediction.reliability import Exceedance, estimate, outcomes, warn_of_missing_error
 from ..priors.distributions import Distribution
 from ..text_tables import text_table
 from ..units import DIMENSIONS, find_unit, from_si
@@ -144,7 +144,7 @@ def damage(
     *,
     ratios: EventRatios | Mapping[str, EventRatios] | None = None,
     noise: bool | None = None,
-    level: float = 0.95,
+    interval_probability: float = 0.95,
     seed: int = 0,
 ) -> Damage:
     """Find presence, location and extent of damage from a prediction.
@@ -161,7 +161,7 @@ def damage(
         ``EventRatios([1.0], prior_sd=0.3, prior_events=10)``.
     noise : bool, optional
         False states that the model error is left out on purpose. Default: a warning if there are no ratios.
-    level : float
+    interval_probability : float
         Level of the probabilities' intervals, between 0 and 1.
     seed : int
         Seed for drawing the ratios.
@@ -208,7 +208,7 @@ def damage(
     every, effective = outcomes(prediction)
     values = measures.split(every)
     errors = _ratios_of_measures(ratios, tuple(values))
-    presence, location, settings = {}, {}, (effective, check_level(level), seed)
+    presence, location, settings = {}, {}, (effective, interval_probability, seed)
     for state in states:
         if state.measure not in values:
             raise ValueError(

@@ -171,7 +171,7 @@ def _load_test(job: Job, cache: SimulationCache | None) -> _DataSet:
 
 
 def _make_noise(job: Job, channels: tuple[Channel, ...]) -> Any:
-    given = {} if job.noise is None else job.noise.given("groups", "level", "sensor", "window", "local")
+    given = {} if job.noise is None else job.noise.given("groups", "shares_of", "sensor", "window", "local")
     if "sensor" in given:
         given["sensor"] = read_by_channel(given["sensor"], channels, "sensor")
     if job.noise is None or job.noise.kind == "gaussian":

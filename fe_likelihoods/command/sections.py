@@ -129,7 +129,7 @@ class Noise(Section):
 
     kind: Any = key("one of gaussian, autoregressive", "Autoregressive noise takes sensor only", "gaussian")
     groups: Any = key("one of channel, all, event", "What has a level: each channel, all, or each in each event")
-    level: Any = key("one of si, measured, response", "Levels in SI units, or as shares of one of these signals")
+    shares_of: Any = key("one of measured, response", "Levels are shares of this signal, and not in SI units")
     sensor: Any = key("table of number with unit", "Channel = known standard deviation of its sensor noise (zero)")
     window: Any = key("time", "Length of the moving window for the root mean square of the response")
     local: Any = key("number", 'For "response": weight of the response envelope in the variance, from 0 to 1 (0.25)')

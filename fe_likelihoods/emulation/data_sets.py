@@ -140,7 +140,7 @@ def _statistic_of(likelihood: Any) -> Callable[[np.ndarray], np.ndarray]:
     if needs_response(statistic):
         raise ValueError(
             f"the level of {noise_title(likelihood.noise)} depends on the response, so the posterior cannot be "
-            'emulated from residuals: sample without a guide, or use GaussianNoise with level="si", or '
+            "emulated from residuals: sample without a guide, or use GaussianNoise without shares_of, or "
             "AutoregressiveNoise"
         )
     if isinstance(measured, Comparison) and statistic is not sums_of_squares:

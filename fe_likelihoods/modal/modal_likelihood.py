@@ -161,7 +161,7 @@ class ModalNoise:
     an error of zero. `student` are the degrees of freedom of Student-t errors, 0 for Gaussian ones.
     """
 
-    level = "si"  # the errors do not depend on the response
+    shares_of = None  # the errors do not depend on the response
 
     def __init__(self, paired: PairedModes, unknown: tuple[Any, Any], student_t: float | None) -> None:
         data, stated = paired.data, (paired.frequency_cv, paired.data.shape_error)
@@ -275,12 +275,12 @@ class PredictedModes(NamedTuple):
         """The same computed modes beside other measured ones; nothing is simulated."""
         return self.of(PairedModes(self.model, data), self.computed, self.unknown, self.student)
 
-    def interval(self, level: float = 0.9) -> np.ndarray:
+    def interval(self, probability: float = 0.9) -> np.ndarray:
         """Central intervals (2, m) of an identified frequency [Hz], with its known and unknown errors."""
         known = 0.0 if self.data.frequency_errors is None else self.data.frequency_errors
         errors = stdtrit(self.student, _PROBABILITIES) if self.student else ndtri(_PROBABILITIES)
         drawn = self.frequencies * (1.0 + np.hypot(self.unknown[:, None], known) * errors[:, None, None])
-        return np.quantile(drawn, [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=(0, 1))
+        return np.quantile(drawn, [0.5 - 0.5 * probability, 0.5 + 0.5 * probability], axis=(0, 1))
 
     def rows(self) -> list[list[str]]:
         """The table as texts: number, measured frequency, median of the computed one, `interval`, median MAC, pairs."""

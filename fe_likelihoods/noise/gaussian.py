@@ -8,8 +8,8 @@ of a sample is
 .. math:: \sigma^2 = s^2 + (a\, l)^2
 
 with the known sensor noise :math:`s`, an unknown parameter :math:`a`, and a reference :math:`l`, which is one
-(``level="si"``), the level of the measured channel (``"measured"``) or the level of the simulated response
-(``"response"``).
+(standard deviations in SI units), the level of the measured channel (``shares_of="measured"``) or the level of the
+simulated response (``shares_of="response"``).
 
 Real measurements differ from a model by more than sensor noise, and the differences are correlated in time. White noise
 counts the n samples of a channel as n independent observations, which makes the posterior too narrow:
@@ -47,7 +47,7 @@ HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 _PARTS = 3  # parts of a window; the window moves by one part
 _ROUND_OFF = 1e-6  # of a step
 _LOCAL = 0.25  # see docs/theory/noise.rst
-_RESPONSE, _SHARES = 'level="response"', 'level="measured" or "response"'
+_RESPONSE, _SHARES = 'shares_of="response"', 'shares_of="measured" or "response"'
 
 
 @dataclass(frozen=True, repr=False)
@@ -61,26 +61,26 @@ class GaussianNoise:
     groups : {"channel", "all", "event"}
         What has a level: each channel; all channels together; or each channel in each event, for a model whose
         excitation is `fe_likelihoods.Events`.
-    level : {"si", "measured", "response"}
-        What a level is: a standard deviation in the SI unit of the channel; a share of the measured root mean square,
-        in predictions of the simulated one; or a share of the simulated response level.
+    shares_of : {"measured", "response"}, optional
+        Levels are shares of the measured root mean square, in predictions of the simulated one; or of the simulated
+        response level. Default: they are standard deviations in the SI unit of the channel.
     window : float, optional
         Length of the moving window for the root mean square of the response [s; steps in a test without time]. Longer
-        than a period of the response, shorter than the strong part of the motion. Needed for ``level="response"``. For
-        ``level="measured"`` it is used in predictions only, by default the whole motion.
+        than a period of the response, shorter than the strong part of the motion. Needed for shares of the response.
+        For shares of the measured channel it is used in predictions only, by default the whole motion.
     local : float, optional
-        For ``level="response"``: weight of the response envelope in the variance, from 0 to 1 (0.25). The rest is the
+        For shares of the response: weight of the response envelope in the variance, from 0 to 1 (0.25). The rest is the
         weight of the mean square over the whole response.
     sensor : mapping of channel names to float, or sequence of float, optional
         Known standard deviations of the sensor noise [SI unit of the channel], one per channel; zero for names that are
-        left out. The parameters are then levels of the model error, and may be zero. ``level="response"`` needs
+        left out. The parameters are then levels of the model error, and may be zero. ``shares_of="response"`` needs
         positive values: they are the standard deviations where the response is zero.
     effective_samples : mapping of channel names to float, or sequence of float, optional
         Number of independent samples that each channel is worth (`fe_likelihoods.effective_samples`), at most the
         number of samples, which is also the default for names that are left out.
     scales, layout, events, measured, of_parts
         Root mean squares of the measured channels [SI], of which the level of ``groups="all"`` and the shares of
-        ``level="measured"`` are multiples; sample times; events; the measured (event, channel) pairs; the events of
+        ``shares_of="measured"`` are multiples; sample times; events; the measured (event, channel) pairs; the events of
         parts of the time. Set by the likelihood (`with_measurements`, `under`) and by predictions.
 
     Raises
@@ -91,11 +91,11 @@ class GaussianNoise:
     Notes
     -----
     =========== ============== =========================== =======================================================
-    groups      level          parameters                  for
+    groups      shares_of      parameters                  for
     =========== ============== =========================== =======================================================
-    "channel"   "si"           ``sigma_<channel>``         synthetic data, thinned measurements
-    "all"       "si"           ``sigma``                   one noise-to-signal ratio
-    "event"     "si"           ``sigma_<channel>_<event>`` sensors and errors that change from test to test
+    "channel"   None           ``sigma_<channel>``         synthetic data, thinned measurements
+    "all"       None           ``sigma``                   one noise-to-signal ratio
+    "event"     None           ``sigma_<channel>_<event>`` sensors and errors that change from test to test
     "channel"   "measured"     ``share_<channel>``         predictions of weaker or stronger motions
     "channel"   "response"     ``share_<channel>``         the same, and evidences: a normalised density
     "all"       as "channel"   ``share``                   one share for all channels
@@ -113,7 +113,7 @@ class GaussianNoise:
     A share of the response that was calibrated on a part of a motion, with a gap, or with a long quiet end refers to
     another mean square than the whole motion has: calibrate and predict whole motions, or use ``local=1``. Do not
     choose `local` by the evidence alone: where the model is wrong, a `local` near 1 may prefer a response that is too
-    large, because it permits larger errors. Compare the RRMSE of the fit with ``level="si"``. The
+    large, because it permits larger errors. Compare the RRMSE of the fit without shares. The
     statistics are not quadratic in the residuals, so samplers cannot use a guide.
 
     Examples
@@ -123,7 +123,7 @@ class GaussianNoise:
 
     Errors that grow with the response, beside a known noise of the sensors [SI]:
 
-    >>> shares = GaussianNoise(model.channels, level="response", window=1.0, sensor=[0.01, 0.001])
+    >>> shares = GaussianNoise(model.channels, shares_of="response", window=1.0, sensor=[0.01, 0.001])
     >>> shares.parameter_names
     ('share_acceleration', 'share_displacement')
     """
@@ -131,7 +131,7 @@ class GaussianNoise:
     channels: Sequence[Channel]
     _: KW_ONLY
     groups: Literal["channel", "all", "event"] = "channel"
-    level: Literal["si", "measured", "response"] = "si"
+    shares_of: Literal["measured", "response"] | None = None
     window: float | None = None
     local: float | None = None
     sensor: PerChannel = None
@@ -144,36 +144,36 @@ class GaussianNoise:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "channels", checked_channels(self, self.channels))
-        for name, known in (("groups", ("channel", "all", "event")), ("level", ("si", "measured", "response"))):
+        for name, known in (("groups", ("channel", "all", "event")), ("shares_of", (None, "measured", "response"))):
             if getattr(self, name) not in known:
                 raise ValueError(f"GaussianNoise: {name} must be one of {known}; got {getattr(self, name)!r}")
-        if self.groups == "event" and self.level != "si":
-            raise ValueError('GaussianNoise: groups="event" has levels in SI units, level="si", alone')
+        if self.groups == "event" and self.shares_of:
+            raise ValueError('GaussianNoise: groups="event" has levels in SI units alone; leave shares_of out')
         self._check_options()
 
     def _check_options(self) -> None:
         """Set options as floats, with their defaults; ValueError if one is missing or has no meaning here."""
         positive, local = lambda x: 0.0 < x < math.inf, "from 0 (one level for the motion) to 1 (the envelope)"
         for name, means, default, where, meaning, possible in (
-            ("window", self.level != "si", None, _SHARES, "a positive length [s]", positive),
-            ("local", self.level == "response", _LOCAL, _RESPONSE, local, lambda x: 0.0 <= x <= 1.0),
+            ("window", self.shares_of is not None, None, _SHARES, "a positive length [s]", positive),
+            ("local", self.shares_of == "response", _LOCAL, _RESPONSE, local, lambda x: 0.0 <= x <= 1.0),
         ):
             if (value := self._option(name, means, where, default)) is not None:
                 object.__setattr__(self, name, as_number(self, name, value, meaning, possible))
-        if self.level == "response" and self.window is None:
+        if self.shares_of == "response" and self.window is None:
             raise ValueError(
-                'GaussianNoise: level="response" needs window=, a length [s] in which the level of the response is '
+                'GaussianNoise: shares_of="response" needs window=, a length [s] in which the level of the response is '
                 "taken: longer than a period of the response, shorter than the strong part of the motion"
             )
         object.__setattr__(self, "sensor", sensor_levels(self, self.channels, self.sensor))
-        if self.level == "response" and not all(level > 0.0 for level in self.sensor or (0.0,)):
+        if self.shares_of == "response" and not all(level > 0.0 for level in self.sensor or (0.0,)):
             raise ValueError(
-                'GaussianNoise: level="response" needs the noise of the sensor of each channel, a positive standard '
-                f"deviation in SI units, for parts in which the response is zero; got {self.sensor!r}. Take "
+                'GaussianNoise: shares_of="response" needs the noise of the sensor of each channel, a positive '
+                f"standard deviation in SI units, for parts in which the response is zero; got {self.sensor!r}. Take "
                 "it from the quiet part before the motion, or from the resolution of the sensor, or use levels in SI "
                 "units"
             )
-        whole = 'groups="channel" and "all", with level="si" or "measured"'
+        whole = 'groups="channel" and "all", without shares_of or with shares_of="measured"'
         given = self._option("effective_samples", self._whole, whole)
         values = per_channel(self, self.channels, "effective_samples", given, math.inf, "of samples")
         if values is not None and not all(value > 0.0 for value in values):
@@ -187,7 +187,7 @@ class GaussianNoise:
         if given is not None and not means:
             raise ValueError(
                 f"GaussianNoise: {name}= is for {where}; got {name}={given!r} with groups={self.groups!r} and "
-                f"level={self.level!r}: leave it out"
+                f"shares_of={self.shares_of!r}: leave it out"
             )
         return default if given is None and means else given
 
@@ -196,22 +196,22 @@ class GaussianNoise:
     @cached_property
     def _whole(self) -> bool:
         """Whether the sums of squares over all samples are sufficient."""
-        return self.groups != "event" and self.level != "response"
+        return self.groups != "event" and self.shares_of != "response"
 
     @cached_property
     def _scaled(self) -> bool:
         """Whether parameters are multiples of channel scales."""
-        return self.level == "measured" or (self.level == "si" and self.groups == "all")
+        return self.shares_of == "measured" or (self.shares_of is None and self.groups == "all")
 
     @cached_property
     def white(self) -> bool:
         """Whether errors are white, with levels in SI units for the whole measurements."""
-        return self._whole and self.level == "si"
+        return self._whole and self.shares_of is None
 
     @property
     def title(self) -> str:
         """Class and options, without channels and numbers per channel, for reports."""
-        options = shown((), self._options(("groups", "level", "window", "local")))
+        options = shown((), self._options(("groups", "shares_of", "window", "local")))
         return type(self).__name__ + (f"({options})" if options else "")
 
     def __repr__(self) -> str:
@@ -221,7 +221,7 @@ class GaussianNoise:
         return f"{type(self).__name__}({shown(self.channels, self._options(names))})"
 
     def _options(self, names: Sequence[str]) -> dict[str, Any]:
-        default = {"groups": "channel", "level": "si"}
+        default = {"groups": "channel"}
         return {name: getattr(self, name) for name in names if getattr(self, name) != default.get(name)}
 
     @cached_property
@@ -230,7 +230,7 @@ class GaussianNoise:
 
         Levels per event are known when the likelihood has set the events; ValueError before.
         """
-        kind, names = "sigma" if self.level == "si" else "share", [channel.name for channel in self.channels]
+        kind, names = "sigma" if self.shares_of is None else "share", [channel.name for channel in self.channels]
         if self.groups == "all":
             return (kind,)
         if self.groups == "event":
@@ -241,7 +241,7 @@ class GaussianNoise:
     @property
     def parameter_channels(self) -> dict[str, Channel]:
         """Channels by the names of parameters that are standard deviations in the channel's unit."""
-        if self.level != "si" or self.groups == "all":
+        if self.shares_of is not None or self.groups == "all":
             return {}
         rows = [row for _, row in self.measured] if self.groups == "event" else range(len(self.channels))
         return {name: self.channels[row] for name, row in zip(self.parameter_names, rows, strict=True)}
@@ -289,7 +289,7 @@ class GaussianNoise:
         """
         if self.groups == "event" and not self.events:
             return replace(self, events=events_of(model).windows)
-        if self.level != "response":
+        if self.shares_of != "response":
             return self
         self._check_step(model.dt)
         events = find_events(model)
@@ -433,7 +433,7 @@ class GaussianNoise:
             return np.where(values >= 0.0, values, np.nan)  # the usual noise takes the short way
         if self._scaled:
             levels = self._scales
-        elif self.level == "response":
+        elif self.shares_of == "response":
             with np.errstate(invalid="ignore"):
                 levels = np.sqrt(squared_levels(power, counts, self.local, self.of_parts))
         return self._with_sensor(values, levels)
@@ -441,7 +441,7 @@ class GaussianNoise:
     def _with_sensor(self, values: np.ndarray, levels: np.ndarray) -> np.ndarray:
         """Sensor noise and model error together; NaN for impossible parameters."""
         with np.errstate(invalid="ignore"):
-            impossible = ~(values >= 0.0) | ((values >= 1.0) & (self.level == "measured"))
+            impossible = ~(values >= 0.0) | ((values >= 1.0) & (self.shares_of == "measured"))
             return np.where(impossible, np.nan, np.hypot(self._floor, values * levels))
 
     def _values(self, parameters: np.ndarray, unknown: float) -> np.ndarray:
@@ -471,7 +471,7 @@ class GaussianNoise:
         With shares of the response, the sensor noise alone: see `response_deviations`.
         """
         values, levels = self._values(parameters, 1.0), np.ones(1)
-        if self.level == "response":
+        if self.shares_of == "response":
             levels = np.zeros(1)
         elif self._scaled:
             levels = self._scales
@@ -486,7 +486,7 @@ class GaussianNoise:
         values = self._values(parameters, np.nan)
         return np.where(values < 0.0, values, np.hypot(self._floor, values))
 
-    @only_if(lambda noise: noise.level != "si")
+    @only_if(lambda noise: noise.shares_of is not None)
     def response_deviations(
         self, parameters: np.ndarray, response: np.ndarray, dt: float | Sequence[float] | None = None
     ) -> np.ndarray:
@@ -495,7 +495,7 @@ class GaussianNoise:
         A response with a step `dt` [s] begins at time zero; by default it is at the measured samples. Shares of the
         measured channel need the step.
         """
-        if self.level == "measured":
+        if self.shares_of == "measured":
             level = local_level(response, None if self.window is None else self.window / dt)
             shares = np.asarray(parameters, dtype=float)[:, None]
             return np.hypot(self._floor[:, None], shares * level) / np.sqrt((1.0 - shares) * (1.0 + shares))
@@ -511,7 +511,7 @@ class GaussianNoise:
         power = sums.powers(response, there)[None]
         return sums, self._deviations(np.asarray(parameters, dtype=float)[None], sums.counts(there), power)[0]
 
-    @only_if(lambda noise: noise.level == "response")
+    @only_if(lambda noise: noise.shares_of == "response")
     def whitened(self, residuals: np.ndarray, response: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         """Residuals (n_channels, n_samples) by their standard deviations.
 

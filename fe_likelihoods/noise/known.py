@@ -23,7 +23,7 @@ _METHODS = {
     "whitened": 2,
 }
 _AGAIN = "under", "with_measurements"  # methods that return the noise for other data
-_OF_THE_NOISE = "channels", "statistic", "level", "effective_samples", "counts", "n_sets", "student"
+_OF_THE_NOISE = "channels", "statistic", "shares_of", "effective_samples", "counts", "n_sets", "student"
 
 
 class KnownNoise:

@@ -89,4 +89,4 @@ def noise_under(noise: Noise, model: Any, first: int = 0) -> Noise:
 
 def follows_response(noise: Any) -> bool:
     """Whether the standard deviation of a noise is a share of the response, and so is valid for other motions."""
-    return hasattr(noise, "response_deviations") and getattr(noise, "level", "") != "si"
+    return hasattr(noise, "response_deviations") and getattr(noise, "shares_of", "") is not None

@@ -70,7 +70,7 @@ class StudentNoise:
     channels: Sequence[Channel]
     degrees: float = 4.0
     statistic = staticmethod(each_square)
-    level = "si"
+    shares_of = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "channels", checked_channels(self, self.channels))

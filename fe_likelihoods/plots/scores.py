@@ -31,7 +31,7 @@ def plot_scores(scores: QuantityScores | Mapping[str, QuantityScores]) -> Figure
     Parameters
     ----------
     scores : QuantityScores, or mapping from names of events to them
-        Results of `Prediction.score` for numbers, with one level.
+        Results of `Prediction.score` for numbers, with one `interval_probability`.
 
     Returns
     -------
@@ -51,11 +51,11 @@ def plot_scores(scores: QuantityScores | Mapping[str, QuantityScores]) -> Figure
     >>> figure = plot_scores(peaks.score(measurements))
     """
     events = dict(scores) if isinstance(scores, Mapping) else {"": scores}
-    levels = {each.level for each in events.values()}
-    if len(levels) != 1 or any(hasattr(each, "coverage") for each in events.values()):
+    probabilities = {each.interval_probability for each in events.values()}
+    if len(probabilities) != 1 or any(hasattr(each, "coverage") for each in events.values()):
         raise ValueError(
-            "plot_scores: expected scores of numbers such as peaks, of one event or more, with one level; got "
-            f"{[(name, type(each).__name__, getattr(each, 'level', None)) for name, each in events.items()]}"
+            "plot_scores: expected scores of numbers such as peaks, of one event or more, with one probability; got "
+            f"{[(name, getattr(each, 'interval_probability', None)) for name, each in events.items()]}"
         )
     rows = sum(len(each.names) for each in events.values())
     size = (8.0, max(3.6, 1.3 + (0.24 if rows <= 30 else 0.15) * rows))
@@ -68,7 +68,7 @@ def plot_scores(scores: QuantityScores | Mapping[str, QuantityScores]) -> Figure
 
 
 def _draw(intervals: Axes, shares: Axes, events: Mapping[str, QuantityScores]) -> None:
-    level = next(iter(events.values())).level
+    probability = next(iter(events.values())).interval_probability
     names = "measured", "median", "lower", "upper", "lower_quartile", "upper_quartile", "interval_score", "pit"
     joined = {name: np.concatenate([np.asarray(getattr(each, name)) for each in events.values()]) for name in names}
     labels = [_label(event, each, k) for event, each in events.items() for k in range(len(each.names))]
@@ -77,7 +77,7 @@ def _draw(intervals: Axes, shares: Axes, events: Mapping[str, QuantityScores]) -
         raise ValueError(f"plot_scores: intervals are divided by the measured values; zero is among those of {labels}")
     n = len(measured)
     places = np.arange(n)[::-1]
-    for ends, width, text in ("", 1.2, f"{level:.0%}"), ("_quartile", 3.5, "50%"):
+    for ends, width, text in ("", 1.2, f"{probability:.0%}"), ("_quartile", 3.5, "50%"):
         left, right = joined[f"lower{ends}"] / measured, joined[f"upper{ends}"] / measured
         intervals.hlines(places, left, right, color=BLUE, linewidth=width, label=text)
     intervals.plot(joined["median"] / measured, places, "o", color="white", markeredgecolor=BLUE, markersize=4)
@@ -87,15 +87,15 @@ def _draw(intervals: Axes, shares: Axes, events: Mapping[str, QuantityScores]) -
     intervals.set_xlabel("predicted / measured [-]")
     add_legend(intervals, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
 
-    for k, probability in enumerate((0.5, level)):
-        low, high = _chance(n, probability)
+    for k, p in enumerate((0.5, probability)):
+        low, high = _chance(n, p)
         shares.fill_between([k - 0.4, k + 0.4], low, high, color=GREY, alpha=0.3, linewidth=0.0)
-        shares.hlines(probability, k - 0.4, k + 0.4, color=GREY, linewidth=1.0)
-        shares.plot(k, np.mean(np.abs(pit - 0.5) <= 0.5 * probability), "o", color=BLUE)
+        shares.hlines(p, k - 0.4, k + 0.4, color=GREY, linewidth=1.0)
+        shares.plot(k, np.mean(np.abs(pit - 0.5) <= 0.5 * p), "o", color=BLUE)
     size = np.abs(measured)
     width, score = np.mean((joined["upper"] - joined["lower"]) / size), np.mean(joined["interval_score"] / size)
     shares.set_title(f"width {width:.2f}, interval score {score:.2f}\nof the measured value", fontsize="small")
-    shares.set_xticks([0, 1], ["50%", f"{level:.0%}"])
+    shares.set_xticks([0, 1], ["50%", f"{probability:.0%}"])
     shares.set_xlim(-0.6, 1.6)
     shares.set_ylim(-0.03, 1.03)
     shares.set(xlabel="interval", ylabel="share of measured values within [-]")

@@ -27,23 +27,23 @@ PRIOR_SD = 0.12
 PRIOR_EVENTS = 6.0
 """Number of events that the expected scatter is worth: 90 % of the structures are within factors of 0.7 and 1.9."""
 SLOPE_SD = 0.05
-"""Slope of the log ratio over the log level: 0.03 to 0.08 is best for a bridge in eleven events of 0.02 to 0.9 g."""
+"""Slope of log ratio over log prediction: best are 0.03 to 0.08 for a bridge in eleven events, 0.02 to 0.9 g."""
 _SHOWN = 0.9  # probability of printed intervals
 
 
 class RatioPopulations(NamedTuple):
     """Posterior draws (n,) or (n, n_quantities) of the ratio distribution."""
 
-    center: np.ndarray  # mean log ratio at the mean log level of the events
-    slope: np.ndarray  # change of the mean log ratio per unit of the log level
+    center: np.ndarray  # mean log ratio at the mean log predicted value of the events
+    slope: np.ndarray  # change of the mean log ratio per unit of the log predicted value
     sd: np.ndarray  # of log ratios between events
-    log_level: np.ndarray  # mean logarithm of the predicted values of the events
+    log_predicted: np.ndarray  # mean logarithm of the predicted values of the events
 
     def probability_above(self, ratio: np.ndarray, log_predicted: np.ndarray) -> np.ndarray:
         """Probability that a ratio from each population exceeds `ratio` (n, ...), at logarithms of predicted values."""
         rows = (..., *(None,) * (log_predicted.ndim - self.center.ndim))
         center, slope, sd = self.center[rows], self.slope[rows], self.sd[rows]
-        center = center + slope * (log_predicted - self.log_level)
+        center = center + slope * (log_predicted - self.log_predicted)
         return special.ndtr((center - np.log(ratio)) / sd)
 
 
@@ -60,10 +60,10 @@ class EventRatios:
         intensity or an energy scatters twice as much as a peak. `event_ratios` computes it for each event and quantity.
     prior_events : float
         Number of events that the expected scatter is worth, positive. See `prior_share`.
-    levels : array_like, optional
+    predicted : array_like, optional
         Predicted values of the events, in the shape of `values`; positive. The log ratio may then follow a line in
         their logarithm, because a linear model may be right for weak motions and predict too large peaks for strong
-        ones. The interval of a new ratio grows with the distance from the levels of the events.
+        ones. The interval of a new ratio grows with the distance from the predicted values.
     slope_sd : float
         Standard deviation of the slope of this line before the events, around zero.
     at : mapping of str to float, optional
@@ -78,7 +78,7 @@ class EventRatios:
     Raises
     ------
     ValueError
-        If a ratio, a level or a scatter is not positive, or shapes differ.
+        If a ratio, a predicted value or a scatter is not positive, or shapes differ.
 
     Notes
     -----
@@ -111,7 +111,7 @@ class EventRatios:
     values: ArrayLike
     prior_sd: ArrayLike = PRIOR_SD
     prior_events: float = PRIOR_EVENTS
-    levels: ArrayLike | None = None
+    predicted: ArrayLike | None = None
     slope_sd: float = SLOPE_SD
     at: Mapping[str, float] | None = None
     new_sd: ArrayLike | None = None
@@ -133,39 +133,39 @@ class EventRatios:
                 f"EventRatios: expected one prior_sd, one per quantity, {values.shape[1:]}, or one per ratio, "
                 f"{values.shape}; got {sd.shape}"
             )
-        levels = np.ones(values.shape) if self.levels is None else np.array(self.levels, dtype=float)
-        if levels.shape != values.shape or not _positive(levels):
+        predicted = np.ones(values.shape) if self.predicted is None else np.array(self.predicted, dtype=float)
+        if predicted.shape != values.shape or not _positive(predicted):
             raise ValueError(
                 f"EventRatios: expected one positive predicted value for each ratio, {values.shape}; got "
-                f"{self.levels!r}"
+                f"{self.predicted!r}"
             )
         degrees = self.prior_events + len(values) - 1.0
         sd = np.broadcast_to(sd, values.shape)
         new_sd = np.sqrt(np.square(sd).mean(axis=0)) if self.new_sd is None else np.asarray(self.new_sd, dtype=float)
         if not _positive(new_sd) or new_sd.shape not in ((), values.shape[1:]):
             raise ValueError(f"EventRatios: new_sd must be positive, one or one per quantity; got {self.new_sd!r}")
-        logs, x, weights = np.log(values), np.log(levels), 1.0 / np.square(sd)
+        logs, x, weights = np.log(values), np.log(predicted), 1.0 / np.square(sd)
         total = weights.sum(axis=0)
-        log_level, mean = (weights * x).sum(axis=0) / total, (weights * logs).sum(axis=0) / total
-        offsets = x - log_level
-        slope_sd = 0.0 if self.levels is None else self.slope_sd
+        log_predicted, mean = (weights * x).sum(axis=0) / total, (weights * logs).sum(axis=0) / total
+        offsets = x - log_predicted
+        slope_sd = 0.0 if self.predicted is None else self.slope_sd
         gain = slope_sd**2 / (1.0 + slope_sd**2 * (weights * np.square(offsets)).sum(axis=0))
         slope = gain * (weights * offsets * logs).sum(axis=0)
         squares = (weights * np.square(logs - mean - slope * offsets)).sum(axis=0)
         squares = squares + (np.square(slope) / slope_sd**2 if slope_sd else 0.0)
-        found = {"values": values, "degrees_of_freedom": degrees, "new_sd": new_sd, "_log_level": log_level}
+        found = {"values": values, "degrees_of_freedom": degrees, "new_sd": new_sd, "_log_predicted": log_predicted}
         found |= {"_mean": mean, "_slope": slope, "_gain": gain, "_total": total, "_squares": squares}
         for name, value in found.items():
             object.__setattr__(self, name, value)
 
     def __str__(self) -> str:
         rows = [("number", "at a predicted value of", "median", f"{_SHOWN:.0%} interval", "expected scatter", "by it")]
-        known = np.unique(np.log(self.levels), axis=0) if self.levels is not None else self._log_level[None]
-        for level in np.exp(known[[0, -1]] if len(known) > 1 else known):
-            ends = [self.quantile(p, level) for p in (0.5, 0.5 - 0.5 * _SHOWN, 0.5 + 0.5 * _SHOWN)]
-            columns = np.broadcast_arrays(level, *ends, self.new_sd, self.prior_share)
+        known = np.unique(np.log(self.predicted), axis=0) if self.predicted is not None else self._log_predicted[None]
+        for predicted in np.exp(known[[0, -1]] if len(known) > 1 else known):
+            ends = [self.quantile(p, predicted) for p in (0.5, 0.5 - 0.5 * _SHOWN, 0.5 + 0.5 * _SHOWN)]
+            columns = np.broadcast_arrays(predicted, *ends, self.new_sd, self.prior_share)
             for k, (at, median, low, high, sd, share) in enumerate(zip(*map(np.atleast_1d, columns), strict=True)):
-                place = "any" if self.levels is None else number(at)
+                place = "any" if self.predicted is None else number(at)
                 cells = number(median), f"{number(low)} to {number(high)}", number(sd, 2), f"{share:.0%}"
                 rows.append((f"{k + 1}", place, *cells))
         first = f"Ratios of measured to predicted values in {len(self.values)} events, and in a new one"
@@ -195,7 +195,7 @@ class EventRatios:
         probability : float or array_like
             Between 0 and 1.
         predicted : (...) array_like
-            Predicted values, positive; without effect if there are no levels.
+            Predicted values, positive; without effect if the ratios have none.
 
         Returns
         -------
@@ -234,11 +234,11 @@ class EventRatios:
         )
         center = self._mean + factor / np.sqrt(self._total) * rng.standard_normal(shape)
         slope = self._slope + factor * np.sqrt(self._gain) * rng.standard_normal(shape)
-        return RatioPopulations(center, slope, factor * self.new_sd, self._log_level)
+        return RatioPopulations(center, slope, factor * self.new_sd, self._log_predicted)
 
     def _center_and_scale(self, log_predicted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Center and scale of the t distribution of a new log ratio at log predicted values (...)."""
-        offset = np.where(self._gain > 0.0, log_predicted - self._log_level, 0.0)
+        offset = np.where(self._gain > 0.0, log_predicted - self._log_predicted, 0.0)
         own = np.square(self.new_sd)
         scale = self.sd * np.sqrt((own + 1.0 / self._total + self._gain * np.square(offset)) / own)
         return self._mean + self._slope * offset, scale

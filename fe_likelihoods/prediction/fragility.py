@@ -21,7 +21,7 @@ from scipy import special
 from ..population.ratios import EventRatios
 from ..text_tables import number, text_table
 from .prediction import Prediction
-from .reliability import Estimate, Exceedance, check_level, estimate, inputs
+from .reliability import Estimate, Exceedance, estimate, inputs
 
 __all__ = ["Fragility", "FragilityCurve", "fit_fragility", "fragility"]
 
@@ -101,7 +101,7 @@ def fragility(
     unit: str | None = None,
     ratios: EventRatios | None = None,
     noise: bool | None = None,
-    level: float = 0.95,
+    interval_probability: float = 0.95,
     seed: int = 0,
 ) -> Fragility:
     """Estimate the probability that a quantity exceeds a threshold under each of several records, and fit a curve.
@@ -116,7 +116,7 @@ def fragility(
         Positive intensity of each record, such as its peak acceleration [m/s²].
     threshold : float
         The threshold; positive if there are ratios.
-    unit, ratios, noise, level, seed
+    unit, ratios, noise, interval_probability, seed
         As for `exceedance`.
 
     Returns
@@ -174,7 +174,7 @@ def fragility(
             raise ValueError(f"fragility needs one threshold; got an array of shape {limit.shape}")
         if own is not None and own.shape:
             raise ValueError(f"fragility needs ratios of one quantity, (n_events,); got {own.values.shape}")
-        estimates.append(estimate(known.values, limit, own, known.effective, check_level(level), seed))
+        estimates.append(estimate(known.values, limit, own, known.effective, interval_probability, seed))
         contains[known.contents.partition(";")[0]] = known
     if len(contains) > 1:
         raise ValueError(f"fragility needs predictions of one kind; their probabilities contain {' / '.join(contains)}")

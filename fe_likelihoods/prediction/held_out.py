@@ -37,7 +37,7 @@ class HeldOutScores(dict[str, HeldOutScore]):
         of_numbers = [each.scores for each in self.values() if isinstance(each.scores, QuantityScores)]
         for k, name in enumerate(of_numbers[0].names if of_numbers else ()):
             pit = [each.pit[k] for each in of_numbers]
-            shares = "; ".join(f"within {level:.0%}, {share_within(pit, level)}" for level in (0.9, 0.5))
+            shares = "; ".join(f"within {p:.0%}, {share_within(pit, p)}" for p in (0.9, 0.5))
             lines.append(f"{name}: {shares} (intervals of 95 % for the share in further events)")
         return "\n".join(lines)
 

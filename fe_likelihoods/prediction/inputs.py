@@ -21,7 +21,7 @@ from .model_error import ModelError, model_error
 __all__ = [
     "PredictionSource",
     "distinct_rows",
-    "part_of",
+    "one_data_set",
     "read_source",
     "split_samples",
 ]
@@ -52,22 +52,22 @@ def read_source(posterior_or_model: Any, pool: Any = None) -> PredictionSource:
     return PredictionSource(posterior_or_model, None, None, as_executor(pool, posterior_or_model))
 
 
-def part_of(posterior_or_model: Any, samples: Any, part: str | None, noise: bool) -> tuple[Any, Any]:
-    """The likelihood named `part` of a `JointLikelihood` and its samples; anything else as it is given.
+def one_data_set(posterior_or_model: Any, samples: Any, data_set: str | None, noise: bool) -> tuple[Any, Any]:
+    """The likelihood named `data_set` of a `JointLikelihood` and its samples; anything else as it is given.
 
-    `noise` says whether the noise parameters are needed. ValueError if there is one model and `part` is given, or
+    `noise` says whether the noise parameters are needed. ValueError if there is one model and `data_set` is given, or
     several and it is not.
     """
     likelihood = getattr(posterior_or_model, "likelihood", posterior_or_model)
     if not isinstance(likelihood, JointLikelihood):
-        if part is not None:
-            raise ValueError(f"part={part!r} is for a JointLikelihood; leave it out")
+        if data_set is not None:
+            raise ValueError(f"data_set={data_set!r} is for a JointLikelihood; leave it out")
         return posterior_or_model, samples
-    if part is None:
+    if data_set is None:
         raise ValueError(
-            f"a prediction is of one model: give part= one of {', '.join(map(repr, likelihood.likelihoods))}"
+            f"a prediction is of one model: give data_set= one of {', '.join(map(repr, likelihood.likelihoods))}"
         )
-    return likelihood[part], likelihood.samples_of(part, samples, noise)
+    return likelihood[data_set], likelihood.samples_of(data_set, samples, noise)
 
 
 def split_samples(

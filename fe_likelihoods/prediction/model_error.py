@@ -1,6 +1,6 @@
 r"""Model error in the response of a structure, without the sensor noise. See ``docs/theory/prediction.rst``.
 
-A noise whose standard deviation follows the response (`GaussianNoise` with ``level="measured"`` or ``"response"``) has
+A noise whose standard deviation follows the response (`GaussianNoise` with ``shares_of="response"`` or "measured") has
 two parts, the sensor noise, which is no motion of the structure, and the model error: :math:`\sigma^2 = s^2 +
 \sigma_m^2`. The likelihood takes both as white, but the largest of many independent errors adds to each peak, while
 model errors change as slowly as the response. A draw of the model error therefore has the Fourier amplitudes of the
@@ -49,7 +49,7 @@ def model_error(noise: Any, parameters: np.ndarray, dt: float) -> ModelError:
     """
     if not follows_response(noise):
         raise ValueError(
-            'noise="model" needs a noise that follows the response, such as GaussianNoise(..., level="response"); '
+            'noise="model" needs a noise that follows the response, such as GaussianNoise(..., shares_of="response"); '
             f"{noise_title(noise)} does not tell model error from sensor noise: use noise=True, or ratios="
         )
     return ModelError(noise, parameters, dt)

@@ -159,7 +159,7 @@ def predict_new_event(
     n : int
         Number of draws. Histories need a simulation for each. Numbers need three to five for each event and for the new
         one; their quantiles are exact, and their draws have equal probabilities. Draws with an impossible noise, such
-        as a share of 1 or more of ``level="measured"``, are left out.
+        as a share of 1 or more of ``shares_of="measured"``, are left out.
     seed : int, optional
         Seed for drawing parameters and noise, and for the order of the draws of numbers.
     **options
@@ -321,7 +321,7 @@ def _possible(draws: dict[str, np.ndarray], noise: Any) -> dict[str, np.ndarray]
     if (share := 1.0 - possible.mean()) > _IMPOSSIBLE:
         raise ValueError(
             f"{share:.0%} of the draws have an impossible noise, a share of the signal of 1 or more: use "
-            "level='response', or a narrower prior of the spread of shares between events"
+            "shares_of='response', or a narrower prior of the spread of shares between events"
         )
     return {name: values[possible] for name, values in draws.items()}
 

@@ -30,13 +30,13 @@ def predict_channels_of(
     """
     if source.likelihood is None:
         raise ValueError(
-            "model= predicts other channels of a posterior or likelihood; to predict with a model, give it alone"
+            "channels_of= predicts other channels of a posterior or likelihood; to predict with a model, give it alone"
         )
     check_model(model)
     names, own = tuple(model.parameter_names), tuple(source.model.parameter_names)
     if names != own:
         raise ValueError(
-            f"model= must have the parameters of the calibrated model in the same order, {', '.join(own)}; got "
+            f"channels_of= must have the parameters of the calibrated model in the same order, {', '.join(own)}; got "
             f"{', '.join(names)}"
         )
     if not noise:
@@ -64,7 +64,7 @@ def _weights(model: Model, source: PredictionSource) -> np.ndarray:
             known = measured[rows[channel.name]]
             if known.quantity != channel.quantity:
                 raise ValueError(
-                    f"the channel {channel.name!r} of model= is {channel.quantity!r}, and was calibrated as "
+                    f"the channel {channel.name!r} of channels_of= is {channel.quantity!r}, and was calibrated as "
                     f"{known.quantity!r}: give it another name"
                 )
             row[rows[channel.name]] = 1.0
@@ -74,7 +74,7 @@ def _weights(model: Model, source: PredictionSource) -> np.ndarray:
             raise ValueError(
                 f"the noise of the channel {channel.name!r} is not known: no measured channel is {channel.quantity!r}; "
                 f"measured are {', '.join(f'{each.name} ({each.quantity})' for each in measured)}. Leave the channel "
-                "out of model=, or predict with noise=False"
+                "out of channels_of=, or predict with noise=False"
             )
         row[alike] = 1.0 / len(alike)
     return weights

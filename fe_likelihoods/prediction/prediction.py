@@ -14,7 +14,7 @@ from ..signals.comparison import Comparison, compare_with
 from ..text_tables import number, text_table
 from ..units import find_unit
 from .quantities import measured_quantity
-from .scores import HistoryScores, QuantityScores, score_histories, score_values
+from .scores import HistoryScores, QuantityScores, check_probability, score_histories, score_values
 
 if TYPE_CHECKING:
     import xarray
@@ -133,7 +133,7 @@ class Prediction:
         return self.quantiles[self.probabilities.index(probability)]
 
     def score(
-        self, measured: Measurements | ArrayLike, level: float = 0.9, part: slice = slice(None)
+        self, measured: Measurements | ArrayLike, interval_probability: float = 0.9, part: slice = slice(None)
     ) -> HistoryScores | QuantityScores:
         """Compute proper scores, coverage and sharpness; ``print(prediction.score(measurements))`` is a table.
 
@@ -144,9 +144,9 @@ class Prediction:
             has times of its own, the histories are interpolated there (quantiles too, which is approximate). For
             quantities other than histories also the measured values themselves [SI], in the shape of the quantity. From
             `Measurements` the quantity, such as a peak, is computed as it was from the responses.
-        level : float
+        interval_probability : float
             Probability of the scored intervals, between 0 and 1. For histories, the prediction must have the quantiles
-            with the probabilities (1 - level) / 2 and (1 + level) / 2, which a default prediction has for 0.9.
+            with the probabilities (1 - p) / 2 and (1 + p) / 2, which a default prediction has for 0.9.
         part : slice
             The samples of the histories to score. Default: all.
 
@@ -178,28 +178,28 @@ class Prediction:
         acceleration     g ...
         displacement    cm ...
         """
-        if not 0.0 < level < 1.0:
-            raise ValueError(f"score: level must be a probability between 0 and 1; got {level!r}")
+        check_probability(interval_probability)
         if self.dt is None:
-            return self._score_values(measured, level)
+            return self._score_values(measured, interval_probability)
         if not isinstance(measured, Measurements):
             raise ValueError(f"score: a prediction of histories needs Measurements; got {type(measured).__name__}")
         compared = self._compared(measured)
         own_times = isinstance(compared, Comparison)
         values, at = (compared.values, compared.at_samples) if own_times else (compared, np.asarray)
-        ends = (self._near_quantile(0.5 - 0.5 * level), self._near_quantile(0.5 + 0.5 * level))
+        half = 0.5 * interval_probability
+        ends = self._near_quantile(0.5 - half), self._near_quantile(0.5 + half)
         # Interpolated ends of a narrow band may cross: their order is nearer to the true quantiles (Chernozhukov,
         # Fernandez-Val and Galichon, 2010, doi:10.3982/ECTA7880).
         lower, upper = np.sort([at(each) for each in ends], axis=0)
-        _check_number(self.n_samples, 2, level)
+        _check_number(self.n_samples, 2, interval_probability)
         values, mean, sd, lower, upper = (each[:, part] for each in (values, at(self.mean), at(self.sd), lower, upper))
-        return score_histories(self.channels, values, (mean, sd), (lower, upper), level)
+        return score_histories(self.channels, values, (mean, sd), (lower, upper), interval_probability)
 
-    def _score_values(self, measured: Measurements | ArrayLike, level: float) -> QuantityScores:
+    def _score_values(self, measured: Measurements | ArrayLike, probability: float) -> QuantityScores:
         """Scores of numbers against the same numbers of measurements."""
         if self.values is None:
             raise ValueError("score: an average of models has no samples; score the prediction of each model")
-        _check_number(len(self.values), 3, level)
+        _check_number(len(self.values), 3, probability)
         observed = measured_quantity(self.quantity, measured) if isinstance(measured, Measurements) else measured
         observed = np.asarray(observed, dtype=float)
         if observed.shape != self.mean.shape or not np.isfinite(observed).all():
@@ -211,7 +211,7 @@ class Prediction:
         names = [c.name for c in self.channels] if known else [str(k) for k in range(observed.size)]
         units = [c.unit for c in self.channels] if known else ["SI"] * observed.size
         values = self.values.reshape(len(self.values), -1)
-        return score_values(names, units, values, observed.ravel(), level, self.effective_sample_size)
+        return score_values(names, units, values, observed.ravel(), probability, self.effective_sample_size)
 
     def to_xarray(self) -> "xarray.Dataset":
         """Mean, standard deviation and quantiles with their coordinates, and `values` where they are kept.
@@ -306,8 +306,8 @@ class Prediction:
         return compare_with(chosen, self.dt, self.mean.shape[1])
 
 
-def _check_number(n_samples: int, least: int, level: float) -> None:
+def _check_number(n_samples: int, least: int, probability: float) -> None:
     """Raise ValueError for fewer samples than `least`, or if the ends of an interval are beyond all samples."""
-    least = max(least, math.ceil(2.0 / (1.0 - level) - 1e-9))
+    least = max(least, math.ceil(2.0 / (1.0 - probability) - 1e-9))
     if n_samples < least:
-        raise ValueError(f"score: expected {least} samples or more for intervals of {level:g}; got {n_samples}")
+        raise ValueError(f"score: expected {least} samples or more for intervals of {probability:g}; got {n_samples}")

@@ -36,7 +36,7 @@ from ..simulation.model import Model, SimulationFailed
 from .accumulator import Accumulator
 from .calibrated_range import Ends, Peaks, bandwidth, calibration_of, difference_of_responses
 from .excitation import chosen_state, excite, under_record
-from .inputs import distinct_rows, part_of, read_source, split_samples
+from .inputs import distinct_rows, one_data_set, read_source, split_samples
 from .other_channels import predict_channels_of
 from .prediction import Prediction
 from .quantities import Quantity, evaluator
@@ -54,8 +54,8 @@ def propagate(
     posterior_or_model: Any,
     samples: Any,
     *,
-    part: str | None = None,
-    model: Model | None = None,
+    data_set: str | None = None,
+    channels_of: Model | None = None,
     quantity: Quantity | Mapping[str, Quantity] = None,
     record: Record | None = None,
     from_state: str | None = None,
@@ -80,9 +80,9 @@ def propagate(
         Samples of equal weight: all parameters of the posterior (``sampler.get_chain(flat=True)``), or, without noise,
         the structural parameters alone. For a posterior whose noise was integrated out, the result of
         `Posterior.draw_noise`.
-    part : str, optional
+    data_set : str, optional
         For a `JointLikelihood` or its posterior: the name of the likelihood whose model and noise predict.
-    model : Model, optional
+    channels_of : Model, optional
         A model with the same parameters and other channels, such as unmeasured floors, and possibly another excitation.
         Default: the posterior's model. With noise, an unmeasured channel gets the mean noise parameters of the measured
         channels with the same quantity: the mean share if the noise is in shares of the response, the mean standard
@@ -143,8 +143,7 @@ def propagate(
     ValueError
         Before any simulation, for samples of another shape or not finite, unknown channels, noise of a bare model,
         impossible noise parameters, a model with one excitation or without a state at the end, other settings out of
-        range, and channels of `model` whose noise is not known. Later, for a function that returns arrays of different
-        shapes.
+        range, and channels whose noise is not known. Later, for a function that returns arrays of different shapes.
     SimulationFailed
         If every simulation fails, unless structures collapsed and the quantity is a number (`exceedance` is then 1).
 
@@ -165,12 +164,12 @@ def propagate(
     displacement    cm  16.5      0.01  0.173  16.2  16.5  16.8
     """
     known = calibration_of(posterior_or_model if calibrated is None else list(calibrated))
-    posterior_or_model, samples = part_of(posterior_or_model, samples, part, noise)
+    posterior_or_model, samples = one_data_set(posterior_or_model, samples, data_set, noise)
     calibration = source = read_source(posterior_or_model, pool)
-    other = record is not None or model is not None
-    moved = record is not None and model is None  # the calibrated model under another motion
-    if model is not None:
-        source, samples = predict_channels_of(model, source, samples, noise)
+    other = record is not None or channels_of is not None
+    moved = record is not None and channels_of is None  # the calibrated model under another motion
+    if channels_of is not None:
+        source, samples = predict_channels_of(channels_of, source, samples, noise)
     thetas, sample_noise = split_samples(source, samples, noise, record is not None)
     n = len(thetas)
     probabilities = _probabilities(quantiles)

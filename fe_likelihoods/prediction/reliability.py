@@ -23,11 +23,11 @@ from ..signals.channels import Channel
 from ..text_tables import number, text_table
 from ..units import DIMENSIONS, find_unit, to_si
 from .prediction import Prediction
+from .scores import check_probability
 
 __all__ = [
     "Estimate",
     "Exceedance",
-    "check_level",
     "estimate",
     "exceedance",
     "inputs",
@@ -94,7 +94,7 @@ def exceedance(
     unit: str | None = None,
     ratios: EventRatios | None = None,
     noise: bool | None = None,
-    level: float = 0.95,
+    interval_probability: float = 0.95,
     seed: int = 0,
 ) -> Exceedance:
     """Estimate the probability that a quantity exceeds a threshold, given the data.
@@ -114,7 +114,7 @@ def exceedance(
         noise. A prediction by `predict_new_event` has its ratios already.
     noise : bool, optional
         False states that the model error is left out on purpose. Default: a prediction without it gives a warning.
-    level : float
+    interval_probability : float
         Probability of the interval, between 0 and 1.
     seed : int
         Seed of the draws for the interval, where there are ratios or an event population.
@@ -157,7 +157,7 @@ def exceedance(
         )
     if values.ndim == 1 and limits.ndim:
         values = values.reshape(-1, *(1,) * limits.ndim)
-    found = estimate(values, limits, ratios, known.effective, check_level(level), seed).exceedance
+    found = estimate(values, limits, ratios, known.effective, interval_probability, seed).exceedance
     return found._replace(threshold=limits, uncertainty=known.contents, unit=known.unit)
 
 
@@ -247,7 +247,7 @@ class Estimate(NamedTuple):
 
 
 def estimate(
-    values: np.ndarray, limits: ArrayLike, ratios: EventRatios | None, effective: float, level: float, seed: int
+    values: np.ndarray, limits: ArrayLike, ratios: EventRatios | None, effective: float, probability: float, seed: int
 ) -> Estimate:
     """Probability that values (n, ...), times a ratio, exceed limits, which are broadcast to them.
 
@@ -255,6 +255,7 @@ def estimate(
     probability is a number; its mean over populations is the probability, and its quantiles, over samples and
     populations, are the interval. Without ratios this is the Clopper-Pearson interval.
     """
+    check_probability(probability)
     values, limits = np.broadcast_arrays(values, limits)
     counted = 1.0 - np.isnan(values)
     regular = (values > 0.0) & (values < np.inf)
@@ -270,12 +271,12 @@ def estimate(
     share, trials = (single * counted).sum(axis=0) / number_of, effective * number_of / len(values)
     error = np.sqrt((np.square(single - share) * counted).sum(axis=0) / number_of / trials)
     if ratios is None:
-        ends = _binomial_interval(share, trials, level)
+        ends = _binomial_interval(share, trials, probability)
         return Estimate(Exceedance(limits[0], share, error, *ends, effective), single, counted, None)
     rng = np.random.default_rng(seed)
     rows = rng.permutation(np.resize(rng.permutation(len(values)), _DRAWS))  # each population has one of the samples
     draws = np.where(counted[rows] > 0.0, above(ratios.draw_populations(_DRAWS, rng), rows), np.nan)
-    lower, upper = np.nanquantile(draws, [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=0)
+    lower, upper = np.nanquantile(draws, [0.5 - 0.5 * probability, 0.5 + 0.5 * probability], axis=0)
     # far in a tail the mean over populations can be above nearly all of their probabilities
     ends = np.minimum(lower, share), np.maximum(upper, share)
     return Estimate(Exceedance(limits[0], share, error, *ends, effective), single, counted, draws)
@@ -328,19 +329,12 @@ def _unit_of_threshold(unit: str | None, channels: Sequence[Channel]) -> str:
     return DIMENSIONS[dimensions.pop()] if len(dimensions) == 1 else "SI"
 
 
-def _binomial_interval(share: np.ndarray, effective: ArrayLike, level: float) -> tuple[np.ndarray, np.ndarray]:
+def _binomial_interval(share: np.ndarray, effective: ArrayLike, probability: float) -> tuple[np.ndarray, np.ndarray]:
     """Clopper-Pearson interval of a probability, for a share of `effective` trials, which may be no whole number."""
-    tail = 0.5 * (1.0 - level)
+    tail = 0.5 * (1.0 - probability)
     share = np.asarray(share, dtype=float)
     hits, misses = share * effective, (1.0 - share) * effective
     # The beta distribution does not exist for a count of zero. The bound is then 0 or 1.
     lower = np.where(hits > 0.0, betaincinv(np.maximum(hits, 1e-300), misses + 1.0, tail), 0.0)
     upper = np.where(misses > 0.0, betainccinv(hits + 1.0, np.maximum(misses, 1e-300), tail), 1.0)
     return lower, upper
-
-
-def check_level(level: float) -> float:
-    """Return the level; raise ValueError if it is not between 0 and 1."""
-    if not 0.0 < level < 1.0:
-        raise ValueError(f"level must be between 0 and 1; got {level!r}")
-    return level

@@ -33,6 +33,7 @@ __all__ = [
     "QuantityScores",
     "Share",
     "central_interval",
+    "check_probability",
     "crps_normal",
     "crps_samples",
     "interval_score",
@@ -70,14 +71,14 @@ def crps_samples(values: ArrayLike, observed: ArrayLike, effective: float | None
     return np.abs(ascending - observed).mean(axis=0) - np.tensordot(ranks, ascending, axes=1) / pairs
 
 
-def interval_score(lower: ArrayLike, upper: ArrayLike, observed: ArrayLike, level: float) -> np.ndarray:
+def interval_score(lower: ArrayLike, upper: ArrayLike, observed: ArrayLike, probability: float) -> np.ndarray:
     r"""Score (...) of central intervals with the probability p: :math:`(u - l) + 2 [(l - y)_+ + (y - u)_+] / (1 - p)`.
 
     Gneiting and Raftery 2007, section 6.2, in the unit of the values; NaN where the observed value is.
     """
     lower, upper, observed = (np.asarray(each, dtype=float) for each in (lower, upper, observed))
     outside = np.maximum(lower - observed, 0.0) + np.maximum(observed - upper, 0.0)
-    return (upper - lower) + 2.0 / (1.0 - level) * outside
+    return (upper - lower) + 2.0 / (1.0 - probability) * outside
 
 
 def pit_samples(values: ArrayLike, observed: ArrayLike) -> np.ndarray:
@@ -122,7 +123,13 @@ class Share(NamedTuple):
     __repr__ = __str__
 
 
-def share_within(pit: ArrayLike, level: float) -> Share:
+def check_probability(probability: float) -> None:
+    """Raise ValueError if the probability of an interval is not between 0 and 1."""
+    if not 0.0 < probability < 1.0:
+        raise ValueError(f"interval_probability must be between 0 and 1; got {probability!r}")
+
+
+def share_within(pit: ArrayLike, interval_probability: float) -> Share:
     """Share of measured values within their central predicted intervals, from their PIT.
 
     Parameters
@@ -130,7 +137,7 @@ def share_within(pit: ArrayLike, level: float) -> Share:
     pit : (n,) array_like
         Probability integral transforms of independent measured values, such as the peaks of several events; NaN values
         are left out.
-    level : float
+    interval_probability : float
         Probability of the intervals, between 0 and 1. The share is about as large if the predictions are calibrated.
 
     Returns
@@ -141,7 +148,7 @@ def share_within(pit: ArrayLike, level: float) -> Share:
     Raises
     ------
     ValueError
-        If there is no value, one is not between 0 and 1, or the level is out of range.
+        If there is no value, one is not between 0 and 1, or `interval_probability` is out of range.
 
     References
     ----------
@@ -153,13 +160,12 @@ def share_within(pit: ArrayLike, level: float) -> Share:
     >>> print(share_within([0.1, 0.4, 0.97], 0.9))
     2 of 3: 21 to 94 %
     """
-    if not 0.0 < level < 1.0:
-        raise ValueError(f"share_within: level must be a probability between 0 and 1; got {level!r}")
+    check_probability(interval_probability)
     there = np.ravel(np.asarray(pit, dtype=float))
     there = there[~np.isnan(there)]
     if not there.size or not ((there >= 0.0) & (there <= 1.0)).all():
         raise ValueError(f"share_within: expected PIT values between 0 and 1; got {pit!r}")
-    return Share(int((np.abs(there - 0.5) <= 0.5 * level).sum()), there.size)
+    return Share(int((np.abs(there - 0.5) <= 0.5 * interval_probability).sum()), there.size)
 
 
 class HistoryScores(NamedTuple):
@@ -172,7 +178,7 @@ class HistoryScores(NamedTuple):
     ----------
     channels : tuple of Channel
         The channels.
-    level : float
+    interval_probability : float
         Probability of the intervals.
     samples : ndarray of int, shape (n_channels,)
         Number of measured samples.
@@ -191,7 +197,7 @@ class HistoryScores(NamedTuple):
     """
 
     channels: tuple[Channel, ...]
-    level: float
+    interval_probability: float
     samples: np.ndarray
     rms: np.ndarray
     rrmse: np.ndarray
@@ -202,7 +208,7 @@ class HistoryScores(NamedTuple):
 
     def __str__(self) -> str:
         head = ["channel", "unit", "RMS", "RRMSE", "CRPS", "interval score", "width"]
-        rows = [[*head, f"in {self.level:.0%} band"]]
+        rows = [[*head, f"in {self.interval_probability:.0%} band"]]
         for k, channel in enumerate(self.channels):
             scaled = [from_si(a[k], channel.unit) for a in (self.rms, self.crps, self.interval_score, self.width)]
             rms, crps, score, width = (f"{each:.3g}" for each in scaled)
@@ -226,7 +232,7 @@ class QuantityScores(NamedTuple):
         Names of the quantities: their channels' names, or numbers.
     units : tuple of str
         Display units, "SI" for a function of the whole response.
-    level : float
+    interval_probability : float
         Probability of the intervals.
     measured : ndarray, shape (n_quantities,)
         Measured values.
@@ -234,7 +240,7 @@ class QuantityScores(NamedTuple):
         Predicted medians.
     lower, upper : ndarray, shape (n_quantities,)
         Ends of the predicted intervals: the samples whose ranks are nearest to (n + 1) p, at most the smallest and the
-        largest. An interval between such ranks has its level on average, also if it is estimated from few samples.
+        largest. Intervals between such ranks have their probability on average, also if estimated from few samples.
     crps : ndarray, shape (n_quantities,)
         CRPS of the samples, for their effective sample size.
     interval_score : ndarray, shape (n_quantities,)
@@ -247,7 +253,7 @@ class QuantityScores(NamedTuple):
 
     names: tuple[str, ...]
     units: tuple[str, ...]
-    level: float
+    interval_probability: float
     measured: np.ndarray
     median: np.ndarray
     lower: np.ndarray
@@ -264,10 +270,10 @@ class QuantityScores(NamedTuple):
 
         Fewer than ten samples cannot show that a value is outside a 90 % interval.
         """
-        return np.abs(self.pit - 0.5) <= 0.5 * self.level
+        return np.abs(self.pit - 0.5) <= 0.5 * self.interval_probability
 
     def __str__(self) -> str:
-        head = ["quantity", "unit", "measured", "median", f"{self.level:.0%} interval", "within"]
+        head = ["quantity", "unit", "measured", "median", f"{self.interval_probability:.0%} interval", "within"]
         rows = [[*head, "CRPS", "interval score", "PIT"]]
         for k, (name, unit) in enumerate(zip(self.names, self.units, strict=True)):
             arrays = (self.measured, self.median, self.lower, self.upper, self.crps, self.interval_score)
@@ -286,24 +292,24 @@ def score_histories(
     measured: np.ndarray,
     moments: tuple[np.ndarray, np.ndarray],
     band: tuple[np.ndarray, np.ndarray],
-    level: float,
+    probability: float,
 ) -> HistoryScores:
     """Score predicted histories [SI]; all arrays are (n_channels, n_samples), measured values NaN where missing.
 
-    Moments are means and standard deviations, the band has quantiles with the probabilities (1 - level) / 2 and (1 +
-    level) / 2. ValueError if a channel has no sample or is zero at all of them.
+    Moments are means and standard deviations; the band is central. ValueError if a channel has no sample or only
+    zeros.
     """
     error = rrmse(moments[0], measured, [channel.name for channel in channels])
     there = np.isfinite(measured)
     inside = (band[0] <= measured) & (measured <= band[1])
     return HistoryScores(
         channels=tuple(channels),
-        level=level,
+        interval_probability=probability,
         samples=there.sum(axis=1),
         rms=np.sqrt(np.nanmean(np.square(measured), axis=1)),
         rrmse=error,
         crps=np.nanmean(crps_normal(*moments, measured), axis=1),
-        interval_score=np.nanmean(interval_score(*band, measured, level), axis=1),
+        interval_score=np.nanmean(interval_score(*band, measured, probability), axis=1),
         width=np.nanmean(np.where(there, band[1] - band[0], np.nan), axis=1),
         coverage=inside.sum(axis=1) / there.sum(axis=1),
     )
@@ -314,30 +320,31 @@ def score_values(
     units: Sequence[str],
     values: np.ndarray,
     measured: ArrayLike,
-    level: float,
+    probability: float,
     effective_sample_size: float | None = None,
 ) -> QuantityScores:
     """Score predicted numbers (n, n_quantities), three samples or more, against measured ones (n_quantities,) [SI]."""
     measured, ascending = np.asarray(measured, dtype=float), np.sort(values, axis=0)
-    (lower, upper), quartiles = central_interval(ascending, level), central_interval(ascending, 0.5)
+    (lower, upper), quartiles = central_interval(ascending, probability), central_interval(ascending, 0.5)
     return QuantityScores(
         names=tuple(names),
         units=tuple(units),
-        level=level,
+        interval_probability=probability,
         measured=measured,
         median=np.median(values, axis=0),
         lower=lower,
         upper=upper,
         crps=crps_samples(values, measured, effective_sample_size),
-        interval_score=interval_score(lower, upper, measured, level),
+        interval_score=interval_score(lower, upper, measured, probability),
         pit=pit_samples(values, measured),
         lower_quartile=quartiles[0],
         upper_quartile=quartiles[1],
     )
 
 
-def central_interval(ascending: np.ndarray, level: float) -> tuple[np.ndarray, np.ndarray]:
+def central_interval(ascending: np.ndarray, probability: float) -> tuple[np.ndarray, np.ndarray]:
     """Ends (n_quantities,) of the central interval of sorted samples (n, n_quantities), see `QuantityScores.lower`."""
     n = len(ascending)
-    rank = max(1, math.ceil(0.5 * (1.0 - level) * (n + 1) - 0.5))  # as `share_within` of the PIT (rank + 0.5) / (n + 1)
+    # as `share_within` of the PIT (rank + 0.5) / (n + 1)
+    rank = max(1, math.ceil(0.5 * (1.0 - probability) * (n + 1) - 0.5))
     return ascending[rank - 1], ascending[n - rank]

@@ -68,7 +68,7 @@ def names(findings):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("noise", [{}, pytest.param({"level": "measured"}, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("noise", [{}, pytest.param({"shares_of": "measured"}, marks=pytest.mark.slow)])
 def test_a_unit_that_is_wrong_is_named_after_the_run_and_before_it(noise):
     """A frequency makes up for a part of the factor."""
     model, measured = deck()

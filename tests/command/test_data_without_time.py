@@ -155,7 +155,7 @@ def test_a_bridge_deck_has_a_mode(tmp_path):
         ("modal", [("frequency_cv = 0.005", "covariance = [[1, 2], [1]]")], "symmetric positive definite"),
         ("modal", [("frequency_cv = 0.005", "frequency_cv = [0.005, 0.01]")], "one for each of 4 modes"),
         ("modal", [("frequency_cv = 0.005", "temperatures = 293")], "from -80 to 80"),
-        ("modal", [("[sampler]", '[noise]\nlevel = "si"\n[sampler]')], "modes have no such errors"),
+        ("modal", [("[sampler]", '[noise]\ngroups = "all"\n[sampler]')], "modes have no such errors"),
         ("modal", [("floor_4 = 4}", "roof = 4}")], "the model has no sensors floor_4"),
         ("modal", [("synthetic_modes", "synthetic_mode")], "did you mean synthetic_modes.csv"),
         ("load-test", [("errors = {quarter", "errors = {third")], "third: unknown channel"),

@@ -28,9 +28,9 @@ def problem_of(folder, noise):  # noqa: F811
         (SENSOR, "sigma_{}", {}),
         ('kind = "autoregressive"\n' + SENSOR, "sigma_{} rho_{}", {}),
         ('groups = "all"\n' + SENSOR, "sigma", {}),
-        ('level = "measured"\n', "share_{}", {"sensor": None, "window": None}),
-        ('level = "measured"\nwindow = "1.5 s"\n' + SENSOR, "share_{}", {"window": 1.5}),
-        ('level = "response"\nwindow = 1.0\nlocal = 0.5\n' + SENSOR, "share_{}", {"window": 1.0, "local": 0.5}),
+        ('shares_of = "measured"\n', "share_{}", {"sensor": None, "window": None}),
+        ('shares_of = "measured"\nwindow = "1.5 s"\n' + SENSOR, "share_{}", {"window": 1.5}),
+        ('shares_of = "response"\nwindow = 1.0\nlocal = 0.5\n' + SENSOR, "share_{}", {"window": 1.0, "local": 0.5}),
     ],
 )
 def test_noises_are_those_of_python(folder, keys, parameters, options):  # noqa: F811
@@ -54,7 +54,7 @@ def test_noises_are_those_of_python(folder, keys, parameters, options):  # noqa:
     [
         ('kind = "autoregresive"', "got 'autoregresive'; did you mean autoregressive?"),
         ('kind = "autoregressive"\ngroups = "all"', '[noise] groups: the kind "autoregressive" has no such key'),
-        ('level = "response"\nwindow = "1 g"\n' + SENSOR, "[noise] window: expected a number in s"),
+        ('shares_of = "response"\nwindow = "1 g"\n' + SENSOR, "[noise] window: expected a number in s"),
         ("groups = true\n" + SENSOR, "[noise] groups: expected one of channel, all, event"),
         ('sensor = {acceleration = "1 mm"}', "[noise] sensor: acceleration: expected a number in m/s"),
         ('sensor = {accelaration = "1 g"}', "sensor: accelaration: unknown channel; did you mean acceleration?"),
@@ -73,7 +73,7 @@ def test_wrong_keys_of_the_noise_are_named(folder, keys, message):  # noqa: F811
 
 
 def test_a_noise_without_a_guide_is_told_before_the_run(folder):  # noqa: F811
-    (folder / "oscillator.toml").write_text(f'{PLAIN}[noise]\nlevel = "response"\nwindow = "1 s"\n{SENSOR}')
+    (folder / "oscillator.toml").write_text(f'{PLAIN}[noise]\nshares_of = "response"\nwindow = "1 s"\n{SENSOR}')
     output = call("run", "oscillator.toml", "--quiet", code=1)
     assert "[sampler]" in output and "guide" in output and not (folder / "results-oscillator").exists()
 

@@ -129,8 +129,8 @@ def test_noise_integrated_out(pieces, rng):
     np.testing.assert_array_equal(marginal.log_likelihood(points), expected)
     drawn = marginal.draw_noise(points, 1)
     assert list(drawn) == ["k", "c", "m", "sigma_top_component", "sigma_top_system"]
-    found = propagate(marginal, drawn, part="system", noise=True, progress=False)
-    assert (found.variance > propagate(marginal, drawn, part="system", progress=False).variance).all()
+    found = propagate(marginal, drawn, data_set="system", noise=True, progress=False)
+    assert (found.variance > propagate(marginal, drawn, data_set="system", progress=False).variance).all()
     with pytest.raises(ValueError, match=r"sigma_top belong to several likelihoods.*separate=\['sigma_top'\]"):
         Posterior(JointLikelihood(pieces), prior_of(JointLikelihood(pieces))).marginal()
 
@@ -141,16 +141,16 @@ def test_predictions_are_of_one_part(pieces, rng):
     for part, columns in {"component": [0, 1, 3], "system": [0, 2, 3]}.items():
         for noise in (False, True):
             settings = {"noise": noise, "seed": 1, "progress": False}
-            ours = propagate(posterior, samples, part=part, **settings)
+            ours = propagate(posterior, samples, data_set=part, **settings)
             theirs = propagate(pieces[part], samples[:, columns], **settings)
             np.testing.assert_array_equal(ours.mean, theirs.mean)
             np.testing.assert_array_equal(ours.variance, theirs.variance)
-        structural = propagate(joint, samples[:, :3], part=part, progress=False)
+        structural = propagate(joint, samples[:, :3], data_set=part, progress=False)
         np.testing.assert_array_equal(structural.mean, theirs.mean)
     cases = {
-        "give part= one of 'component', 'system'": (posterior, {}),
+        "give data_set= one of 'component', 'system'": (posterior, {}),
         "no likelihood 'pier'; the likelihoods are 'component'": (posterior, {"part": "pier"}),
-        "part='system' is for a JointLikelihood": (joint["system"], {"part": "system"}),
+        "data_set='system' is for a JointLikelihood": (joint["system"], {"data_set": "system"}),
     }
     for message, (target, settings) in cases.items():
         with pytest.raises(ValueError, match=message):

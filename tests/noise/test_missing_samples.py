@@ -239,14 +239,14 @@ def test_checks_refuse_channels_with_too_few_samples():
 # errors, predictions --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("options", [{}, {"groups": "all"}, {"level": "response", "window": 0.5}])
+@pytest.mark.parametrize("options", [{}, {"groups": "all"}, {"shares_of": "response", "window": 0.5}])
 @pytest.mark.parametrize("gaps", [[(0, 20, 30)], [(1, 20, 30)], [(0, 15, 20), (1, 40, 45)], [(0, 20, 30), (1, 25, 35)]])
 def test_a_gap_in_one_channel_leaves_a_density(options, gaps, rng):
     """A channel without samples in a stretch of time has no level there, and nothing is compared with it."""
     there = np.ones((2, 60), dtype=bool)
     for channel, start, stop in gaps:
         there[channel, start:stop] = False
-    sensor = {"sensor": (1e-3, 1e-4)} if options.get("level") else {}
+    sensor = {"sensor": (1e-3, 1e-4)} if options.get("shares_of") else {}
     model = FunctionModel(wave, ["size", "speed"], CHANNELS, 0.02, 60)
     likelihood = FELikelihood(model, measured(rng, there), GaussianNoise(CHANNELS, **options, **sensor))
     n = likelihood.ndim - 2

@@ -53,15 +53,15 @@ def test_a_shared_sigma_is_in_units_of_the_scale_of_each_channel(noise, rng):
 
 
 @pytest.mark.parametrize(
-    ("level", "options"), [("measured", {"window": 0.5}), ("response", {"window": 0.6, "sensor": (0.1, 0.001)})]
+    ("shares_of", "options"), [("measured", {"window": 0.5}), ("response", {"window": 0.6, "sensor": (0.1, 0.001)})]
 )
-def test_one_share_for_all_channels_is_equal_shares_per_channel(level, options, rng):
+def test_one_share_for_all_channels_is_equal_shares_per_channel(shares_of, options, rng):
     record = Record("motion", 0.02, rng.standard_normal(200))
     model = LinearOscillator(record)
     response = model.simulate([1.0, 1.0])
     measured = Measurements(model.channels, 0.02, response * (1.0 + 0.3 * rng.standard_normal(response.shape)))
     each, one = (
-        FELikelihood(model, measured, GaussianNoise(model.channels, groups=groups, level=level, **options))
+        FELikelihood(model, measured, GaussianNoise(model.channels, groups=groups, shares_of=shares_of, **options))
         for groups in ("channel", "all")
     )
     assert one.parameter_names[2:] == ("share",)
@@ -75,7 +75,7 @@ def test_one_share_for_all_channels_is_equal_shares_per_channel(level, options, 
     assert other.parameter_names == ("share",) and weights.tolist() == [[1.0]]
 
 
-RESPONSE = {"level": "response", "window": 1.0, "sensor": (1.0, 1.0)}
+RESPONSE = {"shares_of": "response", "window": 1.0, "sensor": (1.0, 1.0)}
 NUMBER = "must be a number, .*; got .*to_si"
 
 
@@ -84,12 +84,12 @@ NUMBER = "must be a number, .*; got .*to_si"
     [
         # combinations
         ({"groups": "each"}, "groups must be one of .'channel', 'all', 'event'.; got 'each'"),
-        ({"level": "SI"}, "level must be one of .'si', 'measured', 'response'."),
-        ({"groups": "event", "level": "measured"}, 'groups="event" has levels in SI units'),
-        ({"window": 1.0}, 'window= is for level="measured" or "response"; got window=1.0'),
-        ({"local": 0.5, "level": "measured"}, 'local= is for level="response"'),
+        ({"shares_of": "SI"}, "shares_of must be one of .None, 'measured', 'response'."),
+        ({"groups": "event", "shares_of": "measured"}, 'groups="event" has levels in SI units'),
+        ({"window": 1.0}, 'window= is for shares_of="measured" or "response"; got window=1.0'),
+        ({"local": 0.5, "shares_of": "measured"}, 'local= is for shares_of="response"'),
         ({"effective_samples": (1.0, 1.0), "groups": "event"}, 'effective_samples= is for groups="channel"'),
-        (RESPONSE | {"window": None}, 'level="response" needs window='),
+        (RESPONSE | {"window": None}, 'shares_of="response" needs window='),
         (RESPONSE | {"sensor": {"top": 0.1}}, "needs the noise of the sensor.*quiet part.*levels in SI units"),
         # values
         ({"sensor": {"bottom": 1.0}}, "unknown channels .*bottom.*the channels are top, drift"),
@@ -100,7 +100,7 @@ NUMBER = "must be a number, .*; got .*to_si"
             for number in ([1.0, 0.0], [1.0, math.nan], {"drift": -3.0})
         ),
         *((RESPONSE | {"local": local}, "local must be from 0") for local in (-0.1, 1.1)),
-        *(({"level": "measured", "window": window}, "window must be a positive") for window in (0.0, math.inf)),
+        *(({"shares_of": "measured", "window": window}, "window must be a positive") for window in (0.0, math.inf)),
         # no numbers
         *(({"sensor": sensor}, f"sensor {NUMBER}") for sensor in ("0.02 g", {"top": "0.02 g"}, {"top": None})),
         ({"effective_samples": "few"}, f"effective_samples {NUMBER}"),

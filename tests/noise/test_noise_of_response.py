@@ -28,7 +28,7 @@ from fe_likelihoods.emulation.target import ResponseTarget
 N, DT = 240, 0.02
 CHANNELS = (Channel("top", "acceleration", "m/s2"), Channel("base", "displacement", "mm"))
 SENSOR, WINDOW = (0.02, 1e-4), 0.6
-NOISE = GaussianNoise(CHANNELS, level="response", window=WINDOW, sensor=SENSOR)
+NOISE = GaussianNoise(CHANNELS, shares_of="response", window=WINDOW, sensor=SENSOR)
 PARAMETERS = np.array([0.3, 0.1])
 
 
@@ -145,7 +145,7 @@ def test_guides_refuse_shares():
 
 
 def test_measurements_that_do_not_fit_are_refused():
-    options, data = {"level": "response", "sensor": SENSOR}, measured(response([1.0]))
+    options, data = {"shares_of": "response", "sensor": SENSOR}, measured(response([1.0]))
     with pytest.raises(ValueError, match="at least three steps"):
         FELikelihood(MODEL, data, GaussianNoise(CHANNELS, window=0.05, **options))
     with pytest.raises(ValueError, match="needs the times of the samples"):
@@ -162,7 +162,7 @@ def test_events_have_levels_of_their_own_response(rng):
     events = Events([strong, strong.scale(0.1)], rest=4.0, names=["EQ1", "EQ2"])
     model = LinearOscillator(events)
     simulated, sensor = model.simulate([1.0, 1.0]), {"acceleration": 1e-3, "displacement": 1e-6}
-    noise = GaussianNoise(model.channels, level="response", window=WINDOW, sensor=sensor)
+    noise = GaussianNoise(model.channels, shares_of="response", window=WINDOW, sensor=sensor)
     parameters = np.array([0.2, 0.3])
     single = {}
     for window in events.windows:
@@ -192,7 +192,7 @@ def test_a_gap_makes_the_share_that_of_another_level(rng):
     shares = np.linspace(0.02, 1.0, 400)
 
     def found(local, gap):
-        noise = GaussianNoise(CHANNELS, level="response", window=WINDOW, sensor=SENSOR, local=local)
+        noise = GaussianNoise(CHANNELS, shares_of="response", window=WINDOW, sensor=SENSOR, local=local)
         values = motion.copy()
         exact = noise.with_measurements(Measurements(CHANNELS, DT, values))
         values += exact.response_deviations(np.array([0.2, 0.2]), motion) * rng.standard_normal(motion.shape)

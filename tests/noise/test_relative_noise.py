@@ -25,7 +25,7 @@ def record(rng):
 
 def posterior_of(model, measured, **options):
     prior = {"stiffness": TruncatedNormal(1.0, 0.3), "damping": TruncatedNormal(1.0, 0.3)}
-    noise = GaussianNoise(measured.channels, level="measured", **options)
+    noise = GaussianNoise(measured.channels, shares_of="measured", **options)
     return Posterior(FELikelihood(model, measured, noise), prior | {n: HalfNormal(0.5) for n in noise.parameter_names})
 
 
@@ -37,19 +37,19 @@ def test_the_likelihood_is_that_of_white_noise_with_the_scaled_deviations(rng):
     misfit, shares = np.array([[1e-4, 3.0], [np.nan, 1.0]]), np.array([[0.2, 0.3], [0.2, 0.3]])
     levels = np.sqrt(np.nanmean(values**2, axis=1))
     for options in ({}, {"sensor": (0.001, 0.1)}, {"effective_samples": (20, 30)}):
-        noise = GaussianNoise(channels, level="measured", **options).with_measurements(measured)
+        noise = GaussianNoise(channels, shares_of="measured", **options).with_measurements(measured)
         expected = GaussianNoise(channels, **options).log_likelihood(misfit, 40, shares * levels)
         np.testing.assert_array_equal(noise.log_likelihood(misfit, 40, shares), expected)
         assert noise.log_likelihood(misfit, 40, -shares)[0] == -np.inf
         assert noise.log_likelihood(misfit, 40, [[0.2, 1.0], [0.2, 1.0]])[0] == -np.inf
     assert noise.parameter_names == ("share_top", "share_base")
-    sensor = GaussianNoise(channels, level="measured", sensor={"base": 0.1}).with_measurements(measured)
+    sensor = GaussianNoise(channels, shares_of="measured", sensor={"base": 0.1}).with_measurements(measured)
     sensor = sensor.standard_deviations(shares)
     np.testing.assert_allclose(sensor[0], [0.2 * levels[0], np.hypot(0.1, 0.3 * levels[1])])
     assert (
         repr(noise)
-        != repr(GaussianNoise(measured.channels, level="measured"))
-        != repr(GaussianNoise(measured.channels, level="measured", window=1.0))
+        != repr(GaussianNoise(measured.channels, shares_of="measured"))
+        != repr(GaussianNoise(measured.channels, shares_of="measured", window=1.0))
     )
 
 
@@ -98,7 +98,7 @@ def test_a_prediction_of_a_weaker_motion_has_the_noise_of_the_weaker_response(re
 def test_what_has_no_level_is_refused():
     model = FunctionModel(lambda theta: [theta[0] * np.ones(5)], ["a"], [TOP], 0.1, 5)
     likelihood = FELikelihood(
-        model, Measurements((TOP,), 0.1, [np.ones(5)]), GaussianNoise((TOP,), level="measured", scales=[1.0])
+        model, Measurements((TOP,), 0.1, [np.ones(5)]), GaussianNoise((TOP,), shares_of="measured", scales=[1.0])
     )
     posterior = Posterior(likelihood, {"a": TruncatedNormal(1.0, 0.1), "share_top": HalfNormal(0.2)})
     assert [each.unit for each in posterior.parameters][-1] == "-"

@@ -170,8 +170,8 @@ def test_samples_that_failed_are_not_counted():
     assert "\n1 of 4 samples failed and are not counted: probabilities may be too low." in damage(found, limits).table()
     with pytest.raises(ValueError, match="measures are peak drift, residual drift"):
         damage(found, [LimitState("reached", "bar tension", 0.1)])
-    with pytest.raises(ValueError, match="level must be between 0 and 1; got 95"):
-        damage(found, limits, level=95)
+    with pytest.raises(ValueError, match="interval_probability must be between 0 and 1; got 95"):
+        damage(found, limits, interval_probability=95)
     with pytest.raises(ValueError, match="needs probabilities at sections"):
         plot_damage(damage(found, limits))
 

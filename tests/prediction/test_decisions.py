@@ -77,9 +77,9 @@ def wave():
     return Wave(Record("motion", 0.01, np.linspace(-1.0, 1.0, 500)))
 
 
-def with_noise(model, level):
+def with_noise(model, shares_of=None):
     measured = Measurements(model.channels, model.dt, model.simulate([1.0]))
-    noise = GaussianNoise(model.channels, level=level)
+    noise = GaussianNoise(model.channels, shares_of=shares_of)
     prior = {"gain": LogNormal(1.0, 0.5), noise.parameter_names[0]: HalfNormal(0.5)}
     return Posterior(FELikelihood(model, measured, noise), prior)
 
@@ -113,10 +113,10 @@ def test_intervals_of_the_probability_cover_the_true_probability(limit, rng):
     truth, inside = stats.norm.sf(np.log(limit), 0.1, 0.2), []
     for _ in range(300):
         ratios = EventRatios(np.exp(0.1 + 0.2 * rng.standard_normal(5)), prior_events=1e-9)
-        found = exceedance(np.ones(50), limit, ratios=ratios, level=0.9)
+        found = exceedance(np.ones(50), limit, ratios=ratios, interval_probability=0.9)
         inside.append(found.lower <= truth <= found.upper)
     assert abs(np.mean(inside) - 0.9) < 4.0 * np.sqrt(0.09 / 300)
-    control = exceedance(np.ones(50), limit, level=0.9)
+    control = exceedance(np.ones(50), limit, interval_probability=0.9)
     assert not control.lower <= truth <= control.upper
 
 
@@ -141,9 +141,7 @@ def test_intervals_contain_their_own_probability(hierarchy, rng):  # noqa: F811
 
 def test_each_record_has_the_scatter_that_it_makes_of_the_parameters(wave, rng):
     """Fragility of a population is the probability of each new event; near a resonance it is wider than the mean."""
-    posteriors = {
-        name: with_noise(wave.with_record(wave.record.scale(k)), "si") for name, k in (("a", 0.5), ("b", 1.0))
-    }
+    posteriors = {name: with_noise(wave.with_record(wave.record.scale(k))) for name, k in (("a", 0.5), ("b", 1.0))}
     prior = Prior({"gain": LogNormal(1.0, 0.5)})
     tests = {name: StoredPosterior({"gain": np.exp(0.05 * rng.standard_normal(200))}, prior) for name in posteriors}
     population = HierarchicalPosterior(tests, {"gain": Varying(LogNormal(1.0, 0.5), HalfNormal(0.1))})
@@ -170,7 +168,7 @@ def test_each_record_has_the_scatter_that_it_makes_of_the_parameters(wave, rng):
 def test_error_of_the_model_has_the_level_of_the_noise_and_the_spectrum_of_the_response(wave):
     noise = GaussianNoise(
         Measurements(wave.channels, wave.dt, wave.simulate([1.0])).channels,
-        level="measured",
+        shares_of="measured",
         window=1.0,
         sensor={"top": 0.1},
     )
@@ -193,7 +191,7 @@ def test_error_of_the_model_has_the_level_of_the_noise_and_the_spectrum_of_the_r
     }
     assert medians[True] > 1.15 * plain and 0.98 * plain < medians["model"] < 1.06 * plain
     with pytest.raises(ValueError, match='noise="model" needs a noise that follows the response'):
-        propagate(with_noise(wave, "si"), samples, quantity=peak("top"), noise="model")
+        propagate(with_noise(wave), samples, quantity=peak("top"), noise="model")
 
 
 def test_fragility_has_the_error_of_the_model_where_it_is_known(wave, rng):

@@ -11,8 +11,8 @@ LOGS = np.array([0.1, -0.05, 0.2, 0.0])
 
 @pytest.fixture
 def events(rng):
-    levels = np.exp(rng.standard_normal(8))
-    return np.exp(0.1 + 0.3 * np.log(levels) + 0.1 * rng.standard_normal(8)), levels
+    predicted = np.exp(rng.standard_normal(8))
+    return np.exp(0.1 + 0.3 * np.log(predicted) + 0.1 * rng.standard_normal(8)), predicted
 
 
 def test_ratio_of_a_new_event_is_the_t_distribution_of_the_textbook():
@@ -44,12 +44,12 @@ def test_the_prior_of_the_scatter_is_worth_its_events_and_says_how_much_of_the_w
 
 def test_each_ratio_counts_by_its_expected_scatter(rng):
     """The conjugate posterior of a weighted regression with a prior of its slope, in matrices."""
-    levels, sd = np.exp(rng.standard_normal((8, 2))), 0.05 + 0.2 * rng.random((8, 2))
-    values = np.exp(0.1 + 0.2 * np.log(levels) + sd * rng.standard_normal((8, 2)))
-    ratios = EventRatios(values, sd, 6.0, levels, slope_sd=0.3, new_sd=[0.1, 0.2])
+    predicted, sd = np.exp(rng.standard_normal((8, 2))), 0.05 + 0.2 * rng.random((8, 2))
+    values = np.exp(0.1 + 0.2 * np.log(predicted) + sd * rng.standard_normal((8, 2)))
+    ratios = EventRatios(values, sd, 6.0, predicted, slope_sd=0.3, new_sd=[0.1, 0.2])
     at, p = 1.7, np.array([0.05, 0.5, 0.95])
     for k, new_sd in enumerate((0.1, 0.2)):
-        y, x, w = np.log(values[:, k]), np.log(levels[:, k]), sd[:, k] ** -2
+        y, x, w = np.log(values[:, k]), np.log(predicted[:, k]), sd[:, k] ** -2
         rows = np.column_stack([np.ones(8), x])
         precision = rows.T @ (w[:, None] * rows) + np.diag([0.0, 0.3**-2])
         line = np.linalg.solve(precision, rows.T @ (w * y))
@@ -63,13 +63,13 @@ def test_each_ratio_counts_by_its_expected_scatter(rng):
 
 @pytest.mark.parametrize("slope_sd", (0.0, 1.0))
 def test_populations_and_probabilities_belong_together(events, slope_sd):
-    values, levels = events
-    ratios, rng = EventRatios(values, levels=levels, slope_sd=slope_sd), np.random.default_rng(1)
+    values, predicted = events
+    ratios, rng = EventRatios(values, predicted=predicted, slope_sd=slope_sd), np.random.default_rng(1)
     populations = ratios.draw_populations(4000, rng)
-    for level in (0.05, 1.0, 8.0):
-        limit = ratios.quantile(0.8, level)
-        assert ratios.probability_above(limit, np.log(level)) == pytest.approx(0.2, abs=1e-9)
-        above = populations.probability_above(np.full(4000, limit), np.full(4000, np.log(level)))
+    for predicted in (0.05, 1.0, 8.0):
+        limit = ratios.quantile(0.8, predicted)
+        assert ratios.probability_above(limit, np.log(predicted)) == pytest.approx(0.2, abs=1e-9)
+        above = populations.probability_above(np.full(4000, limit), np.full(4000, np.log(predicted)))
         assert abs(above.mean() - 0.2) < 4.0 * above.std() / np.sqrt(4000)
 
 
@@ -82,10 +82,10 @@ def test_what_cannot_be_used_is_refused():
         (two, {"prior_events": 0}, "prior_events must be positive"),
         (two, {"new_sd": 0.0}, "new_sd must be positive"),
         (two, {"slope_sd": -0.1}, "slope_sd zero or more"),
-        *((two, {"levels": bad}, "one positive predicted value") for bad in ([1.0], [1.0, 0.0], [1.0, np.inf])),
+        *((two, {"predicted": bad}, "one positive predicted value") for bad in ([1.0], [1.0, 0.0], [1.0, np.inf])),
     ):
         with pytest.raises(ValueError, match=message):
             EventRatios(values, **options)
-    for p, level in ((1.5, 1.0), (0.5, 0.0)):
+    for p, predicted in ((1.5, 1.0), (0.5, 0.0)):
         with pytest.raises(ValueError, match="expected probabilities between 0 and 1 and positive"):
-            EventRatios(two).quantile(p, level)
+            EventRatios(two).quantile(p, predicted)

@@ -124,7 +124,7 @@ def test_what_is_no_fragility_is_refused(record):
         (peaks, [1.0], 0.1, "one for each of 2 predictions", {}),
         (other, [1.0, 2.0], 0.1, "from the same samples", {}),
         (mixed, [1.0, 2.0], 0.1, "predictions of one kind", {}),
-        (peaks, [1.0, 2.0], 0.1, "level", {"level": 2.0}),
+        (peaks, [1.0, 2.0], 0.1, "interval_probability", {"interval_probability": 2.0}),
         (peaks, [1.0, 2.0], 0.1, "ratios of one quantity", {"ratios": EventRatios([[1.0, 1.0]] * 2)}),
         (peaks, [1.0, 2.0], -0.1, "thresholds must be positive", {"ratios": EventRatios([1.0, 1.1])}),
     ):

@@ -21,7 +21,7 @@ def quake(seed, duration=12.0):
 
 def noise_for(model, **options):
     deviations = 1e-3 * np.abs(model.simulate([1.0, 1.0])).max(axis=1)
-    return GaussianNoise(model.channels, level="response", window=WINDOW, sensor=deviations, **options)
+    return GaussianNoise(model.channels, shares_of="response", window=WINDOW, sensor=deviations, **options)
 
 
 def test_pauses_of_the_calibration_are_no_gap_of_another_record():

@@ -89,7 +89,7 @@ def hierarchy(rng):
 def posterior(rng):
     model = Amplified()
     measured = Measurements([TOP], model.dt, model.simulate([MEDIAN]) + 1e-4 * rng.standard_normal((1, 100)))
-    noise = GaussianNoise(measured.channels, level="measured")
+    noise = GaussianNoise(measured.channels, shares_of="measured")
     return Posterior(FELikelihood(model, measured, noise), {"gain": LogNormal(0.03, 1.0), "share_top": HalfNormal(0.5)})
 
 
@@ -160,7 +160,7 @@ def test_histories_of_a_new_event_have_noise_of_its_own_level(hierarchy, posteri
 
 def test_many_draws_of_impossible_shares_are_refused(hierarchy, posterior):
     wide = Hierarchy(hierarchy.posterior, hierarchy.samples * [1.0, 1.0, 3.0, 5.0])  # a median of 0.6, a spread of 0.5
-    with pytest.raises(ValueError, match=r"1\d% of the draws have an impossible noise.*level='response'"):
+    with pytest.raises(ValueError, match=r"1\d% of the draws have an impossible noise.*shares_of='response'"):
         predict_new_event(wide, {"EQ0": posterior}, 0.1, noise=True, n=2000, seed=1)
 
 

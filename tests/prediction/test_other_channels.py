@@ -54,9 +54,11 @@ KINDS = {
     "white": lambda channels, sensor, levels: GaussianNoise(channels, sensor=sensor),
     "shared": lambda channels, sensor, levels: GaussianNoise(channels, groups="all", scales=levels, sensor=sensor),
     "relative": lambda channels, sensor, levels: GaussianNoise(
-        channels, level="measured", scales=levels, window=0.4, sensor=sensor
+        channels, shares_of="measured", scales=levels, window=0.4, sensor=sensor
     ),
-    "modulated": lambda channels, sensor, levels: GaussianNoise(channels, level="response", window=0.4, sensor=sensor),
+    "modulated": lambda channels, sensor, levels: GaussianNoise(
+        channels, shares_of="response", window=0.4, sensor=sensor
+    ),
     "autoregressive": lambda channels, sensor, levels: AutoregressiveNoise(channels, sensor=sensor),
 }
 
@@ -91,36 +93,38 @@ def test_the_prediction_is_that_of_a_noise_of_all_channels_with_mean_parameters(
 
     stacked = np.stack([value(name) for name in whole.parameter_names], axis=1)
     for settings in ({}, {"quantity": [peak(channel.name) for channel in ALL]}):
-        ours = quiet(likelihood, samples, model=wave(ALL), noise=True, **settings)
+        ours = quiet(likelihood, samples, channels_of=wave(ALL), noise=True, **settings)
         theirs = quiet(whole, stacked, noise=True, **settings)
-        without = quiet(likelihood, samples, model=wave(ALL), **settings)
+        without = quiet(likelihood, samples, channels_of=wave(ALL), **settings)
         np.testing.assert_allclose(ours.quantiles, theirs.quantiles, rtol=1e-12, atol=1e-14)
         np.testing.assert_allclose(ours.variance, theirs.variance, rtol=1e-12)
         assert (np.ptp(ours.quantiles[[0, 2]], axis=0) > np.ptp(without.quantiles[[0, 2]], axis=0)).mean() > 0.7
     if kind in ("relative", "modulated"):
-        assert quiet(likelihood, samples, model=wave(ALL), noise="model", quantity=peak("middle")).noise
+        assert quiet(likelihood, samples, channels_of=wave(ALL), noise="model", quantity=peak("middle")).noise
 
 
 def test_the_noise_of_measured_channels_is_that_of_the_posterior(rng):
     likelihood = FELikelihood(wave(MEASURED), measured(MEASURED))
     samples = drawn(likelihood, rng)
     few = (DRIFT, TOP)
-    for settings in ({"model": wave(few), "noise": True}, {"model": wave((*ALL, FORCE))}):
+    for settings in ({"channels_of": wave(few), "noise": True}, {"channels_of": wave((*ALL, FORCE))}):
         assert quiet(likelihood, samples, **settings).findings == ()
-    ours = quiet(likelihood, samples, model=wave(few), noise=True)
+    ours = quiet(likelihood, samples, channels_of=wave(few), noise=True)
     part = FELikelihood(wave(few), measured(few))
     np.testing.assert_array_equal(ours.quantiles, quiet(part, samples[:, [0, 1, 4, 2]], noise=True).quantiles)
     by_name = dict(zip(likelihood.parameter_names, samples.T, strict=True))
-    np.testing.assert_array_equal(ours.quantiles, quiet(likelihood, by_name, model=wave(few), noise=True).quantiles)
+    np.testing.assert_array_equal(
+        ours.quantiles, quiet(likelihood, by_name, channels_of=wave(few), noise=True).quantiles
+    )
 
 
 def test_a_model_under_another_excitation_is_compared_with_the_calibration(rng):
     """Peaks of the measured channels that are ten times as large as in the calibration are warned of."""
     likelihood = FELikelihood(wave(MEASURED), measured(MEASURED))
     samples = drawn(likelihood, rng)
-    (peaks,) = quiet(likelihood, samples, model=wave(ALL, 10.0), noise=True).findings
+    (peaks,) = quiet(likelihood, samples, channels_of=wave(ALL, 10.0), noise=True).findings
     assert "top (" in peaks.text and "middle" not in peaks.text
-    assert quiet(likelihood, samples, model=wave(ALL), noise=True).findings[1:] == ()
+    assert quiet(likelihood, samples, channels_of=wave(ALL), noise=True).findings[1:] == ()
 
 
 @pytest.mark.parametrize(
@@ -139,7 +143,7 @@ def test_a_model_under_another_excitation_is_compared_with_the_calibration(rng):
 def test_other_channels_that_cannot_be_predicted_are_refused(other, noise, words, rng):
     likelihood = FELikelihood(wave(MEASURED), measured(MEASURED))
     with pytest.raises(ValueError, match=re.escape(words)):
-        propagate(likelihood, drawn(likelihood, rng), model=other, noise=noise, progress=False)
+        propagate(likelihood, drawn(likelihood, rng), channels_of=other, noise=noise, progress=False)
 
 
 def test_levels_per_event_are_means_of_the_channels_measured_in_the_event(rng):
@@ -170,7 +174,7 @@ def test_levels_per_event_are_means_of_the_channels_measured_in_the_event(rng):
     assert likelihood.parameter_names[2:] == ("sigma_a_EQ1", "sigma_b_EQ1", "sigma_a_EQ2")
     samples = np.hstack([rng.normal(1.0, 0.05, (50, 2)), rng.uniform(0.5, 1.0, (50, 3))])
     other, _ = copies(["c", "b"])
-    clean, noisy = (quiet(likelihood, samples, model=other, noise=noise) for noise in (False, True))
+    clean, noisy = (quiet(likelihood, samples, channels_of=other, noise=noise) for noise in (False, True))
     added = noisy.variance - clean.variance
     mean = 0.5 * (samples[:, 2] + samples[:, 3])
     expected = np.zeros_like(added)

@@ -202,7 +202,7 @@ def test_coverage_of_measurements(oscillator, rng):
     inside = [half.coverage for half in halves]
     assert np.allclose(np.mean(inside, axis=0), scores.coverage) and not np.allclose(*inside)
     with pytest.raises(ValueError, match=r"no quantile 0\.01"):
-        noisy.score(measurements, level=0.98)
+        noisy.score(measurements, interval_probability=0.98)
     with pytest.raises(ValueError, match=r"400 samples with a step of 0\.02 s .* got 200"):
         noisy.score(measurements.trim(0.0, 199 * 0.02))
 

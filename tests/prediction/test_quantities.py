@@ -72,7 +72,7 @@ def test_an_energy_has_its_own_name_dimension_and_unit():
         ("energy of force", "energy", "kJ"),
         ("deck", "acceleration", "g"),
     ]
-    row = str(both.score(DATA, level=0.5)).splitlines()[2].split()
+    row = str(both.score(DATA, interval_probability=0.5)).splitlines()[2].split()
     assert row[:5] == ["energy", "of", "force", "kJ", f"{measured_quantity(WORK, DATA) / 1e3:.3g}"]
     work = propagate(MODEL, SAMPLES, quantity=WORK, progress=False)
     assert exceedance(work, 7.5, unit="kJ").probability == 0.25

@@ -59,7 +59,7 @@ def test_units_and_shapes_of_thresholds(record, rng):
         (np.zeros((50, 3)), [1.0, 2.0], {}, r"shape \(3,\); got shape \(2,\)"),
         (propagate(model, samples, progress=False), 0.1, {}, "quantity, such as peak"),
         ([1.0, np.nan], 0.1, {}, "values must be finite"),
-        (p, 0.1, {"level": 95}, "level"),
+        (p, 0.1, {"interval_probability": 95}, "interval_probability"),
     ):
         with pytest.raises(ValueError, match=message):
             exceedance(values, limit, **options)

@@ -69,14 +69,14 @@ def test_crps_of_copies_is_unbiased_for_the_effective_sample_size(rng):
     assert abs(share - (1 / 20 - 1 / 400)) < 4.0 * wrong.std() / np.sqrt(len(y)) / exact.mean()
 
 
-@pytest.mark.parametrize(("n", "level"), ((10, 0.9), (19, 0.9), (20, 0.9), (101, 0.9), (30, 0.5)))
-def test_intervals_from_few_samples_have_their_level_and_are_those_of_the_pit(n, level, rng):
+@pytest.mark.parametrize(("n", "probability"), ((10, 0.9), (19, 0.9), (20, 0.9), (101, 0.9), (30, 0.5)))
+def test_intervals_from_few_samples_have_their_level_and_are_those_of_the_pit(n, probability, rng):
     values, y = rng.normal(size=(2, n, 20_000))[0], rng.normal(size=20_000)
-    scores = score_values([""] * 20_000, ["SI"] * 20_000, values, y, level)
+    scores = score_values([""] * 20_000, ["SI"] * 20_000, values, y, probability)
     np.testing.assert_array_equal(scores.within, (scores.lower <= y) & (y <= scores.upper))
-    assert scores.within.mean() == share_within(scores.pit, level).value
+    assert scores.within.mean() == share_within(scores.pit, probability).value
     nearest = 1.0 / (n + 1.0)  # half a rank at both ends
-    assert abs(scores.within.mean() - level) < nearest + 4.0 * np.sqrt(level * (1 - level) / 20_000)
+    assert abs(scores.within.mean() - probability) < nearest + 4.0 * np.sqrt(probability * (1 - probability) / 20_000)
 
 
 def test_share_within_leaves_missing_values_out_and_refuses_others():
@@ -165,8 +165,8 @@ def test_what_cannot_be_scored_is_refused(oscillator, rng):
     gaps[1, 3] = np.nan
     for prediction, given, options, message in (
         (histories, [1.0, 2.0], {}, "needs Measurements"),
-        (histories, measured, {"level": 0.5}, "no quantile"),
-        (histories, measured, {"level": 90}, "level must be a probability"),
+        (histories, measured, {"interval_probability": 0.5}, "no quantile"),
+        (histories, measured, {"interval_probability": 90}, "interval_probability must be between"),
         (whole, measured, {}, "give the measured values"),
         (whole, 1.0, {}, "of the shape of the quantity"),
         (top, Measurements(measured.channels, measured.dt, gaps), {}, "samples of channel 'displacement' are missing"),

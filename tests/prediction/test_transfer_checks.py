@@ -106,7 +106,7 @@ def test_the_range_is_that_of_all_calibrated_events(rng):
     record = excitation(rng, 5.0)
     joint = JointLikelihood({"weak": weak.likelihood, "strong": strong.likelihood})
     assert said(propagate, weak, samples, record=record)
-    assert not said(propagate, joint, samples, part="weak", record=record)
+    assert not said(propagate, joint, samples, data_set="weak", record=record)
     events = [weak.likelihood.measurements, strong.likelihood.measurements]
     assert not said(propagate, weak, samples, record=record, calibrated=events)
     assert not said(propagate, weak.likelihood.model, samples[:, :1], record=record)  # nothing is known of a bare model

@@ -37,7 +37,7 @@ def make_posterior(limit=np.inf, joint=False):
     noise = 0.008 * np.random.default_rng(0).standard_normal((1, N))
     measured = Measurements(CHANNEL, DT, 0.01 * np.sin(9.0 * TIME) + noise)
     model = FunctionModel(simulate, ["amplitude", "phase"], CHANNEL, DT, N, version=str(limit))
-    likelihood = FELikelihood(model, measured, GaussianNoise(measured.channels, level="measured"))
+    likelihood = FELikelihood(model, measured, GaussianNoise(measured.channels, shares_of="measured"))
     prior = {name: TruncatedNormal(1.0, 0.5) for name in ("amplitude", "phase")} | {"share_top": HalfNormal(1.0)}
     return Posterior(JointLikelihood({"first": likelihood}) if joint else likelihood, prior)
 
