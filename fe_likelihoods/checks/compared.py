@@ -104,7 +104,7 @@ def checks_of(residuals: np.ndarray) -> ResidualChecks | None:
 def data_sets_of(posterior: Any) -> list[tuple[str, FELikelihood, np.ndarray]]:
     """Name (empty if there is one only), likelihood and columns of the parameters of each data set."""
     likelihood = posterior.likelihood
-    return [(key, *part) for key, part in zip(likelihood.likelihoods, likelihood.parts(), strict=True)]
+    return [(key, *part) for key, part in zip(likelihood.likelihoods, likelihood.data_sets(), strict=True)]
 
 
 def draws_to_compare(posterior: Posterior) -> np.ndarray:

@@ -55,7 +55,7 @@ def halve_steps(posterior: Posterior, point: np.ndarray, sd: np.ndarray) -> tupl
     precision = np.diag(np.square(np.where(np.isfinite(widths), widths, 0.0)))
     pulls, squares = dict[str, np.ndarray](), dict[str, np.ndarray]()
     tests = {STEP: "not tested: the model takes neither a motion nor a step that could be halved"}
-    for likelihood, columns in posterior.likelihood.parts():
+    for likelihood, columns in posterior.likelihood.data_sets():
         model, n = likelihood.model, len(likelihood.model.parameter_names)
         theta, at = point[columns][:n], columns[:n]
         batch = likelihood.simulate(theta + np.vstack([np.zeros(n), np.diag(sd[at])]))
@@ -124,7 +124,7 @@ def check_chance(model: Any, theta: np.ndarray, response: np.ndarray, pool: Any)
 def refuse_chance(posterior: Posterior) -> None:
     """Simulate the mean of the prior again; ValueError if the responses differ. A failed simulation is no such case."""
     mean = posterior.prior.mean()
-    for likelihood, columns in posterior.likelihood.parts():
+    for likelihood, columns in posterior.likelihood.data_sets():
         theta = mean[columns][: len(likelihood.model.parameter_names)]
         first, pool = likelihood.simulate(theta[None]), likelihood.simulator.pool
         found = [] if first.reasons[0] else check_chance(likelihood.model, theta, first.response[0], pool)

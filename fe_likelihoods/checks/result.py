@@ -80,7 +80,7 @@ def check_model(posterior: Posterior) -> ModelCheck:
         # where responses differ by chance, other differences say nothing
         found += chance or check_motion(part.model, theta, batch.response[0])
     found += _check_inputs(likelihood, fits)
-    report, attempts = posterior.report(), sum(part.simulator.failures.outcomes for part, _ in likelihood.parts())
+    report, attempts = posterior.report(), sum(part.simulator.failures.outcomes for part, _ in likelihood.data_sets())
     rows = tuple(Failure(*each, "") for each in Counter(report["failure_reasons"]).most_common(1))
     found += check_failures(Failures(rows, report["failure_count"], attempts))
     return ModelCheck(in_order(found), tuple(fits))
@@ -126,7 +126,7 @@ def judge_run(run: FinishedRun) -> JudgedRun:
 
     A run that says nothing about the parameters gets no findings that compare its samples with prior, truth or noise.
     """
-    rows, fits, parts = rows_of(run), fit_data_sets(run), [] if run.likelihood is None else run.likelihood.parts()
+    rows, fits, parts = rows_of(run), fit_data_sets(run), [] if run.likelihood is None else run.likelihood.data_sets()
     histories = not parts or any(part.measurements.is_history for part, _ in parts)
     found, tested = _check_steps(run) if parts and histories else ([], {})
     failed = failures(run)  # those of the fits included
@@ -152,7 +152,7 @@ def judge_run(run: FinishedRun) -> JudgedRun:
 def _check_inputs(likelihood: Any, fits: Iterable[Fit]) -> list[Finding]:
     """Findings about the data of a likelihood, or of none, by themselves and beside responses."""
     found = check_responses(fits)
-    for part, _ in [] if likelihood is None else likelihood.parts():
+    for part, _ in [] if likelihood is None else likelihood.data_sets():
         found += check_supports(part.model)
         found += check_data(part.measurements, motions_to_replace(part.model))
         if text := getattr(part.model, "range_remark", ""):  # also of simulations that verify stored rows
@@ -170,7 +170,7 @@ def _check_steps(run: FinishedRun) -> tuple[list[Finding], dict[str, str]]:
     if run.prior is None or run.is_inconclusive:
         return [], {}
     report = run.likelihood.report()
-    needed = sum(2 + len(likelihood.model.parameter_names) for likelihood, _ in run.likelihood.parts())
+    needed = sum(2 + len(likelihood.model.parameter_names) for likelihood, _ in run.likelihood.data_sets())
     seconds = report["seconds"] / max(report["simulations"], 1)
     if run.n_modes > 1:
         return [], {STEP: "not tested: the samples have several modes, which have no common standard deviation"}

@@ -210,7 +210,7 @@ class Failures(NamedTuple):
 def failures(run: FinishedRun) -> Failures:
     """Failed simulations by reason, counted in likelihoods, also of first parts of the record, or in the sampler."""
     known, count, attempts, unknown = list[tuple[str, dict]](), 0, 0, ""
-    for likelihood, columns in [] if run.likelihood is None else run.likelihood.parts():
+    for likelihood, columns in [] if run.likelihood is None else run.likelihood.data_sets():
         logs = [each.simulator.failures for each in (likelihood, *likelihood.shortened)]
         known += [(each["reason"], each["parameters"]) for log in logs for each in log.records]
         count, attempts = count + sum(each.count for each in logs), attempts + sum(each.outcomes for each in logs)

@@ -43,7 +43,7 @@ def _say_data(problem: Problem, say: Callable[[str], None]) -> None:
     posterior, record = problem.posterior, problem.record
     if record is not None:
         say(f"Record: {record}" + (f"\n  from {record.source}" if record.source else ""))
-    for part, _ in posterior.likelihood.parts():
+    for part, _ in posterior.likelihood.data_sets():
         say("Measurements:\n" + (str(part.model.data) if part.is_modal else "\n".join(describe(part.measurements))))
     rows = [("parameter", "prior mean", "standard deviation", "")]
     for parameter in posterior.parameters:
@@ -56,7 +56,7 @@ def _say_data(problem: Problem, say: Callable[[str], None]) -> None:
 def _say_simulation(problem: Problem, checked: ModelCheck, say: Callable[[str], None]) -> None:
     report, mean = problem.posterior.report(), problem.posterior.prior.mean()[None]
     say(f"One simulation takes {report['seconds'] / report['simulations']:.2g} s")
-    for part, columns in problem.posterior.likelihood.parts():
+    for part, columns in problem.posterior.likelihood.data_sets():
         theta, measured = mean[:, columns[: len(part.model.parameter_names)]], part.measurements
         if part.is_modal:
             say(f"At the mean of the prior:\n{part.predict_modes(theta)}")
@@ -72,7 +72,7 @@ def _zero_of(job: Job, problem: Problem, checked: ModelCheck) -> str:
     """The line of ``[measurements]`` that moves all channels by the time by which all are late, else empty."""
     found = [each for each in checked.findings if each.kind == FAULTS["lag"][0]]
     late, said = [each.numbers["lag"] for each in found], " ".join(each.text for each in found)
-    parts = [part.measurements for part, _ in problem.posterior.likelihood.parts()]
+    parts = [part.measurements for part, _ in problem.posterior.likelihood.data_sets()]
     alike = late and max(late) - min(late) <= min(min(part.steps) for part in parts)
     if not alike or any(channel.name not in said for part in parts for channel in part.channels):
         return ""

@@ -228,7 +228,7 @@ def _make_priors(
     job: Job, likelihood: FELikelihood | JointLikelihood, known: Mapping[str, float]
 ) -> tuple[dict[str, Any], dict[str, Distribution]]:
     """The priors of all parameters, numbers for `known` ones, and the assumed ones, which the file does not give."""
-    names, parts, where = likelihood.parameter_names, [part for part, _ in likelihood.parts()], job.where("priors")
+    names, parts, where = likelihood.parameter_names, [part for part, _ in likelihood.data_sets()], job.where("priors")
     channels, given, assumed = {}, dict[str, Any](known), {}  # of each parameter that is a noise level, its channel
     for part in parts:
         channels |= channels_of_deviations(part.noise, part.model.channels)

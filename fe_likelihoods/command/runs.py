@@ -119,7 +119,7 @@ def _write(folder: Path, job: Job, again: str, chains: list[Any], problem: Probl
     judged = judge_run(run)
     agreement = write_samples(folder, run, chains, prediction, str(judged.judgement))
     write_page(folder / PAGE, run, prediction, judged, repeat=again)
-    said = [each.measurements.description for each, _ in problem.posterior.likelihood.parts()]
+    said = [each.measurements.description for each, _ in problem.posterior.likelihood.data_sets()]
     said = [agreement, *(f"Measurements: {each}" for each in said if "CAUTION" in each)]
     said += [f"Assumed priors [SI], which the file does not give: {problem.assumed}"] if problem.assumed else []
     for of, findings in (("", judged.judgement.findings), ("prediction: ", prediction and prediction.findings)):

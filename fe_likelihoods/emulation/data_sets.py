@@ -55,7 +55,7 @@ class DataSets:
         self.parameter_names = tuple(likelihood.parameter_names[:n_structural])
         self._parts: list[_DataSet] = []
         channels = numbers = 0
-        for part, columns in likelihood.parts():
+        for part, columns in likelihood.data_sets():
             statistic, values, own = _statistic_of(part), measured_values(part.measured), part.simulator.n_structural
             check_quadratic(statistic, values)
             places = list(columns[:own]), [place - n_structural for place in columns[own:]]

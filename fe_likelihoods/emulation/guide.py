@@ -77,7 +77,7 @@ class ResponseGuide(Guide):
 
     def __init__(self, posterior: Any, starts: int = 12) -> None:
         starts = check_starts(starts)
-        fewest = min(part.simulator.memory_cache.most for part, _ in posterior.likelihood.parts())
+        fewest = min(part.simulator.memory_cache.most for part, _ in posterior.likelihood.data_sets())
         if fewest < _FEWEST_CACHED:
             raise ValueError(
                 f"a guide needs a likelihood with memory_rows of {_FEWEST_CACHED} or more, so that no simulation is "

@@ -12,12 +12,12 @@ from ..simulation.faults import reason_of
 from ..simulation.label import items_of
 from .failure_log import FailureLog
 from .parameters import Parameter, parameter_of
-from .sum_of_parts import COUNTS, SumOfParts
+from .sum_of_data_sets import COUNTS, SumOfDataSets
 
 __all__ = ["FunctionLikelihood"]
 
 
-class FunctionLikelihood(SumOfParts):
+class FunctionLikelihood(SumOfDataSets):
     """Any log-likelihood of named parameters, as a likelihood of a `Posterior`.
 
     Samplers, `to_arviz`, tables, figures and the adapters take the posterior. What needs a model or its responses does

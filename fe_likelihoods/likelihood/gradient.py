@@ -59,7 +59,7 @@ def likelihood_gradient(
     `sd` (ndim,) are scales of the parameters and `bounds` (ndim, 2) those of the prior.
     """
     total, good = np.zeros(rows.shape), np.ones(len(rows), dtype=bool)
-    for part, columns in likelihood.parts():
+    for part, columns in likelihood.data_sets():
         own, left = columns[: part.simulator.n_structural], np.flatnonzero(good)
         batch, noise = part.simulate(rows[np.ix_(left, own)]), columns[len(own) :]
         good[left] = [not reason for reason in batch.reasons]

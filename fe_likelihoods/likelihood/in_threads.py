@@ -19,7 +19,7 @@ class InThreads:
     """An executor for functions that call a posterior, see `Posterior.executor`."""
 
     def __init__(self, posterior: Any) -> None:
-        simulators = [part.simulator for part, _ in posterior.likelihood.parts()]
+        simulators = [part.simulator for part, _ in posterior.likelihood.data_sets()]
         pools = {id(each.pool): each.pool for each in simulators if each.pool is not None}
         sizes = [getattr(pool, "n_workers", None) for pool in pools.values()]
         self.n_workers: int | None = None if None in sizes else sum(sizes) or 1

@@ -14,12 +14,12 @@ from ..noise.marginal import sampled_noise
 from ..priors.points import as_points
 from .likelihood import FELikelihood
 from .parameters import channels_of_deviations
-from .sum_of_parts import SumOfParts
+from .sum_of_data_sets import SumOfDataSets
 
 __all__ = ["JointLikelihood"]
 
 
-class JointLikelihood(SumOfParts):
+class JointLikelihood(SumOfDataSets):
     """Sum of log-likelihoods of several data sets over the union of their parameters.
 
     Parameters with the same name are one parameter. `Posterior` accepts the object like an `FELikelihood`. Calling it

@@ -25,12 +25,12 @@ from ..signals.events import events_of
 from ..simulation.model import Model, SimulationBatch, first_part
 from .inputs import check_model, check_noise, match_measurements
 from .simulator import Simulator
-from .sum_of_parts import SumOfParts
+from .sum_of_data_sets import SumOfDataSets
 
 __all__ = ["FELikelihood"]
 
 
-class FELikelihood(SumOfParts):
+class FELikelihood(SumOfDataSets):
     """Log-likelihood of structural parameters and noise parameters, given measurements.
 
     Calling the object is `log_likelihood`.

@@ -161,7 +161,7 @@ class Posterior:
     @property
     def is_differentiable(self) -> bool:
         """Whether `grad_log_prob` can be computed: all models know the derivatives of their response."""
-        models = [part.model for part, _ in self.likelihood.parts()]
+        models = [part.model for part, _ in self.likelihood.data_sets()]
         return bool(models) and all(map(has_jacobian, models))
 
     def grad_log_prob(self, x: Any) -> np.ndarray:
@@ -198,7 +198,7 @@ class Posterior:
 
     def _gradient(self, x: Any, with_prior: bool) -> np.ndarray:
         if not self.is_differentiable:
-            kinds = ", ".join(sorted({type(part.model).__name__ for part, _ in self.likelihood.parts()}))
+            kinds = ", ".join(sorted({type(part.model).__name__ for part, _ in self.likelihood.data_sets()}))
             raise ValueError(
                 "the gradient needs models with a method jacobian(theta), the derivatives (n_parameters, n_channels, "
                 f"n_steps) of the response; got {kinds}: give FunctionModel jacobian=, or use a sampler that needs no "
@@ -259,7 +259,7 @@ class Posterior:
 
     def _check_models(self, what: str) -> None:
         """ValueError if the likelihood is a function without a model."""
-        if not self.likelihood.parts():
+        if not self.likelihood.data_sets():
             raise ValueError(
                 f"{what} needs the responses of a model, and {type(self.likelihood).__name__} has none: describe the "
                 "data by an FELikelihood, with FunctionModel for a model of your own"
@@ -426,7 +426,7 @@ class Posterior:
         announces.handlers = [each for each in announces.handlers if not isinstance(each, _Compiling)]
         if callback is not None:
             announces.addHandler(_Compiling(callback))
-        parts = self.likelihood.parts()
+        parts = self.likelihood.data_sets()
         share = 1.0 / max(len(parts), 1)
         for likelihood, _ in parts:
             likelihood.simulator.when_simulated = None if callback is None else lambda n: callback(n * share)

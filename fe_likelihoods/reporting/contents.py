@@ -72,8 +72,8 @@ def summary_sentences(
     sets = data_sets(run)
     if sets:
         models = " and ".join(sorted({each.model for each in sets}))
-        n_channels = sum(len(likelihood.measurements.channels) for likelihood, _ in run.likelihood.parts())
-        modal = any(likelihood.is_modal for likelihood, _ in run.likelihood.parts())
+        n_channels = sum(len(likelihood.measurements.channels) for likelihood, _ in run.likelihood.data_sets())
+        modal = any(likelihood.is_modal for likelihood, _ in run.likelihood.data_sets())
         what = "modes" if modal and len(sets) == 1 else "modes and channels" if modal else "channels"
         channels = f"{n_channels} measured {what if n_channels > 1 else what[:-1]}"
         what = f"{len(rows)} parameters of {models} and its noise were updated with {channels}"
@@ -182,7 +182,7 @@ def cost(run: FinishedRun) -> list[tuple[str, str]]:
 
 def _of_parts(run: FinishedRun) -> str:
     """How many simulations of this process were short parts of the record, which count as fractions."""
-    likelihoods = [] if run.likelihood is None else [likelihood for likelihood, _ in run.likelihood.parts()]
+    likelihoods = [] if run.likelihood is None else [likelihood for likelihood, _ in run.likelihood.data_sets()]
     parts = sum(part.simulations for likelihood in likelihoods for part in likelihood.shortened)
     return f"; {parts} simulations of short parts of the record count as fractions" if parts else ""
 

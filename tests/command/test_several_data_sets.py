@@ -91,7 +91,7 @@ def test_three_data_sets_are_one_posterior(settings_of):
     assert posterior.parameter_names == ["stiffness_1", "stiffness_2", "damping_1", "damping_2", "sigma_roof"]
     joint, point = posterior.likelihood, [*TRUTH, 0.02]
     parts = joint.likelihoods
-    alone = [part([point[column] for column in columns]) for part, columns in joint.parts()]
+    alone = [part([point[column] for column in columns]) for part, columns in joint.data_sets()]
     assert list(parts) == ["measurements", "modes", "load_test"] and joint(point) == pytest.approx(sum(alone))
     assert parts["load_test"].model.parameter_names == ("stiffness_1", "stiffness_2")
 

@@ -16,7 +16,7 @@ from ..priors.multivariate import as_distribution
 from ..priors.points import as_points
 from .parameters import Parameter, describe_parameters
 
-__all__ = ["COUNTS", "SumOfParts"]
+__all__ = ["COUNTS", "SumOfDataSets"]
 
 COUNTS = (  # numbers of the report, which are added for several data sets
     "simulations",
@@ -30,7 +30,7 @@ COUNTS = (  # numbers of the report, which are added for several data sets
 )
 
 
-class SumOfParts:
+class SumOfDataSets:
     """Base class of `FELikelihood`, which is its only data set, and `JointLikelihood`, whose data are independent."""
 
     parameter_names: tuple[str, ...]
@@ -40,7 +40,7 @@ class SumOfParts:
     likelihoods: Mapping[str, Any]  # an `FELikelihood` for each, in the order of their evaluation; "" for the only one
     _columns: dict[str, list[int]]  # indices of their parameters
 
-    def parts(self) -> list[tuple[Any, list[int]]]:
+    def data_sets(self) -> list[tuple[Any, list[int]]]:
         """The data sets in the order of their evaluation, with the indices of their parameters."""
         return [(likelihood, self._columns[key]) for key, likelihood in self.likelihoods.items()]
 
@@ -67,12 +67,12 @@ class SumOfParts:
 
     def _with_noises(self, make: Callable[[Any, dict], Any], values: Mapping[str, Any]) -> Self:
         """The same likelihood with noises made of each noise, and of the values of its parameters by its own names."""
-        parts = {}
-        for key, part in self.likelihoods.items():
-            names = ((name, self.name_of(key, name)) for name in part.noise.parameter_names)
-            noise = make(part.noise, {name: values[ours] for name, ours in names if ours in values})
-            parts[key] = part if noise is part.noise else part.with_noise(noise)
-        return self.with_likelihoods(parts)
+        found = {}
+        for key, data_set in self.likelihoods.items():
+            names = ((name, self.name_of(key, name)) for name in data_set.noise.parameter_names)
+            noise = make(data_set.noise, {name: values[ours] for name, ours in names if ours in values})
+            found[key] = data_set if noise is data_set.noise else data_set.with_noise(noise)
+        return self.with_likelihoods(found)
 
     # densities ----------------------------------------------------------------------------------------------------
 
@@ -104,25 +104,25 @@ class SumOfParts:
         points = as_points(x, self.parameter_names)
         rows = points if points.ndim == 2 else points[None]
         total = np.where(inside, np.zeros(len(rows)), -np.inf)
-        for part, columns in self.parts():
+        for data_set, columns in self.data_sets():
             left = (total > -np.inf).nonzero()[0]
             if len(left):
                 wanted = rows if len(left) == len(rows) else rows[left]
                 own = wanted.take(columns, axis=1)
-                simulator = part.simulator
+                simulator = data_set.simulator
                 statistics = simulator.run(own[:, : simulator.n_structural], partial(self.possible, wanted))
-                total[left] += part.of_statistics(own, statistics)
+                total[left] += data_set.of_statistics(own, statistics)
         return total if points.ndim == 2 else float(total[0])
 
     def possible(self, rows: np.ndarray) -> np.ndarray:
         """Whether each of the points (n, ndim) is finite and has possible noise parameters; nothing is simulated."""
-        return np.all([part.possible(rows[:, columns]) for part, columns in self.parts()], axis=0)
+        return np.all([data_set.possible(rows[:, columns]) for data_set, columns in self.data_sets()], axis=0)
 
     def failures_at(self, x: Any) -> list[str]:
         """Reasons of failed simulations at points, after the name of the data set, see `Posterior.failures_at`."""
         found = []
         for point in np.atleast_2d(as_points(x, self.parameter_names)):
-            reasons = {key: part.simulator.reason(point[self._columns[key]]) for key, part in self.likelihoods.items()}
+            reasons = {key: each.simulator.reason(point[self._columns[key]]) for key, each in self.likelihoods.items()}
             key, reason = next(((key, reason) for key, reason in reasons.items() if reason), ("", ""))
             found.append(type(reason)(f"{key}: {reason}") if key else reason)
         return found
@@ -130,11 +130,11 @@ class SumOfParts:
     def recall_failures(self, x: Any, reasons: Sequence[str]) -> None:
         """Count simulations of an earlier process, see `Posterior.recall_failures`."""
         points, reasons = np.atleast_2d(as_points(x, self.parameter_names)), np.array(reasons, dtype=object)
-        for key, part in self.likelihoods.items():
+        for key, data_set in self.likelihoods.items():
             name = f"{key}: " if key else ""
             own = [each[len(name) :] if each.startswith(name) else "" for each in reasons]
-            thetas = points[:, self._columns[key]][:, : part.simulator.n_structural]
-            part.simulator.recall(thetas, None, own)
+            thetas = points[:, self._columns[key]][:, : data_set.simulator.n_structural]
+            data_set.simulator.recall(thetas, None, own)
             left = [not each for each in own]  # later data sets were not simulated where this one failed
             points, reasons = points[left], reasons[left]
 
@@ -144,8 +144,8 @@ class SumOfParts:
     def parameters(self) -> tuple[Parameter, ...]:
         """Units, nominal values and labels of the parameters."""
         described: dict[str, Parameter] = {}
-        for key, part in self.likelihoods.items():
-            for each in describe_parameters(part.model, part.noise):
+        for key, data_set in self.likelihoods.items():
+            for each in describe_parameters(data_set.model, data_set.noise):
                 name = self.name_of(key, each.name)
                 described.setdefault(name, each._replace(name=name))
         return tuple(described[name] for name in self.parameter_names)
@@ -158,9 +158,9 @@ class SumOfParts:
         for EQ2 alone and for EQ2 after an EQ1 that is not compared.
         """
         samples: dict[str, list[np.ndarray]] = {}
-        for part in self.likelihoods.values():
-            compared = getattr(part.measured, "values", part.measured)
-            for channel, dt, row in zip(part.measurements.channels, part.measurements.steps, compared, strict=True):
+        for data_set in self.likelihoods.values():
+            data, compared = data_set.measurements, getattr(data_set.measured, "values", data_set.measured)
+            for channel, dt, row in zip(data.channels, data.steps, compared, strict=True):
                 name = f"{channel.name} {channel.quantity} {dt:.9g}"
                 samples.setdefault(name, []).append(row[~np.isnan(row)] + 0.0)
         digest = hashlib.blake2b(digest_size=16)
@@ -170,20 +170,22 @@ class SumOfParts:
 
     def density_parts(self) -> list[str]:
         """Texts that identify the density; ValueError if the ``repr`` of a noise does not show its values."""
-        parts = list(self.parameter_names)
-        for part, columns in self.parts():
-            parts += [json.dumps(columns), *part.density_parts()]
-        return parts
+        found = list(self.parameter_names)
+        for data_set, columns in self.data_sets():
+            found += [json.dumps(columns), *data_set.density_parts()]
+        return found
 
     def report(self) -> dict:
         """Summary of all simulations, and of several likelihoods one for each, see `Posterior.report`."""
-        parts = {key: part.simulator.report() for key, part in self.likelihoods.items()}
-        if "" in parts:
-            return parts[""]
-        total = {name: sum(part[name] for part in parts.values()) for name in COUNTS}
-        total["failures"] = [{"likelihood": key, **each} for key, part in parts.items() for each in part["failures"]]
-        total["failure_reasons"] = dict(sum((Counter(part["failure_reasons"]) for part in parts.values()), Counter()))
-        return total | {"likelihoods": parts}
+        found = {key: data_set.simulator.report() for key, data_set in self.likelihoods.items()}
+        if "" in found:
+            return found[""]
+        total = {name: sum(each[name] for each in found.values()) for name in COUNTS}
+        total["failures"] = [
+            {"likelihood": key, **failure} for key, own in found.items() for failure in own["failures"]
+        ]
+        total["failure_reasons"] = dict(sum((Counter(each["failure_reasons"]) for each in found.values()), Counter()))
+        return total | {"likelihoods": found}
 
     def __getattr__(self, name: str) -> Any:
         """An entry of the report, such as ``simulations`` or ``failures``."""
@@ -205,7 +207,7 @@ class SumOfParts:
                 f"{', '.join(correlated)} have a joint prior distribution and cannot be integrated out; give them "
                 "independent priors"
             )
-        owners = Counter(column for _, columns in self.parts() for column in columns)
+        owners = Counter(column for _, columns in self.data_sets() for column in columns)
         if shared := [self.parameter_names[place] for place in self.fast_parameters if owners[place] > 1]:
             raise ValueError(
                 f"{', '.join(shared)} belong to several likelihoods and cannot be integrated out; give each likelihood "
@@ -216,18 +218,18 @@ class SumOfParts:
 
     def draw_noise(self, x: Any, rng: RandomState = None) -> dict[str, np.ndarray]:
         """Complete samples (n,) of all parameters from structural ones (n, ndim), see `Posterior.draw_noise`."""
-        for part in self.likelihoods.values():
-            if not isinstance(part.noise, MarginalNoise):
+        for data_set in self.likelihoods.values():
+            if not isinstance(data_set.noise, MarginalNoise):
                 raise ValueError(
-                    f"the noise parameters {', '.join(part.noise.parameter_names)} are in the samples of this "
+                    f"the noise parameters {', '.join(data_set.noise.parameter_names)} are in the samples of this "
                     "posterior; draw_noise is for posteriors from which they are integrated out, see marginal()"
                 )
         points = np.atleast_2d(as_points(x, self.parameter_names))
         rng = as_generator(rng)
         named = dict(zip(self.parameter_names, points.T, strict=True))
-        for key, part in self.likelihoods.items():
-            names, own = part.noise.noise.parameter_names, points[:, self._columns[key]]
+        for key, data_set in self.likelihoods.items():
+            names, own = data_set.noise.noise.parameter_names, points[:, self._columns[key]]
             uniform = rng.random((len(own), len(names)))
-            drawn = part.noise.draw(part.misfit(own), part.n_samples, uniform)
+            drawn = data_set.noise.draw(data_set.misfit(own), data_set.n_samples, uniform)
             named |= {self.name_of(key, name): sigmas for name, sigmas in zip(names, drawn.T, strict=True)}
         return named
