@@ -17,16 +17,16 @@ from .modal.modal_data import ModalData
 from .modal.modal_likelihood import ModalLikelihood
 from .modal.mode_models import FunctionModes
 from .models.executable import ExecutableModel
+from .models.frames_and_decks import BridgeDeck, ModalModel, ShearFrame
 from .models.function import FunctionModel
 from .models.isolated_bridge import IsolatedBridge
 from .models.linear_oscillator import LinearOscillator
 from .models.linear_structure import LinearStructure
-from .models.linear_structure_parts import BridgeDeck, ModalModel, ShearFrame
 from .models.opensees import OpenSeesModel
 from .models.rc_column import RCColumn
 from .models.rc_column_curves import material_curves, moment_curvature
-from .models.rc_column_parts import Bars, ColumnAnalysis, Concrete, Hoops, LowCycleFatigue, Steel
-from .models.sensed import SensedModel, Sensor
+from .models.rc_column_materials import Bars, ColumnAnalysis, Concrete, Hoops, LowCycleFatigue, Steel
+from .models.sensor_errors import SensedModel, Sensor
 from .models.umbridge import UMBridgeModel
 from .noise.autoregressive import AutoregressiveNoise
 from .noise.gaussian import GaussianNoise
@@ -39,18 +39,18 @@ from .plots.predictions import plot_bands, plot_fragility
 from .plots.scores import plot_scores
 from .plots.sensors import plot_ranking
 from .plots.structures import plot_hysteresis, plot_section, plot_sensors
+from .population.event_ratios import EventRatios
 from .population.hierarchical_posterior import HierarchicalPosterior, Varying
-from .population.hierarchy_result import Hierarchy
-from .population.ratios import EventRatios
+from .population.hierarchy import Hierarchy
 from .population.stiffness_loss import stiffness_loss
 from .population.stored_posterior import StoredPosterior
 from .prediction.averaging import average_predictions
+from .prediction.exceedance import exceedance
 from .prediction.fragility import fragility
 from .prediction.held_out import leave_one_out
 from .prediction.new_event import event_ratios, predict_new_event
 from .prediction.propagation import propagate
 from .prediction.quantities import final_value, peak, rms
-from .prediction.reliability import exceedance
 from .prediction.scores import share_within
 from .priors.distributions import HalfNormal, LogNormal, TruncatedNormal, Uniform
 from .priors.mixture_prior import fit_mixture

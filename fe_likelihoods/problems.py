@@ -166,7 +166,7 @@ def bridge_column(
     ['Ec', 'Es', 'a0', 'a1', 'ft', 'sigma_acceleration', 'sigma_displacement']
     """
     from .models.rc_column import RCColumn
-    from .models.rc_column_parts import ColumnAnalysis
+    from .models.rc_column_materials import ColumnAnalysis
 
     if data == "short":
         changes = {"analysis": ColumnAnalysis(substeps=SHORT_SUBSTEPS)} | changes

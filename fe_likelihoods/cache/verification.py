@@ -34,7 +34,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..noise.statistics import Statistic, needs_response, statistic_width
+from ..noise.sufficient_statistics import Statistic, needs_response, statistic_width
 from ..signals.comparison import Comparison
 from ..simulation.faults import ChangedModel, TransientReason
 from ..simulation.files import digests_by_name, observing, read_again

@@ -1,7 +1,7 @@
 r"""Damage as a quantity of the posterior: presence, location and extent.
 
 The presence of a limit state is the probability that its measure exceeds its limit, estimated by the fraction of the
-samples (`fe_likelihoods.prediction.reliability`). A limit may have a distribution: the capacity of such structures.
+samples (`fe_likelihoods.prediction.exceedance`). A limit may have a distribution: the capacity of such structures.
 For a strain limit, the location is the same probability at each section and side of a column. The extent is given by
 quantiles of the measures.
 
@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..checks.finding import labelled
-from ..population.ratios import EventRatios
+from ..population.event_ratios import EventRatios
+from ..prediction.exceedance import Exceedance, estimate, outcomes, warn_of_missing_error
 from ..prediction.prediction import Prediction
-from ..prediction.reliability import Exceedance, estimate, outcomes, warn_of_missing_error
 from ..priors.distributions import Distribution
 from ..text_tables import text_table
 from ..units import DIMENSIONS, find_unit, from_si

@@ -11,8 +11,8 @@ from ..checks.finding import labelled
 from ..checks.result import ModelCheck, check_model
 from ..signals.comparison import rrmse
 from ..text_tables import text_table
+from .describe_files import describe
 from .job import Job, read_job
-from .listing import describe
 from .models import Problem, make_problem
 from .runs import default_folder, make_sampler
 
@@ -88,8 +88,8 @@ def _zero_of(job: Job, problem: Problem, checked: ModelCheck) -> str:
 
 def _draw(problem: Problem, checked: ModelCheck, picture: Path) -> list[Path]:
     """The draws of the prior that a check has simulated, with the measurements, as a PNG file for each data set."""
+    from ..plots.modes_and_load_tests import plot_modes, plot_points
     from ..plots.predictions import plot_bands  # slow to import
-    from ..plots.without_time import plot_modes, plot_points
     from ..prediction.propagation import propagate
     from ..reporting.pictures import save_picture
 

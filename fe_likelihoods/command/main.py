@@ -155,7 +155,7 @@ def data(files: tuple[Path, ...]) -> None:
 
     A file is a table of a logger, a ground motion, a zip archive of V2 files, a data set, or a MATLAB file.
     """
-    from .listing import describe_data
+    from .describe_files import describe_data
 
     for file in files:
         click.echo(f"{describe_data(file)}\n")

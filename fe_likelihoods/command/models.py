@@ -22,7 +22,7 @@ from ..modal.modal_likelihood import ModalLikelihood
 from ..modal.mode_models import FunctionModes, modal_channels
 from ..modal.pairing import SLOPE
 from ..models.one_run import one_run
-from ..models.sensed import SensedModel, Sensor
+from ..models.sensor_errors import SensedModel, Sensor
 from ..noise.autoregressive import AutoregressiveNoise
 from ..noise.gaussian import GaussianNoise
 from ..priors.distributions import Distribution, HalfNormal, LogNormal, TruncatedNormal, Uniform
@@ -271,7 +271,7 @@ def built_in(job: Job, record: Record, names: tuple[str, ...] | None) -> Model:
     values = dict(job.model)
     if job.kind == "column":
         from ..models.rc_column import RCColumn
-        from ..models.rc_column_parts import LowCycleFatigue
+        from ..models.rc_column_materials import LowCycleFatigue
 
         usual = RCColumn.lhpost(record)
         analysis = {each.name: values.pop(each.name) for each in fields(usual.analysis) if each.name in values}
@@ -293,7 +293,7 @@ def built_in(job: Job, record: Record, names: tuple[str, ...] | None) -> Model:
 
 def linear_parts(job: Job) -> Any:
     """A shear frame, with groups of storeys or without, or a bridge deck."""
-    from ..models.linear_structure_parts import BridgeDeck, ShearFrame
+    from ..models.frames_and_decks import BridgeDeck, ShearFrame
 
     return job.located("model", ShearFrame if job.kind == "frame" else BridgeDeck, **job.model)
 

@@ -215,9 +215,9 @@ _OSCILLATOR = (
 )
 _COLUMN_PARTS = dict(concrete="Concrete", steel="Steel", bars="Bars", hoops="Hoops", fatigue="LowCycleFatigue")
 _BUILT_IN = {  # modules and classes
-    "column": (("rc_column", "RCColumn"), ("rc_column_parts", "ColumnAnalysis")),
-    "frame": (("linear_structure_parts", "ShearFrame"),),
-    "bridge deck": (("linear_structure_parts", "BridgeDeck"),),
+    "column": (("rc_column", "RCColumn"), ("rc_column_materials", "ColumnAnalysis")),
+    "frame": (("frames_and_decks", "ShearFrame"),),
+    "bridge deck": (("frames_and_decks", "BridgeDeck"),),
 }
 MODEL_KINDS = (*_BUILT_IN, "oscillator", *_OWN)
 """Kinds of ``[model]``."""
@@ -239,4 +239,8 @@ def model_keys(kind: str) -> tuple[Key, ...]:
 
 def part_keys(kind: str) -> dict[str, tuple[Key, ...]]:
     """Keys of the tables below ``[model]`` by name; a key that is left out has the value of the built-in column."""
-    return {part: _keys_of("rc_column_parts", name, True) for part, name in _COLUMN_PARTS.items() if kind == "column"}
+    return {
+        name: _keys_of("rc_column_materials", kind_of, True)
+        for name, kind_of in _COLUMN_PARTS.items()
+        if kind == "column"
+    }

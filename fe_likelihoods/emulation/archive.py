@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from ..noise.statistics import sums_of_squares
+from ..noise.sufficient_statistics import sums_of_squares
 
 __all__ = ["Archive", "check_quadratic"]
 

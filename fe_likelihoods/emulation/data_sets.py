@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..noise.protocol import noise_title
-from ..noise.statistics import needs_response, sums_of_squares
+from ..noise.sufficient_statistics import needs_response, sums_of_squares
 from ..signals.comparison import Comparison, measured_values
 from ..simulation.model import derivatives_batch, has_jacobian, most_responses
 from .archive import check_quadratic

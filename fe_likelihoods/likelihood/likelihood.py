@@ -23,7 +23,7 @@ from ..signals.channels import Measurements
 from ..signals.comparison import Comparison
 from ..signals.events import events_of
 from ..simulation.model import Model, SimulationBatch, first_part
-from .inputs import check_model, check_noise, match_measurements
+from .check_inputs import check_model, check_noise, match_measurements
 from .simulator import Simulator
 from .sum_of_data_sets import SumOfDataSets
 

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from ..models.base import digest
+from ..models.frames_and_decks import Parts
 from ..models.function import FunctionModel
-from ..models.linear_structure_parts import Parts
 from ..models.undamped_modes import mode_derivatives, undamped_modes
 from ..models.user_model import ExternalModel
 from ..models.validation import check_theta

@@ -23,7 +23,7 @@ from ..signals.channels import Channel
 from ..signals.records import Record
 from ..signals.sampling import rest_samples, same_step, sample_window
 from .base import BuiltInModel, remark_on_range
-from .isolated_bridge_parts import ALL_CHANNELS, CHANNELS, Bearing, Damper, Pier, Rubber
+from .isolated_bridge_bearings import ALL_CHANNELS, CHANNELS, Bearing, Damper, Pier, Rubber
 from .isolated_bridge_system import (
     FORMS,
     BridgeMatrices,

@@ -23,7 +23,7 @@ from ..kernels.bearings import BOUC_WEN, COULOMB, RubberLaw, Slider
 from ..kernels.exponential import matrix_exponential
 from ..kernels.isolated_bridge import N_OUT, N_STATES, Isolators, StepMatrices, step_isolated
 from ..simulation.model import SimulationFailed
-from .isolated_bridge_parts import OF_A_PIER, Damper, Pier, Rubber, at_pier
+from .isolated_bridge_bearings import OF_A_PIER, Damper, Pier, Rubber, at_pier
 from .validation import check_values
 
 __all__ = ["FORMS", "BridgeMatrices", "PreparedBridge", "channel_matrix", "prepare_bridge", "run_bridge"]

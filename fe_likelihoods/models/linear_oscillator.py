@@ -1,4 +1,4 @@
-"""Linear oscillator under a base acceleration, solved exactly (`fe_likelihoods.signals.sdof`).
+"""Linear oscillator under a base acceleration, solved exactly (`fe_likelihoods.signals.response_spectrum`).
 
 One simulation takes tens of microseconds, which makes this the model for first steps, tests and trials of samplers. The
 equations are in ``docs/theory/time_integration.rst``.
@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from ..signals.channels import Channel
 from ..signals.records import Record
-from ..signals.sdof import respond, response_slopes
+from ..signals.response_spectrum import respond, response_slopes
 from ..simulation.model import SimulationFailed
 from .base import StructuralModel, digest
 from .validation import check_theta, positive_float

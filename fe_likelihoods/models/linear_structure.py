@@ -11,7 +11,7 @@ uncouple in the complex modes, q' = lam q + f(t). With accelerations that are li
 has a closed-form solution without time-stepping error (``docs/theory/time_integration.rst``).
 
 `LinearStructure` makes a model from any object that computes these matrices from parameters: a bridge deck, a frame, or
-a building as a sum of modes (`fe_likelihoods.models.linear_structure_parts`).
+a building as a sum of modes (`fe_likelihoods.models.frames_and_decks`).
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from numpy.typing import ArrayLike
 from ..kernels.complex_modes import superpose_modes
 from ..signals.channels import Channel
 from ..signals.records import Record
+from ..signals.response_spectrum import hold_integrals
 from ..signals.sampling import same_step, sample_window
-from ..signals.sdof import hold_integrals
 from ..simulation.model import SimulationFailed
-from .linear_structure_parts import LinearSystem, Parts
+from .frames_and_decks import LinearSystem, Parts
 from .undamped_modes import Modes, undamped_modes
 from .user_model import ExternalModel
 from .validation import check_theta

@@ -37,8 +37,7 @@ from ..signals.sampling import sample_window
 from ..units import G0, to_si
 from .base import BuiltInModel
 from .rc_column_analysis import ColumnHistory, PreparedColumn, check_loading, run_column
-from .rc_column_outputs import Output, Sections, check_units, display_channels, parse_outputs, section_heights
-from .rc_column_parts import (
+from .rc_column_materials import (
     Bars,
     ColumnAnalysis,
     Concrete,
@@ -49,6 +48,7 @@ from .rc_column_parts import (
     Steel,
     gauss_lobatto,
 )
+from .rc_column_outputs import Output, Sections, check_units, display_channels, parse_outputs, section_heights
 from .validation import (
     check_described,
     check_names,

@@ -20,8 +20,8 @@ from ..signals.records import DisplacementHistory, Record
 from ..simulation.model import SimulationFailed
 from ..units import G0
 from .base import BuiltInModel, History, remark_on_range
+from .rc_column_materials import gauss_lobatto, hardening_fault
 from .rc_column_outputs import Output, Recording
-from .rc_column_parts import gauss_lobatto, hardening_fault
 from .validation import check_values, invalid
 
 __all__ = ["ColumnHistory", "PreparedColumn", "check_loading", "expect_fracture", "make_column", "run_column"]

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..signals.channels import Channel
 from .gaussian import HALF_LOG_TWO_PI
-from .options import PerChannel, checked_channels, sensor_levels, shown, weighted
+from .option_checks import PerChannel, checked_channels, sensor_levels, shown, weighted
 from .residuals import innovations, lag_one_sums
 from .sample_counts import SampleCounts
 

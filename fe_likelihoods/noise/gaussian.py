@@ -28,7 +28,7 @@ import numpy as np
 from ..signals.channels import Channel, Measurements
 from ..signals.events import EventWindow, events_of, find_events
 from .groups import EventSums, GroupSums, Layout, PartSums, split_sums
-from .options import (
+from .option_checks import (
     PerChannel,
     as_number,
     checked_channels,

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..signals.channels import Channel
-from .options import as_number
+from .option_checks import as_number
 from .protocol import Noise, noise_title
 
 __all__ = ["KnownNoise"]

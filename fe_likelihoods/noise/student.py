@@ -18,7 +18,7 @@ import numpy as np
 from scipy.special import gammaln
 
 from ..signals.channels import Channel
-from .options import checked_channels
+from .option_checks import checked_channels
 from .sample_counts import SampleCounts, samples_per_channel
 
 __all__ = ["StudentNoise", "check_degrees", "each_square", "student_constant"]

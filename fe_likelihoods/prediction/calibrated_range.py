@@ -14,7 +14,7 @@ from ..checks.model import relative_difference
 from ..likelihood.joint import JointLikelihood
 from ..signals.events import find_events, motions_of
 from ..simulation.faults import ChangedModel
-from .inputs import PredictionSource
+from .model_and_samples import PredictionSource
 from .quantities import ChannelQuantity, MeanOfLast
 
 __all__ = ["Calibrated", "Ends", "Peaks", "bandwidth", "calibration_of", "difference_of_responses"]

@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import special
 
-from ..population.ratios import EventRatios
+from ..population.event_ratios import EventRatios
 from ..text_tables import number, text_table
+from .exceedance import Estimate, Exceedance, estimate, inputs
 from .prediction import Prediction
-from .reliability import Estimate, Exceedance, estimate, inputs
 
 __all__ = ["Fragility", "FragilityCurve", "fit_fragility", "fragility"]
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..population.hierarchical_posterior import HierarchicalPosterior
-from ..population.hierarchy_result import Hierarchy
+from ..population.hierarchy import Hierarchy
 from .new_event import predict_new_event
 from .prediction import Prediction
 from .quantities import Quantity

@@ -6,7 +6,7 @@ give too low a response come with a measured value above the fitted one. A numbe
 from *one* distribution for both. With the median parameters of the population (`Hierarchy`), the ratios of measured
 values to the values at these parameters contain the deviation of each event from the median, its fitting error, and
 their correlation. How much they are expected to scatter follows from the model, for each event and number
-(`fe_likelihoods.population.scatter`). How much more or less this structure scatters follows from the events
+(`fe_likelihoods.population.event_scatter`). How much more or less this structure scatters follows from the events
 (`EventRatios`). One event has the same formula.
 
 Histories are predicted with the parameters of the population, and with its noise.
@@ -20,13 +20,13 @@ from typing import Any
 import numpy as np
 
 from ..likelihood.likelihood import FELikelihood
-from ..population.hierarchy_result import Hierarchy
-from ..population.ratios import PRIOR_EVENTS, PRIOR_SD, EventRatios
-from ..population.scatter import REMAINDER, log_variance, remainder_variance, spread_rows
+from ..population.event_ratios import PRIOR_EVENTS, PRIOR_SD, EventRatios
+from ..population.event_scatter import REMAINDER, log_variance, remainder_variance, spread_rows
+from ..population.hierarchy import Hierarchy
 from ..priors.between_events import BETWEEN_EVENTS
 from ..signals.records import Record
 from ..simulation.model import SimulationFailed
-from .inputs import read_source
+from .model_and_samples import read_source
 from .prediction import Prediction
 from .propagation import propagate
 from .quantities import ChannelQuantity, Quantity, evaluator, measured_quantity

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from ..likelihood.inputs import check_model
+from ..likelihood.check_inputs import check_model
 from ..noise.protocol import noise_channels, noise_title, noise_under
 from ..priors.points import as_points
 from ..simulation.model import Model
-from .inputs import PredictionSource, split_samples
+from .model_and_samples import PredictionSource, split_samples
 
 __all__ = ["predict_channels_of"]
 

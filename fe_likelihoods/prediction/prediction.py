@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..checks.finding import Finding, labelled
-from ..population.ratios import EventRatios
+from ..population.event_ratios import EventRatios
 from ..signals.channels import Channel, Measurements
 from ..signals.comparison import Comparison, compare_with
 from ..text_tables import number, text_table

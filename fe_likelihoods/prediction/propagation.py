@@ -35,9 +35,9 @@ from ..signals.records import Record
 from ..simulation.model import Model, SimulationFailed
 from .accumulator import Accumulator
 from .calibrated_range import Ends, Peaks, bandwidth, calibration_of, difference_of_responses
-from .excitation import chosen_state, excite, under_record
-from .inputs import distinct_rows, one_data_set, read_source, split_samples
+from .model_and_samples import distinct_rows, one_data_set, read_source, split_samples
 from .other_channels import predict_channels_of
+from .other_record import chosen_state, excite, under_record
 from .prediction import Prediction
 from .quantities import Quantity, evaluator
 

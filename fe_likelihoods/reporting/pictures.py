@@ -14,7 +14,7 @@ from samplers import plot_corner, plot_marginals, plot_run
 from ..checks.compared import Fit
 from ..checks.run import FinishedRun
 from ..plots.fits import plot_fit
-from ..plots.without_time import plot_modes, plot_points
+from ..plots.modes_and_load_tests import plot_modes, plot_points
 from .other_events import OtherEvent
 
 if TYPE_CHECKING:

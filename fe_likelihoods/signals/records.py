@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..units import from_si
+from .response_spectrum import ResponseSpectrum, spectrum_of
 from .sampling import array_digest, check_samples, check_step, expect, rest_samples, same_step, sample_window
-from .sdof import ResponseSpectrum, spectrum_of
 
 __all__ = ["DisplacementHistory", "Record", "growing_durations"]
 

@@ -24,7 +24,7 @@ from samplers.interrupts import (
     raise_if_it_ends_the_run,
 )
 
-from ..noise.statistics import Statistic, reduce_response, statistic_width, sums_of_squares
+from ..noise.sufficient_statistics import Statistic, reduce_response, statistic_width, sums_of_squares
 from ..signals.channels import Channel
 from ..signals.comparison import Comparison
 from .faults import MisfitReason, SimulationFailed, is_transient, reason_of, shortened

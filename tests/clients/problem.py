@@ -24,7 +24,7 @@ from fe_likelihoods import (
     TruncatedNormal,
     Uniform,
 )
-from fe_likelihoods.signals.sdof import respond
+from fe_likelihoods.signals.response_spectrum import respond
 
 PERIOD, DAMPING_RATIO, DT, N_STEPS = 0.8, 0.5, 0.05, 30
 CRITICAL = 1.0 / DAMPING_RATIO  # multiple of the nominal damping above which all simulations fail

@@ -8,7 +8,7 @@ import pytest
 
 from fe_likelihoods.emulation.archive import Archive, check_quadratic
 from fe_likelihoods.noise.residuals import lag_one_sums
-from fe_likelihoods.noise.statistics import sums_of_squares
+from fe_likelihoods.noise.sufficient_statistics import sums_of_squares
 from fe_likelihoods.priors.distributions import TruncatedNormal
 from samplers import SMCSampler
 from tests.statistics.hard_posteriors import HardPosterior

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fe_likelihoods import Channel, Measurements, Record, read_columns, read_record
-from fe_likelihoods.command.listing import describe_data
+from fe_likelihoods.command.describe_files import describe_data
 from fe_likelihoods.signals.datasets import read_dataset, write_dataset
 from fe_likelihoods.units import G0
 from tests.signals.logger_styles import ACCELERATION, COLUMNS, READ, STEP

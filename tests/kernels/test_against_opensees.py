@@ -12,7 +12,7 @@ import pytest
 
 from fe_likelihoods import rrmse
 from fe_likelihoods.models.rc_column import RCColumn
-from fe_likelihoods.models.rc_column_parts import ColumnAnalysis
+from fe_likelihoods.models.rc_column_materials import ColumnAnalysis
 from fe_likelihoods.problems import BRIDGE_COLUMN_MEANS, bridge_column_data
 from fe_likelihoods.signals.records import DisplacementHistory
 from tests.opensees_column import CORE, INCH, KIP, STEEL, peer_of, push, require_opensees, shake

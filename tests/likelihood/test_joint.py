@@ -135,7 +135,7 @@ def test_noise_integrated_out(pieces, rng):
         Posterior(JointLikelihood(pieces), prior_of(JointLikelihood(pieces))).marginal()
 
 
-def test_predictions_are_of_one_part(pieces, rng):
+def test_predictions_are_of_one_data_set(pieces, rng):
     joint = JointLikelihood(pieces)
     posterior, samples = Posterior(joint, prior_of(joint)), points_of(joint, rng)
     for part, columns in {"component": [0, 1, 3], "system": [0, 2, 3]}.items():
@@ -149,7 +149,7 @@ def test_predictions_are_of_one_part(pieces, rng):
         np.testing.assert_array_equal(structural.mean, theirs.mean)
     cases = {
         "give data_set= one of 'component', 'system'": (posterior, {}),
-        "no likelihood 'pier'; the likelihoods are 'component'": (posterior, {"part": "pier"}),
+        "no likelihood 'pier'; the likelihoods are 'component'": (posterior, {"data_set": "pier"}),
         "data_set='system' is for a JointLikelihood": (joint["system"], {"data_set": "system"}),
     }
     for message, (target, settings) in cases.items():

@@ -5,12 +5,12 @@ import pytest
 
 from fe_likelihoods.cache.simulation_cache import SimulationCache
 from fe_likelihoods.likelihood.likelihood import FELikelihood
+from fe_likelihoods.models.frames_and_decks import ShearFrame
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.models.linear_structure import LinearStructure
-from fe_likelihoods.models.linear_structure_parts import ShearFrame
 from fe_likelihoods.models.rc_column import RCColumn
-from fe_likelihoods.models.rc_column_parts import ColumnAnalysis
+from fe_likelihoods.models.rc_column_materials import ColumnAnalysis
 from fe_likelihoods.noise.autoregressive import AutoregressiveNoise
 from fe_likelihoods.problems import isolated_bridge
 from fe_likelihoods.signals.channels import Channel, Measurements

@@ -7,7 +7,7 @@ import pytest
 from scipy.io import savemat
 
 from fe_likelihoods import read_modal_data
-from fe_likelihoods.signals.sdof import respond
+from fe_likelihoods.signals.response_spectrum import respond
 
 SHAPES = np.array([[1.0, 2.0, 3.0], [-2.0, -1.0, 2.0]])
 UNIT = SHAPES / np.linalg.norm(SHAPES, axis=1, keepdims=True)

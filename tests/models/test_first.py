@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from fe_likelihoods.likelihood.likelihood import FELikelihood
+from fe_likelihoods.models.frames_and_decks import BridgeDeck, ShearFrame
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.models.linear_structure import LinearStructure
-from fe_likelihoods.models.linear_structure_parts import BridgeDeck, ShearFrame
 from fe_likelihoods.models.rc_column import RCColumn
-from fe_likelihoods.models.rc_column_parts import ColumnAnalysis
+from fe_likelihoods.models.rc_column_materials import ColumnAnalysis
 from fe_likelihoods.noise.autoregressive import AutoregressiveNoise
 from fe_likelihoods.problems import bridge_column, isolated_bridge
 from fe_likelihoods.signals.channels import Channel, Measurements

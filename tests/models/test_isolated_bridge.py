@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import IsolatedBridge, Record, SimulationFailed
-from fe_likelihoods.models.isolated_bridge_parts import OF_A_PIER, Bearing, Damper, Pier, Rubber, at_pier
+from fe_likelihoods.models.isolated_bridge_bearings import OF_A_PIER, Bearing, Damper, Pier, Rubber, at_pier
 
 PART = Path(__file__).parents[1] / "kernels" / "data" / "isolated_bridge.npz"
 PIER_1, PIER_2 = (tuple(at_pier(name, i) for name in OF_A_PIER) for i in (1, 2))

@@ -7,7 +7,7 @@ import pytest
 from scipy import signal
 
 from fe_likelihoods import LinearOscillator, Record, SimulationFailed
-from fe_likelihoods.signals.sdof import respond
+from fe_likelihoods.signals.response_spectrum import respond
 from fe_likelihoods.simulation.model import first_part, simulate_batch
 
 DAMPING = (0.0, 0.02, 0.3, 0.95)

@@ -9,8 +9,8 @@ from scipy import signal
 from scipy.linalg import eigh
 
 from fe_likelihoods import BridgeDeck, LinearStructure, Record, ShearFrame, SimulationFailed
-from fe_likelihoods.models.linear_structure_parts import LinearSystem
-from fe_likelihoods.signals.sdof import respond
+from fe_likelihoods.models.frames_and_decks import LinearSystem
+from fe_likelihoods.signals.response_spectrum import respond
 from fe_likelihoods.simulation.model import simulate_batch
 
 DT = 0.02

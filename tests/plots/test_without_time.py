@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import Channel, LogNormal, Measurements, ModalData, ModalLikelihood, Posterior, ShearFrame
-from fe_likelihoods.plots.without_time import plot_modes, plot_points
+from fe_likelihoods.plots.modes_and_load_tests import plot_modes, plot_points
 
 CHANNELS = (Channel("quarter", "displacement", "mm"), Channel("middle", "displacement", "mm"))
 CASES = ("truck left", "truck right")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fe_likelihoods.population.scatter import log_variance, remainder_variance, spread_rows
+from fe_likelihoods.population.event_scatter import log_variance, remainder_variance, spread_rows
 
 PHASES = 2.0 * np.pi * np.arange(16) / 16
 TURNS = 2.0 * np.pi * np.arange(400) / 100  # four periods

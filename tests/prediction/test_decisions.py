@@ -11,16 +11,16 @@ from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.likelihood.posterior import Posterior
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.noise.gaussian import GaussianNoise
+from fe_likelihoods.population.event_ratios import EventRatios
 from fe_likelihoods.population.hierarchical_posterior import HierarchicalPosterior, Varying
-from fe_likelihoods.population.hierarchy_result import Hierarchy
-from fe_likelihoods.population.ratios import EventRatios
+from fe_likelihoods.population.hierarchy import Hierarchy
 from fe_likelihoods.population.stored_posterior import StoredPosterior
+from fe_likelihoods.prediction.exceedance import exceedance
 from fe_likelihoods.prediction.fragility import fragility
 from fe_likelihoods.prediction.model_error import model_error
 from fe_likelihoods.prediction.new_event import event_ratios, predict_new_event
 from fe_likelihoods.prediction.propagation import propagate
 from fe_likelihoods.prediction.quantities import peak
-from fe_likelihoods.prediction.reliability import exceedance
 from fe_likelihoods.priors.distributions import HalfNormal, LogNormal
 from fe_likelihoods.priors.priors import Prior
 from fe_likelihoods.signals.channels import Channel, Measurements

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fe_likelihoods.population.ratios import PRIOR_EVENTS, PRIOR_SD, EventRatios
+from fe_likelihoods.population.event_ratios import PRIOR_EVENTS, PRIOR_SD, EventRatios
 
 LOGS = np.array([0.1, -0.05, 0.2, 0.0])
 

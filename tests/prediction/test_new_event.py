@@ -8,14 +8,14 @@ from fe_likelihoods import GaussianNoise
 from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.likelihood.posterior import Posterior
 from fe_likelihoods.models.function import FunctionModel
+from fe_likelihoods.population.event_ratios import PRIOR_EVENTS, PRIOR_SD, EventRatios
+from fe_likelihoods.population.event_scatter import REMAINDER
 from fe_likelihoods.population.hierarchical_posterior import HierarchicalPosterior, Varying
-from fe_likelihoods.population.hierarchy_result import Hierarchy
-from fe_likelihoods.population.ratios import PRIOR_EVENTS, PRIOR_SD, EventRatios
-from fe_likelihoods.population.scatter import REMAINDER
+from fe_likelihoods.population.hierarchy import Hierarchy
 from fe_likelihoods.population.stored_posterior import StoredPosterior
+from fe_likelihoods.prediction.exceedance import exceedance
 from fe_likelihoods.prediction.new_event import event_ratios, predict_new_event
 from fe_likelihoods.prediction.quantities import arias_intensity, peak, rms
-from fe_likelihoods.prediction.reliability import exceedance
 from fe_likelihoods.priors.distributions import HalfNormal, LogNormal
 from fe_likelihoods.priors.priors import Prior
 from fe_likelihoods.signals.channels import Channel, Measurements

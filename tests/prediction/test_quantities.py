@@ -7,6 +7,7 @@ import pytest
 
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
+from fe_likelihoods.prediction.exceedance import exceedance
 from fe_likelihoods.prediction.propagation import propagate
 from fe_likelihoods.prediction.quantities import (
     arias_intensity,
@@ -18,7 +19,6 @@ from fe_likelihoods.prediction.quantities import (
     peak,
     rms,
 )
-from fe_likelihoods.prediction.reliability import exceedance
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record
 from fe_likelihoods.units import G0

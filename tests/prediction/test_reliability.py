@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from fe_likelihoods.prediction.exceedance import exceedance
 from fe_likelihoods.prediction.propagation import propagate
 from fe_likelihoods.prediction.quantities import peak
-from fe_likelihoods.prediction.reliability import exceedance
 from tests.prediction.flexible import DISPERSION, MEDIAN, Flexible
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods.signals.records import Record
-from fe_likelihoods.signals.sdof import respond
+from fe_likelihoods.signals.response_spectrum import respond
 
 
 @pytest.fixture

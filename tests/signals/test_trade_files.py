@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import Channel, read_columns, read_record
-from fe_likelihoods.command.listing import describe_data
+from fe_likelihoods.command.describe_files import describe_data
 from fe_likelihoods.units import G0
 from tests.signals.network_files import csmip_v1, esm, geonet, knet, smc
 from tests.signals.test_readers import cosmos, csmip

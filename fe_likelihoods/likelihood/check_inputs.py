@@ -3,7 +3,7 @@
 import numpy as np
 
 from ..noise.protocol import Noise, noise_channels
-from ..noise.statistics import Statistic, apply_statistic
+from ..noise.sufficient_statistics import Statistic, apply_statistic
 from ..signals.channels import Measurements
 from ..signals.comparison import Comparison
 from ..simulation.model import Model

@@ -74,7 +74,7 @@ class Bearing:
 
     Examples
     --------
-    >>> from fe_likelihoods.models.isolated_bridge_parts import Bearing
+    >>> from fe_likelihoods.models.isolated_bridge_bearings import Bearing
     >>> rough = Bearing(load=70e3, f_min=0.08)
     >>> bridge = IsolatedBridge(record.resample(0.005), bearings=(rough, rough))
     """
@@ -108,7 +108,7 @@ class Damper:
 
     Examples
     --------
-    >>> from fe_likelihoods.models.isolated_bridge_parts import Damper
+    >>> from fe_likelihoods.models.isolated_bridge_bearings import Damper
     >>> softer = Damper(viscosity=10e3, count=1)
     >>> bridge = IsolatedBridge(record.resample(0.005), dampers=(softer, softer))
     """

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import betainccinv, betaincinv
 
-from ..population.ratios import EventRatios
+from ..population.event_ratios import EventRatios
 from ..signals.channels import Channel
 from ..text_tables import number, text_table
 from ..units import DIMENSIONS, find_unit, to_si
