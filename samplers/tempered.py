@@ -46,7 +46,7 @@ from .results import RunResults
 from .settings import Settings, as_whole_number, check_arguments, check_names
 from .tempering.anneal import anneal
 from .tempering.guide import Guide, check_guide
-from .tempering.guided import Guidance, lend
+from .tempering.guided import lend
 from .tempering.mutation import MoveSchedule, check_moves
 from .tempering.population import Population, check_size
 
@@ -317,7 +317,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
                 if isinstance(state, RunStart):
                     start_of_run, stored, skip = state, self._chain.last_state(), True
                     try:
-                        with self._annealing(start_of_run, stored, bar) as (steps, guidance, take):
+                        with self._annealing(start_of_run, stored, bar) as (steps, take):
                             answer = None
                             while True:
                                 try:
@@ -326,7 +326,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
                                     break
                                 # the search of a guide asks for a function to be called: it is no part of the stack
                                 answer = report() if callable(report) else take(population, report)
-                        state = self._annealed(population, guidance, stored)
+                        state = self._annealed(population, stored)
                     except Incomplete:
                         state = self._go_on_without_annealing(stored)
                 if store and provisional and not self._chain.provisional:
@@ -553,19 +553,19 @@ class TemperedSampler(RunResults, EnsembleSampler):
 
     @contextmanager
     def _annealing(self, start: RunStart, stored: State | None, bar: dict) -> Iterator[tuple]:
-        """The steps of an annealing from draws of the prior, its guide, and a function that takes what they report.
+        """The steps of an annealing from draws of the prior, and a function that takes what they report.
 
         `stored` is the last state at beta = 1 if the run is made again.
         """
         self._result, self._verdict, self._must_repeat = AnnealingResult(), None, True
         self.random_state = start.random_state
         self._record.use(None)
-        schedule, guidance = MoveSchedule(*copy.deepcopy(self._first_moves)), None
+        schedule, guided = MoveSchedule(*copy.deepcopy(self._first_moves)), None
         self._moves, self._weights = schedule
         self._evaluator.remember = remember = self._record.remembering()
         if self._given_guide is not None:
             self._guide = self._given_guide.fresh()
-            guidance = lend(self._guide, self._random, remember, self._record)
+            guided = self._guide, lend(self._guide, self._random, remember, self._record)
         self._record.is_complete = stored is not None
         population = Population(0.0, start.coords, None, float(self.nwalkers))
         since = time.perf_counter(), self._evaluator.evaluations
@@ -586,24 +586,23 @@ class TemperedSampler(RunResults, EnsembleSampler):
                     self._result = self._result.add(report, population.founders)
                     progress.show(self._result, population, report)
 
-                arguments = population, self._evaluator, self._random, schedule, self.settings, guidance
-                yield anneal(*arguments), guidance, take
+                yield anneal(population, self._evaluator, self._random, schedule, self.settings, guided), take
         finally:
             self._record.is_complete = False
 
-    def _annealed(self, population: Population, guidance: Guidance | None, stored: State | None) -> State:
+    def _annealed(self, population: Population, stored: State | None) -> State:
         """The state at beta = 1 that an annealing has led to, or the last `stored` state of a run made again."""
         result, weighted = self._result, self._result.weighted
         first = self._record.latest()
         coords, log_prob = first.coords[: self.nwalkers], first.log_prob[: self.nwalkers]  # of the prior, or of a guide
         log_prior = self._target.log_prior(coords)
         said = check_end(result, population.coords) + check_likelihood(log_prob, log_prior)
-        said += check_prior(coords, log_prior) if guidance is None else list(guidance.guide.findings)
+        said += check_prior(coords, log_prior) if self._guide is None else list(self._guide.findings)
         for finding in said:
             warn(finding.message)
         self._result = result._replace(
             findings=(*result.findings, *said),
-            basis="" if guidance is None else guidance.guide.basis,
+            basis="" if self._guide is None else self._guide.basis,
             independent_points=independent_points(result, population.coords),
         )
         ended = bool(result.ended)

@@ -24,7 +24,8 @@ from ..record import BudgetExhausted
 from ..reports import LIMIT, Report, Restart, Stage, Weighted
 from ..resampling import systematic
 from ..settings import Settings
-from .guided import Guidance, draw_rounds
+from .guide import Guide, GuideSession
+from .guided import draw_rounds
 from .mutation import Kernel, MoveSchedule, Mutated, VisitedPoints, move_together
 from .population import Density, Population, StoppedEarly
 from .recycling import Recycled, first_draws, recycle, submit_start
@@ -43,7 +44,7 @@ def anneal(
     random: np.random.RandomState,
     schedule: MoveSchedule,
     settings: Settings,
-    guidance: Guidance | None = None,
+    guided: tuple[Guide, GuideSession] | None = None,
 ) -> Steps:
     """Carry draws of the prior to beta = 1 by moves, recycling or a guide.
 
@@ -52,8 +53,8 @@ def anneal(
     """
     size = len(population.coords)
     try:
-        if guidance is not None:
-            yield from _from_guide(population, density, random, schedule, guidance)
+        if guided is not None:
+            yield from _from_guide(population, density, schedule, *guided)
             return
         coords, more = population.coords, first_draws(size) - size
         if more > 0 and (settings.recycle or schedule.mixtures):  # walks, as in papers, do not use what they reveal
@@ -76,7 +77,7 @@ def anneal(
                 return
             yield from ((population, each) for each in (check, *found))
     except StoppedEarly as stop:
-        yield from _finish_early(stop, size, random, 0.0 if guidance is None else guidance.budget.of_guides)
+        yield from _finish_early(stop, size, random, 0.0 if guided is None else density.record.of_guides)
 
 
 def check_population(
@@ -137,15 +138,11 @@ def _resampled(
 
 
 def _from_guide(
-    population: Population,
-    density: Density,
-    random: np.random.RandomState,
-    schedule: MoveSchedule,
-    guidance: Guidance,
+    population: Population, density: Density, schedule: MoveSchedule, guide: Guide, session: GuideSession
 ) -> Steps:
     """Rounds of a guide's draws. Raises StoppedEarly with all draws if they are not usable, or at the limit."""
     size = len(population.coords)
-    found = yield from draw_rounds(population, density, random, guidance)
+    found = yield from draw_rounds(population, density, guide, session)
     if found.signed is not None:
         yield population, found.signed
     yield from ((population, each) for each in found.findings)
@@ -160,7 +157,7 @@ def _from_guide(
         points = (pooled.coords, pooled.records, pooled.effective_sample_size, (), pooled.log_weights) if pooled else ()
         points = Population(1.0, *(points or (np.empty((0, 0)), np.empty(0), 0.0, (), np.empty(0))))
         raise StoppedEarly(points, *(found.evidence if pooled else (-np.inf, np.inf)), guided=True, why=why)
-    resampled, distinct = _resampled(pooled.coords, pooled.records, pooled.log_weights, size, random)
+    resampled, distinct = _resampled(pooled.coords, pooled.records, pooled.log_weights, size, session.random)
     schedule.calibrate(pooled.coords, coarse_weights(pooled.log_weights), density.inside)
     ess, share = pooled.effective_sample_size, found.rounds[-1].effective_share
     yield resampled, Weighted(len(pooled.coords), ess, pooled.pareto_shape, guided=True)

@@ -44,7 +44,7 @@ from ..reports import GuidedRound, GuideTick, Report
 from .guide import Guide, GuideSession, checked_density, checked_draws
 from .population import Density, Population
 
-__all__ = ["Guidance", "RoundsOfGuide", "draw_rounds", "lend"]
+__all__ = ["draw_rounds", "lend"]
 
 
 # Draws in the first round, as a share of the number of walkers: few, since the guide may still be poor; and in each
@@ -56,19 +56,10 @@ FEWEST_DRAWS = 25
 MOST_ROUNDS, PATIENT_ROUNDS = 20, 8
 
 
-class Guidance(NamedTuple):
-    """A guide, the session that a sampler provides to it, and the simulations so far with their limit."""
-
-    guide: Guide
-    session: GuideSession
-    budget: Record
-
-
-def lend(guide: Guide, random: np.random.RandomState, remember: Callable, budget: Record) -> Guidance:
-    """A fresh guide with its session; its simulations count from now on."""
+def lend(guide: Guide, random: np.random.RandomState, remember: Callable, budget: Record) -> GuideSession:
+    """The session of a guide, whose simulations count from now on."""
     budget.use(guide)
-    fits = partial(budget.fits, remember=remember)
-    return Guidance(guide, GuideSession(random, remember, fits, lambda: budget.remaining), budget)
+    return GuideSession(random, remember, partial(budget.fits, remember=remember), lambda: budget.remaining)
 
 
 class RoundsOfGuide(NamedTuple):
@@ -118,14 +109,14 @@ def _evaluated(coords: np.ndarray, density: Density, guide: Guide, session: Guid
 
 
 def draw_rounds(
-    population: Population, density: Density, random: np.random.RandomState, guidance: Guidance
+    population: Population, density: Density, guide: Guide, session: GuideSession
 ) -> Generator[tuple[Population, Report], None, RoundsOfGuide]:
     """Let the guide search, then draw, evaluate and refine until a fresh round is reliable.
 
     Yields the `population`, draws of the prior that are not evaluated, with a tick of the progress bar, a round, or a
     function of the guide's search, whose result is sent back.
     """
-    guide, session, budget = guidance
+    budget, random = density.record, session.random
     session = session._replace(weighted=lambda: None if pooled is None else (pooled.coords, pooled.log_weights))
     size, population = len(population.coords), population._replace(effective_sample_size=0.0)
     rounds: list[Round] = []
