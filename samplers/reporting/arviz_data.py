@@ -29,14 +29,7 @@ _ONE_RUN = (
 _RUNS = "Each chain is an independent run, so r_hat compares runs."
 
 
-def to_arviz(
-    sampler: Any,
-    prediction: Any = None,
-    *,
-    parameter_names: Sequence[str] | None = None,
-    discard: int = 0,
-    seed: int = 0,
-) -> Any:
+def to_arviz(sampler: Any, prediction: Any = None, *, discard: int = 0) -> Any:
     """Convert one run, or several independent runs, to arviz data.
 
     Parameters
@@ -45,24 +38,20 @@ def to_arviz(
         Samplers that have run, with chains of equal length; `emcee.EnsembleSampler` is accepted too.
     prediction : fe_likelihoods.prediction.prediction.Prediction, optional
         The result of `fe_likelihoods.propagate`; adds the group ``predictions``.
-    parameter_names : sequence of str, optional
-        One name per parameter; by default the names of the posterior, or those given to the sampler (of a group
-        ``name`` with several, name_0, name_1, ...), or else theta_0, theta_1, ...
     discard : int
         Burn-in of each run, in steps. Chains of SMC and TMCMC have none.
-    seed : int
-        Seed for draws of the prior.
 
     Returns
     -------
     arviz.InferenceData
         A DataTree from arviz 1.0 on; ``to_netcdf(path)`` writes it to a file. It has the groups ``posterior``,
-        ``sample_stats`` and, where they are known, ``prior`` and ``predictions``; ``docs/arviz`` describes them. A
-        slash in the name of a parameter or channel becomes ``_``.
+        ``sample_stats`` and, where they are known, ``prior`` and ``predictions``; ``docs/arviz`` describes them. Names
+        are those of the posterior, or given to the sampler (name_0, name_1, ... of a group), or else theta_0, theta_1,
+        ...; a slash becomes ``_``.
 
     Examples
     --------
-    >>> data = to_arviz(sampler, parameter_names=posterior.parameter_names)
+    >>> data = to_arviz(sampler)
     >>> data.posterior["stiffness"].shape
     (1, 300)
     """
@@ -76,9 +65,8 @@ def to_arviz(
             "different seeds"
         )
     known = log_posterior_of(runs[0])
-    if parameter_names is None:
-        parameter_names = getattr(known, "parameter_names", None) or _names_in_emcee(runs[0])
-    names = names_of_parameters(parameter_names, runs[0].ndim)
+    names = getattr(known, "parameter_names", None) or _names_in_emcee(runs[0])
+    names = names_of_parameters(names, runs[0].ndim)
     if not all(hasattr(run, "get_chain") and run.ndim == len(names) for run in runs):
         raise ValueError(f"expected samplers of {len(names)} parameters; got {[type(run).__name__ for run in runs]}")
     chains, stats = _ordered(runs, discard)
@@ -95,7 +83,7 @@ def to_arviz(
             _statistics_of_runs(runs),
         ),
     }
-    if (prior := _prior_group(runs, known, names, described, seed)) is not None:
+    if (prior := _prior_group(runs, known, names, described)) is not None:
         groups["prior"] = prior
     if prediction is not None:
         groups["predictions"] = prediction.to_xarray()
@@ -176,7 +164,7 @@ def _parameter_group(
 
 
 def _prior_group(
-    runs: Sequence[Any], known: Any, names: Sequence[str], described: Mapping[str, Any], seed: int
+    runs: Sequence[Any], known: Any, names: Sequence[str], described: Mapping[str, Any]
 ) -> "xarray.Dataset | None":
     first = [getattr(run, "prior_draws", None) for run in runs]
     if all(draws is not None for draws in first):
@@ -184,9 +172,8 @@ def _prior_group(
         return _parameter_group(np.stack(first), names, described, {"source": source})
     if not hasattr(known, "sample_prior"):
         return None
-    source = f"{_PRIOR_DRAWS} draws of sample_prior with the seed {seed}"
-    samples = np.asarray(known.sample_prior(_PRIOR_DRAWS, np.random.default_rng(seed)))
-    return _parameter_group(samples[None], names, described, {"source": source})
+    samples = np.asarray(known.sample_prior(_PRIOR_DRAWS, np.random.default_rng(0)))
+    return _parameter_group(samples[None], names, described, {"source": f"{_PRIOR_DRAWS} draws of sample_prior"})
 
 
 def _statistics_of_runs(runs: Sequence[Any]) -> dict[str, Any]:
