@@ -1,14 +1,23 @@
 """A model that costs nothing, with an exact response: for tests of what stands between a sampler and a model."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from fe_likelihoods import Channel
 from fe_likelihoods.simulation.model import SimulationBatch, SimulationFailed, misfit_of_responses, simulate_batch
 
 
+class Misfits(NamedTuple):
+    """Statistics of many parameter sets."""
+
+    misfit: np.ndarray
+    reasons: list[str]
+
+
 def misfit_batch(model, thetas, measured, pool=None, statistic=None):
     """Statistics of many parameter sets."""
-    return misfit_of_responses(model, simulate_batch(model, thetas, pool), measured, statistic)
+    return Misfits(*misfit_of_responses(model, simulate_batch(model, thetas, pool), measured, statistic))
 
 
 class Line:

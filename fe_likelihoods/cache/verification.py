@@ -39,7 +39,7 @@ from ..signals.comparison import Comparison
 from ..simulation.faults import ChangedModel, TransientReason
 from ..simulation.files import digests_by_name, observing, read_again
 from ..simulation.label import ModelLabel
-from ..simulation.model import MisfitBatch, Model, SimulationBatch, misfit_of_responses, most_responses, simulate_batch
+from ..simulation.model import Model, SimulationBatch, misfit_of_responses, most_responses, simulate_batch
 from .memory import MemoryCache, ResponseMemory
 from .simulation_cache import (
     LABEL_COLUMNS,
@@ -247,7 +247,7 @@ class VerifiedModel:
         if self.cache is not None and other.cache is not None and is_same:
             self._trust = other._trust
 
-    def statistics_of(self, responses: np.ndarray, reasons: list[str]) -> MisfitBatch:
+    def statistics_of(self, responses: np.ndarray, reasons: list[str]) -> tuple[np.ndarray, list[str]]:
         """Statistics (n, n_numbers) of responses (n, n_channels, n_steps) [SI], and reasons of failures."""
         return misfit_of_responses(self.model, SimulationBatch(responses, reasons), self.measured, self.statistic)
 

@@ -78,7 +78,7 @@ def _slopes(
 
     def density(moved: np.ndarray) -> np.ndarray:
         batch = SimulationBatch(response + np.tensordot(moved[:, :d], along, 1), [""] * len(moved))
-        statistics = misfit_of_responses(part.model, batch, part.measured, noise_statistic(part.noise)).misfit
+        statistics, _ = misfit_of_responses(part.model, batch, part.measured, noise_statistic(part.noise))
         return part.noise.log_likelihood(statistics, part.n_samples, moved[:, d:])
 
     sizes = np.sqrt(np.nanmean(np.square(part.residuals_of(response)), axis=1))

@@ -10,7 +10,6 @@ import os
 import re
 import shutil
 import string
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -21,7 +20,8 @@ import numpy as np
 from ..signals.channels import Channel
 from ..signals.records import Record
 from ..simulation.faults import SimulationFailed, TransientReason, reason_of
-from ..simulation.worker import describe_exit, last_lines, run_program
+from ..simulation.files import Group
+from ..simulation.worker import describe_exit, run_program
 from ..units import find_unit
 from .user_model import UserModel, content_digest
 from .validation import positive_float
@@ -214,20 +214,22 @@ class ExecutableModel(UserModel):
     def _respond(self, theta: np.ndarray) -> Any:
         values = {name: repr(float(value)) for name, value in zip(self.parameter_names, theta, strict=True)}
         values |= self._record_values
-        with tempfile.TemporaryDirectory(prefix="fe_likelihoods_", ignore_cleanup_errors=True) as name:
-            place = Path(name)
-            folder = place / "run"
+        group = Group()
+        place = Path(group.place)
+        folder = place / "run"
+        try:
             folder.mkdir()
-            try:
-                self._write(folder, values)
-                self._execute(place, [string.Template(part).substitute(values) for part in self.command[1:]])
-                return self._check_response(self._read(folder))
-            except Exception as error:
-                reason = reason_of(error)
-                if not isinstance(reason, TransientReason) and shutil.disk_usage(place).free < _FREE_BYTES:
-                    text = f"{reason} (the disk of the temporary folder {place.parent} is full)"
-                    raise SimulationFailed(TransientReason(text)) from error
-                raise
+            self._write(folder, values)
+            self._execute(group, [string.Template(part).substitute(values) for part in self.command[1:]])
+            return self._check_response(self._read(folder))
+        except Exception as error:
+            reason = reason_of(error)
+            if not isinstance(reason, TransientReason) and shutil.disk_usage(place).free < _FREE_BYTES:
+                text = f"{reason} (the disk of the temporary folder {place.parent} is full)"
+                raise SimulationFailed(TransientReason(text)) from error
+            raise
+        finally:
+            group.end()
 
     def _write(self, folder: Path, values: dict[str, str]) -> None:
         """Write the input files into the folder of the run."""
@@ -241,8 +243,9 @@ class ExecutableModel(UserModel):
         for name, source in self.files.items():
             shutil.copyfile(source, folder / name)
 
-    def _execute(self, place: Path, arguments: list[str]) -> None:
-        """Run the program in the folder ``run`` of `place`; raise SimulationFailed unless it succeeds."""
+    def _execute(self, group: Group, arguments: list[str]) -> None:
+        """Run the program in the folder ``run`` of the group's; raise SimulationFailed unless it succeeds."""
+        place = Path(group.place)
 
         def watch(seconds: float) -> float:
             text = f"stopped at the time limit of {self.time_limit:g} s" if seconds > self.time_limit else ""
@@ -253,10 +256,10 @@ class ExecutableModel(UserModel):
             return min(_WATCH_INTERVAL, self.time_limit - seconds + 1e-3)
 
         outputs = place / "stdout.txt", place / "stderr.txt"
-        exit_code = run_program([self.command[0], *arguments], place / "run", *outputs, place, watch)
+        exit_code = run_program(group, [self.command[0], *arguments], place / "run", *outputs, watch)
         if exit_code:
             with open(outputs[1], "rb") as stderr:
-                reason = ": ".join(filter(None, [describe_exit(exit_code, "the program"), last_lines(stderr, 3)]))
+                reason = ": ".join(filter(None, [describe_exit(exit_code, "the program"), _last_lines(stderr, 3)]))
             reason += self._missing(place / "run")
             killed = exit_code < 0 or exit_code in _EXIT_CODES_OF_SHELLS
             raise SimulationFailed(TransientReason(reason) if killed else reason)
@@ -283,6 +286,14 @@ class ExecutableModel(UserModel):
             wanted = f"{len(self.columns)} columns" if self._no_other_columns else listed
             raise SimulationFailed(f"{self.output} has {table.shape[1]} columns, expected {wanted}")
         return self._factors * table[:, self.columns].T
+
+
+def _last_lines(file: Any, most: int) -> str:
+    """The last non-empty lines of an open file, at most `most` lines and 300 characters."""
+    size = os.fstat(file.fileno()).st_size
+    data = os.pread(file.fileno(), 4096, max(0, size - 4096)).decode(errors="replace")
+    lines = [line.strip() for line in data.splitlines() if line.strip()]
+    return " / ".join(lines[-most:])[-300:]
 
 
 def read_table(folder: Path, name: str) -> np.ndarray:

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..noise.draws import SampleNoise
-from ..simulation.model import is_collapse
 from .model_error import ModelError
 from .quantities import Evaluator
 
@@ -167,7 +166,7 @@ class Accumulator:
 
     def _leave_out(self, samples: np.ndarray, reason: str) -> None:
         self.failed.append(samples)
-        if is_collapse(reason):
+        if reason.startswith("collapse"):
             self.collapsed.append(samples)
         self.reasons[reason] += len(samples)
 

@@ -8,8 +8,6 @@ notebook functions work. The worker imports this library, installed packages and
   the script or notebook (``__main__``), only the values that the sent functions use are sent.
 * A lock becomes a new lock. Other values that cannot be sent, such as an open file, are refused with their name.
 * A worker refuses everything if its version of this library has different source code.
-
-User code has no version. This library is represented by a digest of its files, installed packages by their versions.
 """
 
 import dis
@@ -32,20 +30,20 @@ from typing import Any, NamedTuple
 import cloudpickle
 from cloudpickle.cloudpickle import _dynamic_class_reduce
 
-from samplers.interrupts import become_worker, process_name
+from samplers.interrupts import become_worker, is_worker, process_name
 
 from .faults import ChangedModel
 
 __all__ = [
     "LIBRARY",
     "SCRIPTS",
-    "Arrived",
     "CannotLoad",
     "Pickled",
     "code_within",
     "dumps",
     "is_arriving",
     "is_of_user",
+    "load",
     "names_in",
     "package_version",
     "sources_digest",
@@ -60,8 +58,9 @@ _CODE = (types.FunctionType, type, _CACHED)
 _OF_THE_IMPORT = {"__builtins__", "__loader__", "__spec__", "__cached__"}
 _COMPILED = tuple(importlib.machinery.EXTENSION_SUFFIXES)
 _MOST_LOADED = 8
+_STANDARD = [Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib")]
+_packages = functools.cache(importlib.metadata.packages_distributions)
 _lock = threading.RLock()
-loaded_functions: "dict[bytes, Arrived]" = {}  # in a worker, by key, the last used last
 _arriving: dict[str, types.ModuleType] | None = None  # modules of the function that is being loaded
 
 
@@ -80,17 +79,15 @@ class CannotLoad(ValueError):
 
 
 class Pickled(NamedTuple):
-    """A function as it is sent to workers."""
+    """A function as it is sent to workers; another one after a change of its values."""
 
     payload: bytes  # digest of the library, name of the sending process, and the pickled function
-    key: bytes  # digest of the payload; differs after a change of the function's values
 
     @classmethod
     def of(cls, function: Any) -> "Pickled":
         """Pickle a function with everything that it uses at present; ValueError, with a name, if that is impossible."""
         try:
-            payload = sources_digest() + process_name() + dumps(function)
-            return cls(payload, blake2b(payload, digest_size=16).digest())
+            return cls(sources_digest() + process_name() + dumps(function))
         except Exception as error:
             name, value = _culprit(function)
             kind = getattr(function, "__qualname__", type(function).__qualname__)
@@ -103,53 +100,42 @@ class Pickled(NamedTuple):
 
     def __call__(self, item: Any) -> Any:
         """The result for an item in another process, which loads the function once."""
-        return self.loaded()(item)
-
-    def loaded(self) -> "Arrived":
-        """The function, loaded unless it is one of the last that this process has loaded; see `load`."""
-        with _lock:
-            function = loaded_functions[self.key] = loaded_functions.pop(self.key, None) or self.load()
-            if len(loaded_functions) > _MOST_LOADED:
-                del loaded_functions[next(iter(loaded_functions))]
-        return function
-
-    def load(self) -> "Arrived":
-        """The function, in a worker.
-
-        CannotLoad if it cannot be unpickled; ChangedModel if this process has another version of this library, or a
-        file that the model depends on differs.
-        """
-        global _arriving
-        if self.payload[:16] != sources_digest():
-            raise ChangedModel(
-                "the worker process has another version of fe_likelihoods than the process that sends simulations: "
-                "install the same version everywhere, and start a new pool"
-            )
-        with _lock:
-            # a pool may run the function in the sending process, whose modules must not be replaced
-            if self.payload[16:32] != process_name():
-                _arriving = {}
-                become_worker()
-            try:
-                return Arrived(pickle.loads(memoryview(self.payload)[32:]), _arriving or {})
-            except ChangedModel:
-                raise
-            except Exception as error:
-                text = without_addresses(f"{type(error).__name__}: {error}")
-                raise CannotLoad(f"a function cannot be loaded in a worker process: {text}") from error
-            finally:
-                _arriving = None
+        return load(self)(item)
 
 
-class Arrived:
-    """A function that was sent, with its user modules."""
+@functools.lru_cache(_MOST_LOADED)
+def load(pickled: Pickled) -> Callable[[Any], Any]:
+    """The function, in a worker, with user modules of its own.
 
-    def __init__(self, function: Any, modules: dict[str, types.ModuleType]) -> None:
-        self._function, self._modules = function, modules
+    CannotLoad if it cannot be unpickled; ChangedModel if this process has another version of this library, or a file
+    that the model depends on differs.
+    """
+    global _arriving
+    if pickled.payload[:16] != sources_digest():
+        raise ChangedModel(
+            "the worker process has another version of fe_likelihoods than the process that sends simulations: "
+            "install the same version everywhere, and start a new pool"
+        )
+    with _lock:
+        if pickled.payload[16:32] != process_name():
+            become_worker()
+        _arriving = modules = {}
+        try:
+            function = pickle.loads(memoryview(pickled.payload)[32:])
+        except ChangedModel:
+            raise
+        except Exception as error:
+            text = without_addresses(f"{type(error).__name__}: {error}")
+            raise CannotLoad(f"a function cannot be loaded in a worker process: {text}") from error
+        finally:
+            _arriving = None
 
-    def __call__(self, item: Any) -> Any:
-        sys.modules.update(self._modules)  # for functions that import them while they run
-        return self._function(item)
+    def call(item: Any) -> Any:
+        if is_worker():
+            sys.modules.update(modules)  # for functions that import them while they run
+        return function(item)
+
+    return call
 
 
 def dumps(thing: Any) -> bytes:
@@ -234,7 +220,7 @@ class _Pickler(cloudpickle.Pickler):
         reduced = self._dynamic_function_reduce(function)
         used = _possible_modules(function.__code__, module.__dict__.get("__package__") or "")
         reduced[2][1]["_cloudpickle_submodules"].extend(filter(None, map(self._module, used)))
-        return *reduced[:-1], functools.partial(_fill_function, reduced[-1])
+        return reduced
 
 
 @functools.lru_cache(maxsize=4096)
@@ -271,26 +257,18 @@ class _Namespace(NamedTuple):
         return vars, (self.module,)
 
 
-def _fill_function(fill: Callable, function: types.FunctionType, state: tuple) -> None:
-    """As cloudpickle does; at home, the module keeps its values."""
-    fill(function, state if _arriving is not None else (state[0], state[1] | {"__globals__": {}}))
-
-
 def _new_module(name: str) -> types.ModuleType:
-    if _arriving is None and name in sys.modules:  # at home
-        return sys.modules[name]
-    module = sys.modules[name] = types.ModuleType(name)
-    if _arriving is not None:
-        _arriving[name] = module
+    module = _arriving[name] = types.ModuleType(name)
+    if is_worker():  # else a pool runs the function in the sending process, which keeps its modules
+        sys.modules[name] = module
     return module
 
 
 def _fill_module(module: types.ModuleType, state: tuple[Any, Mapping[str, Any]]) -> None:
-    if _arriving is not None:
-        parent, values = state
-        vars(module).update(values)
-        if parent is not None:
-            vars(parent)[module.__name__.rpartition(".")[2]] = module
+    parent, values = state
+    vars(module).update(values)
+    if parent is not None:
+        vars(parent)[module.__name__.rpartition(".")[2]] = module
 
 
 def _new_cached(function: Any, maxsize: int | None, typed: bool) -> Any:
@@ -338,19 +316,9 @@ def _is_of_user(name: str, places: tuple[str, ...]) -> bool:
     for path in map(Path, places):
         if {"site-packages", "dist-packages"} & set(path.resolve().parts):
             return not package_version(top)
-        if any(path.resolve().is_relative_to(folder) for folder in _standard_folders()):
+        if any(path.resolve().is_relative_to(folder) for folder in _STANDARD):
             return False
     return bool(places) or top not in sys.stdlib_module_names  # a module created by code has no file
-
-
-@functools.cache
-def _standard_folders() -> tuple[Path, ...]:
-    return tuple(Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib"))
-
-
-@functools.cache
-def _distributions() -> Mapping[str, list[str]]:
-    return importlib.metadata.packages_distributions()
 
 
 @functools.cache  # of what this process has imported; reading it takes milliseconds, and labels ask again and again
@@ -361,7 +329,7 @@ def package_version(top: str) -> str:
     except (importlib.metadata.PackageNotFoundError, ValueError):
         pass
     try:
-        return " ".join(map(importlib.metadata.version, _distributions().get(top, ())))
+        return " ".join(map(importlib.metadata.version, _packages().get(top, ())))
     except importlib.metadata.PackageNotFoundError:
         return ""
 

@@ -10,13 +10,11 @@ The rule for ``pool=``:
 
 The function (model and measurements) is sent by value (`fe_likelihoods.simulation.by_value`): by a `LocalPool` to each
 worker once, and again when anything that it uses has changed; by other pools with each item. Workers load it once.
-``submit(function, item)`` returns a future; `result_of` gives what ``map`` would return, even if the item kills every
-process that runs it. A pool that only has ``map`` runs items when they are submitted: its attribute ``submits`` is
-False. Results do not depend on the pool, to the last bit.
+A pool that only has ``map`` runs items when they are submitted: its attribute ``submits`` is False. Results do not
+depend on the pool, to the last bit.
 
 When a worker dies, the standard library's pools hang or break, and cannot say which item killed it. Each worker of a
-`LocalPool` has a pipe, and a thread in this process sends it one item at a time. So the item that a dead worker was
-running is known. Only this item is run again, and it is given up after the third death.
+`LocalPool` has a pipe, and a thread in this process sends it one item at a time, which is run again if the worker dies.
 """
 
 import os
@@ -46,7 +44,7 @@ _THREADS = ("OMP", "OPENBLAS", "MKL", "BLIS", "VECLIB_MAXIMUM", "NUMBA")
 
 
 class Submitting:
-    """Base class of executors: `map` and `submit` by `submit_all` and `give_up`."""
+    """Base class of executors, which have `submit_all` and `give_up`."""
 
     def map(self, function: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
         """Results of a function for every item, in order; ``(None, reason)`` for one that kills all its processes.
@@ -166,12 +164,9 @@ class LocalPool(Submitting):
     """Pool of local processes.
 
     The processes start with the first items. They end with `close`, when this object is garbage-collected, or when this
-    process ends, even if it is killed (on macOS with their items then). A process that dies is replaced and its item
-    run again; the other items are not affected. Linear algebra and numba use one thread per process, unless environment
-    variables such as OMP_NUM_THREADS are set.
-
-    Functions are sent by value, with the present values of their modules (`fe_likelihoods.simulation.by_value`), so
-    lambdas and functions of a script or notebook can be used.
+    process ends, even if it is killed. A process that dies is replaced and its item run again; it is given up after the
+    third death. Linear algebra and numba use one thread per process, unless environment variables such as
+    OMP_NUM_THREADS are set. Lambdas and functions of a script or notebook can be used.
 
     A pool can be shared by several likelihoods, and can be the ``pool=`` of samplers. Its methods may be called from
     several threads.

@@ -13,13 +13,13 @@ One audit hook (`sys.addaudithook`) sees what Python code of this process opens,
   have written is noticed when Python code reads it, since it has changed since the simulation began.
 """
 
-import atexit
 import contextlib
 import functools
 import hashlib
 import itertools
 import os
 import shutil
+import signal
 import stat
 import subprocess
 import sys
@@ -27,28 +27,28 @@ import sysconfig
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+import weakref
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from samplers.interrupts import process_name
 
 from .faults import SimulationFailed, TransientReason, UnusableModel
 
 __all__ = [
+    "Group",
     "Observed",
     "Opened",
-    "Sender",
     "digests_by_name",
     "file_digest",
+    "given_places",
     "mapped",
     "note",
     "observing",
     "of_this_library",
     "read_again",
-    "removed_at_end",
-    "run_in_folder",
     "working_folder",
 ]
 
@@ -70,6 +70,7 @@ _lock = threading.Lock()
 _own = threading.local()
 _digests: dict[str, tuple[tuple, float, str]] = {}
 _mirror: "_Mirror | None" = None
+given_places: dict[int, str] = {}  # folder of a process, by its id, since a fork copies it
 _fresh: set[str] = set()  # files that simulations have read and that were written while they ran
 
 
@@ -197,7 +198,7 @@ class RunningSimulation:
     def _reads(self, path: str) -> None:
         """Note a file that was written twice while a simulation ran, but not by Python code of this simulation."""
         path = os.path.realpath(path)
-        if self._is_own(path) or path.startswith(_SYSTEM) or _is_cache(path) or self._has_made(path):
+        if path.startswith(_SYSTEM) or self._is_private(path):
             return
         with contextlib.suppress(OSError):
             status = os.stat(path)
@@ -218,9 +219,7 @@ class RunningSimulation:
 
     def writes(self, path: Any) -> None:
         """Note a file that does not belong to this simulation alone."""
-        if self._shared or (path := _full(path)) is None:
-            return
-        if self._is_own(path) or _is_cache(path) or self._has_made(path):
+        if self._shared or (path := _full(path)) is None or self._is_private(path):
             return
         with contextlib.suppress(OSError):
             mode = os.stat(path).st_mode
@@ -228,8 +227,10 @@ class RunningSimulation:
                 return
         self._shared = os.path.dirname(path) if path.endswith("/*") else path
 
-    def _has_made(self, path: str) -> bool:
-        return any(path == made or path.startswith(made + os.sep) for made in self._made)
+    def _is_private(self, path: str) -> bool:
+        """Whether no other simulation writes a file while this one runs."""
+        made = any(path == each or path.startswith(each + os.sep) for each in self._made)
+        return made or self._is_own(path) or _is_cache(path)
 
     def _is_own(self, path: str) -> bool:
         return bool(self.place) and path.startswith(self.place + os.sep)
@@ -366,28 +367,6 @@ def _is_cache(path: str) -> bool:
 # working folders ----------------------------------------------------------------------------------------------------
 
 
-def removed_at_end(place: str | Path) -> subprocess.Popen:
-    """A shell that leads a group of processes: it removes a folder and kills its group when its standard input closes.
-
-    Workers and programs may still write in the folder then, so it is removed twice.
-    """
-    nothing = subprocess.DEVNULL
-    command = ["/bin/sh", "-c", _WATCH, place]
-    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=nothing, stderr=nothing, process_group=0)
-
-
-class Sender(NamedTuple):
-    """The process that sends simulations: its name, and its working folder."""
-
-    process: bytes
-    folder: str
-
-    @classmethod
-    def here(cls) -> "Sender":
-        """This process."""
-        return cls(process_name(), working_folder())
-
-
 def working_folder() -> str:
     """Working folder of this process, also while a simulation runs in its own folder; "" if it was removed."""
     simulation = running_simulation()
@@ -403,10 +382,12 @@ class Observed:
 
     A call returns the result, and all files that calls in this process have opened, since earlier results may have been
     lost. It raises `UnusableModel` if it writes a file that other simulations may write too, unless it runs `alone`; by
-    default, what holds where it is sent.
+    default, what holds where it is sent. `sender` is the name and the working folder of the process that has sent it.
     """
 
-    def __init__(self, function: Callable[[Any], Any], alone: bool | None = None, sender: Sender | None = None) -> None:
+    def __init__(
+        self, function: Callable[[Any], Any], alone: bool | None = None, sender: tuple[bytes, str] | None = None
+    ) -> None:
         self.function, self._alone, self._sender = function, alone, sender
         self.__qualname__ = getattr(function, "__qualname__", type(function).__qualname__)  # for messages
         self._known: Opened = {}
@@ -415,11 +396,11 @@ class Observed:
         alone, simulation = self._alone, running_simulation()
         if alone is None:
             alone = _is_main() if simulation is None else simulation.alone
-        return Observed, (self.function, alone, self._sender or Sender.here())
+        return Observed, (self.function, alone, self._sender or (process_name(), working_folder()))
 
     def __call__(self, item: Any) -> tuple[Any, Opened]:
         """The result for an item, and what was opened."""
-        return run_in_folder(self._observe, item, self._sender, bool(self._alone)), self._known
+        return self._in_folder(item), self._known
 
     def _observe(self, item: Any) -> Any:
         with observing() as observer:
@@ -428,26 +409,23 @@ class Observed:
             self._known = observer.result(self._known)
         return result
 
-
-def run_in_folder(function: Callable[[Any], Any], item: Any, sender: Sender | None, alone: bool) -> Any:
-    """Result of a function for one item; `sender` is the process that has sent the function, None if it was not sent.
-
-    `UnusableModel` if a file that it writes is not its own, unless it runs `alone`.
-    """
-    is_home = sender is None or sender.process == process_name()
-    if running_simulation() is not None or (is_home and _is_main()):  # one after the other
-        return function(item)
-    if is_home or not (_is_main() or _is_only_thread_of_dask()):
-        return RunningSimulation(alone, threading.get_ident()).run(function, item)
-    mirror, before = _mirror_for(sender), working_folder()
-    simulation = RunningSimulation(alone, 0 if _is_main() else threading.get_ident(), mirror.path, mirror.base)
-    os.chdir(mirror.path)
-    try:
-        return simulation.run(function, item)
-    finally:
-        mirror.is_new = not simulation.has_programs  # which may still write
-        with contextlib.suppress(FileNotFoundError):
-            os.chdir(before)
+    def _in_folder(self, item: Any) -> Any:
+        is_home = self._sender is None or self._sender[0] == process_name()
+        if running_simulation() is not None or (is_home and _is_main()):  # one after the other
+            return self._observe(item)
+        if is_home or not (_is_main() or _is_only_thread_of_dask()):
+            return RunningSimulation(bool(self._alone), threading.get_ident()).run(self._observe, item)
+        mirror, before = _mirror_of(self._sender[1]), working_folder()
+        thread = 0 if _is_main() else threading.get_ident()
+        simulation = RunningSimulation(bool(self._alone), thread, mirror.path, mirror.base)
+        os.chdir(mirror.path)
+        try:
+            return simulation.run(self._observe, item)
+        finally:
+            if simulation.has_programs:  # which may still write
+                mirror.states = {}
+            with contextlib.suppress(FileNotFoundError):
+                os.chdir(before)
 
 
 def _is_main() -> bool:
@@ -464,64 +442,98 @@ def _is_only_thread_of_dask() -> bool:
         return False
 
 
-def _mirror_for(sender: Sender) -> "_Mirror":
+class Group:
+    """A group of processes with a temporary folder, `place`.
+
+    Both are removed by `end`, when this object is garbage-collected, and when this process ends, even if it is killed:
+    the first process is a shell that waits for that.
+    """
+
+    def __init__(self) -> None:
+        self.place, nothing = os.path.realpath(tempfile.mkdtemp(prefix="fe_likelihoods_")), subprocess.DEVNULL
+        with of_this_library():
+            options = {"stdin": subprocess.PIPE, "stdout": nothing, "stderr": nothing, "process_group": 0}
+            self.processes = [subprocess.Popen(["/bin/sh", "-c", _WATCH, self.place], **options)]
+        self.end = weakref.finalize(self, _end, self.processes, self.place, os.getpid())
+        _groups.add(self)
+
+    def start(self, command: Sequence[str], **options: Any) -> subprocess.Popen:
+        """A new process of the group, without standard input; `options` are those of `subprocess.Popen`."""
+        with of_this_library():
+            group = self.processes[0].pid
+            process = subprocess.Popen(command, stdin=subprocess.DEVNULL, process_group=group, **options)
+        self.processes.append(process)
+        return process
+
+    def kill(self) -> None:
+        """Kill the processes; the folder stays."""
+        _kill(self.processes)
+
+
+_groups: weakref.WeakSet[Group] = weakref.WeakSet()
+if hasattr(os, "register_at_fork"):  # a forked process must not keep the groups alive
+    os.register_at_fork(after_in_child=lambda: [each.processes[0].stdin.close() for each in list(_groups)])
+
+
+def _end(processes: Sequence[subprocess.Popen], place: str, owner: int) -> None:
+    if owner == os.getpid():  # else it has only a forked copy of the objects
+        _kill(processes)
+        with of_this_library():
+            shutil.rmtree(place, ignore_errors=True)
+
+
+def _kill(processes: Sequence[subprocess.Popen]) -> None:
+    if processes[0].returncode is None:
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(processes[0].pid, signal.SIGKILL)
+        for process in processes:
+            process.communicate()
+
+
+@functools.cache
+def _group_of(_pid: int) -> Group:
+    return Group()
+
+
+def _mirror_of(base: str) -> "_Mirror":
     """The folder of this process, which shows what the sender's working folder contains now."""
     global _mirror
     try:
-        if _mirror is None or _mirror.base != sender.folder or _mirror.owner != os.getpid():
+        if _mirror is None or _mirror.base != base or _mirror.owner != os.getpid():
             sys.path[:] = map(os.path.abspath, sys.path)
-            _mirror = _Mirror(sender.folder)
-        _mirror.show()
+            _mirror = _Mirror(base)
+        if not _mirror.states or _mirror.states != {path: _state(path) for path in _mirror.states}:
+            _mirror.make()
     except OSError as failure:
         text = f"the working folder of a simulation could not be made: {failure}"
         raise SimulationFailed(TransientReason(text)) from failure
     return _mirror
 
 
-@functools.cache
-def _place(pid: int) -> str:
-    """A temporary folder for the folders of this process, removed when this process ends, even if it is killed."""
-    with of_this_library():
-        place = os.path.realpath(tempfile.mkdtemp(prefix="fe_likelihoods_"))
-        watcher = removed_at_end(place)
-    atexit.register(lambda: pid == os.getpid() and watcher.communicate())  # waits until it is removed
-    return place
-
-
 class _Mirror:
     """A folder `path` that shows another folder, `base`, to one simulation after the other.
 
-    A time of modification of 0 says that nothing was added or removed in one of its folders. If not `is_new`, the next
-    simulation gets another folder.
+    It is made anew for the next one if a file or folder, here or there, is not in one of the `states` that it was in.
     """
 
     def __init__(self, base: str) -> None:
-        self.base, self.owner, self.path, self.is_new = base, os.getpid(), "", False
-        self._shown: dict[str, tuple] = {}  # by path here: path there, and the state of both
-        self._folders: list[str] = []
-        self._place = os.path.join(_place(os.getpid()), "shown")
+        self.base, self.owner, self.path = base, os.getpid(), ""
+        self.states: dict[str, tuple | None] = {}
+        self._place = os.path.join(given_places.get(self.owner) or _group_of(self.owner).place, "shown")
         shutil.rmtree(self._place, ignore_errors=True)  # of a mirror of another folder
         os.mkdir(self._place)
         for entry in _scan(os.path.dirname(self.base), _MOST_BESIDE) if self.base else ():
             with contextlib.suppress(FileExistsError):
                 os.symlink(entry.path, os.path.join(self._place, entry.name))
 
-    def show(self) -> None:
+    def make(self) -> None:
         """Show what `base` contains now, and nothing that another simulation has left."""
-        changed = [own for own, (base, *states) in self._shown.items() if [_state(own), _state(base)] != states]
-        if not self.is_new or not set(changed).isdisjoint(self._folders):
-            self._make()
-        else:
-            for own in changed:
-                self._copy(self._shown[own][0], own)
-                self._seal(os.path.dirname(own))
-
-    def _make(self) -> None:
         shutil.rmtree(self.path, ignore_errors=True)
-        self.path, self.is_new = tempfile.mkdtemp(prefix="run_", dir=self._place), True
-        self._shown, left = {}, _MOST_ENTRIES
-        for base, place in (folders := [(self.base, self.path)]):
-            self._shown[place] = base, None, _state(base)
+        self.path = tempfile.mkdtemp(prefix="run_", dir=self._place)
+        shown, left, folders = [], _MOST_ENTRIES, [(self.base, self.path)]
+        self.states = {}
+        for base, place in folders:
+            self.states[base] = _state(base)
             for entry in _scan(base):
                 own = os.path.join(place, entry.name)
                 if self._is_folder(entry) and (below := len(_scan(entry.path, left + 1))) <= left:
@@ -529,28 +541,17 @@ class _Mirror:
                     folders.append((entry.path, own))
                     os.mkdir(own)
                 elif entry.is_file() and entry.stat().st_size <= _MOST_BYTES:
-                    self._copy(entry.path, own)
+                    self.states[entry.path] = _state(entry.path)
+                    shown.append(own)
+                    try:
+                        shutil.copy2(entry.path, own)
+                    except OSError:  # the user may not read it, or it is not there any more
+                        os.symlink(entry.path, own)
                 else:
                     os.symlink(entry.path, own)
-        self._folders = [place for _, place in folders]
-        for place in self._folders:
-            self._seal(place)
-
-    def _copy(self, base: str, own: str) -> None:
-        state = _state(base)
-        with contextlib.suppress(FileNotFoundError):
-            os.unlink(own)
-        try:
-            shutil.copy2(base, own)
-        except OSError:  # the user may not read it, or it is not there any more
-            os.symlink(base, own)
-        self._shown[own] = base, _state(own), state
-
-    def _seal(self, own: str) -> None:
-        """Note the state of an own folder as it is now."""
-        os.utime(own, ns=(0, 0))
-        base, _, state = self._shown[own]
-        self._shown[own] = base, _state(own), state
+        for _, place in folders:
+            os.utime(place, ns=(0, 0))  # so that whatever is added or removed changes it
+        self.states |= {own: _state(own) for own in [*shown, *(place for _, place in folders)]}
 
     def _is_folder(self, entry: os.DirEntry) -> bool:
         """Whether an entry is shown as a folder: not if it is hidden, or contains the mirror."""

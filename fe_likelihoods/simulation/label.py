@@ -157,9 +157,7 @@ class _Walk:
                     items[name] = f"deeper than {sys.getrecursionlimit()}"
                 if isinstance(value, str):  # a command or an input file of a program
                     self._words |= set(re.findall(r"\w+", value))
-        waiting = list(self._modules)
-        while waiting:  # with the user modules that these modules name
-            name = waiting.pop()
+        for name in (names := list(self._modules)):  # with the user modules that these modules name
             if name in SCRIPTS:  # of a script, only the parts that the model uses count
                 continue
             items[f"source of {name}"], words = _source(self._modules[name])
@@ -167,7 +165,7 @@ class _Walk:
             for value in list(vars(self._modules[name]).values()):
                 other = value.__name__ if isinstance(value, types.ModuleType) else _attribute(value, "__module__")
                 if isinstance(other, str) and other not in self._modules and self._is_of_user(other):
-                    waiting += [other] if other in self._modules else []
+                    names += [other] if other in self._modules else []
         items |= {f"package {package}": package_version(package) for package in self._packages}
         return items | {f"environment {n}": os.environ[n] for n in self._words & os.environ.keys() - _OF_SHELLS}
 

@@ -28,10 +28,9 @@ from ..noise.sufficient_statistics import Statistic, reduce_response, statistic_
 from ..signals.channels import Channel
 from ..signals.comparison import Comparison
 from .faults import MisfitReason, SimulationFailed, is_transient, reason_of, shortened
-from .files import Observed, Opened, Sender, note, run_in_folder
+from .files import Observed, Opened, note, working_folder
 
 __all__ = [
-    "MisfitBatch",
     "Model",
     "SimulationBatch",
     "SimulationFailed",
@@ -39,7 +38,6 @@ __all__ = [
     "first_part",
     "has_batch_method",
     "has_jacobian",
-    "is_collapse",
     "misfit_of_responses",
     "most_responses",
     "not_finite",
@@ -55,22 +53,10 @@ logger = logging.getLogger(__name__)
 _RESPONSE_VALUES = 2**23  # largest number of response values in memory at once: 64 MiB
 
 
-def is_collapse(reason: str) -> bool:
-    """Return whether a simulation ended because the structure collapsed: its reason begins with "collapse"."""
-    return reason.startswith("collapse")
-
-
 class SimulationBatch(NamedTuple):
     """Responses for several parameter sets."""
 
     response: np.ndarray  # (n, n_channels, n_steps) [SI]; NaN where the simulation failed
-    reasons: list[str]  # of n failures; empty for successes
-
-
-class MisfitBatch(NamedTuple):
-    """Misfits for several parameter sets."""
-
-    misfit: np.ndarray  # sums of squares (n, n_channels) [SI unit squared], or another statistic; NaN if failed
     reasons: list[str]  # of n failures; empty for successes
 
 
@@ -197,7 +183,7 @@ def derivatives_batch(model: Model, thetas: np.ndarray, pool: Any = None) -> np.
     ValueError if ``jacobian`` fails, or returns an array of another shape, or one that is not real or not finite.
     """
     shape = (len(model.parameter_names), len(model.channels), model.n_steps)
-    values, reasons = run_each(partial(_attempt, _derivatives, model), thetas, shape, pool)
+    values, reasons = run_each(partial(_attempt, partial(_derivatives, shape), model), thetas, shape, pool)
     for theta, reason in zip(thetas, reasons, strict=True):
         if reason:
             named = ", ".join(f"{name} = {x:.6g}" for name, x in zip(model.parameter_names, theta, strict=True))
@@ -209,15 +195,11 @@ def derivatives_batch(model: Model, thetas: np.ndarray, pool: Any = None) -> np.
     return values
 
 
-def _derivatives(model: Any, theta: np.ndarray) -> np.ndarray:
+def _derivatives(shape: tuple[int, int, int], model: Any, theta: np.ndarray) -> np.ndarray:
     """Derivatives (n_parameters, n_channels, n_steps) of one response; `SimulationFailed` if they cannot be used."""
     values = np.asarray(model.jacobian(theta.copy()))
-    shape = (len(model.parameter_names), len(model.channels), model.n_steps)
-    if values.shape != shape:
-        raise SimulationFailed(f"the shape {values.shape}")
-    if values.dtype.kind not in "fiu":
-        raise SimulationFailed(f"values of the type {values.dtype}")
-    values = values.astype(float)
+    if values.shape != shape or values.dtype.kind not in "fiu":
+        raise SimulationFailed(f"the shape {values.shape} and the type {values.dtype}")
     if bad := [name for name, rows in zip(model.parameter_names, values, strict=True) if not np.isfinite(rows).all()]:
         raise SimulationFailed(f"values that are not finite for {', '.join(bad)}")
     return values
@@ -238,15 +220,15 @@ def sent_simulation(
 
 def misfit_of_responses(
     model: Model, batch: SimulationBatch, measured: np.ndarray | Comparison, statistic: Statistic | None = None
-) -> MisfitBatch:
-    """Sums of squared residuals, or another residual statistic, for given responses, as `sent_simulation`."""
+) -> tuple[np.ndarray, list[str]]:
+    """Statistics (n, n_numbers) of given responses, NaN for failures, and reasons; as from `sent_simulation`."""
     outcomes = [
         (None, reason)
         if reason
         else _attempt(lambda _, each: _reduced(each, measured, statistic or sums_of_squares), model, response)
         for response, reason in zip(*batch, strict=True)
     ]
-    return MisfitBatch(*_gathered(outcomes, (statistic_width(measured, statistic),)))
+    return _gathered(outcomes, (statistic_width(measured, statistic),))
 
 
 def _response(model: Model, theta: np.ndarray) -> np.ndarray:
@@ -329,16 +311,16 @@ def run_each(
 
     `run` is a `sent_simulation`, such as one that returns statistics, so that the responses stay in the workers.
     """
-    if pool is None:
-        if is_worker():  # of the pool of a sampler
-            run = partial(run_in_folder, run, sender=Sender.here()._replace(process=b""), alone=False)
-        outcomes = [run(theta) for theta in thetas]
+    if pool is not None:
+        found = map(unpack, pool.map(Observed(run, pool.n_workers == 1), list(thetas)))
+    elif is_worker():  # of the pool of a sampler
+        found = map(Observed(run, False, (b"", working_folder())), thetas)
     else:
-        outcomes = []
-        for outcome in pool.map(Observed(run, pool.n_workers == 1), list(thetas)):
-            result, opened = unpack(outcome)
-            outcomes.append(result)
-            note(opened)
+        return _gathered([run(theta) for theta in thetas], shape)
+    outcomes = []
+    for outcome, opened in found:
+        outcomes.append(outcome)
+        note(opened)
     return _gathered(outcomes, shape)
 
 

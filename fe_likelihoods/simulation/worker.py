@@ -1,13 +1,11 @@
 """A local process that calls a function for one item at a time, and may hang, crash or use too much memory.
 
-The function is received by value, so that the user's script is not imported. The process leads a new session, which is
-killed with it. On Linux it is also killed when the process that started it ends, for whatever reason
-(``PR_SET_PDEATHSIG``); on macOS it ends with its item then. It is started with `subprocess`, because pool processes, in
-which it must also work, often may not use `multiprocessing`.
+The function is received by value, so that the user's script is not imported. Workers and programs run in a group of
+processes of their own, which is killed with them, and when the process that started them ends, for whatever reason. A
+worker is started with `subprocess`, because pool processes, in which it must also work, often may not use
+`multiprocessing`.
 """
 
-import ctypes
-import functools
 import json
 import math
 import os
@@ -18,9 +16,8 @@ import subprocess
 import sys
 import threading
 import time
-import weakref
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import CancelledError, ThreadPoolExecutor
+from concurrent.futures import CancelledError
 from contextlib import suppress
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
@@ -29,33 +26,21 @@ from typing import Any
 
 from samplers.interrupts import become_worker
 
-from .by_value import CannotLoad, Pickled, without_addresses
+from .by_value import CannotLoad, Pickled, load, without_addresses
 from .faults import SimulationFailed, TransientReason, is_transient
-from .files import of_this_library, removed_at_end, working_folder
+from .files import Group, given_places, of_this_library, working_folder
 
-__all__ = ["Died", "Sandbox", "Worker", "describe_exit", "last_lines", "run_program", "serve"]
+__all__ = ["Died", "Sandbox", "Worker", "describe_exit", "run_program", "serve"]
 
 _BOOT = (
     "import json, sys; sys.path[:], sys.argv, *settings = json.loads(sys.argv[1]); "
     "from fe_likelihoods.simulation.worker import serve; serve(*settings)"
 )
-_PR_SET_PDEATHSIG = 1
 _CHECK = 0.5  # [s] between checks that the process lives, while waiting for its answer
 
 
 class Died(SimulationFailed):
     """A worker process that died, or was stopped, before it answered."""
-
-
-@functools.cache
-def _starter(pid: int) -> ThreadPoolExecutor:
-    """A permanent thread that starts processes: Linux kills a process when the thread that started it ends."""
-    return ThreadPoolExecutor(1, "starts workers")
-
-
-def _start(start: Callable[[], subprocess.Popen]) -> subprocess.Popen:
-    with of_this_library():
-        return start()
 
 
 class Worker:
@@ -88,15 +73,15 @@ class Worker:
             self._renew()
         if given_up():  # before, there was no process to kill
             raise CancelledError
-        if self._key != function.key:
+        if self._function != function:
             self._ask(b"\1" + pickle.dumps(function, protocol=5), math.inf)
-            self._key = function.key
+            self._function = function
         self._calls += 1
         return self._ask(message, seconds)
 
     def _is_ready(self) -> bool:
         is_own = self._process is not None and self._owner == os.getpid()  # not of the process that has forked this one
-        return is_own and not _ended(self._process) and self._calls < self._most_calls
+        return is_own and self._process.poll() is None and self._calls < self._most_calls
 
     def _renew(self) -> None:
         environment, quiet = self._settings
@@ -104,24 +89,20 @@ class Worker:
         self._connection, theirs = Pipe()
         output = subprocess.DEVNULL if quiet else None
         with theirs:
+            self._group = Group()
             texts = [[str(text) for text in texts] for texts in (sys.path, sys.argv)]
-            start = functools.partial(
-                subprocess.Popen,
-                [sys.executable, "-c", _BOOT, json.dumps([*texts, theirs.fileno(), os.getpid()])],
+            self._process = self._group.start(
+                [sys.executable, "-c", _BOOT, json.dumps([*texts, theirs.fileno(), self._group.place])],
                 env={**os.environ, **(environment or {})},
                 pass_fds=(theirs.fileno(),),
-                stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=output,
-                start_new_session=True,
                 cwd=working_folder() or None,
             )
-            self._process = _starter(os.getpid()).submit(_start, start).result()
         readable = select.poll()  # kept, since Connection.poll makes one for each call
         readable.register(self._connection, select.POLLIN)
         self._poll = readable.poll
-        self._key, self._calls, self._owner = b"", 0, os.getpid()
-        self._end = weakref.finalize(self, _kill, self._process, os.getpid())
+        self._function, self._calls, self._owner = None, 0, os.getpid()
 
     def _ask(self, message: bytes, seconds: float) -> Any:
         """Answer to a message, a value or an exception; raises `Died` without one, and the process is killed."""
@@ -130,15 +111,14 @@ class Worker:
             self._connection.send_bytes(message)
             # a program that the function has started may hold the connection open
             while not self._poll(1000.0 * max(0.0, min(_CHECK, stop - time.monotonic()))):
-                if _ended(self._process) and not self._poll(0):
+                if self._process.poll() is not None and not self._poll(0):
                     raise EOFError
                 if time.monotonic() >= stop:
                     raise Died(TransientReason(f"stopped at the time limit of {seconds:g} s"))
             value, error = pickle.loads(self._connection.recv_bytes())
         except (EOFError, OSError):
-            give_up = time.monotonic() + 5.0
-            while not _ended(self._process) and time.monotonic() < give_up:  # it may end by itself, with its exit code
-                time.sleep(0.001)
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(5.0)  # it may end by itself, with its exit code
             self.kill()
             raise Died(TransientReason(describe_exit(self._process.wait(), "the worker process"))) from None
         except BaseException:
@@ -149,9 +129,9 @@ class Worker:
         return value
 
     def kill(self) -> None:
-        """Kill the process and its session."""
+        """Kill the process and its group."""
         if self._process is not None and self._owner == os.getpid():
-            self._end()
+            self._group.end()
 
 
 class Sandbox:
@@ -186,78 +166,38 @@ class Sandbox:
             raise SimulationFailed(TransientReason(str(error))) from error
 
 
-def _ended(process: subprocess.Popen) -> bool:
-    """Whether a process has ended; its exit status is not collected, so that its process id is not reused."""
-    if process.returncode is not None:
-        return True
-    if not hasattr(os, "waitid"):  # macOS before Python 3.13
-        return process.poll() is not None
-    try:
-        return os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
-    except ChildProcessError:
-        return True
-
-
-def _kill(process: subprocess.Popen, owner: int) -> None:
-    """Kill a process with its session, unless the calling process has only a forked copy of its object."""
-    if owner == os.getpid():
-        if process.returncode is None or not hasattr(os, "waitid"):
-            with suppress(ProcessLookupError, PermissionError):
-                os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-
-
 def describe_exit(exit_code: int, who: str) -> str:
     """Description of an exit code, such as "the worker process died (signal 11)"."""
     return f"{who} died (signal {-exit_code})" if exit_code < 0 else f"{who} ended with exit code {exit_code}"
-
-
-def last_lines(file: Any, most: int) -> str:
-    """The last non-empty lines of an open file, at most `most` lines and 300 characters."""
-    size = os.fstat(file.fileno()).st_size
-    data = os.pread(file.fileno(), 4096, max(0, size - 4096)).decode(errors="replace")
-    lines = [line.strip() for line in data.splitlines() if line.strip()]
-    return " / ".join(lines[-most:])[-300:]
 
 
 # programs -----------------------------------------------------------------------------------------------------------
 
 
 def run_program(
-    command: Sequence[str], folder: Path, stdout: Path, stderr: Path, place: Path, watch: Callable[[float], float]
+    group: Group, command: Sequence[str], folder: Path, stdout: Path, stderr: Path, watch: Callable[[float], float]
 ) -> int:
-    """Run a program to its end, kill all processes that it leaves behind, and return its exit code, as in `subprocess`.
+    """Run a program in a group to its end, kill the group, and return the exit code, as in `subprocess`.
 
-    The command has an absolute path; no shell is used, standard input is empty.
-    `place` is the folder of the run, which is removed if this process is killed. `watch` is called with the time since
+    The command has an absolute path; no shell is used, standard input is empty. `watch` is called with the time since
     the start [s] and returns the time until the next call [s], or raises an exception, which stops the program and is
     passed on. OSError if the program cannot be started.
     """
-    with of_this_library():
-        watcher, program = removed_at_end(place), None
-        try:
-            with open(stdout, "wb") as out, open(stderr, "wb") as error:
-                options = {"stdin": subprocess.DEVNULL, "stdout": out, "stderr": error, "process_group": watcher.pid}
-                program = subprocess.Popen(command, cwd=folder, **options)
-            start = time.monotonic()
-            waiter = threading.Thread(target=program.wait, daemon=True)  # without the pauses of a wait with a limit
-            waiter.start()
-            while waiter.is_alive():
-                waiter.join(watch(time.monotonic() - start))
-            return program.returncode
-        finally:
-            _kill_program(watcher, program)
-
-
-def _kill_program(watcher: subprocess.Popen, program: subprocess.Popen | None) -> None:
-    """Kill the group of a program, and the processes that it has started in other groups and that it waits for."""
-    for pid in [] if program is None or program.returncode is not None else _descendants(program.pid):
-        with suppress(ProcessLookupError, PermissionError):
-            os.kill(pid, signal.SIGKILL)
-    os.killpg(watcher.pid, signal.SIGKILL)
-    watcher.communicate()
-    if program is not None:
-        program.wait()
+    try:
+        with of_this_library(), open(stdout, "wb") as out, open(stderr, "wb") as error:
+            program = group.start(command, cwd=folder, stdout=out, stderr=error)
+        start = time.monotonic()
+        waiter = threading.Thread(target=program.wait, daemon=True)  # without the pauses of a wait with a limit
+        waiter.start()
+        while waiter.is_alive():
+            waiter.join(watch(time.monotonic() - start))
+        return program.returncode
+    finally:
+        for process in group.processes[1:]:  # and what a program has started in other groups, while it waits for it
+            for pid in _descendants(process.pid) if process.poll() is None else ():
+                with suppress(ProcessLookupError, PermissionError):
+                    os.kill(pid, signal.SIGKILL)
+        group.kill()
 
 
 def _descendants(pid: int) -> list[int]:
@@ -276,15 +216,12 @@ def _descendants(pid: int) -> list[int]:
 # in the worker ------------------------------------------------------------------------------------------------------
 
 
-def serve(fileno: int, parent: int) -> None:
+def serve(fileno: int, place: str) -> None:
     """Main loop of a worker process: answer messages until the connection with a file descriptor closes.
 
-    A message is a function to load, or an item for it. `parent` is the id of the process that has started this process.
+    A message is a function to load, or an item for it. `place` is a folder for this process.
     """
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != parent:  # it has ended before
-            os._exit(1)
+    given_places[os.getpid()] = place
     os.set_inheritable(fileno, False)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the parent, which ends this process
     become_worker()
@@ -297,7 +234,7 @@ def serve(fileno: int, parent: int) -> None:
                 return
             try:
                 if message[0]:
-                    function = pickle.loads(message[1:]).loaded()
+                    function = load(pickle.loads(message[1:]))
                 answer = _packed(None if message[0] else function(pickle.loads(message[1:])))
             except BaseException as error:
                 answer = _packed(None, error)

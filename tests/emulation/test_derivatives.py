@@ -283,11 +283,11 @@ def test_right_derivatives_are_accepted_for_any_width_of_the_prior(prior):
     [
         (
             of_shortened,
-            r"of shape \(n_parameters, n_channels, n_steps\) = \(2, 2, 200\); got the shape \(2, 2, 199\), at",
+            r"of shape \(n_parameters, n_channels, n_steps\) = \(2, 2, 200\); got the shape \(2, 2, 199\) and the type",
         ),
         (lambda theta: np.moveaxis(slopes(theta), 0, -1), r"got the shape \(2, 200, 2\)"),
         (not_finite, "got values that are not finite for damping, at stiffness = "),
-        (lambda theta: 1j * slopes(theta), "got values of the type complex128"),
+        (lambda theta: 1j * slopes(theta), "and the type complex128"),
         (fails, "got ZeroDivisionError: no tangent, at stiffness = .*: correct it, or leave it out"),
     ],
 )

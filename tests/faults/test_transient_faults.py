@@ -139,8 +139,8 @@ def test_a_failure_that_depends_on_the_measurements_is_not_used_for_others(tmp_p
     store_outcomes(cache, Faulty(), THETAS, far)
     assert far == ["ZeroDivisionError: the statistic is not defined"] * 3
     responses = simulate_batch(Faulty(), THETAS)
-    known = misfit_of_responses(Faulty(), responses, np.full((1, N_STEPS), 100.0), _undefined)
-    assert known.reasons == far and np.isnan(known.misfit).all()
+    misfit, reasons = misfit_of_responses(Faulty(), responses, np.full((1, N_STEPS), 100.0), _undefined)
+    assert reasons == far and np.isnan(misfit).all()
     assert stored_outcomes(cache, Faulty(), THETAS) == [None] * 3
 
 

@@ -20,7 +20,6 @@ from fe_likelihoods.kernels import bar_fatigue
 from fe_likelihoods.models.rc_column_analysis import _reason as reason_of_failure
 from fe_likelihoods.prediction.quantities import find_failure
 from fe_likelihoods.problems import bridge_column_data
-from fe_likelihoods.simulation.model import is_collapse
 from fe_likelihoods.units import G0
 from tests.kernels import golden
 from tests.models.tested_columns import read_column
@@ -107,7 +106,7 @@ def test_a_drift_beyond_the_limit_is_a_collapse():
         limited = replace(model, analysis=ColumnAnalysis(collapse_drift=0.5 * drift.max()))
         limited.simulate(np.ones(5))
     first = np.argmax(drift > 0.5 * drift.max())
-    assert is_collapse(error.value.reason)
+    assert error.value.reason.startswith("collapse")
     assert f"at t = {first * model.dt:.4g} s" in error.value.reason
     before = limited.first((first - 1) * model.dt)
     np.testing.assert_array_equal(before.simulate(np.ones(5)), whole[:, :first])
@@ -120,12 +119,12 @@ def test_a_column_without_its_bars_has_collapsed_and_one_with_most_of_them_has_f
     model = replace(column, fatigue=LowCycleFatigue(cf=0.036, cd=0.389), analysis=ColumnAnalysis(max_increment=0.02))
     with pytest.raises(SimulationFailed, match="bars with 78% of the area") as error:
         replace(model, axial_load=16e6).simulate([1.0])
-    assert is_collapse(error.value.reason)
+    assert error.value.reason.startswith("collapse")
     sections = golden.column(golden.circle(), bars_fail=True).sections
     for fractured, collapsed in ((1, False), (sections.steel_memory.shape[1], True)):
         sections.steel_memory[0, :fractured, bar_fatigue.FRACTURED] = 1.0
         reason = reason_of_failure(7, 20, "", 3, sections)
-        assert "had fractured before" in reason and is_collapse(reason) == collapsed
+        assert "had fractured before" in reason and reason.startswith("collapse") == collapsed
 
 
 @pytest.mark.parametrize(

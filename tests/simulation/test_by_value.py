@@ -11,7 +11,7 @@ import pytest
 
 from fe_likelihoods import FunctionModel
 from fe_likelihoods.simulation import by_value
-from fe_likelihoods.simulation.by_value import Pickled
+from fe_likelihoods.simulation.by_value import Pickled, load
 from fe_likelihoods.simulation.executors import LocalPool, as_executor
 from fe_likelihoods.simulation.faults import ChangedModel
 from fe_likelihoods.simulation.label import ModelLabel
@@ -207,7 +207,7 @@ def test_another_version_of_the_library_is_refused(monkeypatch):
     pickled = Pickled.of(line)
     monkeypatch.setattr(by_value, "sources_digest", lambda: bytes(16))
     with pytest.raises(ChangedModel, match="another version of fe_likelihoods"):
-        pickled.load()
+        load(pickled)
 
 
 def test_a_file_that_differs_in_the_worker_is_refused(tmp_path, pool):
@@ -220,12 +220,12 @@ def test_a_file_that_differs_in_the_worker_is_refused(tmp_path, pool):
 
 
 def _load(pickled):
-    return pickled.load() is not None
+    return load(pickled) is not None
 
 
 def test_modules_of_this_process_stay_when_a_function_is_loaded_in_it(user):
     law = user.law
-    assert Pickled.of(user.by_module).load()(1.0) == 3.0
+    assert load(Pickled.of(user.by_module))(1.0) == 3.0
     assert sys.modules["law"] is law and law.K == 3.0
 
 

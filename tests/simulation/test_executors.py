@@ -18,7 +18,6 @@ from fe_likelihoods.signals.records import Record
 from fe_likelihoods.simulation import by_value
 from fe_likelihoods.simulation.executors import LocalPool, as_executor
 from fe_likelihoods.simulation.model import sent_simulation, simulate_batch
-from tests.faults import treacherous
 from tests.faults.treacherous import Absent, Gated, Large, Treacherous, Unpicklable, gone, posterior_of
 from tests.lines import misfit_batch
 
@@ -37,7 +36,7 @@ class Recorder:
 
 @pytest.fixture(autouse=True)
 def nothing_known():
-    by_value.loaded_functions.clear()
+    by_value.load.cache_clear()
 
 
 @pytest.fixture
@@ -101,10 +100,9 @@ def test_invalid_pools_are_refused(pool):
 def test_a_worker_of_another_pool_loads_the_model_once():
     model, thetas = Large(), np.tile([0.2, 0.3], (20, 1))
     executor = as_executor(Recorder())
-    for loaded in (1, 0):
-        treacherous.LOADED.clear()  # a value of the module, so that its change would send the function again
+    for _ in range(2):
         assert simulate_batch(model, thetas, executor).reasons == [""] * 20
-        assert len(treacherous.LOADED) == loaded
+        assert by_value.load.cache_info().misses == 1
 
 
 @pytest.mark.parametrize(
@@ -187,6 +185,10 @@ def function(tmp_path):
     return sent_simulation(Gated(tmp_path))
 
 
+def _process(_item):
+    return os.getpid()
+
+
 def wait_until(condition):
     stop = threading.Event()
     for _ in range(int(SECONDS / 0.01)):
@@ -219,7 +221,7 @@ def test_the_function_is_sent_once_to_each_process(shared_pool):
 
 def test_items_are_given_up(function, tmp_path):
     with LocalPool(1) as pool:
-        (pid,) = pool.map(os.getsid, [0])
+        (pid,) = pool.map(_process, [0])
         running, waiting = pool.submit_all(function, [LONG, SHORT[0]])
         wait_until(lambda: (tmp_path / f"started {LONG[0]!r}").exists())
         pool.give_up([running, waiting])
@@ -256,9 +258,9 @@ def test_cancelled_items_are_not_run(function, tmp_path, shared_pool):
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="NO fork ON THIS SYSTEM")
 def test_a_forked_process_starts_workers_of_its_own():
     with LocalPool(1) as pool:
-        parent = pool.map(os.getsid, [0])
+        parent = pool.map(_process, [0])
         child = os.fork()
         if not child:
-            os._exit(int(pool.map(os.getsid, [0]) == parent))
+            os._exit(int(pool.map(_process, [0]) == parent))
         assert os.waitpid(child, 0)[1] == 0
-        assert pool.map(os.getsid, [0]) == parent
+        assert pool.map(_process, [0]) == parent
