@@ -175,9 +175,8 @@ class _Pickler(cloudpickle.Pickler):
         if name not in self._of_user:
             module = sys.modules.get(name) if isinstance(name, str) else None
             is_sent = is_of_user(module) and module.__name__ == name
-            self._of_user[name] = (
-                module if is_sent and not str(vars(module).get("__file__")).endswith(_COMPILED) else None
-            )
+            is_sent = is_sent and not str(vars(module).get("__file__")).endswith(_COMPILED)
+            self._of_user[name] = module if is_sent else None
         return self._of_user[name]
 
     def reducer_override(self, obj: Any) -> Any:
@@ -199,15 +198,11 @@ class _Pickler(cloudpickle.Pickler):
 
     def _reduce_module(self, module: types.ModuleType) -> tuple:
         name, values = module.__name__, vars(module)
-        present = values.copy()  # other threads may change it
-        if name in SCRIPTS:
-            present = {key: present[key] for key in ("__file__", "__package__") if key in present}
-        else:
-            # modules of a package are sent where a function names them
-            present = {key: value for key, value in present.items() if self._module(f"{name}.{key}") is None}
-        parent = self._module(name.rpartition(".")[0])
-        sent = {key: value for key, value in present.items() if key not in _OF_THE_IMPORT}
-        return _new_module, (name,), (parent, sent), None, None, _fill_module
+        sent = {key: values[key] for key in ("__file__", "__package__") if key in values}
+        if name not in SCRIPTS:  # modules of a package are sent where a function names them
+            present = values.copy().items()  # other threads may change it
+            sent |= {k: v for k, v in present if k not in _OF_THE_IMPORT and self._module(f"{name}.{k}") is None}
+        return _new_module, (name,), (self._module(name.rpartition(".")[0]), sent), None, None, _fill_module
 
     def _function(self, function: types.FunctionType) -> Any:
         """Reduce a function; a user function gets the namespace of its module, and the modules that it imports."""

@@ -236,9 +236,7 @@ class LocalPool(Submitting):
 def as_executor(pool: Any, model: Any = None) -> "LocalPool | PoolExecutor | None":
     """Executor for a pool, by the rule above; None for None.
 
-    Its ``map(function, items)`` returns a list. The functions must return a result and an empty reason, or None and the
-    reason of a failure, as for an item that kills every process that runs it, if the pool survives. ValueError if
-    `pool` is of no such kind, or its workers are other processes and the model cannot be sent to them.
+    ValueError if `pool` is of no such kind, or its workers are other processes and the model cannot be sent to them.
     """
     if pool is None or isinstance(pool, LocalPool | PoolExecutor):
         executor = pool

@@ -66,7 +66,6 @@ _MOST_BESIDE = 3000  # entries beside the working folder, which ``..`` shows
 
 _observers: "list[_Observer]" = []
 _running: "dict[int, RunningSimulation]" = {}  # by thread; 0 for all threads of a process that runs one at a time
-_lock = threading.Lock()
 _own = threading.local()
 _digests: dict[str, tuple[tuple, float, str]] = {}
 _mirror: "_Mirror | None" = None
@@ -121,14 +120,11 @@ class _Observer:
 def observing() -> Iterator[_Observer]:
     """Observe what this process opens."""
     _add_hook()
-    observer = _Observer()
-    with _lock:
-        _observers.append(observer)
+    _observers.append(observer := _Observer())
     try:
         yield observer
     finally:
-        with _lock:
-            _observers.remove(observer)
+        _observers.remove(observer)
 
 
 def note(opened: Opened) -> None:

@@ -98,25 +98,11 @@ class Model(Protocol):
     ('amplitude', 'sigma_displacement')
     """
 
-    @property
-    def parameter_names(self) -> tuple[str, ...]:
-        """Names of the structural parameters: multiples of nominal values, or SI."""
-
-    @property
-    def channels(self) -> tuple[Channel, ...]:
-        """Channels of the response, one per row."""
-
-    @property
-    def dt(self) -> float:
-        """Time step of the response [s]."""
-
-    @property
-    def n_steps(self) -> int:
-        """Number of response samples."""
-
-    @property
-    def fingerprint(self) -> str:
-        """Text that differs between models with different responses."""
+    parameter_names: tuple[str, ...]  #: names of the structural parameters: multiples of nominal values, or SI
+    channels: tuple[Channel, ...]  #: of the response, one per row
+    dt: float  #: time step of the response [s]
+    n_steps: int  #: samples of the response
+    fingerprint: str  #: differs between models with different responses
 
     def simulate(self, theta: np.ndarray) -> np.ndarray:
         """Response (n_channels, n_steps) [SI] for parameters (n_parameters,); may raise `SimulationFailed`."""
