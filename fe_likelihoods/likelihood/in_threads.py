@@ -8,7 +8,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Any
 
-from ..simulation.executors import Threads, settle
+from ..simulation.executors import Job, Threads
 
 __all__ = ["InThreads"]
 
@@ -24,13 +24,17 @@ class InThreads:
         sizes = [getattr(pool, "n_workers", None) for pool in pools.values()]
         self.n_workers: int | None = None if None in sizes else sum(sizes) or 1
         self._streams = all(each.streams for each in simulators)  # no model runs in threads of this process
-        self._threads = Threads(lambda: lambda call: call[0](call[1]))
+        self._threads = Threads(lambda: _run)
 
     def submit(self, function: Callable[[Any], Any], item: Any) -> Future:
         """Begin to call a function for an item; without pools that have ``submit``, the result is there on return."""
-        future: Future = Future()
+        job = Job(function, item)
         if self._streams:
-            self._threads.submit_all([future], [(function, item)], self.n_workers or _MOST_THREADS)
+            self._threads.submit_all([job], self.n_workers or _MOST_THREADS)
         else:
-            settle(future, function, item)
-        return future
+            job.settle(_run)
+        return job
+
+
+def _run(job: Job) -> Any:
+    return job.function(job.item)

@@ -34,7 +34,7 @@ from ..simulation.files import Observed
 from ..simulation.model import (
     Model,
     SimulationBatch,
-    has_batch_method,
+    gathered,
     has_jacobian,
     most_responses,
     run_each,
@@ -328,7 +328,7 @@ class Simulator(VerifiedModel):
         if self.cache is None and (self.when_simulated is None or self.pool is not None):
             return min(n, most)
         workers = (os.cpu_count() or 1) if self.pool is None else self.pool.n_workers or n
-        together = self.pool is not None or has_batch_method(self.model)  # then all workers are to be busy
+        together = self.pool is not None or hasattr(self.model, "simulate_batch")  # then all workers are to be busy
         return min(max(_ROUNDS_PER_CHUNK * workers if together else 1, self.chunk_size), most)
 
     @interrupts_end_the_run()
@@ -385,8 +385,7 @@ class Simulator(VerifiedModel):
                 seconds, self._running.counted_until = now - self._running.counted_until, now
                 responses = self._returns_responses(request.full)
                 shape = (len(self.model.channels), self.model.n_steps) if responses else (self.n_numbers,)
-                values = np.array([np.full(shape, np.nan) if each is None else each for each, _ in done.values()])
-                self._record(request, list(done), values, [reason for _, reason in done.values()], seconds)
+                self._record(request, list(done), *gathered(list(done.values()), shape), seconds)
             self._running.lock.notify_all()
         if error is not None:
             raise error

@@ -20,7 +20,7 @@ from ..signals.channels import Channel
 from ..signals.interpolation import interpolate, make_interpolation
 from ..signals.records import Record
 from ..simulation.by_value import code_within, is_of_user
-from ..simulation.model import Model, SimulationBatch, first_part, has_batch_method, simulate_batch
+from ..simulation.model import Model, SimulationBatch, first_part, simulate_batch
 from .base import digest
 from .validation import check_theta
 
@@ -146,7 +146,7 @@ class SensedModel:
             return lambda record: SensedModel(model.with_record(record), self.outputs, self.inputs)
         if model is not None and name == "first" and _can_be_shortened(model):
             return self._first
-        if model is not None and name == "simulate_batch" and has_batch_method(model):
+        if model is not None and name == "simulate_batch" and hasattr(model, name):
             return self._batch
         raise AttributeError(f"{type(self).__name__} has no {name}")
 

@@ -39,6 +39,7 @@ __all__ = [
     "SCRIPTS",
     "CannotLoad",
     "Pickled",
+    "attribute",
     "code_within",
     "dumps",
     "is_arriving",
@@ -221,18 +222,19 @@ class _Pickler(cloudpickle.Pickler):
 @functools.lru_cache(maxsize=4096)
 def names_in(code: types.CodeType) -> frozenset[str]:
     """Names in a code object and in the code objects inside it."""
-    return frozenset(code.co_names).union(*map(names_in, _inner(code)))
+    return frozenset(name for each in _codes(code) for name in each.co_names)
 
 
 @functools.lru_cache(maxsize=4096)
 def _imported_in(code: types.CodeType) -> frozenset[str]:
     """Modules of import statements in the code, without the dots of relative ones."""
-    own = {step.argval for step in dis.get_instructions(code) if step.opname == "IMPORT_NAME"}
-    return frozenset(own).union(*map(_imported_in, _inner(code)))
+    steps = [step for each in _codes(code) for step in dis.get_instructions(each)]
+    return frozenset(step.argval for step in steps if step.opname == "IMPORT_NAME")
 
 
-def _inner(code: types.CodeType) -> list[types.CodeType]:
-    return [constant for constant in code.co_consts if isinstance(constant, types.CodeType)]
+def _codes(code: types.CodeType) -> list[types.CodeType]:
+    inner = [each for each in code.co_consts if isinstance(each, types.CodeType)]
+    return [code, *(each for part in inner for each in _codes(part))]
 
 
 def _possible_modules(code: types.CodeType, package: str) -> list[str]:
@@ -278,7 +280,7 @@ def is_of_user(module: Any) -> bool:
     if isinstance(module, str):
         name, module = module, sys.modules.get(module)
     else:
-        name = _values(module).get("__name__")
+        name = attribute(module, "__name__") if isinstance(module, types.ModuleType) else None
     if not isinstance(name, str):
         return False
     return _is_of_user(name, _places(module) or _places(sys.modules.get(name.partition(".")[0])))
@@ -290,15 +292,18 @@ def code_within(model: Any) -> dict[str, Any]:
     return own | (model.code_parts() if hasattr(model, "code_parts") else {})
 
 
-def _values(module: Any) -> dict[str, Any]:
-    # asking a lazy module for an attribute would import it
-    return object.__getattribute__(module, "__dict__") if isinstance(module, types.ModuleType) else {}
+def attribute(value: Any, name: str) -> Any:
+    """An attribute, found without running user code, or importing a lazy module; None if there is none."""
+    try:
+        return object.__getattribute__(value, name)
+    except (AttributeError, ValueError):  # an empty cell raises ValueError
+        return None
 
 
 def _places(module: Any) -> tuple[str, ...]:
     """The file of a module, or the folders of a package that has no file."""
-    file = _values(module).get("__file__")
-    return (file,) if isinstance(file, str) else tuple(map(str, _values(module).get("__path__", ())))
+    file = attribute(module, "__file__")
+    return (file,) if isinstance(file, str) else tuple(map(str, attribute(module, "__path__") or ()))
 
 
 @functools.cache

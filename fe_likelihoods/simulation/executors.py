@@ -24,6 +24,7 @@ import weakref
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecutor
 from concurrent.futures import wait as wait_for
+from contextlib import AbstractContextManager
 from functools import cache, cached_property, partial
 from multiprocessing.pool import Pool, ThreadPool
 from numbers import Integral
@@ -37,10 +38,10 @@ from .by_value import Pickled
 from .faults import TransientReason
 from .worker import Died, Worker
 
-__all__ = ["LocalPool", "PoolExecutor", "Submitting", "Threads", "as_executor", "result_of", "settle"]
+__all__ = ["Job", "LocalPool", "PoolExecutor", "Submitting", "Threads", "as_executor", "result_of"]
 
 MAX_ATTEMPTS = 3
-_THREADS = ("OMP", "OPENBLAS", "MKL", "BLIS", "VECLIB_MAXIMUM", "NUMBA")
+_THREADS = [f"{each}_NUM_THREADS" for each in ("OMP", "OPENBLAS", "MKL", "BLIS", "VECLIB_MAXIMUM", "NUMBA")]
 
 
 class Submitting:
@@ -60,10 +61,7 @@ class Submitting:
             raise
 
     def submit(self, function: Callable[[Any], Any], item: Any) -> Future:
-        """Future with the result of a function for one item, as returned by `map`.
-
-        ``cancel()`` has an effect until the item is sent to a process, if the pool can cancel.
-        """
+        """Future with the result of a function for one item, which can be cancelled until a process has it."""
         return self.submit_all(function, [item])[0]
 
 
@@ -88,63 +86,60 @@ def result_of(future: Any) -> Any:
     return None, TransientReason("the worker process died in every attempt of dask")
 
 
+class Job(Future):
+    """An item with its function; the future of its result. `worker` is the one that has it."""
+
+    def __init__(self, function: Any, item: Any) -> None:
+        super().__init__()
+        self.function, self.item, self.worker, self.given_up = function, item, None, False
+
+    def settle(self, run: Callable[["Job"], Any]) -> None:
+        """Set the result of a function for this job, or its error, unless the job was cancelled."""
+        if self.set_running_or_notify_cancel():
+            try:
+                self.set_result(run(self))
+            except BaseException as error:
+                self.set_exception(error)
+
+
 class Threads:
-    """Daemon threads, for which Python does not wait at its end; each has a function of one item from ``make()``.
+    """Daemon threads, for which Python does not wait at its end; each runs jobs by a function from ``make()``.
 
     They end with `close`, or when this object is garbage-collected.
     """
 
-    def __init__(self, make: Callable[[], Callable[[Any], Any]]) -> None:
-        self._make, self._calls, self._lock = make, SimpleQueue(), threading.Lock()
+    def __init__(self, make: Callable[[], Callable[[Job], Any]]) -> None:
+        self._make, self._jobs, self._lock = make, SimpleQueue(), threading.Lock()
         self._threads: list[threading.Thread] = []
-        self.pending: list[Future] = []  # and some that have ended
-        weakref.finalize(self, self._calls.put, None)
+        self.pending: list[Job] = []  # and some that have ended
+        weakref.finalize(self, self._jobs.put, None)
 
-    def submit_all(self, futures: Sequence[Future], items: Sequence[Any], most: int) -> None:
-        """Call a function for each item, in at most `most` threads; `cancel` of its future prevents it before."""
+    def submit_all(self, jobs: Sequence[Job], most: int) -> None:
+        """Run jobs in at most `most` threads; their `cancel` prevents it before."""
         with self._lock:
-            self.pending = [each for each in self.pending if not each.done()] + list(futures)
+            self.pending = [each for each in self.pending if not each.done()] + list(jobs)
             while len(self._threads) < min(most, len(self.pending)):
-                thread = threading.Thread(target=_work, args=(self._calls, self._make()), daemon=True)
+                thread = threading.Thread(target=_work, args=(self._jobs, self._make()), daemon=True)
                 thread.start()
                 self._threads.append(thread)
-        for call in zip(futures, items, strict=True):
-            self._calls.put(call)
+        for job in jobs:
+            self._jobs.put(job)
 
     def close(self) -> None:
-        """End the threads after the calls that wait."""
-        self._calls.put(None)
+        """End the threads after the jobs that wait."""
+        self._jobs.put(None)
         for thread in self._threads:
             thread.join()
 
 
-def _work(calls: SimpleQueue, function: Callable[[Any], Any]) -> None:
-    while (call := calls.get()) is not None:
-        settle(call[0], function, call[1])
-        call = None  # which must not be kept while this thread waits
-    calls.put(None)  # for the other threads
+def _work(jobs: SimpleQueue, run: Callable[[Job], Any]) -> None:
+    while (job := jobs.get()) is not None:
+        job.settle(run)
+        job = None  # which must not be kept while this thread waits
+    jobs.put(None)  # for the other threads
 
 
-def settle(future: Future, function: Callable[[Any], Any], item: Any) -> None:
-    """Set the result of a function for an item, or its error, unless the future was cancelled."""
-    if future.set_running_or_notify_cancel():
-        try:
-            result = function(item)
-        except BaseException as error:
-            future.set_exception(error)
-        else:
-            future.set_result(result)
-
-
-class _Job(Future):
-    """An item with its function; the future of its result. `worker` is the one that has it."""
-
-    def __init__(self, function: Pickled, item: Any) -> None:
-        super().__init__()
-        self.function, self.item, self.worker, self.given_up = function, item, None, False
-
-
-def _result(worker: Worker, job: _Job) -> Any:
+def _result(worker: Worker, job: Job) -> Any:
     """Result of an item, from another process if its process dies."""
     deaths, job.worker = 0, worker
     try:
@@ -160,7 +155,7 @@ def _result(worker: Worker, job: _Job) -> Any:
         job.worker = None
 
 
-class LocalPool(Submitting):
+class LocalPool(Submitting, AbstractContextManager):
     """Pool of local processes.
 
     The processes start with the first items. They end with `close`, when this object is garbage-collected, or when this
@@ -168,8 +163,7 @@ class LocalPool(Submitting):
     third death. Linear algebra and numba use one thread per process, unless environment variables such as
     OMP_NUM_THREADS are set. Lambdas and functions of a script or notebook can be used.
 
-    A pool can be shared by several likelihoods, and can be the ``pool=`` of samplers. Its methods may be called from
-    several threads.
+    Likelihoods and samplers can share a pool, and its methods may be called from several threads.
 
     Parameters
     ----------
@@ -187,16 +181,12 @@ class LocalPool(Submitting):
                 f"got {workers!r}"
             )
         self.n_workers = int(workers)  # items that run at once
-        names = [f"{library}_NUM_THREADS" for library in _THREADS]
-        self._environment = {name: "1" for name in names if name not in os.environ}
+        self._environment = {name: "1" for name in _THREADS if name not in os.environ}
         self._set_up()
 
     def _set_up(self) -> None:
         environment = self._environment
         self._owner, self._threads = os.getpid(), Threads(lambda: partial(_result, Worker(environment)))
-
-    def __enter__(self) -> "LocalPool":
-        return self
 
     def __exit__(self, *exception: object) -> None:
         self.close()
@@ -213,8 +203,8 @@ class LocalPool(Submitting):
     def submit_all(self, function: Callable[[Any], Any], items: Sequence[Any]) -> list[Future]:
         """Futures as from `submit`, for several items; ValueError if the function cannot be sent to the processes."""
         pickled = Pickled.of(function)  # each time: the values that it uses may have changed
-        jobs = [_Job(pickled, item) for item in items]
-        self._threads_here().submit_all(jobs, jobs, self.n_workers)
+        jobs = [Job(pickled, item) for item in items]
+        self._threads_here().submit_all(jobs, self.n_workers)
         return jobs
 
     def give_up(self, futures: Sequence[Future]) -> None:
@@ -238,9 +228,8 @@ def as_executor(pool: Any, model: Any = None) -> "LocalPool | PoolExecutor | Non
 
     ValueError if `pool` is of no such kind, or its workers are other processes and the model cannot be sent to them.
     """
-    if pool is None or isinstance(pool, LocalPool | PoolExecutor):
-        executor = pool
-    else:
+    executor = pool
+    if pool is not None and not isinstance(pool, Submitting):
         executor = PoolExecutor(pool) if hasattr(pool, "map") else LocalPool(pool)
     if executor is not None and executor.other_processes:
         Pickled.of(model)
@@ -251,8 +240,7 @@ class PoolExecutor(Submitting):
     """Executor for any object with ``map(function, items)``.
 
     A `multiprocessing.Pool` replaces a process that dies but does not run its item again, so the call never returns.
-    Use a `LocalPool` if simulations may crash. Dask runs the items of a worker that dies on other workers, and gives
-    up an item after several deaths (``distributed.scheduler.allowed-failures``); see `result_of`.
+    Dask runs the items of a worker that dies on other workers; see `result_of`.
     """
 
     def __init__(self, pool: Any) -> None:

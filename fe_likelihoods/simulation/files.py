@@ -8,9 +8,9 @@ One audit hook (`sys.addaudithook`) sees what Python code of this process opens,
   So a worker process changes into a temporary folder for each simulation, which shows the sender's working folder:
   files as copies, large ones as links, subfolders as folders. If Python code opens a link for writing, a private file
   takes its place first. Threads of one process share its working folder: there, simulations that write are refused.
-* A file outside of this folder is noted, unless the simulation has made it exclusively: other simulations may write it
-  too, so it is refused where several run at once. Compiled code and programs write without an event: a file that they
-  have written is noticed when Python code reads it, since it has changed since the simulation began.
+* A file outside of this folder that a simulation writes, unless it has made it exclusively, is refused where several
+  run at once. Compiled code and programs write without an event: a file that they have written is noticed when Python
+  code reads it.
 """
 
 import contextlib
@@ -44,6 +44,7 @@ __all__ = [
     "digests_by_name",
     "file_digest",
     "given_places",
+    "kill_group",
     "mapped",
     "note",
     "observing",
@@ -72,9 +73,7 @@ _mirror: "_Mirror | None" = None
 given_places: dict[int, str] = {}  # folder of a process, by its id, since a fork copies it
 _fresh: set[str] = set()  # files that simulations have read and that were written while they ran
 
-
-Opened = dict[str, str]
-"""What simulations opened: digests of the contents of files, by path."""
+Opened = dict[str, str]  # what simulations opened: digests of the contents of files, by path
 
 
 def digests_by_name(opened: Opened) -> dict[str, str]:
@@ -461,10 +460,6 @@ class Group:
         self.processes.append(process)
         return process
 
-    def kill(self) -> None:
-        """Kill the processes; the folder stays."""
-        _kill(self.processes)
-
 
 _groups: weakref.WeakSet[Group] = weakref.WeakSet()
 if hasattr(os, "register_at_fork"):  # a forked process must not keep the groups alive
@@ -473,12 +468,13 @@ if hasattr(os, "register_at_fork"):  # a forked process must not keep the groups
 
 def _end(processes: Sequence[subprocess.Popen], place: str, owner: int) -> None:
     if owner == os.getpid():  # else it has only a forked copy of the objects
-        _kill(processes)
+        kill_group(processes)
         with of_this_library():
             shutil.rmtree(place, ignore_errors=True)
 
 
-def _kill(processes: Sequence[subprocess.Popen]) -> None:
+def kill_group(processes: Sequence[subprocess.Popen]) -> None:
+    """Kill the processes of a `Group`; its folder stays."""
     if processes[0].returncode is None:
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(processes[0].pid, signal.SIGKILL)

@@ -1,9 +1,8 @@
 """Label of a model: the code, files and versions that its results depend on, besides its declared identity.
 
 Stored simulations belong to a declared identity, the fingerprint of the model: class, parameters, channels, excitation,
-``version=`` and ``depends_on=``. Whether the code still computes the same results is verified by repeating some stored
-simulations (`fe_likelihoods.cache.verification`). The label only sets how many: a few for rows that were stored under a
-known label, many for an unknown label. So a label may be incomplete, and may change without need. It contains
+``version=`` and ``depends_on=``. The label only sets how many of them are verified by new ones
+(`fe_likelihoods.cache.verification`), so it may be incomplete, and may change without need. It contains
 
 * user functions, classes and values by value: the parts of the model, and everything that their code names,
 * the source files of the user modules among them, without comments, and the versions of installed packages,
@@ -30,12 +29,11 @@ from typing import Any
 
 import numpy as np
 
-from .by_value import LIBRARY, SCRIPTS, is_of_user, names_in, package_version, sources_digest
+from .by_value import LIBRARY, SCRIPTS, attribute, is_of_user, names_in, package_version, sources_digest
 from .files import Opened, digests_by_name, file_digest, mapped, read_again
 
 __all__ = ["ModelLabel", "items_of", "value_digest"]
 
-MOST_OBJECTS = 1_000_000  # in one value; further objects are left out
 _PLAIN = (type(None), bool, int, float, complex, str, bytes, bytearray, type(...), type(NotImplemented))
 _WRAPPERS = (staticmethod, classmethod, property, types.CellType, type(functools.lru_cache(len)))
 _WRAPPED = ("__wrapped__", "fget", "fset", "fdel", "cell_contents")
@@ -163,7 +161,7 @@ class _Walk:
             items[f"source of {name}"], words = _source(self._modules[name])
             self._words |= words
             for value in list(vars(self._modules[name]).values()):
-                other = value.__name__ if isinstance(value, types.ModuleType) else _attribute(value, "__module__")
+                other = value.__name__ if isinstance(value, types.ModuleType) else attribute(value, "__module__")
                 if isinstance(other, str) and other not in self._modules and self._is_of_user(other):
                     names += [other] if other in self._modules else []
         items |= {f"package {package}": package_version(package) for package in self._packages}
@@ -174,8 +172,6 @@ class _Walk:
         if id(value) in self._open:  # it contains itself
             return f"the object {len(self._open) - self._open[id(value)]} levels above".encode()
         if id(value) not in self._done:
-            if len(self._done) >= MOST_OBJECTS:
-                return b""
             digest = blake2b(digest_size=8)
             self._open[id(value)] = len(self._open)
             try:
@@ -217,7 +213,7 @@ class _Walk:
                     self._waiting.setdefault(f"{value.__name__}.{each}", member)
             return f"{name} {value.__name__}", []
         if isinstance(value, _WRAPPERS):
-            return name, [_attribute(value, each) for each in _WRAPPED]
+            return name, [attribute(value, each) for each in _WRAPPED]
         if kind in (list, tuple):
             return name, value
         if kind in (set, frozenset):
@@ -226,7 +222,7 @@ class _Walk:
             state = () if kind in (dict, types.MappingProxyType) else _state(value)
             return name, [*itertools.chain.from_iterable(value.items()), *state]
         if kind.__module__.partition(".")[0] == "numba":  # the compiled variants change with use
-            return name, [_attribute(value, "py_func") or _attribute(_attribute(value, "_dispatcher"), "py_func")]
+            return name, [attribute(value, "py_func") or attribute(attribute(value, "_dispatcher"), "py_func")]
         if is_of_user(kind.__module__) or isinstance(value, types.SimpleNamespace):
             return name, [kind, *_state(value)]
         parts = value.__reduce_ex__(2)  # what pickle would rebuild it from, with iterators as lists
@@ -242,20 +238,20 @@ class _Walk:
             self._waiting.setdefault(f"{_name_of(module)}.{each}", function.__globals__[each])
         attributes = [pair for pair in vars(function).items() if pair[0] != "__wrapped__"]
         values = function.__defaults__, function.__kwdefaults__, function.__closure__
-        return name, [code, *values, attributes, _attribute(function, "__wrapped__")]
+        return name, [code, *values, attributes, attribute(function, "__wrapped__")]
 
     def _class(self, cls: type) -> tuple[str, list[Any]]:
         name = f"{_name_of(cls.__module__)}.{cls.__qualname__}"
         if not isinstance(cls.__module__, str) or not self._is_of_user(cls.__module__):  # a descriptor in Cython
             return name, []
         parts = [*cls.__bases__, type(cls)]
-        for attribute, member in sorted(vars(cls).items()):
-            if attribute in _OF_CLASSES or isinstance(member, types.MemberDescriptorType):
+        for each, member in sorted(vars(cls).items()):
+            if each in _OF_CLASSES or isinstance(member, types.MemberDescriptorType):
                 continue
             if isinstance(member, _DATA) and "<locals>" not in name:
-                self._waiting.setdefault(f"{name}.{attribute}", member)
+                self._waiting.setdefault(f"{name}.{each}", member)
             else:
-                parts += attribute, member
+                parts += each, member
         return name, parts
 
     def _is_of_user(self, module: str) -> bool:
@@ -282,21 +278,13 @@ def _name_of(module: str) -> str:
 
 def _state(value: Any) -> list[tuple[str, Any]]:
     """Attributes of an object in alphabetical order, including slots."""
-    found = dict(_attribute(value, "__dict__") or {})
+    found = dict(attribute(value, "__dict__") or {})
     for cls in type(value).__mro__:
         slots = vars(cls).get("__slots__", ())
         for name in (slots,) if isinstance(slots, str) else slots:
             private = name.startswith("__") and not name.endswith("__")
-            found[name] = _attribute(value, f"_{cls.__name__.lstrip('_')}{name}" if private else name)
+            found[name] = attribute(value, f"_{cls.__name__.lstrip('_')}{name}" if private else name)
     return sorted(found.items())
-
-
-def _attribute(value: Any, name: str) -> Any:
-    """An attribute, found without running user code; None if there is none."""
-    try:
-        return object.__getattribute__(value, name)
-    except (AttributeError, ValueError):  # an empty cell raises ValueError
-        return None
 
 
 def _source(module: types.ModuleType) -> tuple[str, frozenset[str]]:

@@ -1,10 +1,9 @@
 """Protocol of a structural model, and functions that run a batch of its simulations.
 
-A model is any object with named parameters, named channels and a method `simulate` for one parameter set, which raises
-`SimulationFailed` if a simulation is impossible. `simulate_batch` uses the model's own method of this name if it has
-one (compiled kernels that share work or threads); otherwise, and always with a pool, the sets are run one by one. A
-failing simulation never raises here: an exception, or a response that is not finite or has a wrong shape, becomes a
-reason in words and a row of NaN. Ctrl-C and ``sys.exit`` are no failures.
+`simulate_batch` uses the model's own method of this name if it has one (compiled kernels that share work or threads);
+otherwise, and always with a pool, the sets are run one by one. A failing simulation never raises here: an exception, or
+a response that is not finite or has a wrong shape, becomes a reason in words and a row of NaN. Ctrl-C and ``sys.exit``
+are no failures.
 """
 
 import logging
@@ -36,7 +35,7 @@ __all__ = [
     "SimulationFailed",
     "derivatives_batch",
     "first_part",
-    "has_batch_method",
+    "gathered",
     "has_jacobian",
     "misfit_of_responses",
     "most_responses",
@@ -113,11 +112,6 @@ def has_jacobian(model: Model) -> bool:
     return getattr(model, "jacobian", None) is not None
 
 
-def has_batch_method(model: Model) -> bool:
-    """Whether a model has a batch method."""
-    return getattr(model, "simulate_batch", None) is not None
-
-
 def most_responses(model: Model) -> int:
     """Number of responses that are in memory at once where many are simulated one part after the other."""
     return max(1, _RESPONSE_VALUES // (len(model.channels) * model.n_steps))
@@ -149,7 +143,7 @@ def simulate_batch(model: Model, thetas: np.ndarray, pool: Any = None) -> Simula
         shape = (len(model.channels), model.n_steps)
         if getattr(model, "simulate_together", None) is not None:
             return model.simulate_together(thetas, pool)
-        if pool is None and has_batch_method(model):
+        if pool is None and hasattr(model, "simulate_batch"):
             before, known = sys.exception(), interrupts()
             try:
                 batch = SimulationBatch(*_checked_batch(model, model.simulate_batch(thetas), (len(thetas), *shape)))
@@ -211,10 +205,10 @@ def misfit_of_responses(
     outcomes = [
         (None, reason)
         if reason
-        else _attempt(lambda _, each: _reduced(each, measured, statistic or sums_of_squares), model, response)
+        else _attempt(partial(_reduced, measured, statistic or sums_of_squares), model, response)
         for response, reason in zip(*batch, strict=True)
     ]
-    return _gathered(outcomes, (statistic_width(measured, statistic),))
+    return gathered(outcomes, (statistic_width(measured, statistic),))
 
 
 def _response(model: Model, theta: np.ndarray) -> np.ndarray:
@@ -250,10 +244,10 @@ def _misfit(measured: np.ndarray | Comparison, reduce: Statistic, model: Model, 
     response = _response(model, theta)
     if reason := not_finite(model, response):
         raise SimulationFailed(reason)
-    return _reduced(response, measured, reduce)
+    return _reduced(measured, reduce, model, response)
 
 
-def _reduced(response: np.ndarray, measured: np.ndarray | Comparison, reduce: Statistic) -> np.ndarray:
+def _reduced(measured: np.ndarray | Comparison, reduce: Statistic, _model: Model, response: np.ndarray) -> np.ndarray:
     """Statistic of a response; `SimulationFailed` if it cannot be computed."""
     before = sys.exception()
     try:
@@ -302,15 +296,15 @@ def run_each(
     elif is_worker():  # of the pool of a sampler
         found = map(Observed(run, False, (b"", working_folder())), thetas)
     else:
-        return _gathered([run(theta) for theta in thetas], shape)
+        return gathered([run(theta) for theta in thetas], shape)
     outcomes = []
     for outcome, opened in found:
         outcomes.append(outcome)
         note(opened)
-    return _gathered(outcomes, shape)
+    return gathered(outcomes, shape)
 
 
-def _gathered(outcomes: Sequence[tuple], shape: tuple[int, ...]) -> tuple[np.ndarray, list[str]]:
+def gathered(outcomes: Sequence[tuple], shape: tuple[int, ...]) -> tuple[np.ndarray, list[str]]:
     """Results (n, *shape), NaN for failures, and reasons."""
     values = np.full((len(outcomes), *shape), np.nan)
     for row, (result, _) in zip(values, outcomes, strict=True):

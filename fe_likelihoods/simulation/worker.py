@@ -2,8 +2,7 @@
 
 The function is received by value, so that the user's script is not imported. Workers and programs run in a group of
 processes of their own, which is killed with them, and when the process that started them ends, for whatever reason. A
-worker is started with `subprocess`, because pool processes, in which it must also work, often may not use
-`multiprocessing`.
+worker is started with `subprocess`: pool processes, in which it must also work, often may not use `multiprocessing`.
 """
 
 import json
@@ -28,7 +27,7 @@ from samplers.interrupts import become_worker
 
 from .by_value import CannotLoad, Pickled, load, without_addresses
 from .faults import SimulationFailed, TransientReason, is_transient
-from .files import Group, given_places, of_this_library, working_folder
+from .files import Group, given_places, kill_group, of_this_library, working_folder
 
 __all__ = ["Died", "Sandbox", "Worker", "describe_exit", "run_program", "serve"]
 
@@ -66,7 +65,7 @@ class Worker:
         """Result of a function for an item, or its exception.
 
         Without an answer, the process is killed: Died if it dies or does not answer within `seconds` after it was given
-        the item, CancelledError if it is `given_up` before. TypeError and similar ones if the item cannot be pickled.
+        the item, CancelledError if it is `given_up` before.
         """
         message = b"\0" + pickle.dumps(item, protocol=5)
         if not self._is_ready():
@@ -137,9 +136,9 @@ class Worker:
 class Sandbox:
     """Callable that runs a function of one argument in another process, whose output is not shown.
 
-    The process is replaced after a call that did not end by itself, and after `runs_per_process` calls (default:
-    never), which limits memory leaks. Each thread has a process of its own. The function is sent by value, in its state
-    at the call; ValueError if it cannot be sent. `time_limit` [s] is for a call, without the start of the process.
+    The process is replaced after a call that did not end by itself, and after `runs_per_process` calls. Each thread has
+    a process of its own. The function is sent by value, in its state at the call; ValueError if it cannot be sent.
+    `time_limit` [s] is for a call, without the start of the process.
     """
 
     def __init__(
@@ -197,7 +196,7 @@ def run_program(
             for pid in _descendants(process.pid) if process.poll() is None else ():
                 with suppress(ProcessLookupError, PermissionError):
                     os.kill(pid, signal.SIGKILL)
-        group.kill()
+        kill_group(group.processes)
 
 
 def _descendants(pid: int) -> list[int]:
