@@ -376,12 +376,12 @@ class TemperedSampler(RunResults, EnsembleSampler):
                 if self.evaluations > evaluations:  # not for an argument that was refused
                     if reasons := self._target.failure_reasons:
                         error.add_note(f"Failed simulations: {reasons}.")
-                    error.add_note(f"{self._kept} When the cause is removed, call run_mcmc again to go on.")
+                    error.add_note(f"{self._kept} When the cause is removed, the same call goes on from there.")
                 raise
             except (KeyboardInterrupt, SystemExit):
                 with deferred_interrupts():
                     self._undo(random_state)
-                logger.warning("interrupted: %s Call run_mcmc again to go on.", self._kept)
+                logger.warning("interrupted: %s The same call goes on from there.", self._kept)
                 raise
         if self.failure_count > failures:
             warn(
@@ -393,7 +393,13 @@ class TemperedSampler(RunResults, EnsembleSampler):
     def _kept(self) -> str:
         """What remains of a run that ends by an exception or an interrupt, and where."""
         where = "this process" if self._record.path is None else f"{self._record.path} and {self.backend.filename}"
-        return f"{self.evaluations} evaluations and {self.iteration} steps are kept in {where}."
+        return f"{self._made} are kept in {where}."
+
+    @property
+    def _made(self) -> str:
+        """What a run has made so far, in words."""
+        searched = f"{made:.0f} simulations of the guide, " if (made := self._record.of_guides) else ""
+        return f"{searched}{self.evaluations} evaluations and {self.iteration} steps"
 
     def _undo(self, random_state: tuple) -> None:
         """Remove incomplete results: a part of a step, and the draws of a run that has not begun."""
@@ -452,8 +458,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
                     "with it, or use another file; backend.reset(nwalkers, ndim) discards it"
                 )
             if self._record.path is not None:  # a user who waits sees that the time spent is not lost
-                said = "Going on with %s: %d evaluations and %d steps are stored"
-                logger.warning(said, self.backend.filename, self.evaluations, self.iteration)
+                logger.warning("Going on with %s: %s are stored", self.backend.filename, self._made)
             return start
         if given is None or (start is not None and np.array_equal(given.coords, start.coords)):
             given = previous  # a cell, or a script, that is started again with the same draws goes on

@@ -101,11 +101,13 @@ def _go_on(job: Job, folder: Path, file: Path, samples: bool, progress: bool) ->
             # missing: the chain alone has lost which walkers are copies
             sampler.run_mcmc(None, missing, progress=progress)
         chains.append(sampler)
-    return _write(folder, job, again, chains, problem, progress)
+    return _write(folder, job, file, again, chains, problem, progress)
 
 
-def _write(folder: Path, job: Job, again: str, chains: list[Any], problem: Problem, progress: bool) -> Outcome:
-    """Write tables, prediction, samples and report; `again` is the command that makes the run."""
+def _write(
+    folder: Path, job: Job, file: Path, again: str, chains: list[Any], problem: Problem, progress: bool
+) -> Outcome:
+    """Write tables, prediction, samples and report with the name of the TOML file; `again` is the command."""
     from ..prediction.propagation import propagate  # slow to import
     from ..reporting.report import write_page
 
@@ -118,7 +120,7 @@ def _write(folder: Path, job: Job, again: str, chains: list[Any], problem: Probl
             prediction = job.located("prediction", propagate, problem.posterior, drawn, **options)
     judged = judge_run(run)
     agreement = write_samples(folder, run, chains, prediction, str(judged.judgement))
-    write_page(folder / PAGE, run, prediction, judged, repeat=again)
+    write_page(folder / PAGE, run, prediction, judged, title=f"Bayesian updating: {file.stem}", repeat=again)
     said = [each.measurements.description for each, _ in problem.posterior.likelihood.data_sets()]
     said = [agreement, *(f"Measurements: {each}" for each in said if "CAUTION" in each)]
     said += [f"Assumed priors [SI], which the file does not give: {problem.assumed}"] if problem.assumed else []

@@ -15,6 +15,7 @@ import numpy as np
 
 from samplers.estimates.importance import KnownDensity
 from samplers.estimates.weights import effective_sample_size, normalised_weights
+from samplers.evaluation.values import most_common_reasons
 from samplers.finding import Finding
 from samplers.judgement.guides import (
     check_draws_in_memory,
@@ -177,6 +178,9 @@ class ResponseGuide(Guide):
         self.search = yield from self._searching.run(self._starts)
         self._regions = [Region(mode.coords, mode.covariance, None, mode.log_evidence) for mode in self.search.modes]
         archive = self._target.archive
+        if self.search.finished and len(archive.numbers) == 0:
+            reasons = most_common_reasons(self._target.posterior.report()["failure_reasons"])
+            raise RuntimeError(f"all simulations of the search failed (see report()): {reasons}")
         if len(archive.numbers) > 1 and not np.ptp(archive.statistics, axis=0).any():
             raise ValueError(
                 f"expected responses that depend on the parameters; all {len(archive.numbers)} simulations of the "

@@ -145,7 +145,11 @@ def evidence(run: FinishedRun) -> list[str]:
         )
         return [*lines, text if check.reliable else f"{text} Its weights are too uneven to confirm anything."]
     if sampler.rounds:
-        return [*lines, f"It is the mean weight of {sum(each.draws for each in sampler.rounds)} draws of a guide."]
+        *_, mean, error, _ = sampler.rounds[-1]
+        draws = sum(each.draws for each in sampler.rounds)
+        text = f"The mean weight of {draws} draws of a guide is {mean:.2f} ± {error:.2g}"
+        corrected = ", and corrects the evidence of the emulated posterior" if sampler.signed_sample is not None else ""
+        return [*lines, f"{text}{corrected}."]
     return [*lines, "It was not checked by independent draws."]
 
 

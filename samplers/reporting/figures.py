@@ -345,6 +345,8 @@ def plot_run(sampler: Any) -> "Figure":
         points.plot(ends, distinct, "s--", color=BLUE, alpha=0.5, label="distinct points", markersize=4)
     points.axhline(sampler.nwalkers, color=GREY, linewidth=1, linestyle=":", label="walkers")
     points.set(ylim=(0.0, 1.3 * points.get_ylim()[1]), ylabel="number of points")
+    if stages[-1].beta == 1.0:
+        evidence.axhline(sampler.log_evidence, color=GREY, linewidth=1, linestyle=":", label="result")
     evidence.set(xlabel="evaluations of the log-probability", ylabel="log-evidence so far")
     evidence.ticklabel_format(axis="y", useOffset=False)
     for axes in chain:

@@ -69,7 +69,7 @@ def _count(search: GuideTick) -> str:
     if not search.simulations + search.expected:
         return search.phase
     number, most = max(1, round(search.simulations)), float(f"{search.expected:.2g}")
-    about = f" of {'about' if number <= most else 'more than'} {most:.0f}" if most else ""
+    about = (f" of about {most:.0f}" if number <= most else f", {most:.0f} were expected") if most else ""
     return f"{search.phase}: simulation {number}{about}"
 
 
