@@ -60,10 +60,8 @@ def spoiled(channel: RealChannel, rng: np.random.Generator) -> Iterator[tuple[st
     for share in (0.1, 0.2, 0.5):
         yield f"drift of {share}", "drift", x + sign * share * peak * time
     yield "parabola of 0.5", "drift", x + sign * 0.5 * peak * time**2
-    for ratio in (0.3, 1.0):
+    for ratio in (0.3, 1.0, 4.0):
         yield f"noise of {ratio} deviations (right)", "", x + ratio * deviation * rng.standard_normal(len(x))
-    for ratio in (2.0, 4.0):
-        yield f"noise of {ratio} deviations", "noise", x + ratio * deviation * rng.standard_normal(len(x))
 
 
 def screening(repeats: int, every: int = 1) -> Iterator[Row]:

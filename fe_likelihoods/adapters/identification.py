@@ -7,8 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from ..checks.finding import warn
-from ..checks.screening import check_phases
 from ..modal.modal_data import ModalData, read_mode_table, real_shapes
 from ..signals.text_files import agree_on_unit
 from ..units import to_si
@@ -108,8 +106,7 @@ def _of_arrays(frequencies: Any, sensors: Sequence[str], values: dict[str, Any],
     if "shapes" in values:
         found["shapes"] = np.asarray(values["shapes"]).T
         if np.iscomplexobj(found["shapes"]):
-            found["shapes"], scatter = real_shapes(found["shapes"])
-            warn(check_phases(scatter), stacklevel=3)
+            found["shapes"], _ = real_shapes(found["shapes"])
     if "damping" in values:
         found["damping"] = np.ravel(values["damping"])
     if "cv" in values:

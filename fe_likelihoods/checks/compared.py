@@ -64,8 +64,7 @@ class Fit:
     before: np.ndarray | None = None  # the same at the mean of the prior
     white: np.ndarray | None = None  # residuals of the fit as the noise whitens them; None without time
     assumed: np.ndarray | None = None  # (n_channels,) independent samples that the noise assumes at most
-    deviations: np.ndarray | None = None  # (n_channels, 1) of errors without time, at draws of the prior
-    stated: bool = False  # whether the errors are known
+    deviations: np.ndarray | None = None  # (n_channels, 1) of errors without time, where they are stated
     modal: ModalFit | None = None  # modes, instead of responses
     failed: str = ""  # why a response is missing
 
@@ -153,23 +152,20 @@ def compare(
     by_channel, assumed = dict[str, np.ndarray](), getattr(noise, "effective_samples", None)
     if assumed is not None:
         by_channel["assumed"] = np.broadcast_to(assumed, measured.n_channels)
-
-    def at(theta: np.ndarray) -> np.ndarray:
-        values = dict(zip(likelihood.parameter_names, theta, strict=True))
-        return np.array([values.get(name, np.nan) for name in noise.parameter_names])
-
     if measured.is_history and "after" in found and point is not None:
         found["white"] = measured.values - found["after"]
         if hasattr(noise, "whitened"):
-            found["white"] = noise.whitened(found["white"], found["after"], at(point))
-    elif not measured.is_history and len(draws) and hasattr(noise, "standard_deviations"):
-        by_channel["deviations"] = noise.standard_deviations(at(np.median(draws, axis=0))[None])[0][:, None]
-    fits, stated = [], not noise.parameter_names
+            values = dict(zip(likelihood.parameter_names, point, strict=True))
+            theta = np.array([values.get(name, np.nan) for name in noise.parameter_names])
+            found["white"] = noise.whitened(found["white"], found["after"], theta)
+    elif not measured.is_history and not noise.parameter_names and hasattr(noise, "standard_deviations"):
+        by_channel["deviations"] = noise.standard_deviations(np.zeros((1, 0)))[0][:, None]
+    fits = []
     for title, part, rows, inside in _events(likelihood, key):
         cut = {name: each[rows] for name, each in by_channel.items()}
         for name, each in found.items():
             cut[name] = np.where(inside, each, np.nan)[..., rows, :][..., inside[rows].any(axis=0)]
-        fits.append(Fit(title, part, stated=stated, failed="; ".join(failed), **cut))
+        fits.append(Fit(title, part, failed="; ".join(failed), **cut))
     return fits
 
 

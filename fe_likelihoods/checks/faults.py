@@ -1,18 +1,14 @@
 """Faults of measurements that responses show: wrong units or signs, swapped channels, clocks that differ; in words.
 
 A sampler finds parameters that make up for a part of a fault. Each fault is therefore a hypothesis about draws of the
-prior, before a run and after it: with a factor, the other sign, a shift in time or another order of the channels, is
-one of them much closer to the measurements than the best one is without it?
-
-Gain g and lag of measurements y by responses r have the least errors, by their spectra Y and R, where::
+prior: with a factor, the other sign, a lag or another order of the channels, is one of them much closer to the
+measurements than the best one is without it? Gain g and lag of measurements y by responses r follow from spectra::
 
     c(lag) = sum_f Y conj(R) exp(2 pi i f lag),   g = c / sum_f |R|^2,   error^2 = 1 - c^2 / (sum_f |Y|^2 sum_f |R|^2)
 
-Errors are compared relative to the smaller of y and r: half a gain is then as far from one as a gain of two.
-
-Far below its lowest frequency a structure moves as its supports do, whatever its parameters. There, draws agree, and
-only these lines are compared, with the median of the draws. The motions of two supports are compared in the same way,
-in the lowest lines in which they are coherent. Counts of what is named are in docs/results.rst.
+Errors are relative to the smaller of y and r: half a gain is then as far from one as a gain of two. Far below its
+lowest frequency a structure moves as its supports do. Where draws agree, only these lines are compared, with the median
+of the draws. Two supports are compared in the lowest lines in which they are coherent. Counts are in docs/results.rst.
 """
 
 import math
@@ -25,7 +21,7 @@ import numpy as np
 from ..signals.channels import Channel, Measurements
 from ..text_tables import listed
 from ..units import DIMENSIONS, UNITS, find_unit
-from .finding import TAIL, WRONG, Finding, percent
+from .finding import HALF, TAIL, WRONG, Finding, percent
 from .sensor_faults import runs_of
 
 __all__ = ["Fault", "describe_unit", "find_faults", "finding_of", "slow_motion", "supports_apart"]
@@ -35,7 +31,6 @@ EXPLAINED = 0.85  # error (RRMSE) above which a response explains nothing: a cor
 FLOOR = 0.02  # error below which smaller ones count as equal
 FACTOR = 1.5  # from which a factor may be one between units; from 1.67 on, 433 of 444 faults of supports for 442
 SAME_UNITS = 1.25  # ratio of a factor to one between units, up to which it is named after them
-LONGEST_LAG = 0.2  # share of the record
 FEWEST_DRAWS = 5  # of the prior
 AGREE = 0.1  # difference of a draw from the median, half of the draws: gains of 45 right fits are then 0.96 to 1.21
 SMOOTH = 7  # lines of the spectrum over which powers are averaged, and fewest lines of a band
@@ -137,7 +132,7 @@ def _fitted(y: np.ndarray, r: np.ndarray, steps: np.ndarray, n: int) -> tuple[np
     power, lags = np.square(np.abs(r)).sum(axis=-1) / own, np.zeros(1)
     products = (y * r.conj()).real.sum(axis=-1)[..., None] / own[:, None]
     if n:
-        reach = int(LONGEST_LAG * n * steps.min() / steps.max())
+        reach = int(HALF * n * steps.min() / steps.max())
         lags = steps.max() * np.arange(-reach, reach + 1)
         all_lags = 0.5 * n * np.fft.irfft(y * r.conj(), n) / own[:, None]
         products = np.stack([all_lags[:, c, np.rint(lags / step).astype(int)] for c, step in enumerate(steps)], axis=1)
@@ -239,8 +234,7 @@ FAULTS = {  # kind, text and action
     "factor": (
         "A {what} may be wrong",
         "{measured} are {value} times {computed}",
-        "Look up unit and gain of the channel and of the base motion, loads or stiffnesses, and correct the wrong one; "
-        "a model of your own must return SI units.",
+        "Look up unit and gain of the channel, base motion, loads and stiffnesses; a model must return SI units.",
     ),
     "sign": (
         "A sign may be wrong",
@@ -250,8 +244,7 @@ FAULTS = {  # kind, text and action
     "lag": (
         "Clocks may differ",
         "{measured} are {value} s {late} than {computed}",
-        "Check the clocks of sensors and motions, and when the motion begins (`zero` in [measurements], or "
-        "measurements.shift); a lag that stays unknown can be a parameter (`Sensor`).",
+        "Check clocks of sensors and motions (`zero` in [measurements], measurements.shift), or sample it (`Sensor`).",
     ),
     "swap": (
         "Channels may be swapped",
@@ -259,10 +252,7 @@ FAULTS = {  # kind, text and action
         "Look up which cable, or column of the file, belongs to which; if they were exchanged, exchange the columns.",
     ),
 }
-OF_SUPPORTS = (
-    "Check unit, sign and clock of its file. Slow motions of one site are alike, except of supports that did move so, "
-    "or that waves reach one by one."
-)
+OF_SUPPORTS = "Check unit, sign and clock of its file: slow motions of one site are alike, but for waves and slips."
 
 
 def finding_of(
@@ -284,9 +274,8 @@ def finding_of(
     numbers = {name: number for name, number in numbers.items() if not math.isnan(number)}
     if of_supports:
         return Finding(kind, severity, f"{text}.", OF_SUPPORTS, numbers, "input")
-    text += (
-        f"; corrected, the error ({error}) is {percent(fault.after)} instead of {percent(fault.before)}{fault.where}."
-    )
+    after, before = percent(fault.after), percent(fault.before)
+    text += f"; corrected, the error ({error}) is {after} instead of {before}{fault.where}."
     return Finding(kind, severity, text, action, numbers, "data")
 
 

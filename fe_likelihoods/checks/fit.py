@@ -65,10 +65,8 @@ def _check_offset(fit: Fit) -> list[Finding]:
             smooth = np.polynomial.Legendre.fit(np.arange(len(left)), left, 2)(np.arange(len(left)))
             share = float(np.square(smooth).sum() / np.square(left).sum())
             large |= {channel.name: share} if share > HALF else {}
-    text = (
-        f"{percent(max(large.values(), default=0.0))} of the power that the fit leaves of {fit.where(*large)} is one "
-        "slow parabola over the whole record: no vibration makes it, and the noise takes it for scatter."
-    )
+    share = percent(max(large.values(), default=0.0))
+    text = f"{share} of the power that the fit leaves of {fit.where(*large)} is one parabola over the whole record."
     action = "Correct the baseline (`baseline` in [measurements]), or give the model what displaces it for good."
     kind = "A measurement may have an offset or a drift"
     return [Finding(kind, CARE, text, action, large, "data")] if large else []
@@ -89,20 +87,17 @@ def _check_errors(fits: Sequence[Fit]) -> list[Finding]:
                 chance = min(checks.white[0], checks.normal[0])
                 useless |= {name: float(size)} if chance < SMALL_PROBABILITY else {}
     shown = listed([f"{percent(size)} in {name}" for name, size in (useless or far).items()])
-    kind, severity = "The prior does not reach the measurements", CARE
-    text = f"No draw of the prior comes near the measurements; the best one has an error (RRMSE) of {shown}."
-    action = (
-        "Check model and priors. A model of your own must return SI units (m, m/s², N, Pa, rad), and zero in "
-        "[measurements] is the time at which the base motion begins."
-    )
     if useless:
-        kind, severity = "The model does not follow the measurements", WRONG
         text = f"The update leaves more than half of the power unexplained: the error (RRMSE) is {shown}; 71 % is half."
         action = (
-            "Check that it is the right column, its unit, sign and clock, and the place of the sensor in the model; if "
-            "all of them are right, the model lacks what moves it."
+            "Check column, unit, sign, clock and place of the sensor; if all are right, the model lacks what moves it."
         )
-    return [Finding(kind, severity, text, action, useless or far, "fit")] if useless or far else []
+        return [Finding("The model does not follow the measurements", WRONG, text, action, useless, "fit")]
+    text = f"No draw of the prior comes near the measurements; the best one has an error (RRMSE) of {shown}."
+    action = (
+        "Check model and priors, the units of a model of your own (SI), and `zero`, at which the base motion begins."
+    )
+    return [Finding("The prior does not reach the measurements", CARE, text, action, far, "fit")] if far else []
 
 
 def check_other_events(rows: Sequence[ParameterRow]) -> list[Finding]:
@@ -131,10 +126,7 @@ def check_residuals(fits: Iterable[Fit]) -> list[Finding]:
         f"The errors of {listed(coloured)} are correlated: {assumed:.0f} samples are worth {worth:.0f} independent "
         f"ones, and standard deviations from the data are too small by a factor of about {factor:.2g}."
     )
-    action = (
-        'Use the wider standard deviations, or AutoregressiveNoise (kind = "autoregressive" in [noise]), and look at '
-        "the residuals for an effect that the model lacks."
-    )
+    action = 'Use the wider standard deviations, or AutoregressiveNoise (kind = "autoregressive" in [noise]).'
     return [Finding(CORRELATED, NOTE, text, action, {"factor": factor})] if round(factor, 1) > 1.0 else []
 
 
@@ -145,14 +137,9 @@ def check_stated_errors(fits: Iterable[Fit]) -> list[Finding]:
         factor = float(np.sqrt(sum(squares.values()) / max(n, 1)))
         if not chdtrc(n, n * factor**2) < SMALL_PROBABILITY:
             continue
-        text = (
-            f"{what} differ from the model by {factor:.2g} times their stated errors (root mean square): intervals of "
-            "the parameters are too narrow."
-        )
-        action = (
-            f"The largest: {listed(sorted(squares, key=squares.__getitem__)[:-3:-1])}. Look for a wrong number, sensor "
-            "or place, and at the model. If all are right, let the errors be unknown, so that they are estimated."
-        )
+        text = f"{what} differ from the model by {factor:.2g} times their stated errors (root mean square)."
+        largest = listed(sorted(squares, key=squares.__getitem__)[:-3:-1])
+        action = f"The largest: {largest}. Look for a wrong number, sensor or place; else let the errors be unknown."
         severity = WRONG if factor > np.hypot(1.0, LARGE_SHIFT) else CARE  # a mean square five times as stated
         kind = "Values differ more than their stated errors"
         found.append(Finding(kind, severity, text, action, {"factor": factor}, "fit"))
@@ -164,7 +151,7 @@ def _squares(fits: Iterable[Fit]) -> Iterator[tuple[str, dict[str, float], int]]
     for fit in fits:
         if fit.modal is not None:
             yield from squares_of_modes(fit.modal)
-        elif fit.deviations is not None and fit.stated and fit.residuals is not None:
+        elif fit.deviations is not None and fit.residuals is not None:
             measured, squares = fit.measurements, np.square(fit.residuals / fit.deviations)
             cases = measured.points or range(1, measured.n_steps + 1)
             names = [f"{channel.name} at {case}" for channel in measured.channels for case in cases]

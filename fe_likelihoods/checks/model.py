@@ -1,15 +1,14 @@
 """Checks of a model: does it repeat itself and read its motion, and are step and mesh fine enough for its data?
 
-At a fit, the response changes by d with half the step. With the derivatives J of the response by the parameters, each
-in units of its posterior standard deviation, and the weights W = 1 / sigma^2 of the residuals, ::
+Half the step changes the response by d. With its derivatives J by the parameters in units of their posterior standard
+deviations, the weights W = 1 / sigma^2 of the residuals, and the precision P of the prior, the parameters change by ::
 
     delta = (J^T W J + P)^-1 J^T W d
 
-is about the change of the parameters in their standard deviations, where P is the precision of the prior in this unit.
-Simulations that a sampler has made cannot show this error, because all of them contain it.
+standard deviations. Simulations that a sampler has made cannot show this error, because all of them contain it.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
@@ -19,7 +18,7 @@ from ..likelihood.posterior import Posterior
 from ..signals.events import motions_of
 from ..signals.records import Record
 from ..simulation.model import simulate_batch
-from .finding import CARE, WRONG, Finding, percent
+from .finding import CARE, HALF, WRONG, Finding, percent
 
 __all__ = [
     "check_chance",
@@ -32,62 +31,60 @@ __all__ = [
 ]
 
 # Shift of a parameter by half a step, in standard deviations, that limits a result: the mean square of its error is
-# then 1.25 times the variance (0.5^2), and 5 times where the result is wrong (2^2). For an oscillator with known
+# then 1.25 times the variance (HALF^2), and 5 times where the result is wrong (2^2). For an oscillator with known
 # parameters (eleven noises and steps, six seeds each), 90 % intervals held the stiffness in 17 of 18 runs with shifts
 # of 0.3 to 1.3, in 2 of 12 with 2.1 and 2.5, and in 0 of 36 with 5 to 60.
-SHIFT, LARGE_SHIFT = 0.5, 2.0
+LARGE_SHIFT = 2.0
 NOTHING = 1e-6  # difference of two responses, relative to their norm, well above the round-off of a long response
-STEP, MESH = "Time step", "Mesh"
-FINER = {
-    "the integration step": "Double `substeps` of the model, or halve its `step`,",
-    "the fibers of the section": "Double `mesh` of the model",
-    "the time step": "Let the model make several integration steps between two samples of its motion",
-}
+STEP = "Step and mesh"
+STEPS = "integration step", "Double `substeps` of the model, or halve its `step`,"
+MESH = "integration step and size of the fibers", "Double `substeps` or `mesh` of the model"
+SAMPLES = "time step", "Let the model make several integration steps between two samples of its motion"
 
 
-def halve_steps(posterior: Posterior, point: np.ndarray, sd: np.ndarray) -> tuple[list[Finding], dict[str, str]]:
+def halve_steps(posterior: Posterior, point: np.ndarray, sd: np.ndarray) -> tuple[list[Finding], str]:
     """Halve step and mesh at a fit (ndim,), and compare the parameters' change with their standard deviations (ndim,).
 
-    Returns findings, and what was tested, by name. A model that fails with half a step, or whose response does not
-    change, keeps a step of its own, which is not tested.
+    Returns findings, and what was tested. A model that fails with half a step, or whose response does not change, keeps
+    a step of its own, which is not tested.
     """
     widths = sd / np.array([row[3] for row in posterior.prior.table()[1]])
     precision = np.diag(np.square(np.where(np.isfinite(widths), widths, 0.0)))
-    pulls, squares = dict[str, np.ndarray](), dict[str, np.ndarray]()
-    tests = {STEP: "not tested: the model takes neither a motion nor a step that could be halved"}
+    pull, squares, halved, tests = np.zeros(len(sd)), np.zeros(2), dict[str, str](), list[str]()
     for likelihood, columns in posterior.likelihood.data_sets():
         model, n = likelihood.model, len(likelihood.model.parameter_names)
         theta, at = point[columns][:n], columns[:n]
         batch = likelihood.simulate(theta + np.vstack([np.zeros(n), np.diag(sd[at])]))
         if reason := next(filter(None, batch.reasons), ""):
-            return [], {STEP: f"not tested: a simulation failed ({reason})"}
+            return [], f"not tested: a simulation failed ({reason})"
         response = batch.response[0]
         sigma = np.sqrt(np.nanmean(np.square(likelihood.residuals_of(response)), axis=1))[:, None]
         weights = np.divide(1.0, sigma, out=np.zeros_like(sigma), where=sigma > 0.0)
         jacobian = ((batch.response[1:] - response) * weights).reshape(n, -1)
         precision[np.ix_(at, at)] += jacobian @ jacobian.T
-        for what, name, finer, every in _finer(model):
-            fine = simulate_batch(finer, theta[None])
-            if fine.reasons[0]:
-                tests[name] = f"not tested: with half of {what} the simulation fails ({fine.reasons[0]})"
-                continue
-            change = fine.response[0][:, ::every] - response
-            tests[name] = f"{what} was halved at the fit"
-            if relative_difference(change, response) <= NOTHING:
-                tests[name] = f"not tested: half of {what} changes nothing: the model has its own, or it is exact"
-            pulls.setdefault(what, np.zeros(len(sd)))[at] += jacobian @ (change * weights).ravel()
-            squares[what] = squares.get(what, 0.0) + np.array([np.square(each).sum() for each in (change, response)])
-    found = []
-    for what, pull in pulls.items():
-        shift = np.abs(np.linalg.lstsq(precision, pull)[0])
-        numbers = {posterior.parameter_names[i]: float(shift[i]) for i in np.flatnonzero(shift >= SHIFT)}
-        moves = ", ".join(f"{name} by {by:.2g}" for name, by in numbers.items())
-        change = percent(np.sqrt(squares[what][0] / squares[what][1]))
-        text = f"Half of {what} changes the response by {change}, which moves {moves} posterior standard deviations."
-        severity, action = WRONG if (shift > LARGE_SHIFT).any() else CARE, f"{FINER[what]} until this is small."
-        title = "The model is too coarse for its data"
-        found += [Finding(title, severity, text, action, numbers, "fit")] if numbers else []
-    return found, tests
+        if (found := _finer(model)) is None:
+            tests.append("not tested: the model takes neither a motion nor a step that could be halved")
+            continue
+        (what, action), finer, every = found
+        fine = simulate_batch(finer, theta[None])
+        if fine.reasons[0]:
+            tests.append(f"not tested: with half of the {what} the simulation fails ({fine.reasons[0]})")
+            continue
+        change = fine.response[0][:, ::every] - response
+        same, halved[what] = relative_difference(change, response) <= NOTHING, action
+        own = f"not tested: half of the {what} changes nothing: the model has its own, or it is exact"
+        tests.append(own if same else f"the {what} was halved at the fit")
+        pull[at] += jacobian @ (change * weights).ravel()
+        squares += [np.square(each).sum() for each in (change, response)]
+    shift = np.abs(np.linalg.lstsq(precision, pull)[0])
+    numbers = {posterior.parameter_names[i]: float(shift[i]) for i in np.flatnonzero(shift >= HALF)}
+    moves = ", ".join(f"{name} by {by:.2g}" for name, by in numbers.items())
+    change = percent(np.sqrt(squares[0] / max(squares[1], 1e-300)))
+    text = f"Half of the {' and '.join(halved)} changes the response by {change}, which moves {moves} posterior "
+    severity, action = WRONG if max(shift) > LARGE_SHIFT else CARE, f"{'; '.join(halved.values())} until this is small."
+    title = "The model is too coarse for its data"
+    found = [Finding(title, severity, f"{text}standard deviations.", action, numbers, "fit")] if numbers else []
+    return found, "; ".join(dict.fromkeys(tests))
 
 
 def check_motion(model: Any, theta: np.ndarray, response: np.ndarray) -> list[Finding]:
@@ -155,16 +152,15 @@ def _under(model: Any, change: Callable[[Record], Record]) -> Any:
     return model.with_record(motions if getattr(model, "supports", ()) else motions[0])
 
 
-def _finer(model: Any) -> Iterator[tuple[str, str, Any, int]]:
-    """What is halved, its name, the finer model, and its response samples per sample of the model."""
+def _finer(model: Any) -> tuple[tuple[str, str], Any, int] | None:
+    """What is halved and what to do, the finer model, and its response samples per sample of the model."""
     names = {each.name for each in fields(model)} if is_dataclass(model) else set()
     usual = model.analysis if "analysis" in names else None
     if is_dataclass(usual) and {"substeps", "mesh"} <= {each.name for each in fields(usual)}:
-        yield "the integration step", STEP, replace(model, analysis=replace(usual, substeps=2 * usual.substeps)), 1
-        yield "the fibers of the section", MESH, replace(model, analysis=replace(usual, mesh=2 * usual.mesh)), 1
-    elif "step" in names and hasattr(model, "integration_step"):
-        yield "the integration step", STEP, replace(model, step=0.5 * model.integration_step), 1
-    elif motions_to_replace(model):
+        return MESH, replace(model, analysis=replace(usual, substeps=2 * usual.substeps, mesh=2 * usual.mesh)), 1
+    if "step" in names and hasattr(model, "integration_step"):
+        return STEPS, replace(model, step=0.5 * model.integration_step), 1
+    if motions_to_replace(model):
         finer = _under(model, lambda each: each.resample(0.5 * each.dt))
-        if (finer.n_steps - 1) == 2 * (model.n_steps - 1):
-            yield "the time step", STEP, finer, 2
+        return (SAMPLES, finer, 2) if (finer.n_steps - 1) == 2 * (model.n_steps - 1) else None
+    return None

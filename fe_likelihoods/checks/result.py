@@ -1,6 +1,5 @@
 """What is judged before a run (`check_model`) and after it (`check_result`): data, model, fit, sampling, failures."""
 
-from collections import Counter
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
@@ -12,7 +11,7 @@ from .compared import SECONDS, Fit, compare, data_sets_of, draws_to_compare, fit
 from .finding import CARE, NOTE, TAIL, WRONG, Finding, Judgement, in_order, judge
 from .fit import check_other_events, check_residuals, check_responses, check_stated_errors, check_supports
 from .model import STEP, check_chance, check_motion, halve_steps, motions_to_replace
-from .run import Failure, Failures, FinishedRun, ParameterRow, failures, read_run, rows_of
+from .run import Failures, FinishedRun, ParameterRow, failures, read_run, rows_of
 from .screening import check_data
 
 __all__ = ["JudgedRun", "ModelCheck", "check_failures", "check_model", "check_result", "judge_run"]
@@ -81,8 +80,8 @@ def check_model(posterior: Posterior) -> ModelCheck:
         found += chance or check_motion(part.model, theta, batch.response[0])
     found += _check_inputs(likelihood, fits)
     report, attempts = posterior.report(), sum(part.simulator.failures.outcomes for part, _ in likelihood.data_sets())
-    rows = tuple(Failure(*each, "") for each in Counter(report["failure_reasons"]).most_common(1))
-    found += check_failures(Failures(rows, report["failure_count"], attempts))
+    reasons = report["failure_reasons"]
+    found += check_failures(report["failure_count"], attempts, max(reasons, key=reasons.get, default=""))
     return ModelCheck(in_order(found), tuple(fits))
 
 
@@ -128,9 +127,10 @@ def judge_run(run: FinishedRun) -> JudgedRun:
     """
     rows, fits, parts = rows_of(run), fit_data_sets(run), [] if run.likelihood is None else run.likelihood.data_sets()
     histories = not parts or any(part.measurements.is_history for part, _ in parts)
-    found, tested = _check_steps(run) if parts and histories else ([], {})
+    found, tested = _check_steps(run) if parts and histories else ([], "")
     failed = failures(run)  # those of the fits included
-    found += _check_inputs(run.likelihood, fits) + _check_samples(run) + check_failures(failed)
+    found += _check_inputs(run.likelihood, fits) + _check_samples(run)
+    found += check_failures(failed.count, failed.attempts, failed.rows[0].reason if failed.rows else "")
     if not run.is_inconclusive and all(each.severity != WRONG for each in found):  # a fault explains the residuals
         found += check_residuals(fits) + check_stated_errors(fits)
         events = [find_events(part.model) for part, _ in parts]
@@ -145,8 +145,8 @@ def judge_run(run: FinishedRun) -> JudgedRun:
         "Faults of the data": f"{responses} responses were compared" if responses else "not tested",
         "Residuals": f"channels: {checked}" if checked else "not tested: there are none",
     }
-    unique = dict.fromkeys(found)  # data sets may share a description or a motion
-    return JudgedRun(rows, fits, failed, judge(unique, (tests | tested).items()))
+    tests |= {STEP: tested} if tested else {}
+    return JudgedRun(rows, fits, failed, judge(dict.fromkeys(found), tests.items()))  # data sets may share a motion
 
 
 def _check_inputs(likelihood: Any, fits: Iterable[Fit]) -> list[Finding]:
@@ -162,20 +162,20 @@ def _check_inputs(likelihood: Any, fits: Iterable[Fit]) -> list[Finding]:
     return found
 
 
-def _check_steps(run: FinishedRun) -> tuple[list[Finding], dict[str, str]]:
+def _check_steps(run: FinishedRun) -> tuple[list[Finding], str]:
     """The error of step and mesh at the centre of the samples, and what was tested.
 
     This takes a simulation for each parameter and more; more than a twentieth of the run's that take long are not made.
     """
     if run.prior is None or run.is_inconclusive:
-        return [], {}
+        return [], ""
     report = run.likelihood.report()
     needed = sum(2 + len(likelihood.model.parameter_names) for likelihood, _ in run.likelihood.data_sets())
     seconds = report["seconds"] / max(report["simulations"], 1)
     if run.n_modes > 1:
-        return [], {STEP: "not tested: the samples have several modes, which have no common standard deviation"}
+        return [], "not tested: the samples have several modes, which have no common standard deviation"
     if needed > TAIL * report["simulations"] and needed * seconds > SECONDS:
-        return [], {STEP: f"not tested: the test takes about {needed} simulations of {seconds:.2g} s"}
+        return [], f"not tested: the test takes about {needed} simulations of {seconds:.2g} s"
     return halve_steps(run.posterior, run.centre, run.samples.std(axis=0))
 
 
@@ -187,38 +187,26 @@ def _check_samples(run: FinishedRun) -> list[Finding]:
         found.append(Finding("No verdict", CARE, text, "Run it again with this version."))
     if run.is_inconclusive and not run.tempered:
         time = f"{run.autocorrelation_time:.0f} iterations" if np.isfinite(run.autocorrelation_time) else "not known"
-        text = (
-            f"The chain has {run.sampler.iteration - run.discard} iterations, its autocorrelation time is {time}: with "
-            "fewer than 50 of these times it may still be on its way to the posterior."
-        )
+        text = f"The chain has {run.sampler.iteration - run.discard} iterations, its autocorrelation time is {time}: "
+        text += "with fewer than 50 of these times it may still be on its way to the posterior."
         action = "Continue it, or use SMCSampler for the same posterior."
         found.append(Finding("The chain is short", WRONG, text, action))
     if not size >= FEW_SAMPLES:
-        text = f"How many independent samples the {n} samples are worth is not known."
-        if np.isfinite(size):
-            text = (
-                f"The {n} samples are worth about {size:.0f} independent ones: interval ends are rough, and standard "
-                f"deviations have an error of about {100.0 / np.sqrt(2.0 * max(size, 1.0)):.0f} %."
-            )
+        worth = f"about {size:.0f}" if np.isfinite(size) else "an unknown number of"
+        text = f"The {n} samples are worth {worth} independent ones: interval ends are rough."
         found.append(Finding("Few independent samples", CARE, text, "Make more iterations, or use more walkers."))
     if run.n_modes > 1 and not run.is_inconclusive:
         shares = ", ".join(f"{mode.share:.2f} ± {mode.share_error:.2g}" for mode in run.verdict.modes)
         text = f"The posterior has {run.n_modes} regions (shares {shares}); mean and standard deviation describe none."
-        action = (
-            "See the corner figure; the fit is the best sample. Other data or a narrower prior may tell them apart."
-        )
+        action = "The fit is the best sample. Other data or a narrower prior may tell them apart."
         found.append(Finding("Several modes", CARE, text, action))
     return found
 
 
-def check_failures(failed: Failures) -> list[Finding]:
-    """How many simulations failed; the verdict of a sampler says whether they border on the samples."""
-    share = failed.count / max(failed.attempts, 1)
-    most = f", most often: {failed.rows[0].reason}" if failed.rows else ""
-    text = (
-        f"{failed.count} of {failed.attempts} simulations failed ({100.0 * share:.2g} %){most}. A failed simulation "
-        "counts as impossible: the posterior has no samples there."
-    )
+def check_failures(count: int, attempts: int, reason: str) -> list[Finding]:
+    """How many simulations failed, most often for a `reason`; a verdict says whether they border on the samples."""
+    share = count / max(attempts, 1)
+    text = f"{count} of {attempts} simulations failed ({100.0 * share:.2g} %){reason and f', most often: {reason}'}."
+    text += " A failed simulation counts as impossible: the posterior has no samples there."
     action = "Mend the model where its parameters are plausible, else narrow the prior."
-    severity = CARE if share > TAIL else NOTE
-    return [Finding("Simulations failed", severity, text, action, {"share": share})] if failed.count else []
+    return [Finding("Simulations failed", CARE if share > TAIL else NOTE, text, action, {"share": share})] * bool(count)

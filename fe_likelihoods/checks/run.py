@@ -209,27 +209,24 @@ class Failures(NamedTuple):
 
 def failures(run: FinishedRun) -> Failures:
     """Failed simulations by reason, counted in likelihoods, also of first parts of the record, or in the sampler."""
-    known, count, attempts, unknown = list[tuple[str, dict]](), 0, 0, ""
+    parts, records, count, attempts, unknown = [], list[dict](), 0, 0, ""
     for likelihood, columns in [] if run.likelihood is None else run.likelihood.data_sets():
-        logs = [each.simulator.failures for each in (likelihood, *likelihood.shortened)]
-        known += [(each["reason"], each["parameters"]) for log in logs for each in log.records]
-        count, attempts = count + sum(each.count for each in logs), attempts + sum(each.outcomes for each in logs)
-        if logs[0].outcomes < len(np.unique(run.samples[:, columns[: len(likelihood.model.parameter_names)]], axis=0)):
+        points, parts = run.samples[:, columns[: len(likelihood.model.parameter_names)]], [*parts, likelihood]
+        if likelihood.simulator.failures.outcomes < len(np.unique(points, axis=0)):
             unknown = "Not known: simulations of this run were made in another process, or are no longer in memory."
-    if run.likelihood is None:
-        unknown = "Not known: neither the sampler nor the log-density counts failures."
+    for log in (each.simulator.failures for part in parts for each in (part, *part.shortened)):
+        records, count, attempts = records + log.records, count + log.count, attempts + log.outcomes
     if run.likelihood is None and run.tempered:
         unknown = "Not known: whether a log-density of -inf is a failed simulation."
-        count, attempts, failed = run.sampler.failure_count, run.sampler.evaluations, run.sampler.failures
-        known = [(each["reason"], dict(zip(run.names, each["parameters"], strict=True))) for each in failed]
+        records, count, attempts = run.sampler.failures, run.sampler.failure_count, run.sampler.evaluations
+    elif run.likelihood is None:
+        unknown = "Not known: neither the sampler nor the log-density counts failures."
     rows, examples = Counter[str](), dict[str, str]()  # reasons that differ in their numbers only are one
-    for text, point in known:
-        reason, shown = (
-            reason_without_numbers(text),
-            ", ".join(f"{name} = {value:.4g}" for name, value in point.items()),
-        )
+    for text, point in ((each["reason"], each["parameters"]) for each in records):
+        named = point.items() if isinstance(point, dict) else zip(run.names, point, strict=True)
+        reason, shown = reason_without_numbers(text), ", ".join(f"{name} = {value:.4g}" for name, value in named)
         examples.setdefault(reason, shown if text == reason else f"{text}: {shown}")
         rows[reason] += 1
-    rows += Counter({"later ones, whose reasons are not kept": count - len(known)})  # if there are any
+    rows += Counter({"later ones, whose reasons are not kept": count - len(records)})  # if there are any
     table = tuple(Failure(reason, each, examples.get(reason, "")) for reason, each in rows.most_common())
     return Failures(table, count, max(attempts, count), unknown)

@@ -19,8 +19,9 @@ __all__ = [
 # of a predicted peak to the calibrated ones: named in 1 of 100 right runs, and in 96 of 100 at three times the strength
 PEAK_RATIO = 2.0
 NARROW = 0.2  # bandwidth of a motion by that of the calibration; earthquakes of one structure differ by 0.38 or more
-UNSETTLED = 0.1  # half the range in the last two seconds by the final value, which is then known to 10 % at best
-NO_MOTION = 0.01  # half the range there by the largest response: a motion that does not matter
+# half the range in the last two seconds by the final value, which is then known to 10 % at best; a smaller one than a
+# tenth of the largest response counts as a tenth
+UNSETTLED = 0.1
 LARGEST_SHAPE = 0.8  # Pareto shape of weights; up to here, right results have it as well (study `hierarchy_warnings`)
 HARMLESS_ERROR = 0.15  # of the means [posterior sd], up to which uneven weights and mixtures do no harm
 # Standard deviations of the prior by which the median of a common factor may differ from its mean: named in 1 of 120
@@ -54,8 +55,7 @@ def check_bandwidth(bandwidth: float | None, calibrated: float | None) -> list[F
     if bandwidth is None or calibrated is None or not bandwidth < NARROW * calibrated:
         return []
     text = (
-        f"This motion has its power in a band of {bandwidth:.2g} Hz, as a harmonic has ({calibrated:.2g} Hz in the "
-        "calibration): near a resonance the spread of the posterior is too narrow."
+        f"Its power is in a band of {bandwidth:.2g} Hz, as a harmonic has; of the calibration's, {calibrated:.2g} Hz."
     )
     action = "Calibrate with such a motion, or predict with the spread between events (in Python, predict_new_event)."
     return [Finding("A narrow-band motion", CARE, text, action, {"ratio": bandwidth / calibrated})]
@@ -66,14 +66,11 @@ def check_final_values(ends: Mapping[str, Sequence[float]]) -> list[Finding]:
     numbers = {
         name: half / value
         for name, (half, value, largest) in ends.items()
-        if value > 0.0 and half > max(UNSETTLED * value, NO_MOTION * largest)
+        if value > 0.0 and half > UNSETTLED * max(value, UNSETTLED * largest)
     }
     shares = ", ".join(f"{name} (+- {share:.0%})" for name, share in numbers.items())
     text = f"The structure still moves in the last 2 s, by a part of its final value: {shares}."
-    action = (
-        'Append rest to the record, record.followed_by(Record("rest", record.dt, [0.0, 0.0]), rest=20.0), or take the '
-        "mean over whole periods, final_value(channel, samples=...) or damage_measures(settle=...)."
-    )
+    action = "Append rest to the record (record.followed_by), or take a mean, final_value(channel, samples=...)."
     return [Finding("A final value still moves", CARE, text, action, numbers)] if numbers else []
 
 
@@ -103,10 +100,7 @@ def check_common(factors: np.ndarray, expected: float, sd: float) -> list[Findin
     factor = float(np.median(factors))
     if abs(np.log(factor / expected)) <= COMMON * sd:
         return []
-    text = (
-        f"The factor that all share is {factor:.3g}, where {expected:.3g} is expected, with a standard deviation of "
-        f"{sd:.1%}: the losses leave it out, and it may be a damage of all."
-    )
+    text = f"The factor that all share, which is no loss, is {factor:.3g}; {expected:.3g} is expected, +- {sd:.1%}."
     action = "State what else has changed, such as temperature or mass (slopes=, common=), or take it as a loss of all."
     return [Finding("All stiffnesses have changed", CARE, text, action, {"factor": factor})]
 

@@ -29,8 +29,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..checks.finding import warn
-from ..checks.screening import check_steps_of_mass
 from ..signals.channels import Channel
 from ..signals.records import DisplacementHistory, Record
 from ..signals.sampling import sample_window
@@ -96,7 +94,8 @@ class RCColumn(BuiltInModel):
     ``"axial_force"``            axial force of the base section [N]
     ``"displacement@H"``         displacement at height H relative to the base [m]
     ``"velocity@H"``             velocity of the node at height H [m/s], under a `Record`; below the top with
-                                 `column_mass`. So are ``relative_acceleration@H`` and ``acceleration@H`` [m/s²]
+                                 `column_mass`. So are ``relative_acceleration@H`` and ``acceleration@H`` [m/s²],
+                                 which vibrate above 20 Hz: with steps of 1/256 s they are wrong by 48 %, of 1 ms by 4 %
     ``"curvature@H"``            curvature of the section at height H [1/m]
     ``"strain@H:X"``             strain at position X in that section, of the concrete or of a bar
     ``"bar_stress@H:X"``         stress of the bar at position X of an element's section at height H [Pa]
@@ -221,15 +220,6 @@ class RCColumn(BuiltInModel):
         object.__setattr__(self, "units", tuple(dict(self.units).items()))
         if self.outputs is not None:
             object.__setattr__(self, "outputs", tuple(self.outputs))
-            self._warn_of_coarse_steps()
-
-    def _warn_of_coarse_steps(self) -> None:
-        """Accelerations below the top contain vibrations of the column's own mass, which need short steps."""
-        step = self.dt / self.analysis.substeps
-        heights = {name: float(name.partition("@")[2]) for name in self.outputs if "acceleration@" in name}
-        below = [name for name, height in heights.items() if height < self.height * (1.0 - 1e-6)]
-        if isinstance(self.loading, Record):
-            warn(check_steps_of_mass(below, step), stacklevel=4)
 
     @property
     def nominal(self) -> dict[str, float]:

@@ -59,7 +59,7 @@ FAULTS = {
     "clipped": ({"A sensor is clipped"}, with_output(lambda y: np.clip(y, -0.3 * y.max(), 0.3 * y.max()))),
     "spikes": ({"A channel has spikes"}, with_output(with_spikes)),
     "offset": ({"A channel has an offset"}, with_output(lambda y: y + 1.0 * np.abs(y).max())),
-    "size": ({"A size is not plausible"}, lambda y: 1e3 * y),
+    "unit of all": ({"A unit may be wrong"}, lambda y: 1e3 * y),
     "other motion": ({"The model does not follow the measurements"}, lambda y: y[:, ::-1]),
 }
 

@@ -113,14 +113,14 @@ def test_a_motion_that_is_not_read_is_named():
     assert names(check_model(unread)) == ["The motion changes nothing"]
 
 
-def test_failures_and_sizes_are_named():
+def test_failures_and_units_are_named():
     model = LinearOscillator(MOTION.scale(9.80665), 0.4)  # a motion in g, taken for m/s², and then for g again
     values = LinearOscillator(MOTION, 0.4).simulate(TRUE)
     prior = {"stiffness": TruncatedNormal(1.0, 0.3), "damping": TruncatedNormal(1.0, 0.3)}
     likelihood = FELikelihood(model, Measurements(model.channels, model.dt, values))
     prior |= {name: HalfNormal(1.0) for name in likelihood.noise.parameter_names}
     found = names(check_model(Posterior(likelihood, prior)))
-    assert "A size is not plausible" in found and "A unit may be wrong" in found
+    assert "A unit may be wrong" in found
     failing = posterior_of(lambda theta, record: 1 / 0)
     with pytest.raises(ValueError, match="mean of the prior has failed"):
         check_model(failing)
@@ -142,6 +142,6 @@ def test_a_model_that_keeps_its_own_step_is_not_tested():
         posterior = posterior_of(function)
         point, sd = np.array([1.1, 0.9, 0.001]), np.array([0.01, 0.01, 1e-4])
         found, tests = halve_steps(posterior, point, sd)
-        assert not found and tests["Time step"].startswith("not tested: ")
+        assert not found and tests.startswith("not tested: ")
     tests = halve_steps(posterior_of(central_differences), point, sd)[1]
-    assert tests == {"Time step": "the time step was halved at the fit"}
+    assert tests == "the time step was halved at the fit"

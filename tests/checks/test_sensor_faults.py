@@ -44,12 +44,10 @@ def spoil(values, fault):
             return y + 0.1 * peak, (0, N - 1)
         case "drift":
             return y + 0.2 * peak * TIME / TIME[-1], (0, N - 1)
-        case "noise":
-            return y + 3.0 * y.std() * np.random.default_rng(0).normal(size=N), (0, N - 1)
 
 
 KINDS = {"dead": "stuck", "noisy": "stuck"}
-FAULTS = ("clipped", "stuck", "dead", "noisy", "spikes", "offset", "drift", "noise")
+FAULTS = ("clipped", "stuck", "dead", "noisy", "spikes", "offset", "drift")
 
 
 @pytest.mark.parametrize("dimension", ["acceleration", "displacement"])

@@ -170,8 +170,6 @@ def test_a_result_of_an_identification():
     data = read_modal_data(SimpleNamespace(result=result), ["a", "b", "c"])  # an algorithm
     np.testing.assert_allclose(np.abs((data.shapes[0] * UNIT).sum(axis=1)), 1.0, rtol=1e-12)
     np.testing.assert_allclose(data.frequency_cv, [0.01, 0.02], rtol=1e-12)
-    with pytest.warns(UserWarning, match=r"phases of complex mode shapes scatter by 29 degrees \(shape 1\)"):
-        read_modal_data(SimpleNamespace(Fn=[1.0], Phi=np.exp(1j * np.array([[0.0], [1.0]]))), ["a", "b"])
     for nothing in (None, np.array([])):
         with pytest.raises(ValueError, match="choose them first"):
             read_modal_data(SimpleNamespace(Fn=nothing, Phi=nothing))

@@ -3,7 +3,6 @@
 `tests/kernels/test_against_opensees.py` compares them with the recorders of OpenSees.
 """
 
-import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -215,14 +214,3 @@ def test_measurements_of_some_channels_name_the_outputs_to_choose():
         bridge_column(data=data)
     posterior = bridge_column(data=data, outputs=("acceleration",))
     assert posterior.parameter_names[-1] == "sigma_acceleration"
-
-
-def test_accelerations_below_the_top_need_short_steps():
-    record = bridge_column_data().record.trim(6.0, 8.0)  # 1/64 s
-    with pytest.warns(UserWarning, match="acceleration@3.6576: .*Give substeps="):
-        RCColumn.lhpost(record, outputs=("acceleration", "acceleration@3.6576"), column_mass=2e4)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        analysis = ColumnAnalysis(substeps=16)
-        RCColumn.lhpost(record, outputs=("acceleration@3.6576",), column_mass=2e4, analysis=analysis)
-        RCColumn.lhpost(record, outputs=("acceleration", "acceleration@7.3152", "displacement@3.6576"), column_mass=2e4)

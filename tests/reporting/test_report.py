@@ -27,7 +27,7 @@ from fe_likelihoods import (
 from fe_likelihoods.checks.compared import fit_data_sets
 from fe_likelihoods.checks.finding import Finding, judge
 from fe_likelihoods.checks.result import check_failures, check_result
-from fe_likelihoods.checks.run import Failures, moments_of, read_run
+from fe_likelihoods.checks.run import moments_of, read_run
 from fe_likelihoods.reporting.contents import evidence, residual_sentences
 from samplers import SamplingWarning, SMCSampler, TMCMCSampler, plot_run
 from samplers.estimates.control_variates import SignedSample
@@ -154,7 +154,7 @@ def test_the_fit_is_that_of_the_posterior_mean(vibrating):
 
 def test_many_failed_simulations_limit_a_result():
     for count, severity in ((0, []), (4, ["note"]), (30, ["care"])):
-        named = check_failures(Failures((), count, 100))
+        named = check_failures(count, 100, "")
         assert [each.severity for each in named] == severity
         assert all(f"{count} of 100 simulations failed ({count} %)" in each.text for each in named)
 
