@@ -9,10 +9,9 @@ from scipy.special import chdtrc
 from ..noise.residuals import ResidualChecks
 from ..priors.between_events import spread_of
 from ..signals.channels import Channel
-from ..signals.comparison import relative_errors
 from ..text_tables import listed
 from .compared import MOST_DRAWS, Fit, checks_of
-from .faults import EXPLAINED, find_faults, finding_of, supports_apart
+from .faults import find_faults, finding_of, supports_apart
 from .finding import CARE, CORRELATED, HALF, NOTE, SMALL_PROBABILITY, WRONG, Finding, percent
 from .modal import check_modes, squares_of_modes
 from .model import LARGE_SHIFT, motions_to_replace
@@ -72,32 +71,19 @@ def _check_offset(fit: Fit) -> list[Finding]:
     return [Finding(kind, CARE, text, action, large, "data")] if large else []
 
 
-def _check_errors(fits: Sequence[Fit]) -> list[Finding]:
-    """Channels that the fit, or the best draw of the prior, does not explain; white and normal noise is no fault."""
-    useless, far = dict[str, float](), dict[str, float]()
-    for fit in fits:
-        measured, responses = fit.measurements.values, fit.draws if fit.after is None else fit.after[None]
-        errors = np.nan_to_num(relative_errors(measured - responses, measured))
-        best = errors[np.log(np.maximum(errors, 1e-3)).sum(axis=1).argmin()] if len(errors) else ()
-        for row, size in enumerate(best):
-            name = fit.where(fit.measurements.channels[row].name)
-            if fit.after is None:
-                far |= {name: float(size)} if size > EXPLAINED else {}
-            elif size**2 > HALF and (checks := checks_of(fit.residuals[row])) is not None:
-                chance = min(checks.white[0], checks.normal[0])
-                useless |= {name: float(size)} if chance < SMALL_PROBABILITY else {}
-    shown = listed([f"{percent(size)} in {name}" for name, size in (useless or far).items()])
-    if useless:
-        text = f"The update leaves more than half of the power unexplained: the error (RRMSE) is {shown}; 71 % is half."
-        action = (
-            "Check column, unit, sign, clock and place of the sensor; if all are right, the model lacks what moves it."
-        )
-        return [Finding("The model does not follow the measurements", WRONG, text, action, useless, "fit")]
-    text = f"No draw of the prior comes near the measurements; the best one has an error (RRMSE) of {shown}."
-    action = (
-        "Check model and priors, the units of a model of your own (SI), and `zero`, at which the base motion begins."
-    )
-    return [Finding("The prior does not reach the measurements", CARE, text, action, far, "fit")] if far else []
+def _check_errors(fits: Iterable[Fit]) -> list[Finding]:
+    """Channels that the fit does not explain; white and normal noise is no fault."""
+    useless = dict[str, float]()
+    for fit in (each for each in fits if each.after is not None):
+        for each, residuals in zip(fit.channels, fit.residuals, strict=True):
+            checks = checks_of(residuals) if each.after**2 > HALF else None
+            if checks is not None and min(checks.white[0], checks.normal[0]) < SMALL_PROBABILITY:
+                useless[fit.where(each.channel.name)] = each.after
+    shown = listed([f"{percent(size)} in {name}" for name, size in useless.items()])
+    text = f"The update leaves more than half of the power unexplained: the error (RRMSE) is {shown}; 71 % is half."
+    action = "Check column, unit, sign, clock and place of the sensor; if all are right, the model lacks what moves it."
+    kind = "The model does not follow the measurements"
+    return [Finding(kind, WRONG, text, action, useless, "fit")] if useless else []
 
 
 def check_other_events(rows: Sequence[ParameterRow]) -> list[Finding]:
