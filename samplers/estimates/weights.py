@@ -13,6 +13,7 @@ __all__ = [
     "coarse_weights",
     "effective_sample_size",
     "log_mean_weight",
+    "next_beta",
     "normalised_weights",
 ]
 
@@ -22,6 +23,7 @@ WHERE_TO_LOOK = (
 WEIGHT_GRID = 4096.0
 # Below this log-likelihood, rounding errors exceed 1, so that it compares no points: it is as good as -inf.
 LOWEST = -1.0 / np.finfo(float).eps
+BISECTIONS = 20  # of the next tempering exponent
 
 
 def _scaled(log_weights: np.ndarray) -> tuple[np.ndarray, float]:
@@ -61,6 +63,42 @@ def log_mean_weight(log_weights: np.ndarray) -> float:
     """Logarithm of the mean weight from log-weights (n,); -inf if all weights are zero."""
     weights, top = _scaled(log_weights)
     return top if top == -np.inf else top + float(np.log(weights.mean()))
+
+
+def next_beta(log_likelihood: np.ndarray, beta: float, target: float, base: np.ndarray | None = None) -> float:
+    """Largest next exponent in (beta, 1] whose incremental weights keep the effective sample size at `target`, times
+    the share of finite log-likelihoods (n,) if there are no log-weights `base` (n,) at `beta`. ValueError if none is
+    finite, or all are so low that rounding errors exceed 1.
+    """
+    top = np.max(log_likelihood)
+    if top < LOWEST:
+        finite = "" if top == -np.inf else f" above {LOWEST:.2g}, where rounding errors exceed 1 (largest: {top:.4g})"
+        raise ValueError(f"no point of the population has a finite log-likelihood{finite}; {WHERE_TO_LOOK}")
+    alive = log_likelihood > -np.inf
+    relative = log_likelihood[alive] - top
+    if base is None:
+        carried = 0.0
+        target = target * len(relative) / len(log_likelihood)
+    else:
+        carried = base[alive]
+
+    def meets(step: float) -> bool:
+        return effective_sample_size(carried + step * relative) >= target
+
+    step = 1.0 - beta
+    if meets(step):
+        return 1.0
+    while step > 0.0 and not meets(step):
+        step *= 0.5
+    low, high = step, 2.0 * step
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        if meets(middle):
+            low = middle
+        else:
+            high = middle
+    # a step smaller than the rounding error of beta becomes the next representable number, so that annealing ends
+    return min(max(beta + low, float(np.nextafter(beta, 2.0))), 1.0)
 
 
 class EvidenceError:

@@ -43,7 +43,8 @@ __all__ = [
 
 # Degrees of freedom: heavier tails than a Gaussian, and finite fourth moments.
 DOF = 6.0
-# Fewer degrees of freedom that are tried in this order, for points with heavier tails. They must be above 2.
+# Fewer degrees of freedom that are tried in this order, for points with heavier tails. They must be above 2. Standard
+# deviations of a Student t3 in 10 dimensions are .93 to .96 of the true ones, without these .78 to .86, unnoticed.
 HEAVIER = (4.0, 3.0, 2.5)
 # Limits of expectation-maximisation: number of iterations, and gain in mean log-likelihood below which it stops. For a
 # proposal, a trial of one, the density of a population, and another such fit that starts near its end.

@@ -14,11 +14,11 @@ from ..estimates.weights import (
     coarse_weights,
     effective_sample_size,
     log_mean_weight,
+    next_beta,
     normalised_weights,
 )
 from ..reports import Stage, Sweep
 from .mutation import Kernel, grow_chains, move_together
-from .next_beta import next_beta
 from .population import Population, stop_at
 
 __all__ = ["anneal_by_moves"]

@@ -9,10 +9,10 @@ from samplers.estimates.weights import (
     coarse_weights,
     effective_sample_size,
     log_mean_weight,
+    next_beta,
     normalised_weights,
 )
 from samplers.resampling import RESAMPLING
-from samplers.tempering.next_beta import next_beta
 
 
 @pytest.mark.parametrize("offset", [-5000.0, 0.0, 5000.0, 1e8])
