@@ -29,7 +29,9 @@ _ONE_RUN = (
 _RUNS = "Each chain is an independent run, so r_hat compares runs."
 
 
-def to_arviz(sampler: Any, prediction: Any = None, *, discard: int = 0) -> Any:
+def to_arviz(
+    sampler: Any, prediction: Any = None, *, parameter_names: Sequence[str] | None = None, discard: int = 0
+) -> Any:
     """Convert one run, or several independent runs, to arviz data.
 
     Parameters
@@ -38,6 +40,9 @@ def to_arviz(sampler: Any, prediction: Any = None, *, discard: int = 0) -> Any:
         Samplers that have run, with chains of equal length; `emcee.EnsembleSampler` is accepted too.
     prediction : fe_likelihoods.prediction.prediction.Prediction, optional
         The result of `fe_likelihoods.propagate`; adds the group ``predictions``.
+    parameter_names : sequence of str, optional
+        By default the names of the posterior, or those given to the sampler (name_0, name_1, ... of a group), or else
+        theta_0, theta_1, ...
     discard : int
         Burn-in of each run, in steps. Chains of SMC and TMCMC have none.
 
@@ -45,9 +50,8 @@ def to_arviz(sampler: Any, prediction: Any = None, *, discard: int = 0) -> Any:
     -------
     arviz.InferenceData
         A DataTree from arviz 1.0 on; ``to_netcdf(path)`` writes it to a file. It has the groups ``posterior``,
-        ``sample_stats`` and, where they are known, ``prior`` and ``predictions``; ``docs/arviz`` describes them. Names
-        are those of the posterior, or given to the sampler (name_0, name_1, ... of a group), or else theta_0, theta_1,
-        ...; a slash becomes ``_``.
+        ``sample_stats`` and, where they are known, ``prior`` and ``predictions``; ``docs/arviz`` describes them. A
+        slash in the name of a parameter or channel becomes ``_``.
 
     Examples
     --------
@@ -65,7 +69,7 @@ def to_arviz(sampler: Any, prediction: Any = None, *, discard: int = 0) -> Any:
             "different seeds"
         )
     known = log_posterior_of(runs[0])
-    names = getattr(known, "parameter_names", None) or _names_in_emcee(runs[0])
+    names = parameter_names or getattr(known, "parameter_names", None) or _names_in_emcee(runs[0])
     names = names_of_parameters(names, runs[0].ndim)
     if not all(hasattr(run, "get_chain") and run.ndim == len(names) for run in runs):
         raise ValueError(f"expected samplers of {len(names)} parameters; got {[type(run).__name__ for run in runs]}")

@@ -108,6 +108,7 @@ def test_blobs_and_names_given_to_the_sampler(kind, dtype, tmp_path):
         sampler.run_mcmc(start, 2)
     else:
         sampler.run_mcmc(start, 12)
+    assert set(to_arviz(sampler, parameter_names=["x", "y", "z"])["posterior"].data_vars) == {"x", "y", "z"}
     data = to_arviz(sampler, discard=0)
     data.to_netcdf(str(tmp_path / "run.nc"))
     again = arviz.from_netcdf(str(tmp_path / "run.nc"))
