@@ -66,7 +66,6 @@ class Fit:
     assumed: np.ndarray | None = None  # (n_channels,) independent samples that the noise assumes at most
     deviations: np.ndarray | None = None  # (n_channels, 1) of errors without time, where they are stated
     modal: ModalFit | None = None  # modes, instead of responses
-    failed: str = ""  # why a response is missing
 
     @property
     def residuals(self) -> np.ndarray | None:
@@ -128,12 +127,10 @@ def compare(
     the `point` of the fit and the `start` before the update (ndim,).
     """
     measured, n = likelihood.measurements, len(likelihood.model.parameter_names)
-    found, failed = dict[str, np.ndarray](), list[str]()
+    found = dict[str, np.ndarray]()
     for name, theta in (("before", start), ("after", point)) if not likelihood.is_modal else ():
         batch = None if theta is None else likelihood.simulate(theta[None, :n])
-        if batch is not None and batch.reasons[0]:
-            failed.append(f"{name} the update: the simulation failed ({batch.reasons[0]})")
-        elif batch is not None:
+        if batch is not None and not batch.reasons[0]:
             found[name] = measured.values - likelihood.residuals_of(batch.response[0])
     good, made, begin = list[np.ndarray](), 0, perf_counter()
     try:
@@ -152,7 +149,7 @@ def compare(
     by_channel, assumed = dict[str, np.ndarray](), getattr(noise, "effective_samples", None)
     if assumed is not None:
         by_channel["assumed"] = np.broadcast_to(assumed, measured.n_channels)
-    if measured.is_history and "after" in found and point is not None:
+    if measured.is_history and "after" in found:
         found["white"] = measured.values - found["after"]
         if hasattr(noise, "whitened"):
             values = dict(zip(likelihood.parameter_names, point, strict=True))
@@ -165,7 +162,7 @@ def compare(
         cut = {name: each[rows] for name, each in by_channel.items()}
         for name, each in found.items():
             cut[name] = np.where(inside, each, np.nan)[..., rows, :][..., inside[rows].any(axis=0)]
-        fits.append(Fit(title, part, failed="; ".join(failed), **cut))
+        fits.append(Fit(title, part, **cut))
     return fits
 
 

@@ -37,8 +37,6 @@ def check_responses(fits: Iterable[Fit]) -> list[Finding]:
             severity = WRONG if fault.where or len(fit.draws) >= HALF * MOST_DRAWS else CARE
             found.append(finding_of(fault, fit.title, channels, severity))
         found += _check_offset(fit)
-    for why in dict.fromkeys(fit.failed for fit in others if fit.failed):
-        found.append(Finding("A response is missing", CARE, f"{why}.", "Mend the model at this point.", about="fit"))
     return found + (_check_errors(others) if all(each.severity != WRONG for each in found) else [])
 
 

@@ -74,7 +74,6 @@ class Screened(NamedTuple):
     name: str
     unit: str  # of the channel; empty if it is not known
     kind: str  # a key of `FAULTS`
-    size: float
     missing: tuple[tuple[str, str], ...] = ()  # first and last times of the samples that are to be left out
     baseline: tuple[tuple[str, float], ...] = ()  # points of a line through the offset or drift: time, and value
     is_motion: bool = False
@@ -110,7 +109,7 @@ def _gaps(x: np.ndarray) -> list[SensorFault]:
     known = np.flatnonzero(np.isfinite(x))
     distances = np.diff(known) if len(known) > 1 else np.ones(1)
     spans = tuple((known[k] + 1, known[k + 1] - 1) for k in np.flatnonzero(HALF * distances > np.median(distances)))
-    return [SensorFault("gap", spans, sum(last - first + 1 for first, last in spans) / len(x))] if spans else []
+    return [SensorFault("gap", spans)] if spans else []
 
 
 def _placed(name: str, unit: str, fault: SensorFault, step: float, start: float = 0.0) -> Screened:
@@ -119,7 +118,7 @@ def _placed(name: str, unit: str, fault: SensorFault, step: float, start: float 
     spans = tuple((f"{start + a * step:.{digits}f}", f"{start + b * step:.{digits}f}") for a, b in sorted(fault.spans))
     places = start + step * np.linspace(0.0, fault.spans[0][1], max(len(fault.level), 2))
     baseline = tuple((f"{at:.{digits}f}", value) for at, value in zip(places, fault.level, strict=False))
-    return Screened(name, unit, fault.kind, float(fault.size), () if baseline else spans, baseline)
+    return Screened(name, unit, fault.kind, () if baseline else spans, baseline)
 
 
 def repair_lines(found: Sequence[Screened], marks: Sequence[str | float] = ()) -> list[str]:
@@ -146,5 +145,5 @@ def check_sensors(screened: Iterable[Screened]) -> list[Finding]:
             action = "Check the file, or take another record of the motion: a motion needs all samples."
         name = f"The motion {each.name}" if each.is_motion else each.name
         severity = NOTE if each.kind == "gap" else CARE
-        found.append(Finding(kind, severity, f"{name} {text.format(words)}.", action, {each.name: each.size}))
+        found.append(Finding(kind, severity, f"{name} {text.format(words)}.", action))
     return found

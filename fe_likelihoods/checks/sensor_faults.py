@@ -30,7 +30,6 @@ class SensorFault(NamedTuple):
 
     kind: str  # a key of `fe_likelihoods.checks.screening.FAULTS`
     spans: tuple[tuple[int, int], ...]  # first and last samples, both included
-    size: float  # of the peak, as the kind needs it [-]
     level: tuple[float, ...] = ()  # offset, or drift at evenly spaced samples, the first and the last included
 
 
@@ -49,10 +48,9 @@ def find_sensor_faults(values: np.ndarray, dimension: str = "") -> tuple[SensorF
         if np.isfinite(np.diff(x)).sum() < FEWEST or not np.nanmax(x) > np.nanmin(x):
             break
         if (seen := look(x)) and kind == "baseline":
-            size = float(np.ptp((0.0, *seen))) / _peak(x)
-            found.append(SensorFault("offset" if len(seen) == 1 else "drift", ((0, len(x) - 1),), size, seen))
+            found.append(SensorFault("offset" if len(seen) == 1 else "drift", ((0, len(x) - 1),), seen))
         elif seen:
-            found.append(SensorFault(kind, seen, sum(last - first + 1 for first, last in seen) / len(x)))
+            found.append(SensorFault(kind, seen))
             for first, last in seen:
                 x[first : last + 1] = np.nan
     return tuple(found)
