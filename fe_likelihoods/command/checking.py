@@ -104,8 +104,7 @@ def _draw(problem: Problem, checked: ModelCheck, picture: Path) -> list[Path]:
             figure = plot_modes(drawn, label=f"{len(drawn.frequencies)} draws of the prior, 90 %")
         else:
             draws = points[:, columns[: len(part.model.parameter_names)]]
-            options = {"quantiles": (0.05, 0.95), "cache": part.simulator, "progress": False}
-            drawn = propagate(part.model, draws, **options)
+            drawn = propagate(part.model, draws, quantiles=(0.05, 0.95), cache=part.simulator, progress=False)
             figure = plot_bands(drawn, measured) if measured.is_history else plot_points(measured, prediction=drawn)
             figure.suptitle(f"{drawn.n_samples} draws of the prior and the measurements")
         files.append(picture.with_name(f"{picture.stem}-{key}{picture.suffix}") if key else picture)

@@ -97,8 +97,7 @@ def _advised(read: Callable[..., Any], options: dict[str, Any], above: int = 0) 
 
 def _keys(options: dict[str, Any]) -> list[str]:
     """Lines of keys, of which some have "?" for what the file does not state."""
-    texts = {key: _toml(value) for key, value in options.items()}
-    return [f"{key} = {text}{_WRITE * ('?' in text)}" for key, text in texts.items()]
+    return [f"{key} = {(text := _toml(value))}{_WRITE * ('?' in text)}" for key, value in options.items()]
 
 
 def describe(measured: Measurements, unstated: Iterable[str] = ()) -> list[str]:

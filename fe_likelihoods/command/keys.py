@@ -244,14 +244,15 @@ FORMS: dict[str, tuple[type[Distribution], str]] = {
 """Distributions of ``[priors]`` by name: class, and how it is written."""
 
 
-def parse_prior(text: str, dimension: str | None = None) -> Distribution:
-    """Make a distribution from its text, such as ``half-normal(0.1 g)``; numbers without a unit are in SI units."""
-    match = re.fullmatch(r"\s*([A-Za-z-]+)\s*\(([^()]*)\)\s*", text) if isinstance(text, str) else None
+def parse_prior(text: Any, dimension: str | None = None) -> Distribution | float:
+    """A distribution from a text such as ``half-normal(0.1 g)``, or a known number; without a unit in SI units."""
+    if _QUANTITY.fullmatch(str(text)):
+        return _parse(str(text), dimension)[0]
+    match = re.fullmatch(r"\s*([A-Za-z-]+)\s*\(([^();]*)\)\s*", str(text))
     if match is None or match[1].lower() not in FORMS:
-        forms = "; ".join(form for _, form in FORMS.values())
-        raise ValueError(
-            f'expected a distribution in quotes, such as "normal(1, 0.3)"; got {text!r}; known are {forms}'
-        )
+        wanted = 'a distribution in quotes, such as "normal(1, 0.3)", with decimal points and commas between numbers'
+        known = "; ".join(form for _, form in FORMS.values())
+        raise ValueError(f"expected {wanted}, or a known number; got {text!r}; known are {known}")
     make, form = FORMS[name := match[1].lower()]
     try:
         found = [_parse(argument, dimension) for argument in match[2].split(",") if argument.strip()]

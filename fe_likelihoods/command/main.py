@@ -16,8 +16,7 @@ import click
 
 __all__ = ["NOT_USABLE", "TEMPLATES", "main", "write_templates"]
 
-ERROR, INTERRUPTED = 1, 130
-NOT_USABLE = 3
+ERROR, NOT_USABLE, INTERRUPTED = 1, 3, 130
 _FILE = click.Path(path_type=Path)
 _DATA = ("synthetic_record.csv", "synthetic_measured.csv")
 TEMPLATES = {

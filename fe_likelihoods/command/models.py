@@ -78,7 +78,7 @@ def make_problem(job: Job, cache: SimulationCache | None = None) -> Problem:
         known, record = known | dict(each.known), each.record or record
     likelihood = made.popitem()[1] if len(made) == 1 else job.located("model", JointLikelihood, made)
     priors, assumed = _make_priors(job, likelihood, known)
-    return Problem(Posterior(likelihood, priors), record, assumed)
+    return Problem(job.located("priors", Posterior, likelihood, priors), record, assumed)
 
 
 def _histories(job: Job, cache: SimulationCache | None) -> _DataSet:

@@ -27,7 +27,7 @@ _KINDS = {
     "deviation": r"(f|fn|freq|frequency)[ _]std",
     "damping": r"damping|d[äa]e?mpfung|zeta|xi",
     "temperature": r"temp\.?|temp[eé]ratur[ea]?|t[ _]?(°c|degc|[\[(]?c[\])]?)|.*[\[(](°c|degc)[\])]",  # not a T alone
-    "set": r"set|identification|messung",
+    "set": r"set|identification|messung|(daten)?satz",
     "time": r"date|datum|fecha|(date[ _]?)?time|timestamp|zeit(stempel|punkt)?|uhrzeit|heure|hora",
     "mode": r"(eigen)?(mode|modus|modo|form)n?[ _-]?(no\.?|nr\.?|number|nummer|#)?|nr\.?|no\.?",
 }

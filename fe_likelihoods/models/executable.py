@@ -282,7 +282,7 @@ class ExecutableModel(UserModel):
             return self.output(folder)
         table = read_table(folder, self.output)
         if table.shape[1] <= max(self.columns) or (self._no_other_columns and table.shape[1] != len(self.columns)):
-            listed = f"columns {', '.join(map(str, self.columns))}"
+            listed = f"columns {', '.join(map(str, self.columns))}, counted from 0"
             wanted = f"{len(self.columns)} columns" if self._no_other_columns else listed
             raise SimulationFailed(f"{self.output} has {table.shape[1]} columns, expected {wanted}")
         return self._factors * table[:, self.columns].T

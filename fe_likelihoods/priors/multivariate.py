@@ -189,7 +189,7 @@ def as_distribution(name: str, distribution: Any) -> Distribution:
             advice = ": for a distribution of several parameters, give a tuple of their names as key"
     raise ValueError(
         f"Prior: {name!r} must be a Distribution of fe_likelihoods or a frozen continuous distribution of scipy.stats, "
-        f"such as scipy.stats.gamma(2.0); got {distribution!r}{advice}"
+        f"such as scipy.stats.gamma(2.0), or a number for a known noise level; got {distribution!r}{advice}"
     )
 
 

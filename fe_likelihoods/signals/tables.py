@@ -146,7 +146,7 @@ _MARKED = re.compile(rf"[,{_BLANKS}]|\..*\.")
 _THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}")  # 1,000: a thousand, or one with three decimals
 _POINTS = "Numbers with decimal commas need another separator between columns, such as ';'"
 _SKIP = "If the text is about other samples, give skip= to leave it out"
-_CUT = "cut off the line if it is no row of samples"
+_CUT = "cut off the line, and all lines below it, if it is no row of samples"
 _TIME = re.compile(r"(elapsed |relative )?(t|(time|zeit|temps|tempo|tiempo)\d*)(\b|_)", re.IGNORECASE)
 _STAMP = re.compile(r"(timestamp|unix|epoch)(\b|_)", re.IGNORECASE)  # times if no other column has them
 _UNIX = (1e9, 4.2e9)  # times since 1970 of the years 2001 to 2103 [s]

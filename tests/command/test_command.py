@@ -313,6 +313,11 @@ def test_another_file_of_the_same_name_is_refused(finished):
         ("walkers = 20", "walkers = 2", "[sampler]"),
         ("draws = 10", "draws = -5", "[prediction] draws: expected a whole number >= 0, such as 1; got -5"),
         ("half-normal(5 mm)", "halfnormal(5)", "[priors] sigma_displacement: expected a distribution in quotes"),
+        (
+            'damping = "normal(1, 0.3)"',
+            "damping = 1.0",
+            "[priors] a number in the prior is a known parameter of the noise",
+        ),
         ("damping =", "dampng =", "[priors] dampng: the model has no such parameter; did you mean damping?"),
         ('damping = "normal(1, 0.3)"', "", '[priors] damping: this prior is missing; write for example damping = "n'),
         (
@@ -483,6 +488,7 @@ def test_quantities_and_priors_as_text():
     assert parse_prior("half-normal(5mm)", "displacement").sd == 5e-3
     assert parse_prior("half-normal(0.1 g)", "acceleration").sd == pytest.approx(0.980665)
     assert parse_prior("normal(1, 0.5, 0.2, inf)").bounds == (0.2, float("inf"))
+    assert parse_prior("0.4 mm", "displacement") == pytest.approx(4e-4) and parse_prior(4e-4) == 4e-4
     wrong = (
         "uniform(1)",
         "uniform(0, 1, 2)",
@@ -494,7 +500,8 @@ def test_quantities_and_priors_as_text():
         "log-normal(1 mm, 0.3 mm)",
         "normal(1, nan)",
         "normal(0, 1)",
-        3,
+        "normal(2,4e6; 0,5e6)",
+        True,
     )
     for text in wrong:
         with pytest.raises(ValueError, match="expected"):

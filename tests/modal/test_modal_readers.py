@@ -121,7 +121,7 @@ def test_a_table_of_several_identifications(tmp_path):
         ("timestamp", "2021-01-01 {:02}:00"),
         ("Zeit", "01.01.2021 {:02}:00"),
         ("date,time", "2021-01-01,{:02}:00:00"),
-        ("set,time", "{},2021-01-01 08:00"),
+        ("Datensatz,time", "{},2021-01-01 08:00"),
     ):
         lines = f"{stamp},1,1.0,1,2", f"{stamp},2,3.0,1,-1"
         rows = [line.format(hour) for hour in (9, 10, 11) for line in lines]

@@ -110,7 +110,7 @@ CASES = {
     "short": "the response has shape (1, 19), expected (n_channels, n_steps) = (1, 20)",
     "words": "out.txt is not a table of numbers",
     "empty": "out.txt is empty",
-    "one": "out.txt has 1 columns, expected columns 1",
+    "one": "out.txt has 1 columns, expected columns 1, counted from 0",
     "hang": "stopped at the time limit of 0.5 s",
     "flood": "stopped because it wrote more than 1000000 bytes",
     "fill": "stopped because it wrote more than 1000000 bytes",

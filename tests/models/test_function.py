@@ -48,6 +48,11 @@ def test_same_bits_in_process_and_isolated(guarded):
         np.testing.assert_array_equal(model_of().simulate(theta), line(theta))
 
 
+def test_a_forgotten_return_is_named():
+    with pytest.raises(SimulationFailed, match=r"the response is None or one number .*, expected .* = \(1, 20\)"):
+        model_of(lambda theta: None).simulate(THETA)
+
+
 def test_theta_of_the_caller_is_not_changed():
     def scribbles(theta):
         theta[:] = 0.0

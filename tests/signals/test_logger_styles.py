@@ -99,7 +99,7 @@ def test_texts_that_stand_for_no_missing_sample_are_refused(tmp_path, missing):
 @pytest.mark.parametrize("line", ["time_s,acc_g", "0.02,1x", "end,end"])
 def test_a_second_header_line_and_a_damaged_number_are_no_missing_samples(tmp_path, line):
     (tmp_path / "a.csv").write_text(f"time_s,acc_g\n0.00,1\n0.01,2\n{line}\n0.03,2\n")
-    with pytest.raises(ValueError, match="line 4: expected a number, got '[^']*'($|; cut off the line)"):
+    with pytest.raises(ValueError, match="line 4: expected a number, got '[^']*'($|; cut off the line,)"):
         read_record(tmp_path / "a.csv")
 
 
@@ -113,7 +113,9 @@ def test_a_first_sample_that_is_a_mark_is_no_header_line(tmp_path):
 def test_a_line_below_the_samples_is_to_be_cut_and_no_missing_sample(path, footer):
     rows = [f"{0.01 * k:.2f};{0.5 * k:.1f};{17.2 - k:.1f}".replace(".", ",") for k in range(9)]
     path.write_text("\n".join(["Logger;Nr. 12;", "Zeit [s];Weg [mm];Kraft [kN]", *rows, footer, ""]))
-    with pytest.raises(ValueError, match="line 12: expected .*; .*cut off the line if it is no row") as caught:
+    with pytest.raises(
+        ValueError, match="line 12: expected .*; .*cut off the line, and all lines below it, if it is no row"
+    ) as caught:
         read_columns(path, [Channel("F", "force", "kN")], ["Kraft [kN]"])
     assert "missing=" not in str(caught.value)
     path.write_text(path.read_text().replace(f"{footer}\n", ""))
