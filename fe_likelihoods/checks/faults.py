@@ -13,7 +13,7 @@ of the draws. Two supports are compared in the lowest lines in which they are co
 
 import math
 from collections.abc import Sequence
-from itertools import combinations
+from itertools import combinations, product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -55,8 +55,8 @@ class Fault(NamedTuple):
 def find_faults(measurements: Measurements, draws: np.ndarray) -> tuple[Fault, ...]:
     """Faults of histories or load cases, from responses (n, n_channels, n_samples) [SI] at draws of the prior.
 
-    Gain and clock of a channel are judged where the draws agree, if there is such a band, else by the whole record,
-    where each fault is found after the stronger ones are corrected.
+    Exchanged channels come first, because a gain, a sign and a lag make up for them. Gain and clock of a channel are
+    judged where the draws agree, if there is such a band, else by the whole record, the strongest fault first.
     """
     there, history = np.isfinite(measurements.values), measurements.is_history
     usable = np.flatnonzero(np.nan_to_num(measurements.values).any(axis=1) & (history | (there.sum(axis=1) > 2)))
@@ -65,6 +65,37 @@ def find_faults(measurements: Measurements, draws: np.ndarray) -> tuple[Fault, .
     y, r, n = y[usable], r[:, usable], there.shape[1] * history
     channels, steps = [measurements.channels[k] for k in usable], np.array(measurements.steps)[usable]
     names, found, free = [each.name for each in channels], list[Fault](), list[int]()
+    timed = [(measurements.steps[k], measurements.starts[k]) for k in usable]
+    pairs = [(i, j) for i, j in combinations(range(len(y)), 2) if timed[i] == timed[j]]
+    swaps = [([i, j], ratio) for i, j in pairs for ratio in _ratios(channels[i], channels[j])]
+
+    def strongest(groups: Sequence[list[int]]) -> tuple[list[int], list[Fault], np.ndarray] | None:
+        """The group or pair, the faults and the corrected responses of the hypothesis that explains most."""
+        errors, most, chosen = _log_errors(y, r), 0.0, None
+        best = int(np.argmin(errors.sum(axis=1)))
+        hypotheses = [(group, *_fitted(y[group], r[:, group], steps[group], n)) for group in groups]
+        hypotheses += [(pair, None, None, r[:, pair[::-1]] * [[ratio], [1.0 / ratio]]) for pair, ratio in swaps]
+        for group, gains, lags, corrected in hypotheses:
+            after = _log_errors(y[group], corrected)
+            row = int(np.argmin(errors.sum(axis=1) + (after - errors[:, group]).sum(axis=1)))
+            gain = errors[best].sum() - errors[row].sum() + (errors[row, group] - after[row]).sum()
+            least = -math.log(BETTER) * (1 if gains is None else len(group))  # a swap has no number to fit
+            before, left = (_error(y[group], each) for each in (r[best, group], corrected[row]))
+            nearer = errors[best, group].mean() - after[row].mean() > least / len(group)
+            score = gain - least * (gains is None)  # and is named where no other fault explains nearly as much
+            if gain > least and score > most and nearer and left < EXPLAINED:
+                of = [names[k] for k in group]
+                faults = [Fault("swap", tuple(of), math.nan, before, left)]
+                if gains is not None:
+                    faults = _named(of, gains[row], lags[row], max(steps[group]), before, left)
+                if faults:
+                    most, chosen = score, (group, faults, corrected)
+        return chosen
+
+    groups = [[k] for k in range(len(y))] + [[*range(len(y))]]
+    while len(r) and strongest([]) and (chosen := strongest(groups)) and chosen[1][0].kind == "swap":
+        group, faults, r[:, group] = chosen
+        found += faults
     for k, step in enumerate(steps):
         slow = slow_motion(y[k], r[:, k], step, n)
         if slow is None:
@@ -73,33 +104,11 @@ def find_faults(measurements: Measurements, draws: np.ndarray) -> tuple[Fault, .
         clear = abs(slow.lag) > LARGE_LAG and (slow.gain < 0.0 or slow.after < BETTER * slow.before)
         where = f" between {slow.band[0]:.2g} and {slow.band[1]:.2g} Hz, where parameters hardly change it"
         found += _named([names[k]], slow.gain, slow.lag * clear, step, slow.before, slow.after, where)
-    timed, groups = [(measurements.steps[k], measurements.starts[k]) for k in usable], [[k] for k in free]
-    swaps = [[i, j] for i, j in combinations(range(len(y)), 2) if timed[i] == timed[j]]
-    groups += [free] if len(free) > 1 else []
-    while len(r) and len(y):
-        errors, most, chosen = _log_errors(y, r), 0.0, None
-        best = int(np.argmin(errors.sum(axis=1)))
-        hypotheses = [(group, *_fitted(y[group], r[:, group], steps[group], n)) for group in groups]
-        hypotheses += [(pair, None, None, _exchanged(r, pair, channels)) for pair in swaps]
-        for group, gains, lags, corrected in hypotheses:
-            after = _log_errors(y[group], corrected)
-            row = int(np.argmin(errors.sum(axis=1) + (after - errors[:, group]).sum(axis=1)))
-            gain = errors[best].sum() - errors[row].sum() + (errors[row, group] - after[row]).sum()
-            least = -math.log(BETTER) * (1 if gains is None else len(group))  # a swap has no number to fit
-            before, left = (_error(y[group], each) for each in (r[best, group], corrected[row]))
-            nearer = errors[best, group].mean() - after[row].mean() > least / len(group)
-            if gain > max(least, most) and nearer and left < EXPLAINED:
-                of = [names[k] for k in group]
-                faults = [Fault("swap", tuple(of), math.nan, before, left)]
-                if gains is not None:
-                    faults = _named(of, gains[row], lags[row], max(steps[group]), before, left)
-                if faults:
-                    most, chosen = gain, (group, faults, corrected)
-        if chosen is None:
-            break
-        group, faults, corrected = chosen
+    groups = [[k] for k in free] + ([free] if len(free) > 1 else [])
+    swaps = [(pair, ratio) for pair, ratio in swaps if {*pair} <= {*free}]
+    while len(r) and (chosen := strongest(groups)):
+        group, faults, r[:, group] = chosen
         found += faults
-        r[:, group] = corrected
     return tuple(found)
 
 
@@ -147,11 +156,10 @@ def _fitted(y: np.ndarray, r: np.ndarray, steps: np.ndarray, n: int) -> tuple[np
     return gain, lag, r * gain[:, None, None] * shift
 
 
-def _exchanged(r: np.ndarray, pair: list[int], channels: Sequence[Channel]) -> np.ndarray:
-    """Responses of two channels, each read with the unit of the other one."""
-    one, other = (channels[k] for k in pair)
-    ratio = 1.0 if one.dimension == other.dimension else find_unit(one.unit).factor / find_unit(other.unit).factor
-    return r[:, pair[::-1]] * [[ratio], [1.0 / ratio]]
+def _ratios(one: Channel, other: Channel) -> set[float]:
+    """Units of one channel by those of another one: of the channels, or those of a model, which are mostly SI."""
+    units = ({1.0, find_unit(each.unit).factor} for each in (one, other))
+    return {1.0} if one.dimension == other.dimension else {a / b for a, b in product(*units)}
 
 
 def _spectra(histories: np.ndarray, there: np.ndarray | bool = True) -> np.ndarray:
@@ -249,7 +257,7 @@ FAULTS = {  # kind, text and action
     "swap": (
         "Channels may be swapped",
         "each measurement resembles the computed response of the other",
-        "Look up which cable, or column of the file, belongs to which; if they were exchanged, exchange the columns.",
+        "Look up which cable or column (of a file or of a program's output) belongs to which; exchange the wrong ones.",
     ),
 }
 OF_SUPPORTS = "Check unit, sign and clock of its file: slow motions of one site are alike, but for waves and slips."

@@ -79,6 +79,9 @@ def test_signs_lags_and_exchanged_channels_are_named():
     values = np.stack([np.roll(TRUE[0], 60), TRUE[0]])
     (fault,) = find_faults(Measurements(two, MODEL.dt, values), pairs)
     assert fault.kind == "swap" and fault.names == ("acceleration", "other")
+    exchanged = RESPONSES[:, ::-1] * [[100.0], [0.01]]  # m/s², and cm in the output of a program
+    (fault,) = find_faults(measured(TRUE), exchanged)
+    assert fault.kind == "swap" and fault.after < 0.2
 
 
 def test_channels_may_have_other_spellings_of_their_units():
