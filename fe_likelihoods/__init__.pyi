@@ -44,7 +44,6 @@ from .population.hierarchical_posterior import HierarchicalPosterior, Varying
 from .population.hierarchy import Hierarchy
 from .population.stiffness_loss import stiffness_loss
 from .population.stored_posterior import StoredPosterior
-from .prediction.averaging import average_predictions
 from .prediction.exceedance import exceedance
 from .prediction.fragility import fragility
 from .prediction.held_out import leave_one_out
@@ -114,7 +113,6 @@ __all__ = [
     "Uniform",
     "Varying",
     "align",
-    "average_predictions",
     "check_data",
     "check_model",
     "check_result",

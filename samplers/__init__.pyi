@@ -1,14 +1,12 @@
 from . import presets
-from .judgement.verdict import Verdict
 from .moves.population_moves import MixtureMove, RandomWalkMove
 from .rare_events import subset_simulation
 from .reporting.arviz_data import to_arviz
 from .reporting.figures import plot_corner, plot_marginals, plot_run
 from .reporting.model_comparison import compare_models
 from .reporting.summary import summary
-from .reports import SamplingWarning, Stage
+from .reports import SamplingWarning
 from .smc import SMCSampler
-from .tempered import TemperedSampler
 from .tempering.guide import Guide
 from .tmcmc import TMCMCSampler
 
@@ -18,10 +16,7 @@ __all__ = [
     "RandomWalkMove",
     "SMCSampler",
     "SamplingWarning",
-    "Stage",
     "TMCMCSampler",
-    "TemperedSampler",
-    "Verdict",
     "compare_models",
     "plot_corner",
     "plot_marginals",

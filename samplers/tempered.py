@@ -109,6 +109,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
 
     Examples
     --------
+    >>> from samplers.tempered import TemperedSampler
     >>> isinstance(sampler, TemperedSampler)
     True
     >>> SMCSampler.setting_names[:3]

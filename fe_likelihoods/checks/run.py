@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from samplers import Verdict
 from samplers.emcee_names import EnsembleSampler
+from samplers.judgement.verdict import Verdict
 
 from ..likelihood.failure_log import reason_without_numbers
 from ..likelihood.joint import JointLikelihood

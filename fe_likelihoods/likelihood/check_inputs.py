@@ -1,14 +1,10 @@
 """Checks of what a likelihood is made of and called with."""
 
-import numpy as np
-
 from ..noise.protocol import Noise, noise_channels
-from ..noise.sufficient_statistics import Statistic, apply_statistic
 from ..signals.channels import Measurements
-from ..signals.comparison import Comparison
 from ..simulation.model import Model
 
-__all__ = ["check_model", "check_noise", "check_statistic", "match_measurements", "name_of_statistic"]
+__all__ = ["check_model", "check_noise", "match_measurements"]
 
 _MODEL_MEMBERS = ("parameter_names", "channels", "dt", "n_steps", "fingerprint", "simulate")
 
@@ -37,25 +33,6 @@ def check_noise(model: Model, noise: Noise) -> None:
         raise ValueError(
             f"the noise's channels are {', '.join(got)}, the model's are {', '.join(expected)}; make the noise with "
             "model.channels"
-        )
-
-
-def name_of_statistic(statistic: Statistic | None) -> str:
-    """Text that identifies the statistic of a noise in fingerprints; empty for the sums of squares."""
-    if statistic is None:
-        return ""
-    # an object, such as `EventSums`, is represented by its repr
-    return f" {statistic.__module__}.{getattr(statistic, '__qualname__', repr(statistic))}"
-
-
-def check_statistic(statistic: Statistic | None, measured: np.ndarray | Comparison) -> None:
-    """Raise ValueError if samples are missing and the statistic of a noise has no rule for them."""
-    if statistic is None or not isinstance(measured, Comparison):
-        return
-    if not np.isfinite(apply_statistic(statistic, measured.values, measured.values)).all():
-        raise ValueError(
-            f"samples are missing, and the statistic {statistic!r} of the noise is not finite with residuals of NaN at "
-            "these samples; leave such residuals out in the statistic, or use GaussianNoise or AutoregressiveNoise"
         )
 
 

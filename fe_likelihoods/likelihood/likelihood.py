@@ -17,7 +17,7 @@ import numpy as np
 from ..cache.simulation_cache import SimulationCache
 from ..noise.gaussian import GaussianNoise
 from ..noise.protocol import Noise, noise_of_part, noise_statistic, noise_under
-from ..noise.sample_counts import count_samples
+from ..noise.sufficient_statistics import count_samples
 from ..priors.points import as_rows, complete_repr
 from ..signals.channels import Measurements
 from ..signals.comparison import Comparison

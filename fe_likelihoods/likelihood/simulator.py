@@ -25,7 +25,7 @@ from samplers.interrupts import interrupts_end_the_run
 from ..cache.memory import MemoryCache, ResponseMemory, distinct_keys, statistics_in, thetas_of
 from ..cache.simulation_cache import SimulationCache
 from ..cache.verification import StaleCache, VerifiedModel
-from ..noise.sufficient_statistics import Statistic
+from ..noise.sufficient_statistics import Statistic, check_statistic, name_of_statistic
 from ..priors.points import as_rows
 from ..signals.channels import Measurements
 from ..signals.comparison import Comparison, compare_with
@@ -42,7 +42,6 @@ from ..simulation.model import (
     simulate_batch,
     unpack,
 )
-from .check_inputs import check_statistic, name_of_statistic
 from .failure_log import FailureLog
 
 __all__ = ["Simulator"]

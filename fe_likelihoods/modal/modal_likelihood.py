@@ -38,7 +38,7 @@ class ModalLikelihood(FELikelihood):
 
     Parameters
     ----------
-    model : Model, LinearStructure or Parts
+    model : Model, LinearStructure or Structure
         A model that has modes and the sensors of the data: a `FunctionModes`; any model whose channels are
         `modal_channels`, such as an `OpenSeesModel`; or a linear structure, such as a `ShearFrame`.
     data : ModalData
@@ -86,7 +86,7 @@ class ModalLikelihood(FELikelihood):
     ) -> None:
         if not isinstance(data, ModalData):
             raise ValueError(f"ModalLikelihood: expected ModalData; got {type(data).__name__}")
-        model = model.parts if isinstance(model, LinearStructure) else model
+        model = model.structure if isinstance(model, LinearStructure) else model
         model = StructureModes(model) if hasattr(model, "assemble") else model
         self._paired = PairedModes(model if data.temperatures is None else ModesWithSlope(model), data)
         noise = ModalNoise(self._paired, (frequency_error, shape_error), student_t)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..models.base import digest
-from ..models.frames_and_decks import Parts
+from ..models.frames_and_decks import Structure
 from ..models.function import FunctionModel
 from ..models.undamped_modes import mode_derivatives, undamped_modes
 from ..models.user_model import ExternalModel
@@ -141,16 +141,16 @@ class StructureModes(ExternalModel):
 
     path_dependent = False
 
-    def __init__(self, parts: Parts) -> None:
-        self.parts, names = parts, tuple(name for name in parts.parameter_names if not name.startswith("damping"))
-        self.parameter_names = names
+    def __init__(self, structure: Structure) -> None:
+        self.structure = structure
+        names = self.parameter_names = tuple(x for x in structure.parameter_names if not x.startswith("damping"))
         size = len(self._system(np.linspace(0.5, 1.0, len(names))).mass)  # ascending, as frequencies must
-        super().__init__(names, modal_channels(parts.channel_names), 1.0, size)
-        self.fingerprint = self._digest(repr(parts))
+        super().__init__(names, modal_channels(structure.channel_names), 1.0, size)
+        self.fingerprint = self._digest(repr(structure))
 
     def _system(self, theta: np.ndarray) -> Any:
         given = dict(zip(self.parameter_names, theta, strict=True))
-        return self.parts.assemble(np.array([given.get(name, _DAMPING) for name in self.parts.parameter_names]))
+        return self.structure.assemble(np.array([given.get(name, _DAMPING) for name in self.structure.parameter_names]))
 
     def _respond(self, theta: np.ndarray) -> np.ndarray:
         system = self._system(theta)

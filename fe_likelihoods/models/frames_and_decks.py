@@ -18,7 +18,7 @@ from scipy.linalg import eigh
 from ..simulation.model import SimulationFailed
 from .validation import check_integer, check_number, described, structure
 
-__all__ = ["BridgeDeck", "LinearSystem", "ModalModel", "Parts", "ShearFrame"]
+__all__ = ["BridgeDeck", "LinearSystem", "ModalModel", "Structure", "ShearFrame"]
 
 _MOST_MODES = 50
 
@@ -37,7 +37,7 @@ class LinearSystem(NamedTuple):
     direct: np.ndarray  # (n_channels, n_supports) weight of each support acceleration [-]
 
 
-class Parts(Protocol):
+class Structure(Protocol):
     """Interface of the structures that `LinearStructure` simulates; their ``repr`` enters the fingerprint."""
 
     parameter_names: tuple[str, ...]

@@ -28,7 +28,7 @@ from ..signals.records import Record
 from ..signals.response_spectrum import hold_integrals
 from ..signals.sampling import same_step, sample_window
 from ..simulation.model import SimulationFailed
-from .frames_and_decks import LinearSystem, Parts
+from .frames_and_decks import LinearSystem, Structure
 from .undamped_modes import Modes, undamped_modes
 from .user_model import ExternalModel
 from .validation import check_theta
@@ -45,20 +45,20 @@ class Sensor(NamedTuple):
 
     name: str
     quantity: str
-    row: int  # channel of the parts at its place
-    to: int | None = None  # channel of the parts that it is relative to; None: the supports, or absolute
+    row: int  # channel of the structure at its place
+    to: int | None = None  # channel of the structure that it is relative to; None: the supports, or absolute
     motion: int | None = None  # 0 displacement, 1 velocity, 2 relative acceleration; None absolute acceleration
 
 
-def _sensors(parts: Parts, outputs: Sequence[str]) -> tuple[Sensor, ...]:
+def _sensors(structure: Structure, outputs: Sequence[str]) -> tuple[Sensor, ...]:
     """Resolve the names of outputs; ValueError as for `LinearStructure`."""
-    names, found = tuple(parts.channel_names), []
+    names, found = tuple(structure.channel_names), []
     for output in outputs:
         kind, _, place = str(output).partition("@")
         of, _, to = (place, "", "") if place in names else place.partition(":")
         if output in names:
             found.append(Sensor(output, "absolute acceleration", names.index(output)))
-        elif kind in _MOTIONS and of in names and (not to or (to in names and to != of and parts.n_supports == 1)):
+        elif kind in _MOTIONS and of in names and (not to or (to in names and to != of and structure.n_supports == 1)):
             quantity = f"relative {kind.split('_')[-1]}"
             row, other = names.index(of), names.index(to) if to else None
             found.append(Sensor(output, quantity, row, other, _MOTIONS.index(kind)))
@@ -78,26 +78,26 @@ class LinearStructure(ExternalModel):
 
     Parameters
     ----------
-    parts : BridgeDeck, ShearFrame, or an object with the interface `Parts`
+    structure : BridgeDeck, ShearFrame, or an object with the interface `Structure`
         Parameters and matrices of the structure.
     supports : Record or sequence of Record
-        Absolute accelerations of the supports, with the same step and length, in the order that `parts` documents.
+        Absolute accelerations of the supports, with the same step and length, in the order that `structure` documents.
     unit : str
         Display unit of the channels.
     lead : float
         Time before the first sample of the channels [s]. The motion of the supports during this time is simulated but
         not compared with measurements, so that a part of a record need not start from rest.
     outputs : sequence of str, optional
-        Names of the channels. ``"roof"``, a channel of `parts`, is the absolute acceleration there.
+        Names of the channels. ``"roof"``, a channel of `structure`, is the absolute acceleration there.
         ``"displacement@roof"``, ``"velocity@roof"`` and ``"relative_acceleration@roof"`` are relative to the support,
         or to the quasi-static motion R g of several supports; ``"displacement@roof:floor 2"`` is relative to another
-        channel, the drift of the storeys between them. Default: the absolute accelerations of all channels of `parts`.
+        channel, the drift of the storeys between them. Default: the absolute accelerations of all channels.
 
     Raises
     ------
     ValueError
-        If an output is unknown or repeated, there are no supports, their steps or lengths differ, `parts` has another
-        number of supports, or fewer than two samples are after `lead`.
+        If an output is unknown or repeated, there are no supports, their steps or lengths differ, the structure has
+        another number of supports, or fewer than two samples are after `lead`.
 
     Examples
     --------
@@ -111,7 +111,7 @@ class LinearStructure(ExternalModel):
 
     def __init__(
         self,
-        parts: Parts,
+        structure: Structure,
         supports: Record | Sequence[Record],
         unit: str = "g",
         lead: float = 0.0,
@@ -128,31 +128,31 @@ class LinearStructure(ExternalModel):
                     f"{first.dt} s ({first.name}) and {support.n_steps} at {support.dt} s ({support.name}); use "
                     "Record.resample and Record.trim"
                 )
-        if len(supports) != parts.n_supports:
+        if len(supports) != structure.n_supports:
             raise ValueError(
-                f"LinearStructure: expected one record for each of the {parts.n_supports} supports of "
-                f"{type(parts).__name__}; got {len(supports)}"
+                f"LinearStructure: expected one record for each of the {structure.n_supports} supports of "
+                f"{type(structure).__name__}; got {len(supports)}"
             )
-        names = tuple(parts.channel_names)
+        names = tuple(structure.channel_names)
         self.outputs = None if outputs is None or tuple(outputs) == names else tuple(outputs)
-        self.sensors = _sensors(parts, names if outputs is None else outputs)
+        self.sensors = _sensors(structure, names if outputs is None else outputs)
         units = {"displacement": "mm", "velocity": "mm/s"}
         channels = tuple(
             Channel(each.name, each.quantity, units.get(each.quantity.split()[-1], unit)) for each in self.sensors
         )
         self._window = sample_window("the supports", first.n_steps, first.dt, lead, None)
-        super().__init__(tuple(parts.parameter_names), channels, first.dt, self._window.stop - self._window.start)
-        self.parts = parts
+        super().__init__(tuple(structure.parameter_names), channels, first.dt, self._window.stop - self._window.start)
+        self.structure = structure
         self.supports = supports
         self.unit = unit
         self.lead = float(lead)
         self._acceleration = np.stack([support.acceleration for support in supports])
         motions = [support.fingerprint for support in self.supports]
-        self.fingerprint = self._digest(repr(self.parts), self._window.start, motions, *(self.outputs or ()))
+        self.fingerprint = self._digest(repr(self.structure), self._window.start, motions, *(self.outputs or ()))
 
     def with_record(self, record: Record | Sequence[Record]) -> LinearStructure:
         """Return the same structure, with its lead, under other support accelerations; errors as for a new one."""
-        return type(self)(self.parts, record, self.unit, self.lead, self.outputs)
+        return type(self)(self.structure, record, self.unit, self.lead, self.outputs)
 
     def followed_by(self, record: Record | Sequence[Record], rest: float = 10.0) -> LinearStructure:
         """Return the same structure under its present motions, a pause of `rest` [s] and further support motions."""
@@ -166,18 +166,18 @@ class LinearStructure(ExternalModel):
         return self.with_record([support.trim(0.0, (last - 1) * self.dt) for support in self.supports])
 
     def modes(self, theta: ArrayLike, n: int | None = None) -> Modes:
-        """Return the lowest n undamped modes (default: all), with shapes (n, n_channels) at the channels of the parts.
+        """Return the lowest n undamped modes (default: all), with shapes (n, n_channels) at the channels.
 
         `theta` is as for `simulate`. Raises SimulationFailed as `undamped_modes`.
         """
         values = check_theta(theta, self.parameter_names)
-        system = self.parts.assemble(values)
+        system = self.structure.assemble(values)
         modes = undamped_modes(system.stiffness, system.mass, n)
         return modes._replace(shapes=modes.shapes @ system.shape.T)
 
     def _respond(self, theta: np.ndarray) -> np.ndarray:
         motion = self._acceleration
-        system = self.parts.assemble(theta)
+        system = self.structure.assemble(theta)
         modes = _complex_modes(system)
         weights, direct = system.shape, system.direct
         if self.outputs is not None:

@@ -39,14 +39,12 @@ from .rc_column_materials import (
     Bars,
     ColumnAnalysis,
     Concrete,
-    Confinement,
     Hoops,
     LowCycleFatigue,
-    ReinforcedSection,
     Steel,
-    gauss_lobatto,
 )
 from .rc_column_outputs import Output, Sections, check_units, display_channels, parse_outputs, section_heights
+from .rc_column_section import Confinement, ReinforcedSection, gauss_lobatto
 from .validation import (
     check_described,
     check_names,

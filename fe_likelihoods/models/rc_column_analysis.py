@@ -20,8 +20,9 @@ from ..signals.records import DisplacementHistory, Record
 from ..simulation.model import SimulationFailed
 from ..units import G0
 from .base import BuiltInModel, History, remark_on_range
-from .rc_column_materials import gauss_lobatto, hardening_fault
+from .rc_column_materials import hardening_fault
 from .rc_column_outputs import Output, Recording
+from .rc_column_section import gauss_lobatto
 from .validation import check_values, invalid
 
 __all__ = ["ColumnHistory", "PreparedColumn", "check_loading", "expect_fracture", "make_column", "run_column"]

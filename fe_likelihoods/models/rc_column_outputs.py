@@ -17,7 +17,7 @@ import numpy as np
 
 from ..signals.channels import Channel
 from ..units import find_unit
-from .rc_column_materials import ReinforcedSection
+from .rc_column_section import ReinforcedSection
 from .validation import invalid
 
 __all__ = ["Recording", "Output", "Sections", "check_units", "display_channels", "parse_outputs", "section_heights"]

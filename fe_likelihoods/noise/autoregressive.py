@@ -12,7 +12,7 @@ from ..signals.channels import Channel
 from .gaussian import HALF_LOG_TWO_PI
 from .option_checks import PerChannel, checked_channels, sensor_levels, shown, weighted
 from .residuals import innovations, lag_one_sums
-from .sample_counts import SampleCounts
+from .sufficient_statistics import SampleCounts
 
 __all__ = ["AutoregressiveNoise"]
 

@@ -39,7 +39,7 @@ from .option_checks import (
     weighted,
 )
 from .response_level import events_of_parts, local_level, squared_levels
-from .sample_counts import SampleCounts, samples_per_channel
+from .sufficient_statistics import SampleCounts, samples_per_channel
 
 __all__ = ["HALF_LOG_TWO_PI", "GaussianNoise"]
 

@@ -20,7 +20,7 @@ import numpy as np
 from ..signals.channels import Channel
 from .gaussian import GaussianNoise
 from .protocol import Noise, noise_title
-from .sample_counts import SampleCounts, samples_per_channel
+from .sufficient_statistics import SampleCounts, samples_per_channel
 
 __all__ = ["MarginalNoise", "log_integral", "sampled_noise"]
 

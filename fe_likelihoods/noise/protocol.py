@@ -6,7 +6,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ..signals.channels import Channel, Measurements
-from .sample_counts import SampleCounts
+from .sufficient_statistics import SampleCounts
 
 __all__ = [
     "Noise",

@@ -19,7 +19,7 @@ import numpy as np
 from ..signals.channels import Channel
 from ..text_tables import text_table
 from ..units import find_unit
-from .sample_counts import distinct_gaps
+from .sufficient_statistics import distinct_gaps
 
 __all__ = [
     "ResidualChecks",

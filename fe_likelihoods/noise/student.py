@@ -19,7 +19,7 @@ from scipy.special import gammaln
 
 from ..signals.channels import Channel
 from .option_checks import checked_channels
-from .sample_counts import SampleCounts, samples_per_channel
+from .sufficient_statistics import SampleCounts, samples_per_channel
 
 __all__ = ["StudentNoise", "check_degrees", "each_square", "student_constant"]
 

@@ -1,12 +1,26 @@
-"""Statistics of simulation residuals: the few numbers that a likelihood needs instead of the response."""
+"""Sufficient statistics of residuals, which a likelihood needs instead of the response, and counts of samples."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from ..signals.comparison import Comparison
 
-__all__ = ["Statistic", "apply_statistic", "needs_response", "reduce_response", "statistic_width", "sums_of_squares"]
+__all__ = [
+    "SampleCounts",
+    "Statistic",
+    "apply_statistic",
+    "check_statistic",
+    "count_samples",
+    "distinct_gaps",
+    "name_of_statistic",
+    "needs_response",
+    "reduce_response",
+    "samples_per_channel",
+    "statistic_width",
+    "sums_of_squares",
+]
 
 Statistic = Callable[..., np.ndarray]
 """Function of residuals (n_channels, n_samples) that returns (n_numbers,), the sums of squares (n_channels,) first.
@@ -56,3 +70,50 @@ def reduce_response(response: np.ndarray, measured: np.ndarray | Comparison, red
             # a failed simulation: for a statistic, NaN marks a missing sample
             return np.full(statistic_width(measured, reduce), np.nan)
         return apply_statistic(reduce, residuals, np.ascontiguousarray(response))
+
+
+def name_of_statistic(statistic: Statistic | None) -> str:
+    """Text that identifies the statistic of a noise in fingerprints; empty for the sums of squares."""
+    if statistic is None:
+        return ""
+    # an object, such as `EventSums`, is represented by its repr
+    return f" {statistic.__module__}.{getattr(statistic, '__qualname__', repr(statistic))}"
+
+
+def check_statistic(statistic: Statistic | None, measured: np.ndarray | Comparison) -> None:
+    """Raise ValueError if samples are missing and the statistic of a noise has no rule for them."""
+    if statistic is None or not isinstance(measured, Comparison):
+        return
+    if not np.isfinite(apply_statistic(statistic, measured.values, measured.values)).all():
+        raise ValueError(
+            f"samples are missing, and the statistic {statistic!r} of the noise is not finite with residuals of NaN at "
+            "these samples; leave such residuals out in the statistic, or use GaussianNoise or AutoregressiveNoise"
+        )
+
+
+class SampleCounts(NamedTuple):
+    """Numbers of samples and of the distances between them, for measurements with missing samples."""
+
+    samples: np.ndarray  # (n_channels,) without missing ones
+    gaps: np.ndarray  # (n_gaps,) distinct distances between samples in all channels, ascending [steps]; 1: none missing
+    transitions: np.ndarray  # (n_gaps, n_channels), how often each distance occurs
+
+
+def count_samples(values: np.ndarray) -> int | SampleCounts:
+    """Count samples (n_channels, n_steps): the number of steps if no sample is missing (NaN), else `SampleCounts`."""
+    if not np.isnan(values).any():
+        return values.shape[1]
+    places = [np.flatnonzero(there) for there in ~np.isnan(values)]
+    gaps = distinct_gaps(places)
+    transitions = [np.bincount(np.searchsorted(gaps, np.diff(one)), minlength=len(gaps)) for one in places]
+    return SampleCounts(np.array([len(one) for one in places]), gaps, np.array(transitions, dtype=int).T)
+
+
+def distinct_gaps(places: Sequence[np.ndarray]) -> np.ndarray:
+    """The field `gaps` of `SampleCounts`, shape (n_gaps,), from the sample places in each channel."""
+    return np.flatnonzero(np.bincount(np.concatenate([np.diff(one) for one in places])))
+
+
+def samples_per_channel(n_samples: int | SampleCounts) -> int | np.ndarray:
+    """Number of samples per channel: one number for all channels, or (n_channels,) where samples are missing."""
+    return n_samples.samples if isinstance(n_samples, SampleCounts) else n_samples

@@ -197,8 +197,6 @@ class Prediction:
 
     def _score_values(self, measured: Measurements | ArrayLike, probability: float) -> QuantityScores:
         """Scores of numbers against the same numbers of measurements."""
-        if self.values is None:
-            raise ValueError("score: an average of models has no samples; score the prediction of each model")
         _check_number(len(self.values), 3, probability)
         observed = measured_quantity(self.quantity, measured) if isinstance(measured, Measurements) else measured
         observed = np.asarray(observed, dtype=float)

@@ -20,10 +20,13 @@ from .contents import (
     cost,
     data_sets,
     evidence,
+    fingerprints,
+    how_to_repeat,
     residual_sentences,
+    sampler_settings,
     summary_sentences,
+    versions,
 )
-from .origin import fingerprints, how_to_repeat, sampler_settings, versions
 from .other_events import EventPredictions, OtherEvent, as_events, describe_event
 from .pictures import (
     draw_event,

@@ -45,7 +45,7 @@ class ModelComparison(NamedTuple):
 
     @property
     def probabilities(self) -> dict[str, float]:
-        """Posterior probabilities by name, as `fe_likelihoods.average_predictions` takes them."""
+        """Posterior probabilities by name."""
         return dict(zip(self.names, self.probability.tolist(), strict=True))
 
     def table(self) -> str:

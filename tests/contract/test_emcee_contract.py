@@ -9,7 +9,8 @@ import emcee
 import numpy as np
 import pytest
 
-from samplers import SamplingWarning, SMCSampler, TemperedSampler, TMCMCSampler
+from samplers import SamplingWarning, SMCSampler, TMCMCSampler
+from samplers.tempered import TemperedSampler
 from tests.contract.targets import Gaussian
 from tests.covering import covering
 

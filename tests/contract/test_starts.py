@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from samplers import SMCSampler, TemperedSampler, TMCMCSampler
+from samplers import SMCSampler, TMCMCSampler
 from samplers.evaluation import user_target
+from samplers.tempered import TemperedSampler
 from tests.contract.targets import Gaussian
 
 N = 60

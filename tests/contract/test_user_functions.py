@@ -4,7 +4,8 @@ import emcee
 import numpy as np
 import pytest
 
-from samplers import SamplingWarning, SMCSampler, TemperedSampler, TMCMCSampler
+from samplers import SamplingWarning, SMCSampler, TMCMCSampler
+from samplers.tempered import TemperedSampler
 from tests.contract.targets import Box, Gaussian, WithBlobs
 from tests.covering import covering
 from tests.faults.resumable_run import InOrder

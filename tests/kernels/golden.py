@@ -15,7 +15,7 @@ import numpy as np
 
 from fe_likelihoods.kernels import bar_fatigue, concrete04, fiber_section, frame, reinforcing_steel
 from fe_likelihoods.kernels.jit import kernel
-from fe_likelihoods.models.rc_column_materials import gauss_lobatto
+from fe_likelihoods.models.rc_column_section import gauss_lobatto
 
 BUNDLED = Path(__file__).parent / "data"
 

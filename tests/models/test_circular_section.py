@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import RCColumn, Record, to_si
-from fe_likelihoods.models.rc_column_materials import bar_circle, circular_strips, gauss_lobatto
+from fe_likelihoods.models.rc_column_section import bar_circle, circular_strips, gauss_lobatto
 
 INCH, KSI = to_si(1.0, "in").item(), to_si(1.0, "ksi").item()
 RADIUS, CORE_RADIUS = 24.0, 43.375 / 2  # of the tested column [in]

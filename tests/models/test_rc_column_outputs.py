@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import ColumnAnalysis, DisplacementHistory, RCColumn, material_curves
-from fe_likelihoods.models.rc_column_materials import gauss_lobatto
 from fe_likelihoods.models.rc_column_outputs import Sections, parse_outputs
+from fe_likelihoods.models.rc_column_section import gauss_lobatto
 from fe_likelihoods.problems import bridge_column, bridge_column_data
 from fe_likelihoods.units import G0
 

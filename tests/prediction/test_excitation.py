@@ -12,7 +12,6 @@ from fe_likelihoods import (
     LinearStructure,
     Record,
     ShearFrame,
-    average_predictions,
     peak,
     propagate,
 )
@@ -57,8 +56,6 @@ def test_state_is_carried_through_or_not(record):
     settings = {"record": stronger, "from_state": "end", "rest": 1.0, "progress": False}
     peaks = propagate(model, samples, quantity=peak("slip"), **settings)
     np.testing.assert_allclose(peaks.values, [each.max() for each in expected])
-    with pytest.raises(ValueError, match="channels, step, shape, noise, state"):
-        average_predictions({"a": end, "b": virgin}, {"a": 0.5, "b": 0.5})
 
 
 def test_the_default_is_named_in_a_warning_at_the_line_of_the_user_where_it_matters(record):

@@ -1,19 +1,16 @@
 """Uncertainty propagation: closed forms, batches against direct computation, failing models."""
 
 import logging
-from dataclasses import replace
 from multiprocessing.pool import ThreadPool
 
 import numpy as np
 import pytest
 from scipy import stats
 
-from fe_likelihoods.checks.finding import CARE, Finding
 from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.likelihood.posterior import Posterior
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.prediction import accumulator
-from fe_likelihoods.prediction.averaging import average_predictions
 from fe_likelihoods.prediction.propagation import propagate
 from fe_likelihoods.prediction.quantities import ChannelQuantity, peak
 from fe_likelihoods.priors.distributions import HalfNormal, TruncatedNormal
@@ -248,27 +245,6 @@ def test_effective_sample_size_widens_the_errors(rng):
     samples = draws(rng, 400)
     full, quarter = quiet(Line(), samples), quiet(Line(), samples, effective_sample_size=100)
     assert np.allclose(quarter.standard_error, 2.0 * full.standard_error)
-
-
-def test_average_of_two_models_is_their_mixture(rng):
-    first, second = draws(rng, 800), draws(rng, 1200) + [0.3, 0.0]
-    predictions = {"one": quiet(Line(), first), "two": quiet(Line(), second)}
-    average = average_predictions(predictions, {"two": 0.6, "one": 0.4})
-    mixture = quiet(Line(), np.vstack([first, second]))  # 800 : 1200
-    assert np.allclose(average.mean, mixture.mean) and np.allclose(average.variance, mixture.variance)
-    found = tuple(Finding(text, CARE, "Why.") for text in ("Far away", "Few samples"))
-    named = {"one": replace(predictions["one"], findings=found[:1]), "two": replace(predictions["two"], findings=found)}
-    assert average_predictions(named, {"two": 0.6, "one": 0.4}).findings == found  # of each model, once
-    errors = np.stack([p.standard_error for p in predictions.values()])
-    assert np.allclose(average.standard_error, np.hypot(0.4 * errors[0], 0.6 * errors[1]))
-    other = predictions | {"two": quiet(Line(), second, quantity="a")}
-    for given, weights, message in (
-        (predictions, {"one": 0.4, "two": 0.4}, "sum to one"),
-        (predictions, {"one": 0.4, "three": 0.6}, "expected one probability for each"),
-        (other, {"one": 0.4, "two": 0.6}, "one quantity"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            average_predictions(given, weights)
 
 
 @pytest.mark.parametrize(

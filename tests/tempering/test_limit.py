@@ -8,7 +8,8 @@ import emcee
 import numpy as np
 import pytest
 
-from samplers import SMCSampler, TMCMCSampler, Verdict
+from samplers import SMCSampler, TMCMCSampler
+from samplers.judgement.verdict import Verdict
 from tests.contract.targets import Gaussian
 from tests.covering import covering
 from tests.tempering.guides import LearningGuide, SearchingGuide
