@@ -4,7 +4,7 @@ The statistics of a simulation depend neither on the noise parameters nor on the
 noise level, every tempering stage and every sampler. Its key is a digest of the declared identity (fingerprints of
 model and measurements), the generation, and the structural parameters to the last bit. Responses and failures of the
 model have keys of the model alone, for any measurements. Faults of the infrastructure
-(`fe_likelihoods.simulation.faults`), also of a time limit, are not stored.
+(`fe_likelihoods.simulation.failure_reasons`), also of a time limit, are not stored.
 
 A cache never makes a run fail. A row that does not match its checksum is simulated again, a damaged file is moved
 aside, and while the file cannot be written, rows wait in memory.
@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..simulation.faults import MisfitReason, TransientReason
+from ..simulation.failure_reasons import MisfitReason, TransientReason
 from .file import CacheFile, transaction
 
 __all__ = [

@@ -36,7 +36,7 @@ import numpy as np
 
 from ..noise.sufficient_statistics import Statistic, needs_response, statistic_width
 from ..signals.comparison import Comparison
-from ..simulation.faults import ChangedModel, TransientReason
+from ..simulation.failure_reasons import ChangedModel, TransientReason
 from ..simulation.files import digests_by_name, observing, read_again
 from ..simulation.label import ModelLabel
 from ..simulation.model import Model, SimulationBatch, misfit_of_responses, most_responses, simulate_batch

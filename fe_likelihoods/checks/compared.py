@@ -18,7 +18,7 @@ from ..noise.residuals import ResidualChecks, residual_checks
 from ..signals.channels import Channel, Measurements
 from ..signals.comparison import relative_errors
 from ..signals.events import find_events
-from ..simulation.faults import ChangedModel
+from ..simulation.failure_reasons import ChangedModel
 from ..simulation.model import SimulationFailed
 from ..text_tables import listed
 from .faults import FEWEST_DRAWS

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..simulation.faults import TransientReason
+from ..simulation.failure_reasons import TransientReason
 
 __all__ = ["FailureLog", "reason_without_numbers"]
 

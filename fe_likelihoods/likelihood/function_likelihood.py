@@ -8,7 +8,7 @@ import numpy as np
 from samplers.interrupts import raise_if_it_ends_the_run
 
 from ..priors.points import as_points
-from ..simulation.faults import reason_of
+from ..simulation.failure_reasons import reason_of
 from ..simulation.label import items_of
 from .failure_log import FailureLog
 from .parameters import Parameter, parameter_of

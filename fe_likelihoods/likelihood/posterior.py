@@ -18,7 +18,7 @@ import numpy as np
 from ..priors.distributions import Distribution, RandomState
 from ..priors.points import as_points, complete_repr
 from ..priors.priors import Prior
-from ..simulation.faults import TransientReason
+from ..simulation.failure_reasons import TransientReason
 from ..simulation.model import has_jacobian
 from .gradient import likelihood_gradient, slopes_along
 from .in_threads import InThreads

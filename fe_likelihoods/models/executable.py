@@ -19,7 +19,7 @@ import numpy as np
 
 from ..signals.channels import Channel
 from ..signals.records import Record
-from ..simulation.faults import SimulationFailed, TransientReason, reason_of
+from ..simulation.failure_reasons import SimulationFailed, TransientReason, reason_of
 from ..simulation.files import Group
 from ..simulation.worker import describe_exit, run_program
 from ..units import find_unit

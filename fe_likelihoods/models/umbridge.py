@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..signals.channels import Channel
-from ..simulation.faults import ChangedModel, TransientReason, UnusableModel, reason_of
+from ..simulation.failure_reasons import ChangedModel, TransientReason, UnusableModel, reason_of
 from ..simulation.model import SimulationFailed, simulate_batch
 from .user_model import ExternalModel
 from .validation import check_integer, check_number, positive_float

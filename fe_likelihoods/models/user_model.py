@@ -24,7 +24,7 @@ from ..signals.channels import Channel
 from ..signals.records import Record
 from ..signals.sampling import rest_samples
 from ..simulation.by_value import is_arriving
-from ..simulation.faults import ChangedModel, reason_of
+from ..simulation.failure_reasons import ChangedModel, reason_of
 from ..simulation.files import file_digest
 from ..simulation.label import value_digest
 from ..simulation.model import SimulationFailed, real_response
@@ -92,10 +92,10 @@ class ExternalModel(StructuralModel):
         """Response [SI] (n_channels, n_steps) for one set of parameters (n_parameters,), of which the code gets a copy.
 
         Raises SimulationFailed if the external code raises an exception, or its response has a wrong shape, is complex
-        or is not finite; the reason is a `TransientReason` if the cause is not the model
-        (see `fe_likelihoods.simulation.faults`). Raises ValueError if `theta` has another shape. KeyboardInterrupt and
-        SystemExit of the code in this process, even as the cause of another exception, are no failed simulation: they
-        end the run.
+        or is not finite; the reason is a `TransientReason` if the cause is not the model (see
+        `fe_likelihoods.simulation.failure_reasons`). Raises ValueError if `theta` has another shape. KeyboardInterrupt
+        and SystemExit of the code in this process, even as the cause of another exception, are no failed simulation:
+        they end the run.
         """
         theta = check_theta(theta, self.parameter_names).copy()
         before = sys.exception()

@@ -13,7 +13,7 @@ from ..cache.verification import StaleCache
 from ..checks.model import relative_difference
 from ..likelihood.joint import JointLikelihood
 from ..signals.events import find_events, motions_of
-from ..simulation.faults import ChangedModel
+from ..simulation.failure_reasons import ChangedModel
 from .model_and_samples import PredictionSource
 from .quantities import ChannelQuantity, MeanOfLast
 

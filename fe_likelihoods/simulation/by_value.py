@@ -32,7 +32,7 @@ from cloudpickle.cloudpickle import _dynamic_class_reduce
 
 from samplers.interrupts import become_worker, is_worker, process_name
 
-from .faults import ChangedModel
+from .failure_reasons import ChangedModel
 
 __all__ = [
     "LIBRARY",

@@ -35,7 +35,7 @@ from samplers.evaluation.pools import submit_all, workers_of
 from samplers.interrupts import Ended, SentFunction
 
 from .by_value import Pickled
-from .faults import TransientReason
+from .failure_reasons import TransientReason
 from .worker import Died, Worker
 
 __all__ = ["Job", "LocalPool", "PoolExecutor", "Submitting", "Threads", "as_executor", "result_of"]

@@ -35,7 +35,7 @@ from typing import Any
 
 from samplers.interrupts import process_name
 
-from .faults import SimulationFailed, TransientReason, UnusableModel
+from .failure_reasons import SimulationFailed, TransientReason, UnusableModel
 
 __all__ = [
     "Group",

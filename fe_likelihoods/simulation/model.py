@@ -26,7 +26,7 @@ from samplers.interrupts import (
 from ..noise.sufficient_statistics import Statistic, reduce_response, statistic_width, sums_of_squares
 from ..signals.channels import Channel
 from ..signals.comparison import Comparison
-from .faults import MisfitReason, SimulationFailed, is_transient, reason_of, shortened
+from .failure_reasons import MisfitReason, SimulationFailed, is_transient, reason_of, shortened
 from .files import Observed, Opened, note, working_folder
 
 __all__ = [

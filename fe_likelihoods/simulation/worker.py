@@ -26,7 +26,7 @@ from typing import Any
 from samplers.interrupts import become_worker
 
 from .by_value import CannotLoad, Pickled, load, without_addresses
-from .faults import SimulationFailed, TransientReason, is_transient
+from .failure_reasons import SimulationFailed, TransientReason, is_transient
 from .files import Group, given_places, kill_group, of_this_library, working_folder
 
 __all__ = ["Died", "Sandbox", "Worker", "describe_exit", "run_program", "serve"]

@@ -11,7 +11,7 @@ import pytest
 
 from fe_likelihoods import Channel, ExecutableModel, FELikelihood, FunctionModel, Measurements, SimulationCache
 from fe_likelihoods.cache.verification import StaleCache
-from fe_likelihoods.simulation.faults import ChangedModel
+from fe_likelihoods.simulation.failure_reasons import ChangedModel
 from tests.covering import covering
 
 CHANNELS = (Channel("u", "displacement", "m"),)

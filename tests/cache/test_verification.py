@@ -13,7 +13,7 @@ import pytest
 from fe_likelihoods import AutoregressiveNoise, FELikelihood, Measurements, SimulationCache
 from fe_likelihoods.cache import verification
 from fe_likelihoods.cache.verification import StaleCache
-from fe_likelihoods.simulation.faults import ChangedModel, TransientReason
+from fe_likelihoods.simulation.failure_reasons import ChangedModel, TransientReason
 from fe_likelihoods.simulation.model import SimulationFailed
 from samplers import SMCSampler
 from tests.faults.treacherous import CHANNELS, DT, N_STEPS, Hidden, Treacherous, line

@@ -54,7 +54,7 @@ def ours():
     """Our server of a posterior and of a model that fails for several reasons."""
     from fe_likelihoods import Channel, FunctionModel, SimulationFailed
     from fe_likelihoods.adapters import serve
-    from fe_likelihoods.simulation.faults import TransientReason
+    from fe_likelihoods.simulation.failure_reasons import TransientReason
 
     from .problem import make_posterior
 

@@ -10,7 +10,7 @@ import pytest
 
 from fe_likelihoods import Channel, FELikelihood, FunctionModel, HalfNormal, Measurements, Posterior, Uniform
 from fe_likelihoods.problems import bridge_column
-from fe_likelihoods.simulation.faults import ChangedModel
+from fe_likelihoods.simulation.failure_reasons import ChangedModel
 from tests.covering import covering
 
 from .problem import make_posterior, starts_of

@@ -25,7 +25,7 @@ from fe_likelihoods import (
     UMBridgeModel,
 )
 from fe_likelihoods.adapters import serve
-from fe_likelihoods.simulation.faults import TransientReason, UnusableModel
+from fe_likelihoods.simulation.failure_reasons import TransientReason, UnusableModel
 from samplers import SMCSampler
 
 from .problem import CRITICAL, make_posterior, starts_of

@@ -10,7 +10,7 @@ import pytest
 
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.simulation.executors import LocalPool
-from fe_likelihoods.simulation.faults import MisfitReason, TransientReason
+from fe_likelihoods.simulation.failure_reasons import MisfitReason, TransientReason
 from fe_likelihoods.simulation.model import SimulationFailed, simulate_batch
 from tests.faults.treacherous import CHANNELS, DT, N_STEPS, Treacherous, line
 

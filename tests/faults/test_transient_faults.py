@@ -20,7 +20,7 @@ from fe_likelihoods import (
     SimulationCache,
     SimulationFailed,
 )
-from fe_likelihoods.simulation.faults import TransientReason
+from fe_likelihoods.simulation.failure_reasons import TransientReason
 from fe_likelihoods.simulation.model import misfit_of_responses, sent_simulation, simulate_batch
 from samplers import SMCSampler
 from tests.cache.stored import store_outcomes, stored_outcomes

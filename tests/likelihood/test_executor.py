@@ -21,7 +21,7 @@ from fe_likelihoods.priors.distributions import HalfNormal, Uniform
 from fe_likelihoods.signals.channels import Measurements
 from fe_likelihoods.signals.records import Record
 from fe_likelihoods.simulation.executors import LocalPool
-from fe_likelihoods.simulation.faults import ChangedModel
+from fe_likelihoods.simulation.failure_reasons import ChangedModel
 from tests.cache.stored import look_up
 from tests.faults.treacherous import Gated, Treacherous, posterior_of
 

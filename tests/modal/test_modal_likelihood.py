@@ -207,7 +207,7 @@ def test_frequencies_alone_are_paired_by_number():
         (lambda data: ModalLikelihood(FRAME, data, shape_error=0.02), "numbers in the mapping of priors"),
         (lambda data: ModalLikelihood(FRAME, data).predict_modes(np.ones((1, 3))), "shape"),
         (
-            lambda data: ModalLikelihood(LinearStructure(FRAME, Record("m", 0.1, np.ones(5))).parts, data).first(1),
+            lambda data: ModalLikelihood(LinearStructure(FRAME, Record("m", 0.1, np.ones(5))).structure, data).first(1),
             "cannot be shortened",
         ),
     ],

@@ -56,7 +56,7 @@ def test_modes_that_are_left_out_move_with_the_base(record, modes):
     every = LinearStructure(ModalModel(["middle", "roof"], N), record)
     theta = np.concatenate([stiff, [0.02] * 2, [0.7] * 4, shapes.ravel()])
     close(two.simulate(kept)[:, 5:], every.simulate(theta)[:, 5:], 1e-3)
-    assert two.parts.assemble(kept).direct[:, 0] == pytest.approx(1.0 - shapes[:, :2].sum(axis=1))
+    assert two.structure.assemble(kept).direct[:, 0] == pytest.approx(1.0 - shapes[:, :2].sum(axis=1))
 
 
 def test_groups_are_the_frame_with_equal_factors(record):

@@ -13,7 +13,7 @@ from fe_likelihoods import FunctionModel
 from fe_likelihoods.simulation import by_value
 from fe_likelihoods.simulation.by_value import Pickled, load
 from fe_likelihoods.simulation.executors import LocalPool, as_executor
-from fe_likelihoods.simulation.faults import ChangedModel
+from fe_likelihoods.simulation.failure_reasons import ChangedModel
 from fe_likelihoods.simulation.label import ModelLabel
 from fe_likelihoods.simulation.worker import Sandbox
 from tests.faults.treacherous import CHANNELS, DT, N_STEPS, Treacherous, line

@@ -18,7 +18,7 @@ import pytest
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.signals.channels import Channel
 from fe_likelihoods.simulation.executors import LocalPool, as_executor
-from fe_likelihoods.simulation.faults import UnusableModel
+from fe_likelihoods.simulation.failure_reasons import UnusableModel
 from fe_likelihoods.simulation.files import Observed
 from fe_likelihoods.simulation.model import simulate_batch
 from tests.opensees_column import require_opensees
