@@ -76,7 +76,7 @@ class EmulatedPosterior:
             steps = 0.5 * (moved[: target.ndim] - moved[target.ndim :])
             centre = target.scaled(region.centre[None])[0]
             scaled.append(region._replace(centre=centre, covariance=steps.T @ steps))
-        given, own = self.regions, 1.0 - sum(share for _, share in wide)
+        own = 1.0 - sum(share for _, share in wide)
 
         def mixture(regions: Sequence[Region]) -> Mixture:
             shares = normalised_weights(np.array([region.log_evidence for region in regions]))
@@ -86,8 +86,7 @@ class EmulatedPosterior:
 
         for _ in range(_ROUNDS):
             points, coords, log_weights = self._propose([(mixture(scaled), own), *wide], _DRAWS, random)
-            self.regions = scaled
-            scaled, self.regions = self._moments(points, coords, log_weights, 1.5), given
+            scaled = self._moments(scaled, points, coords, log_weights, 1.5)
             if effective_sample_size(log_weights) > _SETTLED * _DRAWS:
                 break
         parts = [(mixture(scaled), own), *wide]
@@ -108,7 +107,7 @@ class EmulatedPosterior:
         if not np.any(log_weights > -np.inf):
             raise np.linalg.LinAlgError("the emulated posterior has no density")
         self._pool[log_weights == -np.inf] = 0.0  # outside the support of the prior, coordinates are infinite
-        self.regions = self._moments(self._pool, self._pool, log_weights, 0.0)
+        self.regions = self._moments(self.regions, self._pool, self._pool, log_weights, 0.0)
         self._weights = normalised_weights(log_weights)
         self.log_evidence, self.effective_share = log_mean_weight(log_weights), effective / size
         self.log_evidence_error = float(np.sqrt(max(1.0 / effective - 1.0 / size, 0.0)))
@@ -140,10 +139,12 @@ class EmulatedPosterior:
         """Draws (n, ndim) of the emulated posterior that are practically independent."""
         return self._pool[random.choice(len(self._pool), n, p=self._weights)]
 
-    def _moments(self, points: np.ndarray, coords: np.ndarray, log_weights: np.ndarray, least: float) -> list[Region]:
-        """The regions with the moments of weighted points (n, ndim), at coordinates, where these suffice."""
+    def _moments(
+        self, regions: Sequence[Region], points: np.ndarray, coords: np.ndarray, log_weights: np.ndarray, least: float
+    ) -> list[Region]:
+        """Regions with the moments of weighted points (n, ndim), at coordinates, where these suffice."""
         enough, nearest, updated = _ENOUGH_PER_DIMENSION * self._target.ndim, self._nearest(coords), []
-        for k, region in enumerate(self.regions):
+        for k, region in enumerate(regions):
             rows = (nearest == k) & (log_weights > -np.inf)
             if rows.any():
                 evidence = np.logaddexp.reduce(log_weights[rows]) - np.log(len(points))

@@ -64,7 +64,6 @@ def plot_corner(
     *,
     truths: Values | None = None,
     names: Sequence[str] | None = None,
-    title: str = "",
 ) -> "Figure":
     """Plot the posterior for all pairs of parameters by `corner.corner`, with the prior on the diagonal.
 
@@ -83,8 +82,6 @@ def plot_corner(
         nominal value if that is near.
     names : sequence of str, optional
         Names of the parameters to draw. Default: all, or the first 12; the figure says how many are left out.
-    title : str
-        Title of the figure.
 
     Returns
     -------
@@ -126,14 +123,12 @@ def plot_corner(
     for i, axes in enumerate(np.array(figure.axes).reshape(k, k).diagonal()):
         _finish_panel(axes, drawn, i)
     note = f"points: fewer than {FEW_POINTS} samples" if few else "contours hold 50 and 90 % of the samples"
-    title = "\n".join(text for text in (title, note, drawn.note) if text)
-    figure.legend(handles=_legend_handles(drawn), loc="upper right", title=title, frameon=False)
+    note += f"\n{drawn.note}" if drawn.note else ""
+    figure.legend(handles=_legend_handles(drawn), loc="upper right", title=note, frameon=False)
     return figure
 
 
-def plot_marginals(
-    samples: np.ndarray, posterior: Any = None, *, truths: Values | None = None, title: str = ""
-) -> "Figure":
+def plot_marginals(samples: np.ndarray, posterior: Any = None, *, truths: Values | None = None) -> "Figure":
     """Plot the prior and posterior density of each parameter, which shows what the data have changed.
 
     A panel shows the prior, but is at most 2.5 times as wide as the range of the samples. If the prior is wider, the
@@ -169,8 +164,6 @@ def plot_marginals(
         axes.xaxis.set_major_locator(plt.MaxNLocator(4))
         axes.ticklabel_format(useOffset=False)
     figure.legend(handles=_legend_handles(drawn), loc="outside lower center", ncols=4, fontsize=9, frameon=False)
-    if title:
-        figure.suptitle(title, fontsize=11)
     return figure
 
 
