@@ -9,9 +9,10 @@ from scipy.special import chdtrc
 from ..noise.residuals import ResidualChecks
 from ..priors.between_events import spread_of
 from ..signals.channels import Channel
+from ..signals.comparison import relative_errors
 from ..text_tables import listed
 from .compared import MOST_DRAWS, Fit, checks_of
-from .faults import find_faults, finding_of, supports_apart
+from .faults import EXPLAINED, find_faults, finding_of, supports_apart
 from .finding import CARE, CORRELATED, HALF, NOTE, SMALL_PROBABILITY, WRONG, Finding, percent
 from .modal import check_modes, squares_of_modes
 from .model import LARGE_SHIFT, motions_to_replace
@@ -37,7 +38,8 @@ def check_responses(fits: Iterable[Fit]) -> list[Finding]:
             severity = WRONG if fault.where or len(fit.draws) >= HALF * MOST_DRAWS else CARE
             found.append(finding_of(fault, fit.title, channels, severity))
         found += _check_offset(fit)
-    return found + (_check_errors(others) if all(each.severity != WRONG for each in found) else [])
+    named = any(each.severity == WRONG for each in found)
+    return found if named else [*found, *_check_errors(others), *_check_prior(others)]
 
 
 def check_supports(model: Any) -> list[Finding]:
@@ -82,6 +84,21 @@ def _check_errors(fits: Iterable[Fit]) -> list[Finding]:
     action = "Check column, unit, sign, clock and place of the sensor; if all are right, the model lacks what moves it."
     kind = "The model does not follow the measurements"
     return [Finding(kind, WRONG, text, action, useless, "fit")] if useless else []
+
+
+def _check_prior(fits: Iterable[Fit]) -> list[Finding]:
+    """Channels that not even the best draw of the prior explains, before a run."""
+    far = dict[str, float]()
+    for fit in (each for each in fits if each.after is None and len(each.draws)):
+        measured = fit.measurements.values
+        errors = np.nan_to_num(relative_errors(measured - fit.draws, measured))
+        best = errors[np.log(np.maximum(errors, 1e-3)).sum(axis=1).argmin()]
+        sizes = zip(fit.measurements.channels, best.tolist(), strict=True)
+        far |= {fit.where(channel.name): size for channel, size in sizes if size > EXPLAINED}
+    shown = listed([f"{percent(size)} in {name}" for name, size in far.items()])
+    text = f"No draw of the prior comes near the measurements; the best one has an error (RRMSE) of {shown}."
+    action = "Check model and priors, units of a model of your own (SI), and `zero`, at which the base motion begins."
+    return [Finding("The prior does not reach the measurements", CARE, text, action, far, "fit")] if far else []
 
 
 def check_other_events(rows: Sequence[ParameterRow]) -> list[Finding]:
