@@ -1,5 +1,6 @@
 """What the command ``check`` does: read everything, simulate a few times, draw the picture."""
 
+import shlex
 from collections.abc import Callable
 from contextlib import suppress
 from datetime import datetime, timedelta
@@ -36,7 +37,7 @@ def check_job(file: Path, picture: Path, say: Callable[[str], None]) -> None:
         say(f"The run stops at {most} simulations (max_simulations)")
     names = ", ".join(map(str, _draw(problem, checked, picture)))
     say(f"{names}: the measurements should lie within the band of the simulations at draws of the prior")
-    say(f"Next: fe-likelihoods run {file} (writes to {default_folder(file)}/)")
+    say(f"Next: fe-likelihoods run {shlex.quote(str(file))} (writes to {default_folder(file)}/)")
 
 
 def _say_data(problem: Problem, say: Callable[[str], None]) -> None:

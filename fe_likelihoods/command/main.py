@@ -142,9 +142,8 @@ def write_templates(kind: str, folder: Path) -> tuple[str, ...]:
 @click.argument("folder", type=_FILE)
 def new(kind: str, folder: Path) -> None:
     """Write a commented TOML file of KIND to FOLDER to start from; it runs as it is, with synthetic data."""
-    files = write_templates(kind, folder)
-    click.echo(f"Written to {folder}/: {', '.join(files)}. The data are SYNTHETIC.")
-    click.echo(f"Next: fe-likelihoods check {folder / kind}.toml")
+    click.echo(f"Written to {folder}/: {', '.join(write_templates(kind, folder))}. The data are SYNTHETIC.")
+    click.echo(f"Next: fe-likelihoods check {shlex.quote(f'{folder / kind}.toml')}")
 
 
 @main.command()

@@ -74,7 +74,7 @@ def _integrate(column, dynamics, ground, dt, every, iteration, history, out):
     history[1, 0] = a[top] + ground[0]
     history[2, 0] = u[top + 1]
     record_forces(column, force, history[3:, 0])
-    record(column, u, v, a, n - n, out)  # no literal, for which it would be compiled again
+    record(column, u, v, a, 0, out)
     smallest = 0.5**halvings
     retries = 0
 

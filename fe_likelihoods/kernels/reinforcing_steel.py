@@ -286,11 +286,10 @@ def _step(x, tension, state, c):
 @kernel(inline=True)
 def transition(x, state, c):
     """Make one transition of any branch at the natural strain `x`; arguments and results as for `_step`."""
-    tension = int(state[BRANCH]) % 2 == 1  # no literal, for which `_step` would be compiled again
-    if tension:
-        return _step(x, tension, state, c)
+    if int(state[BRANCH]) % 2 == 1:
+        return _step(x, True, state, c)
     _mirror(state)
-    done, s, modulus = _step(-x, tension, state, c)
+    done, s, modulus = _step(-x, False, state, c)
     _mirror(state)
     return done, -s, modulus
 

@@ -169,8 +169,7 @@ def lower(column, position, load, imposed, iteration):
         if downwards * position.force[vertical] >= downwards * load[vertical]:
             if count == 0:
                 return False
-            none = min(imposed, -1)
-            return equilibrate(column, position, load, imposed, 0.0, none, tolerance, max_iterations) < tolerance
+            return equilibrate(column, position, load, imposed, 0.0, -1, tolerance, max_iterations) < tolerance
     return False
 
 
@@ -185,7 +184,6 @@ def _static_steps(column, total, share, imposed, targets, iteration, history, ou
         initialise_column(column)
     load, u, force = column.vectors[3], column.vectors[4], column.vectors[5]
     position = Position(u, force, column.matrices[2])
-    none = min(imposed, -1)  # no literal, for which `equilibrate` would be compiled again
     smallest, max_iterations = 0.5**iteration.halvings, iteration.max_iterations
     retries, lowerings = 0, 0
     for step in range(targets.shape[0]):
@@ -196,12 +194,12 @@ def _static_steps(column, total, share, imposed, targets, iteration, history, ou
                 load[i] += part * share * total[i]
             move = part * increment
             tolerance = iteration.tolerance
-            reached = equilibrate(column, position, load, imposed, move, none, tolerance, max_iterations)
+            reached = equilibrate(column, position, load, imposed, move, -1, tolerance, max_iterations)
             if reached >= tolerance:
                 retries += 1
                 tolerance *= LOOSENING
                 if reached < tolerance:
-                    reached = equilibrate(column, position, load, imposed, move, none, tolerance, max_iterations)
+                    reached = equilibrate(column, position, load, imposed, move, -1, tolerance, max_iterations)
             if reached < tolerance:
                 done += part
                 continue
