@@ -72,18 +72,28 @@ def _check_offset(fit: Fit) -> list[Finding]:
 
 
 def _check_errors(fits: Iterable[Fit]) -> list[Finding]:
-    """Channels that the fit does not explain; white and normal noise is no fault."""
-    useless = dict[str, float]()
-    for fit in (each for each in fits if each.after is not None):
-        for each, residuals in zip(fit.channels, fit.residuals, strict=True):
-            checks = checks_of(residuals) if each.after**2 > HALF else None
+    """Channels that the fit does not explain, and before a run or among these, those that no draw of the prior does."""
+    useless, far = dict[str, float](), dict[str, float]()
+    for fit in fits:
+        errors = relative_errors(fit.measurements.values - fit.draws, fit.measurements.values)
+        for row, each in enumerate(fit.channels):
+            name = fit.where(each.channel.name)
+            checks = checks_of(fit.residuals[row]) if each.after**2 > HALF else None
             if checks is not None and min(checks.white[0], checks.normal[0]) < SMALL_PROBABILITY:
-                useless[fit.where(each.channel.name)] = each.after
-    shown = listed([f"{percent(size)} in {name}" for name, size in useless.items()])
+                useless[name] = each.after  # white and normal noise is no fault
+            if (fit.after is None or name in useless) and len(errors) and errors[:, row].min() > EXPLAINED:
+                far[name] = float(errors[:, row].min())
+    nearest, shown = (listed([f"{percent(size)} in {name}" for name, size in each.items()]) for each in (far, useless))
+    text = f"No draw of the prior comes near the measurements: the smallest error (RRMSE) is {nearest}."
+    action = (
+        "Check priors and model, the units of a model of your own (SI), and `zero`, at which the base motion begins."
+    )
+    kind = "The prior does not reach the measurements"
+    found = [Finding(kind, CARE, text, action, far, "input")] if far else []
     text = f"The update leaves more than half of the power unexplained: the error (RRMSE) is {shown}; 71 % is half."
     action = "Check column, unit, sign, clock and place of the sensor; if all are right, the model lacks what moves it."
     kind = "The model does not follow the measurements"
-    return [Finding(kind, WRONG, text, action, useless, "fit")] if useless else []
+    return found + ([Finding(kind, WRONG, text, action, useless, "fit")] if useless else [])
 
 
 def _check_prior(fits: Iterable[Fit]) -> list[Finding]:

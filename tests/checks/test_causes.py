@@ -60,7 +60,7 @@ FAULTS = {
     "spikes": ({"A channel has spikes"}, with_output(with_spikes)),
     "offset": ({"A channel has an offset"}, with_output(lambda y: y + 1.0 * np.abs(y).max())),
     "unit of all": ({"A unit may be wrong"}, lambda y: 1e3 * y),
-    "other motion": ({"The model does not follow the measurements"}, lambda y: y[:, ::-1]),
+    "other motion": ({"The prior does not reach the measurements"}, lambda y: y[:, ::-1]),
 }
 
 
