@@ -15,12 +15,13 @@ from .compared import MOST_DRAWS, Fit, checks_of
 from .faults import EXPLAINED, find_faults, finding_of, supports_apart
 from .finding import CARE, CORRELATED, HALF, NOTE, SMALL_PROBABILITY, WRONG, Finding, percent
 from .modal import check_modes, squares_of_modes
-from .model import LARGE_SHIFT, motions_to_replace
+from .model import motions_to_replace
 from .run import ParameterRow
 
 __all__ = ["check_other_events", "check_residuals", "check_responses", "check_stated_errors", "check_supports"]
 
 FEWEST = 10  # samples that the tests of correlation and distribution need
+FAR = 5.0  # mean square of residuals, relative to the stated one, from which on a result is not used
 
 
 def check_responses(fits: Iterable[Fit]) -> list[Finding]:
@@ -89,7 +90,7 @@ def _check_errors(fits: Iterable[Fit]) -> list[Finding]:
         "Check priors and model, the units of a model of your own (SI), and `zero`, at which the base motion begins."
     )
     kind = "The prior does not reach the measurements"
-    found = [Finding(kind, CARE, text, action, far, "input")] if far else []
+    found = [Finding(kind, WRONG if useless else CARE, text, action, far, "fit")] if far else []
     text = f"The update leaves more than half of the power unexplained: the error (RRMSE) is {shown}; 71 % is half."
     action = "Check column, unit, sign, clock and place of the sensor; if all are right, the model lacks what moves it."
     kind = "The model does not follow the measurements"
@@ -151,7 +152,7 @@ def check_stated_errors(fits: Iterable[Fit]) -> list[Finding]:
         text = f"{what} differ from the model by {factor:.2g} times their stated errors (root mean square)."
         largest = listed(sorted(squares, key=squares.__getitem__)[:-3:-1])
         action = f"The largest: {largest}. Look for a wrong number, sensor or place; else let the errors be unknown."
-        severity = WRONG if factor > np.hypot(1.0, LARGE_SHIFT) else CARE  # a mean square five times as stated
+        severity = WRONG if factor**2 > FAR else CARE
         kind = "Values differ more than their stated errors"
         found.append(Finding(kind, severity, text, action, {"factor": factor}, "fit"))
     return found
