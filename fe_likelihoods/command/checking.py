@@ -11,7 +11,7 @@ from ..checks.faults import FAULTS
 from ..checks.finding import labelled
 from ..checks.result import ModelCheck, check_model
 from ..signals.comparison import rrmse
-from ..text_tables import text_table
+from ..text_tables import number, text_table
 from .describe_files import describe
 from .job import Job, read_job
 from .models import Problem, make_problem
@@ -41,16 +41,19 @@ def check_job(file: Path, picture: Path, say: Callable[[str], None]) -> None:
 
 
 def _say_data(problem: Problem, say: Callable[[str], None]) -> None:
-    posterior, record = problem.posterior, problem.record
+    posterior, record, levels = problem.posterior, problem.record, dict[str, float]()
     if record is not None:
         say(f"Record: {record}" + (f"\n  from {record.source}" if record.source else ""))
     for part, _ in posterior.likelihood.data_sets():
         say("Measurements:\n" + (str(part.model.data) if part.is_modal else "\n".join(describe(part.measurements))))
-    rows = [("parameter", "prior mean", "standard deviation", "")]
+        rms = () if part.is_modal else part.measurements.root_mean_squares
+        levels |= {f"sigma_{each.name}": level for each, level in zip(part.measurements.channels, rms, strict=False)}
+    rows = [("parameter", "prior mean", "standard deviation", "measured RMS", "")]
     for parameter in posterior.parameters:
         mean, sd = (parameter.shown(value) for value in posterior.prior.distributions[parameter.name].moments)
         note = "assumed: not in the file" if parameter.name in problem.assumed else ""
-        rows.append((parameter.label, f"{mean:.3g}", f"{sd:.3g}", note))
+        level = number(parameter.shown(levels[parameter.name])) if parameter.name in levels else ""
+        rows.append((parameter.label, f"{mean:.3g}", f"{sd:.3g}", level, note))
     say(text_table(rows))
 
 

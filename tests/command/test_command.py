@@ -222,6 +222,7 @@ def test_check_says_what_was_read(folder, monkeypatch):
     assert len(simulated) - len(set(simulated)) <= 3
     assert "Record: base, 301 samples at 0.02 s" in output
     assert " 301 " in output and "One simulation takes" in output
+    assert re.search(r"measured RMS\n(?s:.*)sigma_displacement \[cm\] +\S+ +\S+ +[\d.]+\n", output)
     assert (folder / "check-oscillator.png").stat().st_size > 10_000
     assert not (folder / "results-oscillator").exists()
     (folder / "other").mkdir()
