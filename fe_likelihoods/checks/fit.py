@@ -39,8 +39,11 @@ def check_responses(fits: Iterable[Fit]) -> list[Finding]:
             severity = WRONG if fault.where or len(fit.draws) >= HALF * MOST_DRAWS else CARE
             found.append(finding_of(fault, fit.title, channels, severity))
         found += _check_offset(fit)
-    named = any(each.severity == WRONG for each in found)
-    return found if named else [*found, *_check_errors(others), *_check_prior(others)]
+    if any(each.severity == WRONG for each in found):
+        return found
+    missed = _check_errors(others)
+    far = _check_prior([fit for fit in others if missed or fit.after is None], WRONG if missed else CARE)
+    return [*found, *far, *missed]  # causes first
 
 
 def check_supports(model: Any) -> list[Finding]:
@@ -73,34 +76,24 @@ def _check_offset(fit: Fit) -> list[Finding]:
 
 
 def _check_errors(fits: Iterable[Fit]) -> list[Finding]:
-    """Channels that the fit does not explain, and before a run or among these, those that no draw of the prior does."""
-    useless, far = dict[str, float](), dict[str, float]()
-    for fit in fits:
-        errors = relative_errors(fit.measurements.values - fit.draws, fit.measurements.values)
-        for row, each in enumerate(fit.channels):
-            name = fit.where(each.channel.name)
-            checks = checks_of(fit.residuals[row]) if each.after**2 > HALF else None
+    """Channels that the fit does not explain; white and normal noise is no fault."""
+    useless = dict[str, float]()
+    for fit in (each for each in fits if each.after is not None):
+        for each, residuals in zip(fit.channels, fit.residuals, strict=True):
+            checks = checks_of(residuals) if each.after**2 > HALF else None
             if checks is not None and min(checks.white[0], checks.normal[0]) < SMALL_PROBABILITY:
-                useless[name] = each.after  # white and normal noise is no fault
-            if (fit.after is None or name in useless) and len(errors) and errors[:, row].min() > EXPLAINED:
-                far[name] = float(errors[:, row].min())
-    nearest, shown = (listed([f"{percent(size)} in {name}" for name, size in each.items()]) for each in (far, useless))
-    text = f"No draw of the prior comes near the measurements: the smallest error (RRMSE) is {nearest}."
-    action = (
-        "Check priors and model, the units of a model of your own (SI), and `zero`, at which the base motion begins."
-    )
-    kind = "The prior does not reach the measurements"
-    found = [Finding(kind, WRONG if useless else CARE, text, action, far, "fit")] if far else []
+                useless[fit.where(each.channel.name)] = each.after
+    shown = listed([f"{percent(size)} in {name}" for name, size in useless.items()])
     text = f"The update leaves more than half of the power unexplained: the error (RRMSE) is {shown}; 71 % is half."
     action = "Check column, unit, sign, clock and place of the sensor; if all are right, the model lacks what moves it."
     kind = "The model does not follow the measurements"
-    return found + ([Finding(kind, WRONG, text, action, useless, "fit")] if useless else [])
+    return [Finding(kind, WRONG, text, action, useless, "fit")] if useless else []
 
 
-def _check_prior(fits: Iterable[Fit]) -> list[Finding]:
-    """Channels that not even the best draw of the prior explains, before a run."""
+def _check_prior(fits: Iterable[Fit], severity: str) -> list[Finding]:
+    """Channels that not even the best draw of the prior explains."""
     far = dict[str, float]()
-    for fit in (each for each in fits if each.after is None and len(each.draws)):
+    for fit in (each for each in fits if len(each.draws)):
         measured = fit.measurements.values
         errors = np.nan_to_num(relative_errors(measured - fit.draws, measured))
         best = errors[np.log(np.maximum(errors, 1e-3)).sum(axis=1).argmin()]
@@ -108,8 +101,8 @@ def _check_prior(fits: Iterable[Fit]) -> list[Finding]:
         far |= {fit.where(channel.name): size for channel, size in sizes if size > EXPLAINED}
     shown = listed([f"{percent(size)} in {name}" for name, size in far.items()])
     text = f"No draw of the prior comes near the measurements; the best one has an error (RRMSE) of {shown}."
-    action = "Check model and priors, units of a model of your own (SI), and `zero`, at which the base motion begins."
-    return [Finding("The prior does not reach the measurements", CARE, text, action, far, "fit")] if far else []
+    action = "Check priors and model, units of a model of your own (SI), and `zero`, at which the base motion begins."
+    return [Finding("The prior does not reach the measurements", severity, text, action, far, "fit")] if far else []
 
 
 def check_other_events(rows: Sequence[ParameterRow]) -> list[Finding]:
