@@ -12,6 +12,7 @@ from ..models.function import FunctionModel
 from ..signals.channels import Channel, Measurements
 from ..signals.read import units_of
 from ..signals.tables import read_table
+from ..signals.text_files import dimension_of
 from ..units import to_si
 
 __all__ = ["LoadTest", "read_load_test"]
@@ -105,7 +106,8 @@ def read_load_test(
     columns_of = {column.name: column for column in table.columns}
     for channel, unit in zip(channels, units_of(channels, units), strict=True):
         name = (columns or {}).get(channel.name, channel.name)
-        named = [each for each in columns_of if name in (each, re.sub(r"\s*[\[(].*", "", each).strip())]
+        ends = {each: re.fullmatch(rf"{re.escape(name)}(?:\s*[\[(].*|_(.+))?", each) for each in columns_of}
+        named = [each for each, end in ends.items() if end and (end[1] is None or dimension_of(end[1]))]
         wanted.append((named[0] if len(named) == 1 else name, channel.dimension, unit, channel.name))
     values = [to_si(*each) for each in table.samples(wanted, stacklevel=2)]
     first = next(iter(columns_of))

@@ -1,38 +1,21 @@
-"""Identified natural frequencies and mode shapes as data, and tables of them."""
+"""Identified natural frequencies and mode shapes as data."""
 
-import re
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..models.base import digest
 from ..signals.sampling import array_digest
-from ..signals.tables import Column, Table, read_table
-from ..signals.text_files import agree_on_unit
 from ..text_tables import text_table
-from ..units import to_si
 
-__all__ = ["ModalData", "close_groups", "read_mode_table", "real_shapes"]
+__all__ = ["ModalData", "close_groups", "real_shapes"]
 
 _LARGEST_SHARE = 0.5  # above it, an error was given in percent or in hertz
 _ABOVE_ZERO = np.finfo(float).tiny
 _OF_SETS = "frequencies", "damping", "temperatures"  # each has a value in each identification
 _CLOSE = 0.02  # ratio of frequencies, less 1, below which an identification finds the plane of two shapes only
-# what a column is, by its name in lower case without a unit; all others of numbers are sensors
-_KINDS = {
-    "frequency": r"f|fn|freq\.?|(natural[ _]|eigen)?(frequency|frequenz|fr[eé]quence|fre[ck]uencia|frequenza)|omega",
-    "deviation": r"(f|fn|freq|frequency)[ _]std",
-    "damping": r"damping|d[äa]e?mpfung|zeta|xi",
-    "temperature": r"temp\.?|temp[eé]ratur[ea]?|t[ _]?(°c|degc|[\[(]?c[\])]?)|.*[\[(](°c|degc)[\])]",  # not a T alone
-    "set": r"set|identification|messung|(daten)?satz",
-    "time": r"date|datum|fecha|(date[ _]?)?time|timestamp|zeit(stempel|punkt)?|uhrzeit|heure|hora",
-    "mode": r"(eigen)?(mode|modus|modo|form)n?[ _-]?(no\.?|nr\.?|number|nummer|#)?|nr\.?|no\.?",
-}
-_NO_SENSOR = r"\b(re(al)?|im(ag)?|mag|phase|angle|mac|mpc|order|\w*ordnung|poles|index|std|sd|cv|period|factor)\b|[|<∠]"
-_OF_MODE = re.compile(r"(?:fn?|freq|frequency|frequenz)[ _]?(\d+)(?:_hz)?\s*(?:[\[(].*)?", re.I)  # a column for each
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -244,8 +227,8 @@ def _numbers(
 ) -> np.ndarray:
     """Numbers from a limit to below another one, repeated to a shape; NaN where an identification has none."""
     try:
-        values = np.array(given).astype(float, casting="same_kind")
-    except (TypeError, ValueError):  # texts, complex numbers, rows of different lengths
+        values = np.array(given).astype(float, casting="no" if np.asarray(given).dtype == bool else "same_kind")
+    except (TypeError, ValueError):  # texts, complex numbers, truth values, rows of different lengths
         values = np.array([])
     fits = values.ndim in (1, 2) if shape is None else values.shape in ((), shape, shape[-1:])
     wrong = ~((values >= limits[0]) & (values < limits[1]) | np.isnan(values) & (what in ("frequencies", "damping")))
@@ -284,89 +267,3 @@ def _checked_shapes(given: Any, sensors: Sequence[str], known: np.ndarray) -> np
             f"where its frequency is; got {named}: leave a sensor out, or give a row of NaN for a mode without a shape"
         )
     return shapes / lengths[..., None]
-
-
-def read_mode_table(path: str | Path, sensors: Sequence[str], unit: str | None, options: dict[str, Any]) -> ModalData:
-    """Read a table as `read_modal_data`, with `options` of `ModalData`."""
-    import pandas as pd  # slow to import
-
-    table, lines, found = read_table(path), pd.DataFrame(), dict[str, Any]()
-    kinds = ["" if column.name in sensors else _kind(column.name) for column in table.columns]
-    at = {kind: kinds.index(kind) for kind in _KINDS if kind in kinds}
-    of_modes = {k: match for k, each in enumerate(table.columns) if (match := _OF_MODE.fullmatch(each.name))}
-    if not ("frequency" in at or of_modes) or max(map(kinds.count, at.keys() - {"time"}), default=0) > 1:
-        raise ValueError(
-            f"{table.file}: expected one column of frequencies, such as frequency_Hz, and at most one of "
-            f"{', '.join(_KINDS)}; the columns are {', '.join(column.name for column in table.columns)}"
-        )
-    if "temperature" in at:
-        found["temperatures"] = lines["temperature"] = _si(table, at["temperature"], "temperature", "degC")
-    if "frequency" not in at:  # a line for each identification
-        frequencies = np.stack([_in_hertz(table, place, unit) for place in of_modes], axis=1)
-        return ModalData(frequencies, mode_numbers=[int(each[1]) for each in of_modes.values()], **found | options)
-    others = [k for k, kind in enumerate(kinds) if not kind and (k or table.columns[k].name)]  # 0: names of the rows
-    columns = _sensor_columns(table, others, sensors)
-    lines = pd.concat([lines, pd.DataFrame({k: column.values for k, column in enumerate(columns)})], axis=1)
-    lines["frequency"] = _in_hertz(table, at["frequency"], unit)
-    if "deviation" in at:  # the mean square of several identifications
-        usual = table.stated_unit(at["frequency"], "frequency") or unit
-        lines["square"] = np.square(_si(table, at["deviation"], "frequency", usual) / lines["frequency"])
-    if "damping" in at:
-        lines["damping"] = _si(table, at["damping"], "dimensionless", "1")
-    days = [table.columns[k] for k, kind in enumerate(kinds) if kind == ("set" if "set" in at else "time")]
-    cells = [each.values if each.kind == "number" else each.cells for each in days]
-    lines["set"] = pd.factorize(np.array([*map(repr, zip(*cells, strict=True))]))[0] if days else 0
-    counted = 1.0 + np.arange(len(lines)) if lines["set"].nunique() == 1 else np.nan  # which mode was missed?
-    lines["mode"] = table.columns[at["mode"]].values if "mode" in at else counted
-    if lines.duplicated(["set", "mode"]).any() or (lines["mode"] % 1 != 0).any():
-        raise ValueError(
-            f"{table.file}: expected a line for each mode, with different whole numbers in the column of modes; got "
-            f"{lines['mode'].tolist()}: several identifications need a column 'set' with their numbers, and a column "
-            "'mode', because one of them may miss a mode"
-        )
-    wide = lines.pivot(index="set", columns="mode")
-    found |= {"sensors": [each.name for each in columns], "mode_numbers": wide["frequency"].columns}
-    found["shapes"] = np.stack([wide[k] for k in range(len(columns))], axis=-1) if columns else None
-    if "damping" in lines:
-        found["damping"] = wide["damping"]
-    if "square" in lines:
-        found["frequency_cv"] = np.sqrt(wide["square"].mean())
-    if "temperature" in lines:
-        found["temperatures"] = wide["temperature"].mean(axis=1)
-        if (wide["temperature"].nunique(axis=1) != 1).any():
-            raise ValueError(f"{table.file}: expected one temperature for each identification (column 'set')")
-    return ModalData(wide["frequency"], **found | options)
-
-
-def _kind(name: str) -> str:
-    """What a column is, by its name with or without a unit; empty for a sensor."""
-    name = name.strip().lower()
-    plain = re.sub(r"[\s_]*([\[(].*[\])]|_(hz|rad/s|%|c|°c|degc))$", "", name)
-    return next((kind for kind, known in _KINDS.items() if any(re.fullmatch(known, x) for x in (name, plain))), "")
-
-
-def _sensor_columns(table: Table, others: Sequence[int], sensors: Sequence[str]) -> list[Column]:
-    """The columns of the sensors among those at the places `others`: all of them, or those with the given names."""
-    columns = {table.columns[k].name: table.columns[k] for k in others if table.columns[k].kind == "number"}
-    if unknown := [name for name in sensors if name not in columns]:
-        raise ValueError(f"{table.file}: no columns {', '.join(unknown)}; the sensors are {', '.join(columns)}")
-    units = {table.stated_unit(k, "dimensionless") for k in others if table.columns[k].name in columns}
-    doubtful = any(re.search(_NO_SENSOR, name.replace("_", " "), re.I) for name in columns)
-    if not sensors and (doubtful or len(units) > 1):
-        raise ValueError(
-            f"{table.file}: some of the columns {', '.join(columns)} may be no components of real shapes (other units, "
-            "a name as of a phase or a quality): give those that are sensors, sensors=[...] (columns in a TOML file); "
-            "of complex shapes, give ModalData the real_shapes"
-        )
-    return [columns[name] for name in sensors or columns]
-
-
-def _si(table: Table, place: int, dimension: str, usual: str | None) -> np.ndarray:
-    """Values of a column in the SI unit, or °C; `usual` is the unit of one that states none."""
-    return to_si(table.columns[place].values, table.stated_unit(place, dimension) or usual, dimension)
-
-
-def _in_hertz(table: Table, place: int, given: str | None) -> np.ndarray:
-    """Frequencies [Hz] in a column; ValueError if the unit is not known, or is stated and given differently."""
-    unit = agree_on_unit(table.stated_unit(place, "frequency"), given, "frequency", table.file, "unit")
-    return _si(table, place, "frequency", unit)

@@ -66,7 +66,7 @@ def read_record(
     missing : sequence of float or str, optional
         Numbers and texts, such as ``"OL"``, in a table that stand for missing samples; they are read as NaN, which an
         excitation must not have. A warning names those that are not there. If not listed, -9999, -999.25, 1e30 and
-        9.97e36 are refused unless further numbers lie within 1 % of them; -999, 99999, -99999, 32767 and -32768 unless
+        9.97e36 are refused unless further numbers lie within 1 % of them; -999, 9999, ±99999, 32767 and -32768 unless
         a further number has half their size. ``()`` takes all numbers as measured.
     resample : float, optional
         Nominal step of uneven times [s], to which the samples are interpolated linearly. The source of the record says

@@ -233,6 +233,26 @@ class Table(NamedTuple):
         places = self.value_columns
         return self.stated.peaks_of([self.columns[k].name for k in places], places.index(place))
 
+    def measured(self, place: int) -> NDArray[np.float64]:
+        """Values of a column, NaN where one is missing; ValueError for a number that usually stands for a missing one.
+
+        It may be measured if the column has other numbers within 1 % of it, or the plausible ones if others have half
+        its size, like the samples next to a peak.
+        """
+        given, column = self.missing or (), self.columns[place]
+        values = np.where(np.isin(column.values, [x for x in given if not isinstance(x, str)]), np.nan, column.values)
+        for sentinel in (*_SENTINELS, *_PLAUSIBLE_SENTINELS) if self.missing != () else ():
+            there, size = np.flatnonzero(values == sentinel), abs(sentinel)
+            close = sentinel in _SENTINELS
+            similar = np.abs(values - sentinel) <= 0.01 * size if close else np.abs(values) >= 0.5 * size
+            if there.size and np.count_nonzero(similar) == there.size:
+                marks = [repr(each) if isinstance(each, str) else f"{each:g}" for each in (*given, sentinel)]
+                got = f"{sentinel:g} in {there.size} rows, which usually stands for a missing sample"
+                advice = "empty these cells, or in a record or measurements "
+                advice += f"give missing=[{', '.join(marks)}] to read it as NaN, or missing=[] if it was measured"
+                expect(False, f"{self.file}, line {self.lines[there[0]]}", "a measured number", got, advice)
+        return values
+
     def samples(
         self, columns: Sequence[tuple[str | int | None, str, str | None, str]], stacklevel: int
     ) -> list[tuple[NDArray[np.float64], str, str]]:
@@ -240,28 +260,16 @@ class Table(NamedTuple):
 
         Warns if a number for missing samples is in none of the columns: the file may write it in another way.
         """
-        found, places, given = [], [self.place_of(name) for name, *_ in columns], self.missing or ()
-        listed = [each for each in given if not isinstance(each, str)]
+        found, places = [], [self.place_of(name) for name, *_ in columns]
         for place, (_, dimension, unit, where) in zip(places, columns, strict=True):
-            column, named = self.columns[place], self.stated_unit(place, dimension)
-            values = np.where(np.isin(column.values, listed), np.nan, column.values)
-            # a sentinel may be measured if the column has other numbers within 1 % of it, or the plausible ones if
-            # others have half its size, like the samples next to a peak
-            for sentinel in (*_SENTINELS, *_PLAUSIBLE_SENTINELS) if self.missing != () else ():
-                there, size = np.flatnonzero(values == sentinel), abs(sentinel)
-                close = sentinel in _SENTINELS
-                similar = np.abs(values - sentinel) <= 0.01 * size if close else np.abs(values) >= 0.5 * size
-                if there.size and np.count_nonzero(similar) == there.size:
-                    marks = [repr(each) if isinstance(each, str) else f"{each:g}" for each in (*given, sentinel)]
-                    got = f"{sentinel:g} in {there.size} rows, which usually stands for a missing sample"
-                    advice = f"give missing=[{', '.join(marks)}] to read it as NaN, or missing=[] if it was measured"
-                    expect(False, f"{self.file}, line {self.lines[there[0]]}", "a measured number", got, advice)
+            column, named, values = self.columns[place], self.stated_unit(place, dimension), self.measured(place)
             text = self.text_unit(place, dimension, others=named is not None or unit is not None)
             stated = agree_on_unit(named, text, dimension, f"{where} (column and text)") if named or text else None
             unit = agree_on_unit(stated, unit, dimension, where)
             if dimension == "acceleration" and not np.isnan(values).any():
                 check_peaks(self.peaks(place), values, column.decimals, unit, self.file, f". {_SKIP}")
             found.append((values, unit, dimension))
+        listed = [each for each in self.missing or () if not isinstance(each, str)]
         absent = [f"{each:g}" for each in listed if not any(each in self.columns[k].values for k in places)]
         if absent:
             warnings.warn(
@@ -435,7 +443,7 @@ def read_table(
             cells[:] = ["nan" if cell in marks else cell for cell in cells]
     along_rows = along_rows and not any("rows" in row for _, row in rows[:_LAST_LINES])
     rows, stated = (None if along_rows or stated else _announced(rows, file)) or (rows, stated)
-    names, below, rows = _header(rows, separator, along_rows, file)
+    names, below, rows = _header(rows, separator, along_rows, file, labels)
     expect(rows, file, "rows of numbers, found none")
     rows, commas = _with_points(rows, separator, file)
     columns, clock = _columns(names, below, rows, file, marks, labels)
@@ -601,7 +609,7 @@ def _logger_table(lines: list[_Line], file: str) -> tuple[list[_Line], list[str]
 
 
 def _header(
-    lines: list[_Line], separator: str, along_rows: bool, file: str
+    lines: list[_Line], separator: str, along_rows: bool, file: str, labels: str | None = None
 ) -> tuple[list[str], list[str], list[_Line]]:
     """Names, units below them, and rows of equal width, without columns that have neither a name nor a number.
 
@@ -626,7 +634,10 @@ def _header(
     for place, (_, cells) in enumerate(lines[:first]):
         words = cells if any(cells[width:]) else [*cells, *[""] * spare][:width]
         states = width == 1 and any(read_statements(words))  # a line such as "Time step: 10 ms" names no column
-        if len(words) == width and _is_text(words) and not states:
+        filled = [k for k, cell in enumerate(words) if not _is_missing(cell)]
+        label = found[-1][1].index(labels) if found and labels and labels in found[-1][1] else 0
+        alone = found and labels is not None and filled == [label] and not _are_units(words)  # a row without a number
+        if len(words) == width and _is_text(words) and not states and not alone:
             found.append((place, words))
     after, names = found[-1] if found else (first, [])
     below: list[str] = []
@@ -705,7 +716,7 @@ def _with_points(lines: list[_Line], separator: str, file: str) -> tuple[list[_L
 _LONGEST_UNIT = 100
 _SENTINELS = (-9999.0, -999.25, 1e30, 9.97e36)  # numbers that loggers and formats write for missing samples
 # also used for missing samples, but plausible as measured numbers: counts, or accelerations in gal
-_PLAUSIBLE_SENTINELS = (-999.0, 99999.0, -99999.0, 32767.0, -32768.0)
+_PLAUSIBLE_SENTINELS = (-999.0, 9999.0, 99999.0, -99999.0, 32767.0, -32768.0)
 
 
 def _columns(

@@ -58,6 +58,10 @@ def test_a_file_has_a_line_for_each_load_case(tmp_path):
         assert (
             read_load_test(path, CHANNELS[:1]).cases == names == read_load_test(path, CHANNELS[:1], cases="case").cases
         )
+    path.write_text("case,midspan_mm\nA,1.1\nB,\nC,3.3\nD,\n")
+    test = read_load_test(path, CHANNELS[:1])
+    assert test.cases == ("A", "B", "C", "D")
+    np.testing.assert_allclose(test.values, [[1.1e-3, np.nan, 3.3e-3, np.nan]], rtol=1e-12)
     path.write_text("midspan [mm]\n1.1\n1 mm\n")
     with pytest.raises(ValueError, match="expected one column of values named 'midspan .mm.'"):
         read_load_test(path, CHANNELS[:1])

@@ -67,6 +67,7 @@ def test_complex_shapes_become_real_by_their_mean_phase(rng):
         (([1.0, -2.0],), "frequencies must be positive"),
         (([1.0, np.nan],), "leave out modes that were never identified"),
         (("high",), "frequencies must be positive numbers"),
+        (([True, True],), r"frequencies must be positive numbers .* got \[True, True\]"),
         (([1.0, 3.0], SHAPES, FLOORS[:2]), "name each sensor"),
         (([1.0, 3.0], np.transpose(SHAPES), FLOORS), "transpose them"),
         (([1.0, 3.0], SHAPES), "name each sensor"),

@@ -1,5 +1,6 @@
 """Modal data from tables, MATLAB files and results of pyOMA2."""
 
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,6 +11,8 @@ from fe_likelihoods import read_modal_data
 from fe_likelihoods.signals.response_spectrum import respond
 
 SHAPES = np.array([[1.0, 2.0, 3.0], [-2.0, -1.0, 2.0]])
+NO_SENSORS = "T,Periode,T_air,complexity,quality,sigma_f,cov,MPC,modal mass,Dekrement,zeta %".split(",")
+TEMPERATURES = "Lufttemperatur,T_air,temperature_F,T (F),Temp C,Tmean_C,steel temperature,zeta1,remark".split(",")
 UNIT = SHAPES / np.linalg.norm(SHAPES, axis=1, keepdims=True)
 
 
@@ -38,7 +41,7 @@ def test_a_table_has_a_line_for_each_mode(tmp_path):
         ("Mode;Frequenz [Hz];Dämpfung [%];Temperatur [°C];a;b;c", "1;1,0;1;20;1;2;3", "2;3,0;1;20;-2;-1;2"),
         ("Eigenfrequenz_Hz,a,b,c", "1,1,2,3", "3,-2,-1,2"),
         ("Fréquence (Hz),a,b,c", "1,1,2,3", "3,-2,-1,2"),
-        ("f [Hz],a,b,c,remark", "1,1,2,3,good", "3,-2,-1,2,poor"),
+        ("mode,f [Hz],a,b,c,remark", "1,1,1,2,3,good", "2,3,-2,-1,2,poor"),
         ("Mode,omega [rad/s],zeta [%],a,b,c", "1,6.283185307179586,1,1,2,3", "2,18.84955592153876,1,-2,-1,2"),
         ("time,f [Hz],a,b,c", "2021-01-01 08:00,1,1,2,3", "2021-01-01 08:00,3,-2,-1,2"),
         (",Mode number,f [Hz],a,b,c", "first,1,1,1,2,3", "second,2,3,-2,-1,2"),  # names of the rows
@@ -64,7 +67,7 @@ def test_errors_and_what_is_no_sensor(tmp_path):
         assert data.sensors == ("a",)
     data = read_modal_data(written(tmp_path, "f_Hz,T_C,a,MAC", "1.0,12,1,2", "2.0,12,1,3"), ["a", "MAC"])  # a sensor
     assert data.sensors == ("a", "MAC") and data.temperatures == [12.0]
-    data = read_modal_data(written(tmp_path, "f_Hz,T,B", "1.0,1,2"))  # top and bottom
+    data = read_modal_data(written(tmp_path, "f_Hz,T,B", "1.0,1,2"), ["T", "B"])  # top and bottom
     assert data.sensors == ("T", "B") and data.temperatures is None
     data = read_modal_data(written(tmp_path, "frequency_Hz,frequency_std,f1,f2", "1.0,0.01,1,2"))  # floors
     assert data.sensors == ("f1", "f2") and data.frequency_cv == pytest.approx([0.01])
@@ -88,6 +91,22 @@ def test_errors_and_what_is_no_sensor(tmp_path):
         ("frequency_Hz,omega_rad/s,a", "1.0,6.3,1", "one column of frequencies"),
         ("f_Hz,error_Hz,a", "1.0,0.1,1", "other units"),
         ("Ordnung,f_Hz,a", "12,1.0,1", "give those that are sensors"),  # of the mode, or of the identified system
+        *((f"f_Hz,a,{name}", "1.0,1,1", "give those that are sensors") for name in NO_SENSORS),
+        ("f_Hz,fd_Hz", "1.0,0.99", "give those that are sensors"),
+        ("mode,f_Hz,x,y,x,y", "1,1.0,1,2,3,4", "different names, got the columns mode, f_Hz, x, y, x, y"),
+        *((f"{name},f_Hz", "1,1.0\n2,1.1", "several identifications need") for name in ("Tag", "day", "Versuch")),
+        *((f"{name},f_Hz", "2021-01-01,1.0\n2021-01-02,1.1", "several identifications") for name in ("logged", "Zeit")),
+        ("state,f_Hz", "sound,1.0\ndamaged,1.1", r"a column 'mode' beside text, got \['state'\]; write"),
+        ("mode,f1_Hz,f2_Hz", "1,2.9,2.91\n2,7.8,7.81", "got mode; rename or delete"),
+        ("mode,Frequenz 1 [Hz],a,b", "1,2.9,1,2", "got a, b, mode; rename or delete"),
+        *((f"date,{name},f1_Hz", "2021-01-01,14,2.1", f"got {re.escape(name)}; rename") for name in TEMPERATURES),
+        ("set,mode,f_Hz", "1,1,2.9\n,2,7.8", "in each line of 'set', got ''; write"),
+        ("date,f1_Hz", "2021-01-01,2.9\nMean,2.9", "in each line of 'date', got 'Mean'; write"),
+        ("date,f1_Hz,f2_Hz", "2021-01-01,2.1,9999\n2021-01-02,2.1,6.2", "9999 in 1 rows, which usually stands for a"),
+        ("f_Hz,a,b", "2.1,1,-999\n6.2,1,-1", "-999 in 1 rows, which usually stands for a"),
+        ("f_Hz,Dämpfung", "2.1,0.5", "got 0.5; state the unit"),
+        ("omega [Hz]", "2.1", "omega in rad/s, got Hz; correct"),
+        ("mode,f_Hz", "2,1.0\n1,2.0", r"of the modes \[1, 2\]"),
     ],
 )
 def test_columns_that_are_no_modes_are_refused(head, row, text, tmp_path):
@@ -104,6 +123,7 @@ def test_units_are_stated_or_given(tmp_path):
         ("frequency,a,b", {}, "does not state the unit of its frequency: give unit="),
         ("frequency_Hz,a,b", {"unit": "rad/s"}, "states the unit 'Hz'"),
         ("omega,a,b", {}, "does not state the unit of its frequency: give unit="),
+        ("omega,a,b", {"unit": "Hz"}, "omega in rad/s, got Hz; correct"),
         ("lambda,a,b", {}, "expected one column of frequencies"),
         ("frequency_Hz,a,b", {"sensors": ["c"]}, "the sensors are a, b"),
     ):
@@ -159,6 +179,22 @@ def test_a_matlab_file(tmp_path):
     for variables in ({}, {"frequencies": "fn"}, {"frequencies": "f", "modes": "Phi"}):
         with pytest.raises(ValueError, match="the file has f, Phi, xi"):
             read_modal_data(path, unit="Hz", variables=variables)
+    for bad, text in (
+        (
+            [[1.0, 1.1, 1.2], [3.0, 3.1, 3.2]],
+            r"expected frequencies of one identification.* got an array of shape \(2, 3",
+        ),
+        ([1.0 + 0.1j, 3.0], "the variable 'f' is complex numbers"),
+        ({"f": 1.0}, "the variable 'f' is a struct"),
+        ("1.0", "the variable 'f' is text"),
+    ):
+        savemat(path, {"f": bad})
+        with pytest.raises(ValueError, match=text):
+            read_modal_data(path, unit="Hz", variables={"frequencies": "f"})
+    savemat(path, {"f": [1.0, 3.0], "xi": [0.5, 0.8]})
+    names = {"frequencies": "f", "damping": "xi"}
+    with pytest.raises(ValueError, match=r"damping ratios up to 0.1, got \[0.5, 0.8\]; give damping=, as ratios"):
+        read_modal_data(path, unit="Hz", variables=names)
     savemat(path, {"f": [1.0, 3.0], "Phi": SHAPES})
     with pytest.raises(ValueError, match="transpose them"):
         read_modal_data(path, ["a", "b", "c"], unit="Hz", variables={"frequencies": "f", "shapes": "Phi"})
@@ -173,6 +209,8 @@ def test_a_result_of_an_identification():
     for nothing in (None, np.array([])):
         with pytest.raises(ValueError, match="choose them first"):
             read_modal_data(SimpleNamespace(Fn=nothing, Phi=nothing))
+    with pytest.raises(ValueError, match="states the unit 'Hz' but units = 'rad/s'"):
+        read_modal_data(result, ["a", "b", "c"], unit="rad/s")
     with pytest.raises(ValueError, match="expected a path"):
         read_modal_data(7)
 
