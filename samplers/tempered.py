@@ -470,9 +470,11 @@ class TemperedSampler(RunResults, EnsembleSampler):
         if given.log_prob is not None and self._result.finished:
             return given
         if start is not None or self.backend.iteration > 0:
+            path = None if start is not None else self._record.path
+            lost = "" if path is None else f" (the record of the run, {path}, is missing or empty: put it back)"
             raise ValueError(
-                f"the chain has {self.iteration} steps that were not annealed from these points: pass None to add to "
-                "them, make a new sampler for other draws of the prior, or use another file for a chain of emcee"
+                f"the chain has {self.iteration} steps that were not annealed from these points{lost}: pass None to "
+                "add to them, make a new sampler for other draws of the prior, or use another file for a chain of emcee"
             )
         return self._new_start(given, skip_check)
 

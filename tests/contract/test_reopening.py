@@ -155,6 +155,15 @@ def test_other_draws_need_a_new_sampler(kind, finished, in_file, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ONE)
+def test_a_lost_record_is_said(kind, tmp_path):
+    path = tmp_path / "run.h5"
+    begin(make(kind, path, Counted()), 2)
+    record_of(path).unlink()
+    with pytest.raises(ValueError, match="run.h5.mcmc.record, is missing or empty: put it back"):
+        begin(make(kind, path, Counted()), 2)
+
+
+@pytest.mark.parametrize("kind", ONE)
 def test_a_reset_goes_on_with_the_last_state_or_the_same_draws(kind, tmp_path, whole_run):
     whole = whole_run(kind, 2, 2)
     for given in (None, "state", "draws"):
