@@ -252,7 +252,8 @@ FAULTS = {  # kind, text and action
     "lag": (
         "Clocks may differ",
         "{measured} are {value} s {late} than {computed}",
-        "Check clocks of sensors and motions (`zero` in [measurements], measurements.shift), or sample it (`Sensor`).",
+        "If all channels are as {late}, the clock of their logger or of the motion is wrong: {add} `zero` in "
+        "[measurements], or use measurements.shift({shift}). The lag of one sensor can be sampled (`Sensor`).",
     ),
     "swap": (
         "Channels may be swapped",
@@ -274,8 +275,9 @@ def finding_of(
     words = {"measured": "slow motions", "computed": "other supports"} if of_supports else {}
     words = {"measured": "measured values", "computed": "the computed ones"} | words
     words |= {"value": f"{value:.0f}" if value >= 1e3 else f"{value:.3g}", "what": "unit" if units or modes else "gain"}
+    late, add = ("later", f"add {value:.3g} s to") if fault.value > 0.0 else ("earlier", f"subtract {value:.3g} s from")
     kind, text, action = (
-        each.format(late="later" if fault.value > 0.0 else "earlier", **words) for each in FAULTS[fault.kind]
+        each.format(**words, late=late, add=add, shift=f"{-fault.value:.3g}") for each in FAULTS[fault.kind]
     )
     text = f"{listed(fault.names)}{f' ({title})' if title else ''}: {text}{f', as with {units}' if units else ''}"
     numbers = {"before": fault.before, "after": fault.after, fault.kind: fault.value}
@@ -288,17 +290,17 @@ def finding_of(
 
 
 def describe_unit(factor: float, dimension: str, unit: str = "") -> str:
-    """Units whose ratio is about a factor or its inverse, in words; empty if there are none.
+    """Which unit, read as which other one, gives about this factor, in words; empty if there are none.
 
     One of the two is the SI unit or the `unit` of the channel, or they are m/s2 and g of the base motion.
     """
-    bases, ratios = (unit, DIMENSIONS[dimension]), {9.80665: "m/s2 and g of the base motion"}
-    ratios = {} if dimension == "acceleration" else ratios
+    bases, special = (unit, DIMENSIONS[dimension]), {9.80665: "m/s2 and g of the base motion"}
+    special = {"acceleration": {}, "frequency": OF_MODES}.get(dimension, special)
+    ratios = {ratio**sign: words for ratio, words in special.items() for sign in (1, -1)}
     units = sorted((each for each in UNITS.values() if each.dimension == dimension), key=lambda u: u.name not in bases)
-    if dimension == "frequency":
-        ratios, units = OF_MODES, []
-    for one, other in combinations(units, 2):
+    for one, other in () if dimension == "frequency" else combinations(units, 2):
         if one.name in bases:  # of two names of a unit, the first
-            ratios.setdefault(one.factor / other.factor, f"{one.name} and {other.name}")
-    far = {words: abs(abs(math.log(ratio)) - abs(math.log(factor))) for ratio, words in ratios.items()}
-    return " or ".join(words for words, each in far.items() if each < math.log(SAME_UNITS))
+            ratios.setdefault(one.factor / other.factor, f"{other.name} read as {one.name}")
+            ratios.setdefault(other.factor / one.factor, f"{one.name} read as {other.name}")
+    near = (words for ratio, words in ratios.items() if abs(math.log(ratio / factor)) < math.log(SAME_UNITS))
+    return " or ".join(dict.fromkeys(near))

@@ -39,7 +39,7 @@ def findings(change, seed, known):
     [
         ("", "", lambda y: y),
         ("Channels may be swapped", "at 6 m and at 12 m", lambda y: y[[1, 0, 2]]),
-        ("A unit may be wrong", "m and mm", lambda y: 1e-3 * y),
+        ("A unit may be wrong", "m read as mm", lambda y: 1e-3 * y),
         ("A sign may be wrong", "at 6 m", lambda y: y * [[-1.0], [1.0], [1.0]]),
     ],
 )
