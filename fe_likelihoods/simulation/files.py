@@ -468,7 +468,10 @@ if hasattr(os, "register_at_fork"):  # a forked process must not keep the groups
 
 def _end(processes: Sequence[subprocess.Popen], place: str, owner: int) -> None:
     if owner == os.getpid():  # else it has only a forked copy of the objects
-        kill_group(processes)
+        for process in processes[1:]:
+            process.kill()
+        for process in processes:  # the shell kills the others and removes the folder, even if this process ends now
+            process.communicate()
         with of_this_library():
             shutil.rmtree(place, ignore_errors=True)
 
