@@ -58,7 +58,6 @@ _CACHED = type(functools.cache(len))
 _CODE = (types.FunctionType, type, _CACHED)
 _OF_THE_IMPORT = {"__builtins__", "__loader__", "__spec__", "__cached__"}
 _COMPILED = tuple(importlib.machinery.EXTENSION_SUFFIXES)
-_MOST_LOADED = 8
 _STANDARD = [Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib")]
 _packages = functools.cache(importlib.metadata.packages_distributions)
 _lock = threading.RLock()
@@ -104,7 +103,7 @@ class Pickled(NamedTuple):
         return load(self)(item)
 
 
-@functools.lru_cache(_MOST_LOADED)
+@functools.lru_cache(8)
 def load(pickled: Pickled) -> Callable[[Any], Any]:
     """The function, in a worker, with user modules of its own.
 

@@ -5,8 +5,7 @@ The rule for ``pool=``:
 * None: in this process.
 * a whole number: a `LocalPool` of that many processes.
 * any other object with ``map``: ``list(pool.map(function, items))``, and for single items ``submit`` if it has that.
-  This covers the executors of concurrent.futures, loky and mpi4py.futures, the pools of multiprocessing and schwimmbad,
-  and clients of dask.distributed, whose futures are used as they are.
+  This covers executors of concurrent.futures, loky, mpi4py.futures and dask, pools of multiprocessing and schwimmbad.
 
 The function (model and measurements) is sent by value (`fe_likelihoods.simulation.by_value`): by a `LocalPool` to each
 worker once, and again when anything that it uses has changed; by other pools with each item. Workers load it once.

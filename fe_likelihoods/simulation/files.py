@@ -438,10 +438,9 @@ def _is_only_thread_of_dask() -> bool:
 
 
 class Group:
-    """A group of processes with a temporary folder, `place`.
+    """A group of processes with a temporary folder, `place`; the first process is a shell that removes both.
 
-    Both are removed by `end`, when this object is garbage-collected, and when this process ends, even if it is killed:
-    the first process is a shell that waits for that.
+    It does so at `end`, when this object is garbage-collected, and when this process ends, even if it is killed.
     """
 
     def __init__(self) -> None:
