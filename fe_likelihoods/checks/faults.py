@@ -105,7 +105,8 @@ def find_faults(measurements: Measurements, draws: np.ndarray) -> tuple[Fault, .
         where = f" between {slow.band[0]:.2g} and {slow.band[1]:.2g} Hz, where parameters hardly change it"
         found += _named([names[k]], slow.gain, slow.lag * clear, step, slow.before, slow.after, where)
     groups = [[k] for k in free] + ([free] if len(free) > 1 else [])
-    swaps = [(pair, ratio) for pair, ratio in swaps if {*pair} <= {*free}]
+    named = {name for fault in found for name in fault.names}
+    swaps = [(pair, ratio) for pair, ratio in swaps if not named.intersection(names[k] for k in pair)]
     while len(r) and (chosen := strongest(groups)):
         group, faults, r[:, group] = chosen
         found += faults
