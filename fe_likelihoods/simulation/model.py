@@ -234,9 +234,9 @@ def real_response(response: Any, channels: Sequence[Channel], n_steps: int) -> n
         response = response.astype(float, copy=False)
     except (TypeError, ValueError) as error:
         raise SimulationFailed(f"the response is not an array of numbers: {error}") from error
-    if response.shape != (expected := (len(channels), n_steps)):
-        got = f"has shape {response.shape}" if response.shape else "is None or one number (is a return missing?)"
-        raise SimulationFailed(f"the response {got}, expected (n_channels, n_steps) = {expected}")
+    if (got := response.shape) != (expected := (len(channels), n_steps)):
+        none = "" if got else ": is it None, because a return is missing?"
+        raise SimulationFailed(f"the response has shape {got}, expected (n_channels, n_steps) = {expected}{none}")
     return response
 
 

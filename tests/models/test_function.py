@@ -49,7 +49,7 @@ def test_same_bits_in_process_and_isolated(guarded):
 
 
 def test_a_forgotten_return_is_named():
-    with pytest.raises(SimulationFailed, match=r"the response is None or one number .*, expected .* = \(1, 20\)"):
+    with pytest.raises(SimulationFailed, match=r"shape \(\), expected .* = \(1, 20\): is it None"):
         model_of(lambda theta: None).simulate(THETA)
 
 
