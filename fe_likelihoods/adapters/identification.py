@@ -53,7 +53,7 @@ def read_modal_data(
     Returns
     -------
     ModalData
-        Complex shapes are made real (`real_shapes`), with a warning if their phases scatter.
+        Complex shapes are made real (`real_shapes`, which also returns the scatter of their phases).
 
     Raises
     ------
