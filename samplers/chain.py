@@ -31,8 +31,6 @@ from .judgement.verdict import Verdict
 from .record import Record, kept_aside
 from .reports import AnnealingResult, Stage
 
-__all__ = ["Chain", "check_storable", "open_record"]
-
 logger = logging.getLogger(__name__)
 
 SECONDS_BETWEEN, SHARE = 1.0, 0.1  # shortest time between two replacements, and their largest share of the time

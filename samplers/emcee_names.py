@@ -8,22 +8,6 @@ from importlib import import_module
 from types import ModuleType
 from typing import Any
 
-__all__ = [
-    "Backend",
-    "DEMove",
-    "DESnookerMove",
-    "EnsembleSampler",
-    "HDFBackend",
-    "MHMove",
-    "Model",
-    "Move",
-    "RedBlueMove",
-    "State",
-    "get_progress_bar",
-    "ndarray_to_list_of_dicts",
-    "walkers_independent",
-]
-
 _KDE = "emcee.moves.kde"
 
 
@@ -41,9 +25,9 @@ _late.KDEMove = _KDEMove
 if "emcee.moves" not in sys.modules:
     sys.modules[_KDE] = _late
 
-from emcee import EnsembleSampler, State  # noqa: E402
-from emcee.backends import Backend, HDFBackend  # noqa: E402
-from emcee.ensemble import ndarray_to_list_of_dicts, walkers_independent  # noqa: E402
-from emcee.model import Model  # noqa: E402
-from emcee.moves import DEMove, DESnookerMove, MHMove, Move, RedBlueMove  # noqa: E402
-from emcee.pbar import get_progress_bar  # noqa: E402
+from emcee import EnsembleSampler, State  # noqa: E402, F401
+from emcee.backends import Backend, HDFBackend  # noqa: E402, F401
+from emcee.ensemble import ndarray_to_list_of_dicts, walkers_independent  # noqa: E402, F401
+from emcee.model import Model  # noqa: E402, F401
+from emcee.moves import DEMove, DESnookerMove, MHMove, Move, RedBlueMove  # noqa: E402, F401
+from emcee.pbar import get_progress_bar  # noqa: E402, F401

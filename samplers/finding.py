@@ -3,8 +3,6 @@
 from collections.abc import Iterable
 from typing import NamedTuple
 
-__all__ = ["CARE", "NOTE", "WRONG", "Finding", "by_severity"]
-
 NOTE = "note"  # good to know
 CARE = "care"  # limits the result
 WRONG = "wrong"  # speaks against the result

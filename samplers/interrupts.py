@@ -9,19 +9,6 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
-__all__ = [
-    "Ended",
-    "SentFunction",
-    "become_worker",
-    "deferred_interrupts",
-    "interrupts",
-    "interrupts_end_the_run",
-    "is_worker",
-    "process_name",
-    "raise_if_interrupted",
-    "raise_if_it_ends_the_run",
-]
-
 logger = logging.getLogger(__name__)
 
 _EXIT = (

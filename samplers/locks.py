@@ -13,8 +13,6 @@ try:
 except ImportError:  # Windows has no such locks: two programs on one file are not detected there
     _lock = None
 
-__all__ = ["lock_now", "locked_folder"]
-
 PAUSE = 0.002  # [s] between two trials
 
 

@@ -31,8 +31,6 @@ from typing import Any
 
 from .moves.population_moves import RandomWalkMove
 
-__all__ = ["CHING_CHEN_2007", "RAMANCHA_2022_CONSTANT", "RAMANCHA_2022_LITERAL"]
-
 _COMMON = {
     "moves": RandomWalkMove(),  # a sampler copies its moves, so runs do not share it
     "recycle": False,

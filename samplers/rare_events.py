@@ -29,8 +29,6 @@ from .estimates.weights import EvidenceError
 from .resampling import systematic
 from .settings import as_whole_number
 
-__all__ = ["RareEvent", "subset_simulation"]
-
 LEVEL_PROBABILITY = 0.1  # share of the points that each level keeps (Au & Beck 2001)
 FEWEST = 10  # points that a level keeps, and groups of points for the error
 LEAST_PROBABILITY = 1e-15

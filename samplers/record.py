@@ -29,17 +29,6 @@ import numpy as np
 from .interrupts import deferred_interrupts
 from .locks import lock_now
 
-__all__ = [
-    "BudgetExhausted",
-    "EvaluatedBatch",
-    "Incomplete",
-    "Record",
-    "Remember",
-    "RunStart",
-    "as_limit",
-    "kept_aside",
-]
-
 logger = logging.getLogger(__name__)
 
 MAGIC, BLOCK = b"samplers record 1\n", struct.Struct("<4sQII")  # kind, length, checksums of the content and of both

@@ -14,20 +14,6 @@ from .estimates.control_variates import SignedSample
 from .estimates.importance import EvidenceCheck
 from .finding import Finding
 
-__all__ = [
-    "LIMIT",
-    "AnnealingResult",
-    "GuideTick",
-    "GuidedRound",
-    "Report",
-    "Restart",
-    "SamplingWarning",
-    "Stage",
-    "Sweep",
-    "Weighted",
-    "warn",
-]
-
 LIMIT = "The limit of simulations ended the run"  # see `Weighted`
 OUR_PACKAGES = ("samplers", "emcee")
 

@@ -12,8 +12,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-__all__ = ["RESAMPLING", "locate", "multinomial", "systematic"]
-
 Random = np.random.RandomState | np.random.Generator
 
 

@@ -14,8 +14,6 @@ from .record import as_limit
 from .reports import GuidedRound, Stage
 from .tempering.guide import Guide
 
-__all__ = ["RunResults"]
-
 KEPT_FAILURES = 1000
 
 

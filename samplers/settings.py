@@ -13,8 +13,6 @@ import numpy as np
 from .emcee_names import Backend
 from .resampling import RESAMPLING
 
-__all__ = ["MOVES", "Settings", "as_whole_number", "check_arguments", "check_names"]
-
 # settings of annealing by moves that every sampler has
 MOVES = ("resampling", "min_moves", "max_moves", "max_correlation", "fast_sweeps", "max_failure_share")
 

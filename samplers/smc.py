@@ -11,8 +11,6 @@ from .moves.population_moves import MixtureMove
 from .settings import MOVES
 from .tempered import TemperedSampler
 
-__all__ = ["SMCSampler"]
-
 FEWEST_TO_RECYCLE = 150
 # settings for the choice of beta
 _OF_WEIGHTS = ("ess_ratio", "ess_rule", "ess_floor")

@@ -50,8 +50,6 @@ from .tempering.guided import lend
 from .tempering.mutation import MoveSchedule, check_moves
 from .tempering.population import Population, check_size
 
-__all__ = ["TemperedSampler"]
-
 logger = logging.getLogger(__name__)
 
 ARGUMENTS = ("log_prior_fn", "log_likelihood_fn", "guide", "max_simulations", "seed")

@@ -13,8 +13,6 @@ from .settings import MOVES
 from .tempered import TemperedSampler
 from .tempering.mutation import needs_many_walkers
 
-__all__ = ["TMCMCSampler"]
-
 # Steps of a chain from a leader before its points count: without them the shares of the points are biased.
 BURN_IN = 4
 OF_SWEEPS = ("min_moves", "max_moves", "max_correlation")

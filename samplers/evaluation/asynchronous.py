@@ -21,8 +21,6 @@ from .pools import submit_all, workers_of
 from .user_target import Target
 from .values import Caught, Failed
 
-__all__ = ["AsynchronousEvaluator", "check_asynchronous"]
-
 logger = logging.getLogger(__name__)
 
 SECONDS_TO_FETCH = 10.0  # longest wait for the value of a point that has ended, when the run ends

@@ -18,8 +18,6 @@ from ..tempering.population import RECORD, PendingPoints
 from .pools import map_in
 from .user_target import Target
 
-__all__ = ["Evaluator", "unpack"]
-
 SECONDS_BETWEEN_NOTES = 0.05
 
 

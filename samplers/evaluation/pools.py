@@ -5,8 +5,6 @@ from typing import Any
 
 from ..interrupts import SentFunction
 
-__all__ = ["map_in", "submit_all", "workers_of"]
-
 SIZES = ("n_workers", "_max_workers", "_processes", "size")  # attributes of pools with the number of workers
 
 

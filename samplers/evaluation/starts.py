@@ -10,8 +10,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-__all__ = ["not_of_the_prior"]
-
 LEVEL = 1e-4  # probability of a false alarm in a run
 METROPOLIS_STEPS = 20  # a ball of half the width of the prior is then found in 42 to 100 % of the cases (docs/results)
 FEWEST_POINTS = 32  # signed ranks of fewer points cannot reach the level

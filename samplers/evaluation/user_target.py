@@ -14,8 +14,6 @@ from .pools import map_in
 from .starts import not_of_the_prior
 from .values import Caught, log_densities, most_common_reasons, outcomes
 
-__all__ = ["Target"]
-
 logger = logging.getLogger(__name__)
 
 

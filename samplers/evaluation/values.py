@@ -16,8 +16,6 @@ import numpy as np
 
 from ..interrupts import interrupts, raise_if_interrupted, raise_if_it_ends_the_run
 
-__all__ = ["Caught", "Failed", "log_densities", "most_common_reasons", "outcomes"]
-
 logger = logging.getLogger(__name__)
 
 LARGEST_EXACT = 2**53  # integers above are rounded in a float, and stay Python's

@@ -14,17 +14,6 @@ from ..proposals.mixture import Mixture, log_responsibilities
 from ..reports import AnnealingResult
 from .clusters import find_clusters
 
-__all__ = [
-    "LOST",
-    "OF_MEAN",
-    "OF_SHARES",
-    "check_end",
-    "check_evidence",
-    "check_likelihood",
-    "check_prior",
-    "check_shares",
-]
-
 # Differences of the two log-evidences, and standard errors, from 1619 right and 297 wrong runs (docs/results).
 # The limits are soft: with one of the 33 targets left out they wander from 0.8 to 1.5 and from 0.3 to 0.45.
 WRONG_DIFFERENCE, LARGE_DIFFERENCE = 1.0, 0.8

@@ -18,8 +18,6 @@ from scipy.sparse.csgraph import connected_components
 from ..estimates.genealogy import standard_error_of_mean
 from ..proposals.mixture import Mixture, fit_mixture, log_density, log_responsibilities
 
-__all__ = ["Cluster", "error_between_modes", "find_clusters", "find_members"]
-
 # ratio of the density in the valley between two modes to the density of the lower mode
 DEEPEST_VALLEY = 0.2
 POINTS_OF_LINE = 33

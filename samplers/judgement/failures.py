@@ -10,8 +10,6 @@ import numpy as np
 
 from ..finding import CARE, WRONG, Finding
 
-__all__ = ["NearFailures", "check_failed_region", "failures_near", "judged_failures"]
-
 # A failure adjoins the samples if it is one of the evaluated points that are nearest to a sample. With 20 points and at
 # least 5 failures, those 6 standard deviations beside a bent ridge rarely count, and those at an edge do.
 NEAREST = 20

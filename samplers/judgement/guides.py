@@ -4,17 +4,6 @@ import numpy as np
 
 from ..finding import CARE, WRONG, Finding
 
-__all__ = [
-    "DOUBTED_SHARE",
-    "UNSEEN",
-    "check_draws_in_memory",
-    "check_ends",
-    "check_tops",
-    "check_excluded_runs",
-    "check_unseen_modes",
-    "find_missing_part",
-]
-
 UNSEEN = "A part of the posterior may be missing"
 # Counted in 102 searches with limits of 100 to 400 simulations, on eight posteriors with 1 to 10 known modes.
 # Share of further starts that would lead to modes not seen yet, above which a search goes on: where several modes were

@@ -11,18 +11,6 @@ from ..estimates.importance import EvidenceCheck, KnownDensity, PooledRounds, Ro
 from ..estimates.pareto import LARGEST_SHAPE
 from ..finding import Finding
 
-__all__ = [
-    "LIGHT_TAILS",
-    "UNSETTLED",
-    "all_impossible",
-    "describe_rounds",
-    "doubt_recycling",
-    "find_unreached_part",
-    "grown",
-    "is_even",
-    "is_reliable",
-]
-
 # Recycling is given up when the mean efficiency of the last 6 rounds is smaller than 0.03 (moves then need fewer
 # evaluations), or after 200 rounds without a check at beta = 1.
 SMALLEST_EFFICIENCY, PATIENCE, MOST_ROUNDS = 0.03, 6, 200

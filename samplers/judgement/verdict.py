@@ -27,18 +27,6 @@ from .clusters import Cluster, find_clusters
 from .failures import NearFailures, check_failed_region
 from .guides import UNSEEN
 
-__all__ = [
-    "CONVERGED",
-    "NOT_USABLE",
-    "USABLE",
-    "Verdict",
-    "describe_early_stop",
-    "independent_points",
-    "judge",
-    "lost_simulations",
-    "with_lost_record",
-]
-
 LONGEST_REASON = 200  # characters
 CONVERGED = "converged"
 USABLE = "usable"

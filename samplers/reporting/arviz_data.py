@@ -15,8 +15,6 @@ from .summary import is_tempered, log_posterior_of, names_of_parameters
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["to_arviz"]
-
 _PRIOR_DRAWS = 1000
 _ORDER = (
     "Draws are ordered by founder, walker and step, so that dependent draws are neighbours; sample_stats has the step, "

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["plot_corner", "plot_marginals", "plot_run"]
-
 Values = Sequence[float] | np.ndarray | Mapping[str, float]  # one per parameter (NaN: none), or by name
 
 BLUE = "#1f5a8c"

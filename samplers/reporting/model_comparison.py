@@ -10,8 +10,6 @@ from scipy.special import expit, logsumexp, ndtri
 
 from .summary import aligned, is_tempered, log_posterior_of
 
-__all__ = ["ModelComparison", "compare_models"]
-
 
 class ModelComparison(NamedTuple):
     """Comparison of models, one entry per model, in the order given. ``str`` gives `table`.

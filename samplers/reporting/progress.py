@@ -15,8 +15,6 @@ from ..evaluation.evaluator import Evaluator
 from ..reports import AnnealingResult, GuideTick, Report, Restart, Stage, Sweep
 from ..tempering.population import Population
 
-__all__ = ["Progress"]
-
 SECONDS_BETWEEN_LINES = 60.0
 SECONDS_BETWEEN_FIGURES = 0.1
 OF_GUIDES = "{desc} [{elapsed}{postfix}]"

@@ -8,15 +8,6 @@ import numpy as np
 if TYPE_CHECKING:
     import pandas
 
-__all__ = [
-    "Summary",
-    "aligned",
-    "is_tempered",
-    "log_posterior_of",
-    "names_of_parameters",
-    "summary",
-]
-
 
 def is_tempered(sampler: Any) -> bool:
     """Whether a sampler is a `samplers.tempered.TemperedSampler`, with a ladder and an evidence."""
