@@ -35,8 +35,6 @@ from .judgement.verdict import (
     describe_early_stop,
     independent_points,
     judge,
-    lost_simulations,
-    with_lost_record,
 )
 from .moves.population_moves import GuideMove, RandomWalkMove, describe, with_fast_sweeps, without_unfitted
 from .record import BudgetExhausted, EvaluatedBatch, Incomplete, RunStart, as_limit
@@ -66,9 +64,9 @@ class TemperedSampler(RunResults, EnsembleSampler):
         them (not with a `pool` and ``vectorize=False``, since workers do not cache simulations). A point for which
         `log_prob_fn` raises an exception or returns NaN counts as -inf and is recorded (`failures`). Points outside the
         support of the prior are not evaluated. Blobs that are numbers are stored as floats, others as objects, or as
-        `blobs_dtype` says; blobs that this type cannot hold exactly are refused. With an emcee
-        `HDFBackend`, a record of all evaluations is kept beside the file, and a killed run continues without repeating
-        an evaluation (`run_mcmc`). The file is replaced as a whole, about every second and at the end of a call.
+        `blobs_dtype` says. With an emcee `HDFBackend`, a record of all evaluations is kept beside the file, and a
+        killed run continues without repeating an evaluation (`run_mcmc`). The file is replaced as a whole, about every
+        second and at the end of a call.
     log_prior_fn : callable, optional
         Log-density of the normalised prior. It takes the same kind of argument as `log_prob_fn` (a point; a batch with
         `vectorize`; a dict with `parameter_names`) but not `args` and `kwargs`. By default ``log_prob_fn.log_prior``.
@@ -168,8 +166,6 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._chain = Chain(self.backend)
         self._result, self._verdict = self._chain.result, self._chain.verdict
         self._must_compare = reopened or self.backend.iteration > 0
-        known = np.inf if self._record.path is None else self._record.simulations
-        self._lost = lost_simulations(self._verdict, known)
         check_moves(self._moves, given.chains)
         self._fast = target.fast_parameters if pool is None or vectorize else ()
         followed = with_fast_sweeps(self._moves, self._fast, ndim, given.fast_sweeps)
@@ -250,8 +246,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
         Raises
         ------
         KeyboardInterrupt
-            At Ctrl-C, even if a library has set a handler that raises something else, as dask_jobqueue does. The
-            handler is called; one that returns has dealt with Ctrl-C.
+            At Ctrl-C, also if a bare ``except`` of the function hides it. A handler of SIGINT that somebody has set
+            stays in use.
         SystemExit
             If the function calls ``sys.exit`` in this process. In a worker process this is a failed evaluation.
 
@@ -430,7 +426,6 @@ class TemperedSampler(RunResults, EnsembleSampler):
             self._verdict = judge(self._result, *numbers, missing, self._failed[0], *others)
         else:  # an annealing that could not be made again
             self._verdict = self._verdict._replace(simulations=self.simulations)
-        self._verdict = with_lost_record(self._verdict, self._lost)
         self._chain.result, self._chain.verdict = self._result, self._verdict
         self._chain.write()
 
