@@ -1,10 +1,11 @@
-"""Overhead of the samplers per evaluation, measured with a vectorised likelihood of negligible cost.
+"""Overhead of the samplers per evaluation, and memory of a simulation that is kept in RAM.
 
-CPU time of the process for plain moves, mixture moves and recycling.
+CPU time of the process for plain moves, mixture moves and recycling, with a vectorised likelihood of negligible cost.
 """
 
 import tempfile
 import time
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from statistics import median
@@ -12,6 +13,7 @@ from statistics import median
 import emcee
 import numpy as np
 
+from fe_likelihoods import problems
 from samplers import SMCSampler
 from samplers.moves.population_moves import RandomWalkMove
 from tests.contract.targets import Gaussian
@@ -58,9 +60,26 @@ def per_evaluation(run: Callable, nwalkers: int, in_file: bool, clock: Callable[
     return median(values)
 
 
+def memory_per_simulation(posterior: Callable, rows: int = 400) -> float:
+    """Memory that stays allocated for one more simulation [kB], after as many others."""
+    thetas = posterior.sample_prior(2 * rows, 1)
+    tracemalloc.start()
+    posterior(thetas[:rows])
+    before, _ = tracemalloc.get_traced_memory()
+    posterior(thetas[rows:])
+    kept = tracemalloc.get_traced_memory()[0] - before
+    tracemalloc.stop()
+    return kept / rows / 1e3
+
+
 def cost(repeats: int) -> list[Row]:
-    """CPU time per evaluation [µs]."""
-    rows = []
+    """CPU time per evaluation [µs], and memory per simulation [kB]."""
+    rows = [
+        Row(
+            "memory of a simulation in RAM", name, memory_per_simulation(getattr(problems, name)()), "kB", "at most 0.6"
+        )
+        for name in ("bridge_column", "isolated_bridge")
+    ]
     kinds = {
         "plain moves (random walk)": (run_walk, f"at most {LIMIT_PLAIN:g}"),
         "mixture moves": (lambda n, backend: run_smc(n, backend, recycle=False), f"at most {LIMIT_MIXTURE:g}"),
