@@ -172,11 +172,6 @@ class SimulationCache:
         (`FELikelihood.simulate`, guides).
     max_response_bytes : int
         Largest size of all stored responses [bytes], at 8 bytes per channel and sample. The oldest are evicted.
-    verify : bool
-        Whether some stored rows are simulated again before other rows are used (`fe_likelihoods.cache.verification`).
-        If the model's label is known: two rows per likelihood, and one of every 100. If it is unknown, because code, a
-        file or a package has changed: 59 rows, which detect a change in 5 % of the parameter space with a probability
-        of 95 %.
     tolerance : float
         Accepted difference between a stored and a new response, relative to the response norm. On another processor,
         and in sums over several threads, the last digits differ.
@@ -209,7 +204,6 @@ class SimulationCache:
         *,
         responses: bool = False,
         max_response_bytes: int = 2**30,
-        verify: bool = True,
         tolerance: float = TOLERANCE,
     ) -> None:
         if not isinstance(path, str | os.PathLike):
@@ -220,7 +214,7 @@ class SimulationCache:
         if not 0.0 <= tolerance < np.inf:
             raise ValueError(f"SimulationCache: tolerance must be a number of 0 or more; got {tolerance!r}")
         self.max_response_bytes, self.responses = int(max_response_bytes), bool(responses)
-        self.verify, self.tolerance = bool(verify), tolerance
+        self.tolerance = tolerance
         self.file = CacheFile(path)
         self.file.check()
         self.damaged, self._waiting = 0, list[Row]()

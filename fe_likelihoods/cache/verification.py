@@ -1,26 +1,26 @@
 """A model with simulations in a cache: whether it is still the same, and which stored simulations are its own.
 
 Code and files cannot prove that the model with a declared identity still computes the same results. The model's label
-(`fe_likelihoods.simulation.label`) decides how many stored rows are simulated again before others are used; numbers and
-powers: ``docs/parallel.rst``. Rows belong to a generation, the simulations of one state of a model; the file says to
-which generation a label belongs.
+(`fe_likelihoods.simulation.label`) decides how many stored rows are simulated again before others are used (powers:
+``docs/parallel.rst``). Rows belong to a generation, the simulations of one state of a model; the file says to which
+generation a label belongs.
 
 * The label is known: the row stored last and a random one before a likelihood uses its first row, and a random one of
   every 100 rows used. A difference is an error, `StaleCache`.
 * The label is unknown: `ROWS` random rows. If all agree, the label is added to their generation (adoption). If one
   differs, or there are fewer rows, a new generation begins: the earlier rows stay in the file and are not used.
 
-A success is always among the rows, since a changed model often fails at the same points. Rows are used without
-verification, with a warning, if the new simulations do not end, for example without a licence.
+A success is always among the rows, since a changed model often fails at the same points. Rows of a known label are used
+without verification, with a warning, if the new simulations do not end, for example without a licence.
 
 Results from two states of a model must not be mixed either, as when a value is set between two batches. So fingerprint,
 code, values and opened files are compared after simulations, in about 1 % of the time. User code may change values
-itself, such as a counter: the first and the latest simulation are repeated then, and the model counts as unchanged if
-the results are the same.
+itself, such as a counter: the first and the latest simulation are repeated then, and must give the same results.
 """
 
 import json
 import logging
+import math
 import os
 import secrets
 import threading
@@ -40,7 +40,7 @@ from ..simulation.failure_reasons import ChangedModel, TransientReason
 from ..simulation.files import digests_by_name, observing, read_again
 from ..simulation.label import ModelLabel
 from ..simulation.model import Model, SimulationBatch, misfit_of_responses, most_responses, simulate_batch
-from .memory import MemoryCache, ResponseMemory
+from .memory import MemoryCache, ResponseMemory, thetas_of
 from .simulation_cache import (
     LABEL_COLUMNS,
     STORE_LABEL,
@@ -67,13 +67,12 @@ LARGEST_ROUNDING = 1e-4  # largest relative response difference that may come fr
 MAX_TRUSTS = 32
 SHARE_OF_TIME = 0.01  # for comparisons of the model
 NO_TIME = 5e-5  # [s]; a comparison that takes less is always made, since storing a row takes longer
-ROWS_PER_REPETITION = 100  # simulations between two repetitions if only items have changed that simulations change
 FINGERPRINT = "its fingerprint"
 OF_A_PROCESS = ("environment ", "library", "package ", "python", "source of ")  # items that differ between processes
 CHANGED = (
     "Something has changed that neither its declared identity nor its label contains, or the model does not repeat its "
-    "results (make it depend on its parameters alone, for example with a fixed seed). Delete its rows with "
-    "likelihood.simulator.cache.forget(*likelihood.simulator.cache_keys), or give the model a new version= (or "
+    "results or failures (make them depend on the parameters alone, for example with a fixed seed). Delete its rows "
+    "with likelihood.simulator.cache.forget(*likelihood.simulator.cache_keys), or give the model a new version= (or "
     "depends_on=)"
 )
 
@@ -98,9 +97,10 @@ class StaleCache(ValueError):
 class Trust:
     """The label of a model, and which rows of a file this process trusts; likelihoods with one `key` share it.
 
-    `labels` has the rows of the file (see `pack_label`) by the source number of the model; `used` counts rows that were
-    used after a verification, by identity, apart from failures alone. Rows with the number of the `session` were stored
-    here and need no verification. `stale` is the error of a row that differed.
+    `labels` has the rows of the file (see `pack_label`), `generations` the generations, by the source number of the
+    model; `used` counts rows that were used after a verification, by identity, apart from failures alone. Rows with the
+    number of the `session` were stored here and need no verification. `stale` is the error of a row that differed.
+    Simulations that run now are `running`. Hold the `lock` to use it.
     """
 
     _known: "OrderedDict[str, Trust]" = OrderedDict()  # of this process, the most recently used last
@@ -108,8 +108,10 @@ class Trust:
     def __init__(self, label: ModelLabel, key: str) -> None:
         self.label, self.key = label, key
         self.labels: dict[int, tuple] = {}
+        self.generations: dict[int, int] = {}
         self.used: dict[str, int] = {}
         self.stale: StaleCache | None = None
+        self.running: set[bytes] = set()
         self._owner = 0
 
     @classmethod
@@ -124,10 +126,11 @@ class Trust:
         return Trust.of, (self.label, self.key)
 
     @property
-    def lock(self) -> threading.RLock:
+    def lock(self) -> threading.Condition:
         """Lock of this process; replaced after a fork, when another thread of the parent may have held it."""
         if self._owner != os.getpid():
-            self._lock, self._owner, self.session = threading.RLock(), os.getpid(), secrets.randbits(62)
+            self._lock, self._owner, self.session = threading.Condition(), os.getpid(), secrets.randbits(62)
+            self.running.clear()
         return self._lock
 
     def due(self, kind: str, n: int) -> int:
@@ -183,14 +186,14 @@ def difference_in_words(
 class VerifiedModel:
     """A model compared with measurements, whose simulations may be stored in a `SimulationCache`.
 
-    `measured` are values (n_channels, n_steps) or a `Comparison`, `_key` is the identity of stored statistics. `label`
-    is that of the model when it was first simulated, with the statistic's code. Derived likelihoods and copies share
-    its `Trust`. `verifications` counts simulations that were made again, `unverified` rows whose new simulation was
+    `measured` are values (n_channels, n_steps) or a `Comparison`, `simulation_key` identifies stored statistics, and
+    `label` the model when it was first simulated, with the statistic's code. Derived likelihoods and copies share its
+    `Trust`. `verifications` counts simulations that were made again, `unverified` rows whose new simulation was
     stopped (not by the model), `seconds` is the wall time of simulations [s]; `has_results` says whether results are
     known in this process. Methods take the model's `fingerprint`, which is one for a request.
     """
 
-    _key: str
+    simulation_key: str
     memory_cache: MemoryCache
     response_memory: ResponseMemory
 
@@ -219,17 +222,12 @@ class VerifiedModel:
         self.has_results = self._was_sent = False  # from another process
         self._points: list[tuple[np.ndarray, np.ndarray]] = []  # first and latest success: parameters, statistics
         self._unchecked: list[np.ndarray] = []  # parameters (n, n_structural) simulated since the last comparison
-        self._not_before = 0.0  # time of the next comparison [s]
+        self._not_before = self._counted_until = 0.0  # times of the next comparison, and of the last end of a run [s]
         self._random = np.random.default_rng()  # separate, so that the user's random numbers do not change
 
     def __getstate__(self) -> dict:
-        return self.__dict__ | {
-            "pool": None,
-            "_was_sent": os.getpid(),
-            "_points": [],
-            "_unchecked": [],
-            "_random": None,
-        }
+        dropped = {"pool": None, "_points": [], "_unchecked": [], "_random": None}
+        return vars(self) | dropped | {"_was_sent": os.getpid()}
 
     def __setstate__(self, state: dict) -> None:
         vars(self).update(state)
@@ -315,19 +313,16 @@ class VerifiedModel:
         if not self._points or (start := time.monotonic()) < self._not_before:
             return
         if changed := self._changes():
-            if changed <= self.label.changing and sum(map(len, self._unchecked)) < ROWS_PER_REPETITION:
-                return
-            is_other = FINGERPRINT in changed
             # the first simulation may change values itself
-            if is_other or not ((is_first and self.pool is None) or self._repeats()):
+            is_own = FINGERPRINT not in changed and ((is_first and self.pool is None) or self._repeats())
+            if not is_own:
                 self._drop_unchecked()
-                why = f"different: {', '.join(sorted(changed)[:3])}"
-                why += "" if is_other else ", and an earlier simulation gives another result"
                 raise ChangedModel(
-                    f"the {type(self.model).__name__} has changed since the likelihood was made ({why}): "
-                    "a value or file that it uses was changed, or another model was set. Its simulations cannot be "
-                    "stored with the earlier ones. Make a new model and a new likelihood; what varies during a run has "
-                    "to be a parameter"
+                    f"the {type(self.model).__name__} has changed since the likelihood was made (different: "
+                    f"{', '.join(sorted(changed)[:3])}): a value or file that it uses was changed, so that an earlier "
+                    "simulation gives another result, or another model was set. Its simulations cannot be stored with "
+                    "the earlier ones. Make a new model and a new likelihood; what varies during a run has to be a "
+                    "parameter"
                 )
             self.label.has_changed_itself(changed)
             now = self.label.present(self.model)
@@ -338,8 +333,8 @@ class VerifiedModel:
 
     def _drop_unchecked(self) -> None:
         self._clear()
-        for *_, generation, _ in self._trust.labels.values() if self.cache is not None else ():
-            places = self._key, self.model.fingerprint
+        for generation in self._trust.generations.values():
+            places = self.simulation_key, self.model.fingerprint
             self.cache.discard(np.concatenate(self._unchecked), *places, generation=generation)
 
     def _clear(self) -> None:
@@ -369,90 +364,70 @@ class VerifiedModel:
     # stored rows --------------------------------------------------------------------------------------------------
 
     def _store(
-        self,
-        thetas: np.ndarray,
-        misfit: np.ndarray | None,
-        reasons: list[str],
-        responses: np.ndarray | None,
-        fingerprint: str,
+        self, thetas: np.ndarray, misfit: np.ndarray, reasons: list[str], responses: np.ndarray | None, fingerprint: str
     ) -> None:
-        """Store simulations under the model's label: statistics and responses, if given, and failures of the model."""
-        trust, source = self._trust, source_number(fingerprint)
+        """Store simulations under the model's label: statistics, responses if given, and failures of the model."""
+        trust = self._trust
         if {TransientReason}.issuperset(map(type, reasons)):
             return
-        with trust.lock:
-            generation = self._find_generation(source, self._key, self.n_numbers)
-            if generation == 0:  # it is not known which rows agree
-                return
-            generation = self._use(source, generation or self._new_generation([]))
-        rows = []
-        if misfit is not None:
-            rows += pack_rows(self._key, thetas, misfit, reasons, generation, trust.session)
-        if responses is not None or any(reasons):
-            finite = np.zeros(len(thetas), bool) if responses is None else np.isfinite(responses).all(axis=(1, 2))
-            values = np.zeros((len(thetas), 0)) if responses is None else responses
-            chosen = [row for row, reason in enumerate(reasons) if reason or finite[row]]
+        generation = self._generation(fingerprint)
+        self._use(source_number(fingerprint), generation)  # with the files that simulations have opened by now
+        rows = pack_rows(self.simulation_key, thetas, misfit, reasons, generation, trust.session)
+        values = np.zeros((len(thetas), 0)) if responses is None else responses
+        # without a response, only failures; a failure of the statistic alone has one
+        finite = np.zeros(len(thetas), bool) if responses is None else np.isfinite(responses).all(axis=(1, 2))
+        if chosen := [row for row, reason in enumerate(reasons) if reason or finite[row]]:
             why = ["" if finite[row] else reasons[row] for row in chosen]
             rows += pack_rows(fingerprint, thetas[chosen], values[chosen], why, generation, trust.session, True)
         self.cache.write(rows)
 
-    def _stored(self, identity: str, thetas: np.ndarray, fingerprint: str, width: int) -> list[Row | None]:
-        """Stored rows, None where there is none; some are verified. `StaleCache` if one differs and the label is known.
+    def _stored(self, keys: Sequence[bytes], fingerprint: str, of_responses: bool) -> dict[bytes, Any]:
+        """Stored statistics (bytes), or responses (n_channels, n_steps) [SI], and reasons of failures, by key.
 
-        The `identity` is that of statistics, or the model's `fingerprint` for responses.
+        Some are verified; `StaleCache` if one differs and the label is known.
         """
-        trust, source = self._trust, source_number(fingerprint)
-        with trust.lock:
-            generation = self._find_generation(source, identity, width)
-        if not generation:
-            return [None] * len(thetas)
-        rows = self.cache.look_up(identity, thetas, width, generation)
-        if self.cache.verify:
-            self._verify(identity, rows, generation, width)
-        return rows
-
-    def _stored_responses(self, thetas: np.ndarray, fingerprint: str) -> list[np.ndarray | str | None]:
-        """Responses (n_channels, n_steps) [SI], or reasons of failures for any measurements; None if not stored."""
-        shape = len(self.model.channels), self.model.n_steps
-        rows = self._stored(fingerprint, thetas, fingerprint, shape[0] * shape[1])
-        outcomes = [row and row.outcome for row in rows]
-        return [np.frombuffer(each, "<f8").reshape(shape) if isinstance(each, bytes) else each for each in outcomes]
+        shape = (len(self.model.channels), self.model.n_steps) if of_responses else (self.n_numbers,)
+        identity, generation = fingerprint if of_responses else self.simulation_key, self._generation(fingerprint)
+        thetas = thetas_of(keys, len(self.model.parameter_names))
+        rows = self.cache.look_up(identity, thetas, math.prod(shape), generation)
+        self._verify(identity, rows, generation, math.prod(shape))
+        found = {key: row.outcome for key, row in zip(keys, rows, strict=True) if row is not None}
+        if of_responses:
+            found |= {key: np.frombuffer(x, "<f8").reshape(shape) for key, x in found.items() if isinstance(x, bytes)}
+        return found
 
     # generations --------------------------------------------------------------------------------------------------
 
-    def _find_generation(self, source: int, identity: str, width: int) -> int | None:
-        """The generation of a known label, or see `_adopted`; None if nothing is stored."""
-        cache, labels = self.cache, self._trust.labels
-        if source in labels:
-            return labels[source][3]
-        generation = self._known_generation(source) or next((row[3] for row in labels.values()), None)
-        if generation is None and (stored := cache.generations_of(identity)):
-            generation = self._adopted(stored, identity, width) if cache.verify else stored[0]
-        return generation and self._use(source, generation)
+    def _generation(self, fingerprint: str) -> int:
+        """The generation of a known label, or of stored rows that agree; else a new one."""
+        known, source = self._trust.generations, source_number(fingerprint)
+        if source not in known:
+            known[source] = (
+                self._known_generation(source) or next(iter(known.values()), 0) or self._adopted(fingerprint)
+            )
+        return known[source]
 
-    def _adopted(self, stored: list[int], identity: str, width: int) -> int | None:
-        """The generation that new simulations agree with, else a new one; 0 if no simulation ends."""
-        cache, name = self.cache, type(self.model).__name__
-        candidates = {generation: cache.some_rows(identity, generation, width, ROWS) for generation in stored}
-        candidates = {generation: rows for generation, rows in candidates.items() if len(rows) == ROWS}
-        what = "%d of them are simulated again, to see whether they can be used"
-        self._say(
-            "the code, a file, a package or the machine of this %s is not that of its stored simulations; "
-            + (what if candidates else "they are fewer than %d, stay in the file, and are not used"),
-            *(name, ROWS),
-        )
-        for generation, rows in candidates.items():
-            compared, _, other = self._compare(rows, ROWS)
-            if other is not None:
-                continue
-            if compared < ROWS / 2:
-                return 0
-            self._trust.used[identity] = -ROWS_PER_VERIFICATION * compared
-            self._say("%d stored simulations of this %s agree with new ones: all are used", compared, name)
-            return generation
-        if candidates:
-            self._say("stored rows of this %s differ from new simulations: they stay in the file, not used", name)
-        return self._new_generation(stored)
+    def _adopted(self, fingerprint: str) -> int:
+        """The generation that new simulations agree with, else a new one."""
+        identities = self.simulation_key, fingerprint
+        stored = [(each, identity) for identity in identities for each in self.cache.generations_of(identity)]
+        if stored:
+            what = f"are used if {ROWS} of them agree with new simulations"
+            self._say("the code, a file, a package or the machine is not that of stored simulations, which %s", what)
+        for generation, identity in stored:
+            width = len(self.model.channels) * self.model.n_steps if identity == fingerprint else self.n_numbers
+            rows = self.cache.some_rows(identity, generation, width, ROWS)
+            compared, _, other = self._compare(rows, ROWS) if len(rows) == ROWS else (0, [], None)
+            if other is None and compared >= ROWS / 2:
+                self._trust.used[identity] = -ROWS_PER_VERIFICATION * compared
+                self._say("%d stored simulations agree with new ones: all are used", compared)
+                self._use(source_number(fingerprint), generation)
+                return generation
+        if stored:
+            self._say("stored simulations differ from new ones, or are too few: they stay in the file, not used")
+        # the one that another process begins under the same label
+        text = f"{self.label.code} {sorted(digests_by_name(self.label.opened).items())} {stored}".encode()
+        return int.from_bytes(blake2b(text, digest_size=8).digest()) >> 2 | 1
 
     def _known_generation(self, source: int) -> int | None:
         """The generation of the label with the present contents of the files that simulations opened; None if unknown.
@@ -460,8 +435,8 @@ class VerifiedModel:
         Files that belong to other labels of the model count from now on.
         """
         label, known = self.label, None
-        rows = self.cache.file.select(f"SELECT {LABEL_COLUMNS} FROM labels WHERE source = ? ORDER BY rowid", (source,))
-        rows = list(filter(is_undamaged_label, rows))
+        query = f"SELECT {LABEL_COLUMNS} FROM labels WHERE source = ? ORDER BY rowid"
+        rows = list(filter(is_undamaged_label, self.cache.file.select(query, (source,))))
         for row in rows:
             label.add(read_again(json.loads(row[2])))
         for row in rows:
@@ -470,13 +445,7 @@ class VerifiedModel:
                 self._trust.labels[source], known = row, row[3]
         return known
 
-    def _new_generation(self, used: Iterable[int]) -> int:
-        """The generation that another process has begun under the same label, unless its rows differ."""
-        text = f"{self.label.code} {sorted(digests_by_name(self.label.opened).items())}".encode()
-        generation = int.from_bytes(blake2b(text, digest_size=8).digest()) >> 2 | 1
-        return secrets.randbits(62) | 1 if generation in used else generation
-
-    def _use(self, source: int, generation: int) -> int:
+    def _use(self, source: int, generation: int) -> None:
         """Store to which generation the label belongs, with the files that simulations have opened by now."""
         label, trust = self.label, self._trust
         row = pack_label(source, label.code, label.opened, generation)
@@ -484,37 +453,35 @@ class VerifiedModel:
         if before != row:
             delete = "DELETE FROM labels WHERE source = ? AND code = ? AND files = ?"
             self.cache.file.write((delete, [before[:3]] if before else []), (STORE_LABEL, [row]))
-        return generation
 
     def _say(self, text: str, *values: Any) -> None:
-        logger.warning(f"%s: {text}", self.cache.path, *values)
+        logger.warning(f"%s, {type(self.model).__name__}: {text}", self.cache.path, *values)
 
     # comparisons of rows ------------------------------------------------------------------------------------------
 
     def _verify(self, identity: str, rows: list[Row | None], generation: int, width: int) -> None:
         """Verify some of the rows that were found; `StaleCache` if one differs."""
         trust = self._trust
-        with trust.lock:
-            others = [row for row in rows if row is not None and row.session != trust.session]
-            if not others:
-                return
-            if trust.stale is not None:
-                raise StaleCache(str(trust.stale), trust.stale.theta)
-            latest, kind = [], identity
-            if identity not in trust.used:
-                latest = self.cache.some_rows(identity, generation, width, 1, other_than=trust.session)
-            shuffled = [others[place] for place in self._random.permutation(len(others))]
-            shuffled.sort(key=lambda row: bool(row.reason))  # failures last
-            chosen = latest + [row for row in shuffled if row not in latest]
-            if chosen[0].reason and identity not in trust.used:
-                kind += " failures"  # alone, they verify no successes, which may be used later
-            used = sum(trust.used.values())
-            compared, stopped, other = self._compare(chosen, trust.due(kind, len(others)))
-            if other is not None:
-                self._refuse(*other, used)
-            if stopped:
-                text = "%d of %d stored simulations could not be verified, because the new simulation was stopped (%s)"
-                self._say(text, len(stopped), len(stopped) + compared, stopped[0])
+        others = [row for row in rows if row is not None and row.session != trust.session]
+        if not others:
+            return
+        if trust.stale is not None:
+            raise StaleCache(str(trust.stale), trust.stale.theta)
+        latest, kind = [], identity
+        if identity not in trust.used:
+            latest = self.cache.some_rows(identity, generation, width, 1, other_than=trust.session)
+        shuffled = [others[place] for place in self._random.permutation(len(others))]
+        shuffled.sort(key=lambda row: bool(row.reason))  # failures last
+        chosen = latest + [row for row in shuffled if row not in latest]
+        if chosen[0].reason and identity not in trust.used:
+            kind += " failures"  # alone, they verify no successes, which may be used later
+        used = sum(trust.used.values())
+        compared, stopped, other = self._compare(chosen, trust.due(kind, len(others)))
+        if other is not None:
+            self._refuse(*other, used)
+        if stopped:
+            text = "%d of %d stored simulations could not be verified, because the new simulation was stopped (%s)"
+            self._say(text, len(stopped), len(stopped) + compared, stopped[0])
 
     def _compare(self, rows: Iterable[Row], n: int) -> tuple[int, list[str], tuple[Row, Simulated] | None]:
         """Simulate rows again, in growing batches, until n are compared, one differs, or too many stop.
@@ -553,11 +520,7 @@ class VerifiedModel:
         difference, change = self._row_difference(row, new)
         point = ", ".join(f"{n} = {value:.17g}" for n, value in zip(self.model.parameter_names, theta, strict=True))
         text = f"{self.cache.path}: a stored simulation is not that of this {type(self.model).__name__}. At {point}: "
-        text += f"{difference}. {CHANGED}"
-        if used > 0:
-            text += f", and discard this run, which has used {used} rows"
-        if row.reason:
-            text += ". Also do so if failures depend on anything but the parameters, such as a licence"
+        text += f"{difference}. {CHANGED}" + (f", and discard this run, which has used {used} rows" if used > 0 else "")
         if 0.0 < change < LARGEST_ROUNDING:
             text += (
                 ". If such a difference comes from rounding, for example on another machine, accept differences of "

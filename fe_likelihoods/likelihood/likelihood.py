@@ -212,7 +212,7 @@ class FELikelihood(SumOfDataSets):
         return self.simulator.statistics(thetas)[:, : self.measurements.n_channels]
 
     def simulate(self, thetas: np.ndarray) -> SimulationBatch:
-        """Responses (n, n_channels, n_steps) at structural parameters, which are cached, see `Simulator.simulate`."""
+        """Responses (n, n_channels, n_steps) at structural parameters, which are cached, see `Simulator.run`."""
         return self.run(thetas)[1]
 
     def run(self, thetas: np.ndarray) -> tuple[np.ndarray, SimulationBatch]:

@@ -142,7 +142,7 @@ class ModalLikelihood(FELikelihood):
             known = 0.0 if self.model.frequency_cv is None else self.model.frequency_cv
             squares = np.square(self.noise.standard_deviations(parameters)) - np.square(known)
             errors = np.sqrt(np.maximum(squares.mean(axis=1), 0.0))  # of the modes of the data, for any modes
-        batch = self.simulator.simulate(rows)
+        batch = self.simulator.run(rows, full=True)[1]
         batch.response[:, 0] *= paired.factors(batch.response).mean(axis=1, keepdims=True)
         good = (batch.response[:, 0] > 0.0).all(axis=1)
         if not good.any():

@@ -32,7 +32,7 @@ class Excitation(NamedTuple):
 
         With `stored`, responses to the whole excitation are looked up in its cache and stored there.
         """
-        batch = simulate_batch(self.model, thetas, pool) if stored is None else stored.simulate(thetas)
+        batch = simulate_batch(self.model, thetas, pool) if stored is None else stored.run(thetas, full=True)[1]
         return SimulationBatch(np.ascontiguousarray(batch.response[:, :, self.first :]), batch.reasons)
 
 

@@ -202,9 +202,7 @@ def propagate(
     stored = cache if isinstance(cache, Simulator) else None  # of the model that predicts, with its memory
     if cache is not stored:
         nothing = Measurements(model.channels, model.dt, np.zeros((len(model.channels), model.n_steps)))
-        stored = Simulator(
-            model, nothing, pool=source.executor, cache=cache, memory_rows=0, memory_bytes=0, responses_only=True
-        )
+        stored = Simulator(model, nothing, pool=source.executor, cache=cache, memory_rows=0, memory_bytes=0)
     peaks, ends = Peaks(), Ends(wanted.values(), model)
     compared = moved and state == "virgin" and calibration.likelihood is not None
     first: tuple[np.ndarray, np.ndarray] | None = None  # parameters of a sample, and its response to another motion

@@ -10,7 +10,6 @@ notebook functions work. The worker imports this library, installed packages and
 * A worker refuses everything if its version of this library has different source code.
 """
 
-import dis
 import functools
 import importlib.machinery
 import importlib.metadata
@@ -174,7 +173,7 @@ class _Pickler(cloudpickle.Pickler):
         """The module with a name if it is sent; None if the worker imports it."""
         if name not in self._of_user:
             module = sys.modules.get(name) if isinstance(name, str) else None
-            is_sent = is_of_user(module) and module.__name__ == name
+            is_sent = attribute(module, "__name__") == name and is_of_user(name)
             is_sent = is_sent and not str(vars(module).get("__file__")).endswith(_COMPILED)
             self._of_user[name] = module if is_sent else None
         return self._of_user[name]
@@ -221,27 +220,17 @@ class _Pickler(cloudpickle.Pickler):
 @functools.lru_cache(maxsize=4096)
 def names_in(code: types.CodeType) -> frozenset[str]:
     """Names in a code object and in the code objects inside it."""
-    return frozenset(name for each in _codes(code) for name in each.co_names)
-
-
-@functools.lru_cache(maxsize=4096)
-def _imported_in(code: types.CodeType) -> frozenset[str]:
-    """Modules of import statements in the code, without the dots of relative ones."""
-    steps = [step for each in _codes(code) for step in dis.get_instructions(each)]
-    return frozenset(step.argval for step in steps if step.opname == "IMPORT_NAME")
-
-
-def _codes(code: types.CodeType) -> list[types.CodeType]:
-    inner = [each for each in code.co_consts if isinstance(each, types.CodeType)]
-    return [code, *(each for part in inner for each in _codes(part))]
+    inner = [names_in(each) for each in code.co_consts if isinstance(each, types.CodeType)]
+    return frozenset(code.co_names).union(*inner)
 
 
 def _possible_modules(code: types.CodeType, package: str) -> list[str]:
-    """Full names of modules that the code of a package may import."""
-    imported, parts = _imported_in(code), package.split(".")
-    packages = [".".join(parts[:n]) for n in range(1, len(parts) + 1)] if imported else []
-    found = imported | {f"{each}.{name}".rstrip(".") for each in packages for name in imported}
-    return sorted(found | {f"{each}.{name}" for each in found & sys.modules.keys() for name in names_in(code)})
+    """Full names of modules that the code of a package may import: those that are imported are among its names."""
+    names, parts = names_in(code), package.split(".")
+    packages = [".".join(parts[:n]) for n in range(1, len(parts) + 1)]
+    found = names | {f"{each}.{name}".rstrip(".") for each in packages for name in names | {""}}
+    found |= {f"{each}.{name}" for each in found & sys.modules.keys() for name in names}
+    return sorted(found & sys.modules.keys())
 
 
 class _Namespace(NamedTuple):
@@ -275,14 +264,10 @@ def _new_cached(function: Any, maxsize: int | None, typed: bool) -> Any:
 
 
 def is_of_user(module: Any) -> bool:
-    """Whether a module (or its name) is user code, not part of this library, of Python or of an installed package."""
-    if isinstance(module, str):
-        name, module = module, sys.modules.get(module)
-    else:
-        name = attribute(module, "__name__") if isinstance(module, types.ModuleType) else None
-    if not isinstance(name, str):
+    """Whether a module with a name is user code, not part of this library, of Python or of an installed package."""
+    if not isinstance(module, str):  # the module of a descriptor in Cython
         return False
-    return _is_of_user(name, _places(module) or _places(sys.modules.get(name.partition(".")[0])))
+    return _is_of_user(module, _places(sys.modules.get(module)) or _places(sys.modules.get(module.partition(".")[0])))
 
 
 def code_within(model: Any) -> dict[str, Any]:

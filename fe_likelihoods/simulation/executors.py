@@ -20,10 +20,10 @@ import os
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecutor
 from concurrent.futures import wait as wait_for
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, closing
 from functools import cache, cached_property, partial
 from multiprocessing.pool import Pool, ThreadPool
 from numbers import Integral
@@ -52,16 +52,50 @@ class Submitting:
         ValueError if the function or an item cannot be sent or loaded, or the first exception of the function: the
         other items are given up then.
         """
-        futures = self.submit_all(function, list(items))
+        found: dict[int, Any] = {}
+        with closing(self.as_they_end(function, list(items))) as arriving:
+            for each in arriving:
+                found |= each
+        return [found[number] for number in range(len(found))]
+
+    def as_they_end(self, function: Callable[[Any], Any], items: Sequence[Any]) -> Iterator[dict[int, Any]]:
+        """Results as from `map` by the number of their item, all that have ended meanwhile together.
+
+        After an exception of the function, or an interrupt, the results of items that have ended precede it.
+        """
+        left, arrived, error = {}, SimpleQueue(), None
         try:
-            return [result_of(future) for future in futures]
-        except BaseException:
-            self.give_up(futures)
-            raise
+            left |= {each: number for number, each in enumerate(self.submit_all(function, items))}
+            for future in list(left):
+                future.add_done_callback(arrived.put)
+            while left and error is None:
+                found, error = _results(left, [arrived.get() for _ in range(max(1, arrived.qsize()))])
+                yield found
+        except (Exception, KeyboardInterrupt, SystemExit) as raised:
+            error = raised
+        finally:
+            self.give_up(list(left))
+        if error is not None:
+            yield _results(left, [each for each in left if each.done() and not each.cancelled()])[0]
+            raise error
 
     def submit(self, function: Callable[[Any], Any], item: Any) -> Future:
         """Future with the result of a function for one item, which can be cancelled until a process has it."""
         return self.submit_all(function, [item])[0]
+
+
+def _results(left: dict[Any, int], ended: Sequence[Any]) -> tuple[dict[int, Any], BaseException | None]:
+    """Results of futures that have ended, which are taken from those that are `left`, and the first exception."""
+    found, error = {}, None
+    for future in ended:
+        number = left.pop(future)
+        try:
+            found[number] = result_of(future)
+        except CancelledError:
+            error = error or RuntimeError("the pool was closed before a simulation had finished")
+        except BaseException as raised:
+            error = error or raised
+    return found, error
 
 
 def result_of(future: Any) -> Any:

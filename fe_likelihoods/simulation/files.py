@@ -65,8 +65,13 @@ _MOST_ENTRIES = 100  # in subfolders that are shown as folders; other subfolders
 _MOST_BYTES = 2**20  # of a copy
 _MOST_BESIDE = 3000  # entries beside the working folder, which ``..`` shows
 
-_observers: "list[_Observer]" = []
-_running: "dict[int, RunningSimulation]" = {}  # by thread; 0 for all threads of a process that runs one at a time
+_STARTS = {"os.fork", "os.posix_spawn", "os.system", "subprocess.Popen"}
+_REMOVALS = {"os.remove", "os.rmdir"}  # within a folder, whose removal has its own event, or not
+_WRITES = {"os.mkdir": 0, "os.truncate": 0, "shutil.rmtree": 0, "os.remove": 0, "os.rmdir": 0}  # places of paths
+_WRITES |= {"os.link": 1, "os.rename": 1, "os.symlink": 1}
+_EVENTS = _STARTS | _WRITES.keys() | {"open", "tempfile.mkdtemp", "sqlite3.connect", "ctypes.dlopen"}
+
+_observers: "list[Observer]" = []
 _own = threading.local()
 _digests: dict[str, tuple[tuple, float, str]] = {}
 _mirror: "_Mirror | None" = None
@@ -89,89 +94,72 @@ def read_again(opened: Opened) -> Opened:
     return {path: _digest_or(path, digest) for path, digest in opened.items()}
 
 
-class _Observer:
-    """Notes what is opened while it is in the list of observers."""
+class Observer:
+    """Notes what is opened, written and started, by one `thread` or by all (0), while it is in the list of observers.
 
-    def __init__(self) -> None:
+    A simulation has a thread, or a folder of its own, the `mirror`. It must not write a file that other simulations may
+    write too, unless it runs `alone`; `shared` is the first such file.
+    """
+
+    def __init__(self, alone: bool = True, thread: int = 0, mirror: "_Mirror | None" = None) -> None:
+        self.alone, self.thread, self.mirror, self.shared = alone, thread, mirror, ""
+        self.is_simulation = bool(thread or mirror)
         self.read: set[str] = set()
         self.written: set[str] = set()
         self.noted: Opened = {}
-        self.modules = set(sys.modules)
+        self._modules = set(sys.modules)
+        self._made: list[str] = []  # files and folders
+        self._start = time.time_ns()
 
     def result(self, known: Opened) -> Opened:
         """The files that are `known`, and those read and not written, with new modules and shared libraries."""
-        new = sys.modules.keys() - self.modules if len(sys.modules) != len(self.modules) else ()
+        new = sys.modules.keys() - self._modules if len(sys.modules) != len(self._modules) else ()
         read = {file for name in new if isinstance(file := getattr(sys.modules[name], "__file__", None), str)}
         read |= self.read - self.written
         if not new and not any(path not in known and _counts(path) for path in read):
             return known if self.noted.keys() <= known.keys() else known | self.noted
         return known | {path: each for path, each in mapped(read).items() if path not in self.written} | self.noted
 
-    def see(self, path: Any, writes: bool = False) -> None:
+    def on(self, event: str, arguments: tuple, of_library: bool) -> None:
+        """Note an event of the audit hook; `of_library` if the simulation has not caused it."""
+        with contextlib.suppress(Exception):  # never disturb the code that is observed
+            if event == "open":
+                self._see(arguments[0], bool(arguments[2] & _WRITING))
+            elif event in ("ctypes.dlopen", "sqlite3.connect"):
+                self._see(arguments[0])
+            elif event == "subprocess.Popen":
+                program, command, folder, _ = arguments
+                words = [command] if isinstance(command, str | bytes | os.PathLike) else list(command)
+                for word in filter(None, [shutil.which(os.fsdecode(program or words[0])), *words]):
+                    self._see(os.path.join(folder or "", os.fsdecode(word)))
+        if of_library or not self.is_simulation:
+            return
+        if event == "open":
+            self._opens(*arguments)
+        elif event == "tempfile.mkdtemp":
+            self._makes(arguments[0])
+        elif event in _STARTS:
+            if self.mirror is not None:  # where the process may still write
+                self.mirror.states = {}
+            if event != "os.fork":
+                folder = os.fsdecode((event == "subprocess.Popen" and arguments[2]) or ".")
+                self._writes(os.path.join(os.path.realpath(folder), "*"))
+        elif event in _WRITES and (event not in _REMOVALS or arguments[1] in (None, -1)):
+            self._writes(arguments[_WRITES[event]])
+
+    def _see(self, path: Any, writes: bool = False) -> None:
         """Note a path, or the file that it shows if it is in the own folder of a simulation."""
         if isinstance(path, str | bytes | os.PathLike):
             path, simulation = os.path.abspath(os.fsdecode(path)), running_simulation()
-            if simulation is None or (path := simulation.shown(path)) is not None:
-                (self.written if writes else self.read).add(path)
+            if simulation is not None and simulation._is_own(path):
+                path = os.path.join(simulation.mirror.base, os.path.relpath(path, simulation.mirror.path))
+                if not os.path.exists(path):
+                    return
+            elif simulation is not None:
+                path = os.path.realpath(path)
+            (self.written if writes else self.read).add(path)
 
-
-@contextlib.contextmanager
-def observing() -> Iterator[_Observer]:
-    """Observe what this process opens."""
-    _add_hook()
-    _observers.append(observer := _Observer())
-    try:
-        yield observer
-    finally:
-        _observers.remove(observer)
-
-
-def note(opened: Opened) -> None:
-    """Tell the observers of this process what another process has opened for it."""
-    for observer in list(_observers):
-        observer.noted.update(opened)
-
-
-class RunningSimulation:
-    """A simulation that runs now, `alone` or beside others, in its own folder `place` ("" if it has none).
-
-    Links there show the folder `base`. `thread` runs the simulation, 0 if all threads of this process belong to it.
-    `has_programs` says whether it started processes.
-    """
-
-    def __init__(self, alone: bool, thread: int, place: str = "", base: str = "") -> None:
-        self.alone, self.place, self.base, self._thread = alone, place, base, thread
-        self.has_programs, self._shared = False, ""  # the first file that other simulations may write too
-        self._made: list[str] = []  # files and folders
-        self._start = time.time_ns()
-
-    def run(self, function: Callable[[Any], Any], item: Any) -> Any:
-        """Result of the function for an item; `UnusableModel` for a file that simulations share."""
-        _add_hook()
-        _running[self._thread] = self
-        try:
-            result = function(item)
-        finally:
-            del _running[self._thread]
-        if self._shared and not self.alone:
-            raise UnusableModel(
-                f"The simulations write to {self._shared}, or read there what is written while they run, and "
-                "simulations in other workers may do the same at that moment, so that results would be mixed up. Use a "
-                "pool of processes (dask: workers with one thread) and a relative file name, which is private to each "
-                "simulation, or a folder from tempfile (docs/parallel.rst); or use one worker, pool=1"
-            )
-        return result
-
-    def shown(self, path: str) -> str | None:
-        """The file of `base` that a file in the own folder shows; None if there is none, else `path` without links."""
-        if self._is_own(path):
-            path = os.path.join(self.base, os.path.relpath(path, self.place))
-            return path if os.path.exists(path) else None
-        return os.path.realpath(path)
-
-    # events of the audit hook ---------------------------------------------------------------------------------------
-
-    def opens(self, path: Any, mode: Any, flags: int) -> None:
+    def _opens(self, path: Any, mode: Any, flags: int) -> None:
         """A link in the own folder is replaced by a private file before it is opened for writing."""
         if (path := _full(path)) is None:
             return
@@ -186,9 +174,9 @@ class RunningSimulation:
         elif os.path.isdir(path):  # of tempfile, which opens a file in it
             return
         elif flags & os.O_EXCL:
-            self.makes(path)
+            self._makes(path)
         elif (mode is not None or flags & (os.O_RDWR | os.O_TRUNC)) and not flags & os.O_APPEND:  # else Path.touch
-            self.writes(path)
+            self._writes(path)
 
     def _reads(self, path: str) -> None:
         """Note a file that was written twice while a simulation ran, but not by Python code of this simulation."""
@@ -198,29 +186,23 @@ class RunningSimulation:
         with contextlib.suppress(OSError):
             status = os.stat(path)
             if self._start <= status.st_mtime_ns <= time.time_ns() and stat.S_ISREG(status.st_mode):
-                self._shared = self._shared or (path if path in _fresh else "")
+                self.shared = self.shared or (path if path in _fresh else "")
                 _fresh.add(path)
 
-    def makes(self, path: Any) -> None:
+    def _makes(self, path: Any) -> None:
         """A file or folder that is new belongs to this simulation."""
         if (path := _full(path)) is not None and not os.path.lexists(path):
             self._made.append(path)
 
-    def starts(self, folder: Any = None) -> None:
-        """A process, or a program that may write in its folder."""
-        self.has_programs = True
-        if isinstance(folder, str | bytes | os.PathLike):
-            self.writes(os.path.join(os.path.realpath(os.fsdecode(folder)), "*"))
-
-    def writes(self, path: Any) -> None:
+    def _writes(self, path: Any) -> None:
         """Note a file that does not belong to this simulation alone."""
-        if self._shared or (path := _full(path)) is None or self._is_private(path):
+        if self.shared or (path := _full(path)) is None or self._is_private(path):
             return
         with contextlib.suppress(OSError):
             mode = os.stat(path).st_mode
             if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):  # a terminal, a pipe, /dev/null
                 return
-        self._shared = os.path.dirname(path) if path.endswith("/*") else path
+        self.shared = os.path.dirname(path) if path.endswith("/*") else path
 
     def _is_private(self, path: str) -> bool:
         """Whether no other simulation writes a file while this one runs."""
@@ -228,12 +210,37 @@ class RunningSimulation:
         return made or self._is_own(path) or _is_cache(path)
 
     def _is_own(self, path: str) -> bool:
-        return bool(self.place) and path.startswith(self.place + os.sep)
+        return self.mirror is not None and path.startswith(self.mirror.path + os.sep)
 
 
-def running_simulation() -> RunningSimulation | None:
+@contextlib.contextmanager
+def observing(alone: bool = True, thread: int = 0, mirror: "_Mirror | None" = None) -> Iterator[Observer]:
+    """Observe this process; `UnusableModel` for a file that simulations share, see `Observer`."""
+    _add_hook()
+    _observers.append(observer := Observer(alone, thread, mirror))
+    try:
+        yield observer
+    finally:
+        _observers.remove(observer)
+    if observer.shared and not alone:
+        raise UnusableModel(
+            f"The simulations write to {observer.shared}, or read there what is written while they run, and "
+            "simulations in other workers may do the same at that moment, so that results would be mixed up. Use a "
+            "pool of processes (dask: workers with one thread) and a relative file name, which is private to each "
+            "simulation, or a folder from tempfile (docs/parallel.rst); or use one worker, pool=1"
+        )
+
+
+def note(opened: Opened) -> None:
+    """Tell the observers of this process what another process has opened for it."""
+    for observer in list(_observers):
+        observer.noted.update(opened)
+
+
+def running_simulation() -> Observer | None:
     """The simulation that runs in this thread."""
-    return _running.get(threading.get_ident()) or _running.get(0)
+    own = (each for each in list(_observers) if each.is_simulation and each.thread in (0, threading.get_ident()))
+    return next(own, None)
 
 
 @contextlib.contextmanager
@@ -246,52 +253,19 @@ def of_this_library() -> Iterator[None]:
         _own.is_quiet = before
 
 
-_EVENTS: dict[str, Callable[[RunningSimulation, tuple], Any]] = {
-    "open": lambda simulation, arguments: simulation.opens(*arguments),
-    "os.fork": lambda simulation, _: simulation.starts(),
-    "os.posix_spawn": lambda simulation, _: simulation.starts("."),
-    "os.system": lambda simulation, _: simulation.starts("."),
-    "subprocess.Popen": lambda simulation, arguments: simulation.starts(arguments[2] or "."),
-    "tempfile.mkdtemp": lambda simulation, arguments: simulation.makes(arguments[0]),
-    "sqlite3.connect": lambda simulation, _: None,
-    "ctypes.dlopen": lambda simulation, _: None,
-}
-for _event in ("os.mkdir", "os.truncate", "shutil.rmtree"):
-    _EVENTS[_event] = lambda simulation, arguments: simulation.writes(arguments[0])
-for _event in ("os.link", "os.rename", "os.symlink"):
-    _EVENTS[_event] = lambda simulation, arguments: simulation.writes(arguments[1])
-for _event in ("os.remove", "os.rmdir"):  # else within a folder, whose removal has its own event
-    _EVENTS[_event] = lambda simulation, arguments: arguments[1] in (None, -1) and simulation.writes(arguments[0])
-
-
 @functools.cache
 def _add_hook() -> None:
     sys.addaudithook(_hook)  # for the life of the process
 
 
 def _hook(event: str, arguments: tuple) -> None:
-    if not (_observers or _running) or event not in _EVENTS:
+    if not _observers or event not in _EVENTS:
         return
-    with contextlib.suppress(Exception):  # never disturb the code that is observed
+    of_library = getattr(_own, "is_quiet", False)
+    with of_this_library():
         for observer in list(_observers):
-            _observe(observer, event, arguments)
-    simulation = None if getattr(_own, "is_quiet", False) else running_simulation()
-    if simulation is not None:
-        with of_this_library():
-            _EVENTS[event](simulation, arguments)
-
-
-def _observe(observer: _Observer, event: str, arguments: tuple) -> None:
-    if event == "open":
-        path, mode, flags = arguments
-        observer.see(path, any(each in mode for each in "wax+") if isinstance(mode, str) else bool(flags & _WRITING))
-    elif event in ("ctypes.dlopen", "sqlite3.connect"):
-        observer.see(arguments[0])
-    elif event == "subprocess.Popen":
-        program, command, folder, _ = arguments
-        words = [command] if isinstance(command, str | bytes | os.PathLike) else list(command)
-        for word in filter(None, [shutil.which(os.fsdecode(program or words[0])), *words]):
-            observer.see(os.path.join(folder or "", os.fsdecode(word)))
+            if observer.thread in (0, threading.get_ident()):
+                observer.on(event, arguments, of_library)
 
 
 # paths --------------------------------------------------------------------------------------------------------------
@@ -300,10 +274,8 @@ def _observe(observer: _Observer, event: str, arguments: tuple) -> None:
 def file_digest(path: str | os.PathLike) -> str:
     """Digest of a file's content; read again only after its size or modification time has changed."""
     name = os.fspath(path)
-    status = os.stat(name)
-    stamp = status.st_size, status.st_mtime_ns, status.st_ino
-    known = _digests.get(name)
-    if known is not None and known[0] == stamp and known[1] - status.st_mtime > _CLOCK_TICK:
+    stamp, known = _state(name), _digests.get(name)
+    if known is not None and known[0] == stamp and known[1] - 1e-9 * stamp[0] > _CLOCK_TICK:
         return known[2]
     now = time.time()
     with open(name, "rb") as file:
@@ -365,8 +337,8 @@ def _is_cache(path: str) -> bool:
 def working_folder() -> str:
     """Working folder of this process, also while a simulation runs in its own folder; "" if it was removed."""
     simulation = running_simulation()
-    if simulation is not None and simulation.place:
-        return simulation.base
+    if simulation is not None and simulation.mirror is not None:
+        return simulation.mirror.base
     with contextlib.suppress(FileNotFoundError):
         return os.getcwd()
     return ""
@@ -397,30 +369,26 @@ class Observed:
         """The result for an item, and what was opened."""
         return self._in_folder(item), self._known
 
-    def _observe(self, item: Any) -> Any:
-        with observing() as observer:
-            result = self.function(item)
-        with of_this_library():
-            self._known = observer.result(self._known)
-        return result
-
     def _in_folder(self, item: Any) -> Any:
         is_home = self._sender is None or self._sender[0] == process_name()
         if running_simulation() is not None or (is_home and _is_main()):  # one after the other
             return self._observe(item)
         if is_home or not (_is_main() or _is_only_thread_of_dask()):
-            return RunningSimulation(bool(self._alone), threading.get_ident()).run(self._observe, item)
+            return self._observe(item, bool(self._alone), threading.get_ident())
         mirror, before = _mirror_of(self._sender[1]), working_folder()
-        thread = 0 if _is_main() else threading.get_ident()
-        simulation = RunningSimulation(bool(self._alone), thread, mirror.path, mirror.base)
         os.chdir(mirror.path)
         try:
-            return simulation.run(self._observe, item)
+            return self._observe(item, bool(self._alone), 0 if _is_main() else threading.get_ident(), mirror)
         finally:
-            if simulation.has_programs:  # which may still write
-                mirror.states = {}
             with contextlib.suppress(FileNotFoundError):
                 os.chdir(before)
+
+    def _observe(self, item: Any, *simulation: Any) -> Any:
+        with observing(*simulation) as observer:
+            result = self.function(item)
+        with of_this_library():
+            self._known = observer.result(self._known)
+        return result
 
 
 def _is_main() -> bool:

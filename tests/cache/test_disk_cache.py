@@ -251,7 +251,7 @@ def test_threads_share_a_cache(path, rng):
 
 def test_pickles_by_path(tmp_path, monkeypatch, thetas):
     monkeypatch.chdir(tmp_path)
-    cache = SimulationCache("relative.sqlite", max_response_bytes=1000, verify=False)
+    cache = SimulationCache("relative.sqlite", max_response_bytes=1000, tolerance=1e-6)
     likelihood = likelihood_of(Line(), cache, memory_rows=0)
     likelihood.misfit(thetas)
     data = pickle.dumps(likelihood)
@@ -261,7 +261,7 @@ def test_pickles_by_path(tmp_path, monkeypatch, thetas):
     copy = pickle.loads(data)
     assert copy.simulator.cache.path == tmp_path / "relative.sqlite"
     settings = copy.simulator.cache
-    assert (settings.max_response_bytes, settings.verify) == (1000, False)
+    assert (settings.max_response_bytes, settings.tolerance) == (1000, 1e-6)
     copy.misfit(thetas)
     assert (copy.simulations, copy.simulator.disk_hits) == (likelihood.simulations, 300)
 

@@ -76,14 +76,14 @@ def test_a_joint_posterior_runs_once_at_each_point(rng, runs):
 
 
 def test_a_guided_run_with_its_checks_and_a_cache_runs_once(tmp_path, runs):
-    cache = SimulationCache(tmp_path / "both.db", verify=False)
+    cache = SimulationCache(tmp_path / "both.db")
     posterior = joint(of_function(), cache=cache)
     sampler = guided(posterior, starts=3)
     assert sum(runs) == posterior.likelihood["modes"].simulations == posterior.likelihood["static"].simulations
     made = sum(runs)
     other = joint(of_function(), cache=cache)
     np.testing.assert_array_equal(other(sampler.get_chain(flat=True)), sampler.get_log_prob(flat=True))
-    assert sum(runs) == made
+    assert sum(runs) <= made + 8  # verified rows
     assert check_result(sampler).status == "use"
 
 

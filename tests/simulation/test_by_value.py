@@ -2,7 +2,6 @@
 
 import sys
 import threading
-import types
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 
@@ -230,7 +229,7 @@ def test_modules_of_this_process_stay_when_a_function_is_loaded_in_it(user):
 
 
 def test_what_belongs_to_the_user():
-    for module in (sys.modules[__name__], sys.modules["__main__"], types.ModuleType("made_by_hand")):
-        assert by_value.is_of_user(module)
+    for name in (__name__, "__main__", "made_by_hand"):
+        assert by_value.is_of_user(name)
     for module in (np, pytest, threading, by_value, sys, np.random.mtrand):
-        assert not by_value.is_of_user(module)
+        assert not by_value.is_of_user(module.__name__)
