@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from scipy import linalg
 
 from samplers.estimates.weights import effective_sample_size
 from samplers.resampling import systematic
@@ -26,14 +27,20 @@ if TYPE_CHECKING:
 
 __all__ = [
     "DescribedPosterior",
+    "NormalLikelihood",
     "StoredPosterior",
     "describe",
     "log_density_on_scale",
+    "normal_likelihood",
     "on_scale",
     "resampled_description",
 ]
 
 
+_LEAST_INFORMATION = 1.0  # of the data about a direction, relative to the prior, below which it is left to the prior
+_UNSEEN = 1e-6  # information about such a direction
+_FEWEST_SAMPLES = 5  # effective ones per parameter, for their covariance
+_PRIOR_DRAWS = 20_000  # for the moments of a prior
 _MOST = 1000  # samples of a test in a hierarchical model; the time of an evaluation is proportional to them
 
 
@@ -247,6 +254,41 @@ def on_scale(stored: StoredPosterior, names: Sequence[str], scales: Scales) -> t
         ]
         raise ValueError(f"a logarithmic scale needs positive samples of {', '.join(wrong)}; use scale='linear'")
     return prior, scales.to_scale(values)
+
+
+class NormalLikelihood(NamedTuple):
+    """Likelihood of a stored posterior, normal in the logarithms x (d,) of some parameters, and their prior."""
+
+    peak: np.ndarray
+    errors: np.ndarray  # covariance (d, d) of the peak
+    unseen: int  # number of directions about which the data say less than the prior; their errors are vast
+    center: np.ndarray
+    prior: np.ndarray  # covariance (d, d)
+
+
+def normal_likelihood(stored: StoredPosterior, names: Sequence[str]) -> NormalLikelihood:
+    """The posterior of positive parameters over their prior; ValueError as `on_scale`, and for too few samples."""
+    prior, points = on_scale(stored, names, Scales(np.ones(len(names), dtype=bool)))
+    weights, n, d = np.exp(stored.log_weights), stored.effective_sample_size, len(names)
+    mean, covariance = weights @ points, np.cov(points.T, aweights=weights, ddof=0)
+    if n < (fewest := _FEWEST_SAMPLES * d) or not (np.diag(covariance) > 0.0).all():
+        raise ValueError(
+            f"the likelihood of {d} parameters needs at least {fewest} effective samples; got {n:.0f}, with the "
+            f"standard deviations {np.sqrt(np.diag(covariance)).tolist()} of the logarithms"
+        )
+    covariance *= (n - 1.0) / (n - d - 2.0)  # so that its inverse is right on average
+    z = np.random.default_rng(0).standard_normal((_PRIOR_DRAWS, prior.dim))
+    z -= z.mean(axis=0)
+    logs = np.log(prior.from_normal(np.linalg.solve(np.linalg.cholesky(z.T @ z / len(z)), z.T).T))
+    center, prior_covariance = logs.mean(axis=0), np.cov(logs.T, bias=True)  # exact for lognormal priors
+    variances, directions = linalg.eigh(covariance, prior_covariance)
+    axes = prior_covariance @ directions  # in which the prior has the covariance one, and the posterior is diagonal
+    information = 1.0 / np.maximum(variances, np.finfo(float).tiny) - 1.0  # of the data, relative to the prior
+    seen = information > _LEAST_INFORMATION
+    information = np.where(seen, information, _UNSEEN)
+    offset = directions.T @ (mean - center) * seen
+    peak, errors = center + axes @ (offset * (1.0 + 1.0 / information)), axes / information @ axes.T
+    return NormalLikelihood(peak, errors, int((~seen).sum()), center, prior_covariance)
 
 
 def log_density_on_scale(prior: Prior, scales: Scales, points: np.ndarray) -> np.ndarray:

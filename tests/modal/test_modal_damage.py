@@ -52,7 +52,7 @@ def test_losses_lie_in_their_intervals_though_the_masses_are_wrong():
             calibrated(each, day, rng, frame, slope) for each, day in zip((healthy, after), temperatures, strict=True)
         ]
         found = stiffness_loss(*states, NAMES)
-        low, lower, upper, high = found.extent((0.05, 0.25, 0.75, 0.95))
+        low, lower, upper, high = np.quantile(found.loss, (0.05, 0.25, 0.75, 0.95), axis=0)
         loss = 1.0 - after / healthy
         inside.append([(low <= loss) & (loss <= high), (lower <= loss) & (loss <= upper)])
         alarms.append(found.presence() > 0.5)
