@@ -33,7 +33,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..noise.sufficient_statistics import Statistic, needs_response, statistic_width
+from ..noise.sufficient_statistics import Statistic, needs_response, relative_changes, statistic_width
 from ..signals.comparison import Comparison
 from ..simulation.failure_reasons import ChangedModel, TransientReason
 from ..simulation.files import digests_by_name, observing, read_again
@@ -144,27 +144,13 @@ def difference_in_words(
     """How a simulation differs from an earlier one, in words and relative to the response norm; empty if it agrees.
 
     It agrees within the `tolerance` of a response, relative to its norm; zero is for equal bits. `names` are those of
-    the channels, whose sums of squares come first; further numbers have the channel order and the scale of the sums,
-    and contain sums of squared responses if `of_response`. If a response with norm r changes by t r, the sum of squared
-    residuals s^2 changes by at most 2 s t r + (t r)^2, and so does a sum over products of two residuals of the channel;
-    a sum of squared responses by at most 2 r t r + (t r)^2. Rounding errors in the sums do not count as changes.
+    the channels. See `relative_changes`.
     """
     if reason or new.reason:
         was, now = (f"failed ({text})" if text else "succeeded" for text in (reason, new.reason))
         return ("" if reason and new.reason else f"it {was}; simulated again, it {now}"), 0.0
-    if np.array_equal(earlier, new.misfit):
-        return "", 0.0
-    n, channels = len(names), np.arange(len(earlier)) % len(names)
-    s, r = np.sqrt(np.minimum(earlier[:n], new.misfit[:n]))[channels], new.norm[channels]
-    if of_response:
-        s[n:] = r[n:]
-    difference = np.abs(earlier - new.misfit)
-    if tolerance:
-        difference = np.where(difference <= ROUNDING * s**2, 0.0, difference)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        # the positive root of (t r)^2 + 2 s (t r) = difference, in a form without cancellation
-        change = np.where(difference == 0.0, 0.0, difference / (s + np.sqrt(s**2 + difference)) / r)
-    worst = int(np.argmax(np.nan_to_num(change, nan=np.inf)))
+    change = relative_changes(earlier, new.misfit, new.norm, of_response, ROUNDING if tolerance else 0.0)
+    worst, n = int(np.argmax(np.nan_to_num(change, nan=np.inf))), len(names)
     if change[worst] <= tolerance:
         return "", 0.0
     what = "sum of squared residuals" if worst < n else f"statistic {worst}"
