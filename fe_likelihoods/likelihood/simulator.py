@@ -135,14 +135,14 @@ class Simulator(VerifiedModel):
             if wanted.any():
                 statistics[wanted] = self.run(thetas[wanted])
             return statistics
-        trust, size = self._trust, 1
-        with trust.lock:  # after what runs for other requests
-            trust.lock.wait_for(lambda: trust.running.isdisjoint(keys))
-            request = self._look_up(keys, which, full)
-            if left := (new := request.left):
-                self._check_before()  # so that finished simulations are stored
-                self._trust.running.update(new)  # of another label, if the check has made one
+        trust, new, size = self._trust, [], 1
         try:
+            with trust.lock:  # after what runs for other requests
+                trust.lock.wait_for(lambda: trust.running.isdisjoint(keys))
+                request = self._look_up(keys, which, full)
+                if left := (new := request.left):
+                    self._check_before()  # so that finished simulations are stored
+                    self._trust.running.update(new)  # of another label, if the check has made one
             while left:
                 some, start = left[: self._chunk(len(left), size, full)], time.perf_counter()
                 if self.pool is None or self._together:
