@@ -88,6 +88,7 @@ class Simulator(VerifiedModel):
         self.n_structural = len(model.parameter_names)
         self.simulations = self.cache_hits = self.disk_hits = 0
         self._recalled: set[bytes] = set()
+        self._most = 1  # simulations between two writes to the cache on disk, adapted to their duration
         self.when_simulated: Callable[[int], None] | None = None
 
     def __getstate__(self) -> dict:
@@ -135,7 +136,7 @@ class Simulator(VerifiedModel):
             if wanted.any():
                 statistics[wanted] = self.run(thetas[wanted])
             return statistics
-        trust, new, size = self._trust, [], 1
+        trust, new = self._trust, []
         try:
             with trust.lock:  # after what runs for other requests
                 trust.lock.wait_for(lambda: trust.running.isdisjoint(keys))
@@ -144,7 +145,7 @@ class Simulator(VerifiedModel):
                     self._check_before()  # so that finished simulations are stored
                     self._trust.running.update(new)  # of another label, if the check has made one
             while left:
-                some, start = left[: self._chunk(len(left), size, full)], time.perf_counter()
+                some, start = left[: self._chunk(len(left), full)], time.perf_counter()
                 if self.pool is None or self._together:
                     with self._observed():
                         batch = simulate_batch(self.model, self._thetas(some), self.pool)
@@ -152,7 +153,8 @@ class Simulator(VerifiedModel):
                 else:
                     self._run_in_pool(request, some, start)
                 # grows by steps: the first simulations may be failures that took no time
-                size = min(4 * len(some), 1 + int(_SECONDS_PER_CHUNK * len(some) / (time.perf_counter() - start)))
+                rate = len(some) / (time.perf_counter() - start)
+                self._most = min(4 * len(some), 1 + int(_SECONDS_PER_CHUNK * rate))
                 left = request.left
         except BaseException:
             with self._trust.lock:
@@ -198,7 +200,8 @@ class Simulator(VerifiedModel):
         Some stored statistics are verified by runs.
         """
         request, known = Requested(keys, full, self.model), zip(keys, self.memory_cache.look_up(keys), strict=True)
-        skipped = [key for key, theta in zip(keys, self._thetas(keys), strict=True) if not np.isfinite(theta).all()]
+        finite = np.isfinite(self._thetas(keys)).all(axis=1)
+        skipped = [key for key, fine in zip(keys, finite, strict=True) if not fine]
         outcomes = {key: outcome for key, outcome in known if outcome is not None}
         request.enter(outcomes | dict.fromkeys(skipped, "the parameters are not finite"))
         on_disk: set[bytes] = set()
@@ -260,7 +263,7 @@ class Simulator(VerifiedModel):
     def _together(self) -> bool:
         return hasattr(self.model, "simulate_together")
 
-    def _chunk(self, n: int, size: int, full: bool) -> int:
+    def _chunk(self, n: int, full: bool) -> int:
         """Number of simulations, of n, between two writes to the cache on disk, or two reports of progress."""
         if self.streams:
             return n
@@ -270,7 +273,7 @@ class Simulator(VerifiedModel):
             return min(n, most)
         workers = (os.cpu_count() or 1) if self.pool is None else self.pool.n_workers or n
         together = self.pool is not None or hasattr(self.model, "simulate_batch")  # then all workers are to be busy
-        return min(max(_ROUNDS_PER_CHUNK * workers if together else 1, size), most)
+        return min(max(_ROUNDS_PER_CHUNK * workers if together else 1, self._most), most)
 
     @interrupts_end_the_run()
     def _run_in_pool(self, request: Requested, keys: Sequence[bytes], start: float) -> None:
