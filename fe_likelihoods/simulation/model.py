@@ -281,13 +281,12 @@ def _attempt(
     return (None, reason) if reason else (result, "")
 
 
-@interrupts_end_the_run()
 def run_each(
     run: Callable[[np.ndarray], tuple], thetas: np.ndarray, shape: tuple[int, ...], pool: Any
 ) -> tuple[np.ndarray, list[str]]:
     """Results (n, *shape) and reasons of simulations that run one by one, in this process or in the pool's workers.
 
-    `run` is a `sent_simulation`, such as one that returns statistics, so that the responses stay in the workers.
+    `run` is a `sent_simulation`, for example.
     """
     if pool is not None:
         found = map(unpack, pool.map(Observed(run, pool.n_workers == 1), list(thetas)))
