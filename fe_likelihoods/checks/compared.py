@@ -22,9 +22,8 @@ from ..simulation.failure_reasons import ChangedModel
 from ..simulation.model import SimulationFailed
 from ..text_tables import listed
 from .faults import FEWEST_DRAWS
-from .run import FinishedRun
 
-__all__ = ["ChannelFit", "Fit", "ModalFit", "checks_of", "compare", "data_sets_of", "draws_to_compare", "fit_data_sets"]
+__all__ = ["ChannelFit", "Fit", "ModalFit", "checks_of", "compare", "data_sets_of", "draws_to_compare"]
 
 logger = logging.getLogger(__name__)
 
@@ -34,10 +33,9 @@ MOST_DRAWS, SECONDS = 100, 10.0  # of the prior, and of their simulations
 class ModalFit(NamedTuple):
     """Measured and computed modes, `PredictedModes` of `fe_likelihoods.modal`."""
 
-    title: str  # name of the data set; empty if there is one only
     likelihood: Any
     draws: Any  # modes at draws of the prior; None if none can be simulated
-    points: np.ndarray | None = None  # samples of the posterior (n, ndim); None before a run
+    centre: np.ndarray | None = None  # of the samples of the posterior (ndim,); None before a run
     samples: Any = None  # modes at samples, as `predict_modes` takes them
     held_out: Any = None  # modes that were measured, but not compared, at these samples
 
@@ -59,7 +57,7 @@ class Fit:
 
     title: str  # name of the data set and of the event; empty if there is one only
     measurements: Measurements
-    draws: np.ndarray  # (n, n_channels, n_samples) at draws of the prior
+    draws: np.ndarray  # (n, n_channels, n_samples) at draws of the prior; of modes these draws
     after: np.ndarray | None = None  # (n_channels, n_samples) of the fit
     before: np.ndarray | None = None  # the same at the mean of the prior
     white: np.ndarray | None = None  # residuals of the fit as the noise whitens them; None without time
@@ -113,57 +111,65 @@ def draws_to_compare(posterior: Posterior) -> np.ndarray:
         return np.empty((0, posterior.ndim))
 
 
-def compare(
-    likelihood: FELikelihood,
-    draws: np.ndarray,
-    key: str = "",
-    samples: np.ndarray | None = None,
-    point: np.ndarray | None = None,
-    start: np.ndarray | None = None,
-) -> list[Fit]:
-    """The fits of a data set with the name `key`.
+def compare(posterior: Posterior, samples: np.ndarray | None = None, centre: np.ndarray | None = None) -> list[Fit]:
+    """The fits of all data sets and events, with draws of the prior.
 
-    Draws of the prior (n, ndim), as many as ten seconds allow; after a run, also samples of the posterior (n, ndim),
-    the `point` of the fit and the `start` before the update (ndim,).
+    After a run, also with its samples (n, ndim), at the mean of the prior and at the `centre` of the samples (ndim,).
     """
-    measured, n = likelihood.measurements, len(likelihood.model.parameter_names)
-    found = dict[str, np.ndarray]()
-    for name, theta in (("before", start), ("after", point)) if not likelihood.is_modal else ():
-        batch = None if theta is None else likelihood.simulate(theta[None, :n])
-        if batch is not None and not batch.reasons[0]:
-            found[name] = measured.values - likelihood.residuals_of(batch.response[0])
+    draws, start, fits = draws_to_compare(posterior), posterior.prior.mean(), list[Fit]()
+    for key, likelihood, columns in data_sets_of(posterior):
+        few, residuals = _simulate(likelihood, draws[:, columns])
+        of, at = (None if each is None else each[..., columns] for each in (samples, centre))
+        if likelihood.is_modal:
+            modal = _modes(likelihood, few, of, at)
+            fits.append(Fit(key, likelihood.measurements, few, modal=modal))
+        else:
+            points = {} if at is None else {"before": start[columns], "after": at}
+            fits += _responses(likelihood, key, residuals, points)
+    return fits
+
+
+def _simulate(likelihood: FELikelihood, draws: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+    """The draws that ten seconds allow, and residuals (n_channels, n_samples) of those that succeed."""
     good, made, begin = list[np.ndarray](), 0, perf_counter()
     try:
         while made < len(draws) and (not made or perf_counter() - begin < SECONDS):
             more = max(made, FEWEST_DRAWS, getattr(likelihood.simulator.pool, "n_workers", None) or 1)
-            batch = likelihood.simulate(draws[made : made + more, :n])
+            batch = likelihood.simulate(draws[made : made + more, : len(likelihood.model.parameter_names)])
             made = min(made + more, len(draws))
             if not likelihood.is_modal:
                 good += [likelihood.residuals_of(batch.response[k]) for k, why in enumerate(batch.reasons) if not why]
     except (ChangedModel, StaleCache) as error:  # concerns the next sampling, not this result
         logger.warning("the fit is compared with no draws of the prior: %s", error)
-    if likelihood.is_modal:
-        return [Fit(key, measured, np.empty(0), modal=_modes(key, likelihood, draws[:made], samples))]
-    found["draws"] = measured.values - np.reshape(good, (-1, *measured.values.shape))
-    noise = sampled_noise(likelihood.noise)
+    return draws[:made], good
+
+
+def _responses(
+    likelihood: FELikelihood, key: str, good: list[np.ndarray], points: dict[str, np.ndarray]
+) -> Iterator[Fit]:
+    """The fit of each event, from residuals at draws of the prior, and at points (ndim,) by their name in `Fit`."""
+    measured, noise = likelihood.measurements, sampled_noise(likelihood.noise)
+    found = {"draws": measured.values - np.reshape(good, (-1, *measured.values.shape))}
+    for name, point in points.items():
+        batch = likelihood.simulate(point[None, : len(likelihood.model.parameter_names)])
+        if not batch.reasons[0]:
+            found[name] = measured.values - likelihood.residuals_of(batch.response[0])
     by_channel, assumed = dict[str, np.ndarray](), getattr(noise, "effective_samples", None)
     if assumed is not None:
         by_channel["assumed"] = np.broadcast_to(assumed, measured.n_channels)
     if measured.is_history and "after" in found:
         found["white"] = measured.values - found["after"]
         if hasattr(noise, "whitened"):
-            values = dict(zip(likelihood.parameter_names, point, strict=True))
+            values = dict(zip(likelihood.parameter_names, points["after"], strict=True))
             theta = np.array([values.get(name, np.nan) for name in noise.parameter_names])
             found["white"] = noise.whitened(found["white"], found["after"], theta)
     elif not measured.is_history and not noise.parameter_names and hasattr(noise, "standard_deviations"):
         by_channel["deviations"] = noise.standard_deviations(np.zeros((1, 0)))[0][:, None]
-    fits = []
     for title, part, rows, inside in _events(likelihood, key):
         cut = {name: each[rows] for name, each in by_channel.items()}
         for name, each in found.items():
             cut[name] = np.where(inside, each, np.nan)[..., rows, :][..., inside[rows].any(axis=0)]
-        fits.append(Fit(title, part, **cut))
-    return fits
+        yield Fit(title, part, **cut)
 
 
 def _events(likelihood: FELikelihood, key: str) -> Iterator[tuple[str, Measurements, np.ndarray, np.ndarray]]:
@@ -188,7 +194,7 @@ def _events(likelihood: FELikelihood, key: str) -> Iterator[tuple[str, Measureme
             yield ", ".join(filter(None, (key, "" if each is None else each.name))), part, rows, inside
 
 
-def _modes(key: str, likelihood: Any, draws: np.ndarray, samples: np.ndarray | None) -> ModalFit:
+def _modes(likelihood: Any, draws: np.ndarray, samples: np.ndarray | None, centre: np.ndarray | None) -> ModalFit:
     """Modes at draws of the prior, and at four times as many samples of the posterior (n, ndim)."""
     found: list[Any] = []
     for points in (draws, samples):
@@ -198,17 +204,5 @@ def _modes(key: str, likelihood: Any, draws: np.ndarray, samples: np.ndarray | N
         except (SimulationFailed, ChangedModel, StaleCache) as error:
             logger.warning("modes are not compared: %s", error)
             found.append(None)
-    few = None if samples is None else samples[:: -(-len(samples) // max(len(draws), 1))]
     held_out = None if None in (found[1], likelihood.held_out) else found[1].against(likelihood.held_out)
-    return ModalFit(key, likelihood, found[0], few, found[1], held_out)
-
-
-def fit_data_sets(run: FinishedRun) -> tuple[Fit, ...]:
-    """The fits of each data set, at the centre of the samples; empty without a likelihood of this package."""
-    if run.likelihood is None:
-        return ()
-    draws, start, fits = draws_to_compare(run.posterior), run.posterior.prior.mean(), list[Fit]()
-    for key, likelihood, columns in data_sets_of(run):
-        points = (each[..., columns] for each in (run.samples, run.centre, start))
-        fits += compare(likelihood, draws[:, columns], key, *points)
-    return tuple(fits)
+    return ModalFit(likelihood, found[0], centre, found[1], held_out)

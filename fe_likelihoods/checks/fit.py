@@ -1,13 +1,12 @@
 """Findings about a fit: does the model follow the measurements at all, and what would explain it if not?"""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 from scipy.special import chdtrc
 
 from ..noise.residuals import ResidualChecks
-from ..priors.between_events import spread_of
 from ..signals.channels import Channel
 from ..signals.comparison import relative_errors
 from ..text_tables import listed
@@ -16,9 +15,8 @@ from .faults import EXPLAINED, find_faults, finding_of, supports_apart
 from .finding import CARE, CORRELATED, HALF, NOTE, SMALL_PROBABILITY, WRONG, Finding, percent
 from .modal import check_modes, squares_of_modes
 from .model import motions_to_replace
-from .run import ParameterRow
 
-__all__ = ["check_other_events", "check_residuals", "check_responses", "check_stated_errors", "check_supports"]
+__all__ = ["check_residuals", "check_responses", "check_stated_errors", "check_supports"]
 
 FEWEST = 10  # samples that the tests of correlation and distribution need
 FAR = 5.0  # mean square of residuals, relative to the stated one, from which on a result is not used
@@ -31,7 +29,7 @@ def check_responses(fits: Iterable[Fit]) -> list[Finding]:
     """
     found, others = list[Finding](), [fit for fit in fits if not fit.modal]
     for fit in fits:
-        found += check_modes(fit.modal) if fit.modal else []
+        found += check_modes(fit.modal.draws, fit.title) if fit.modal and fit.modal.draws else []
     for fit in others:
         for fault in find_faults(fit.measurements, fit.draws):
             channels = [each for each in fit.measurements.channels if each.name in fault.names]
@@ -105,17 +103,6 @@ def _check_prior(fits: Iterable[Fit], severity: str) -> list[Finding]:
     return [Finding("The prior does not reach the measurements", severity, text, action, far, "fit")] if far else []
 
 
-def check_other_events(rows: Sequence[ParameterRow]) -> list[Finding]:
-    """By which factors the standard deviations from one event are too small for the parameters of another event."""
-    spread = spread_of([row.name for row in rows])
-    known = [(row, spread[row.name]) for row in rows if row.name in spread and row.cv > 0.0]
-    factors = {row.label: float(np.sqrt(1.0 + 2.0 * (sd / row.cv) ** 2)) for row, sd in known}
-    differing = [f"{row.label} by about {percent(sd)} (factor {factors[row.label]:.2g})" for row, sd in known]
-    text = f"For another event the standard deviations are too small: parameters differ, {listed(differing)}."
-    action = "Predict another event with this spread (in Python, predict_new_event), or calibrate several events."
-    return [Finding("Another event differs", NOTE, text, action, factors)] if factors else []
-
-
 def check_residuals(fits: Iterable[Fit]) -> list[Finding]:
     """How much successive errors depend on each other: of real measurements always, so that this limits no result."""
     coloured, assumed, worth = list[str](), 0.0, 0.0
@@ -138,11 +125,13 @@ def check_residuals(fits: Iterable[Fit]) -> list[Finding]:
 def check_stated_errors(fits: Iterable[Fit]) -> list[Finding]:
     """Whether data without time differ from the model by more than the stated standard deviations explain."""
     found = []
-    for what, squares, n in _squares(fits):
+    for fit in fits:
+        squares, n = squares_of_modes(fit.modal) if fit.modal else _squares(fit)
         factor = float(np.sqrt(sum(squares.values()) / max(n, 1)))
         if not chdtrc(n, n * factor**2) < SMALL_PROBABILITY:
             continue
-        text = f"{what} differ from the model by {factor:.2g} times their stated errors (root mean square)."
+        what = "Frequencies and shapes" if fit.modal else f"The {n} values"
+        text = f"{fit.where(what)} differ from the model by {factor:.2g} times their stated errors (root mean square)."
         largest = listed(sorted(squares, key=squares.__getitem__)[:-3:-1])
         action = f"The largest: {largest}. Look for a wrong number, sensor or place; else let the errors be unknown."
         severity = WRONG if factor**2 > FAR else CARE
@@ -151,29 +140,24 @@ def check_stated_errors(fits: Iterable[Fit]) -> list[Finding]:
     return found
 
 
-def _squares(fits: Iterable[Fit]) -> Iterator[tuple[str, dict[str, float], int]]:
-    """What is compared, squares of residuals by their stated errors, by name, and how many errors they are of."""
-    for fit in fits:
-        if fit.modal is not None:
-            yield from squares_of_modes(fit.modal)
-        elif fit.deviations is not None and fit.residuals is not None:
-            measured, squares = fit.measurements, np.square(fit.residuals / fit.deviations)
-            cases = measured.points or range(1, measured.n_steps + 1)
-            names = [f"{channel.name} at {case}" for channel in measured.channels for case in cases]
-            known = {name: float(each) for name, each in zip(names, squares.flat, strict=True) if np.isfinite(each)}
-            yield f"The {len(known)} values{f' of {fit.title}' if fit.title else ''}", known, len(known)
+def _squares(fit: Fit) -> tuple[dict[str, float], int]:
+    """Squares of residuals without time by their stated errors, by name, and how many errors they are of."""
+    measured = fit.measurements
+    if fit.deviations is None or fit.residuals is None:
+        return {}, 0
+    cases = measured.points or range(1, measured.n_steps + 1)
+    names = [f"{channel.name} at {case}" for channel in measured.channels for case in cases]
+    squares = dict(zip(names, np.square(fit.residuals / fit.deviations).ravel().tolist(), strict=True))
+    known = {name: each for name, each in squares.items() if np.isfinite(each)}
+    return known, len(known)
 
 
 def describe_residuals(checks: ResidualChecks | None) -> list[str]:
     """What the residuals of each channel look like, in words; None could not be checked."""
-    if checks is None:
-        return ["not checked (too few samples, or an exact fit)."]
-    found = []
-    for lag, worth, white, normal, n in zip(*checks[2:7], strict=True):
+    found = [] if checks else ["not checked (too few samples, or an exact fit)."]
+    for lag, worth, white, normal, n in zip(*checks[2:7], strict=True) if checks else ():
         text = f"Correlated ({lag:.2f} from sample to sample): {n:.0f} samples are worth {worth:.0f} independent ones."
-        if white >= SMALL_PROBABILITY:
-            text = "White: no correlation from sample to sample was found."
-        more = " Not normal: look at the tails." if normal < SMALL_PROBABILITY else ""
-        few = f"Not checked: {n:.0f} samples are too few, {FEWEST} are needed."
-        found.append(few if n < FEWEST else f"{text}{more}")
+        text = text if white < SMALL_PROBABILITY else "White: no correlation from sample to sample was found."
+        text += " Not normal: look at the tails." if normal < SMALL_PROBABILITY else ""
+        found.append(text if n >= FEWEST else f"Not checked: {n:.0f} samples are too few, {FEWEST} are needed.")
     return found

@@ -1,28 +1,23 @@
 """Findings about modes, which are `PredictedModes` of `fe_likelihoods.modal`, above this folder."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from itertools import combinations
 from typing import Any
 
 import numpy as np
 
-from ..text_tables import listed
 from .compared import MOST_DRAWS
 from .faults import BETTER, FACTOR, FLOOR, Fault, finding_of
-from .finding import CARE, HALF, NOTE, TAIL, Finding, percent
+from .finding import CARE, HALF, Finding
 
 __all__ = ["check_modes", "squares_of_modes"]
 
 
-def check_modes(fit: Any) -> list[Finding]:
-    """Faults and modes without a counterpart at draws of the prior of a `ModalFit`; pairs that change in samples."""
-    pairs = [] if fit.samples is None else _check_pairs(fit.samples)
-    if fit.draws is None:
-        return pairs
-    found = [finding_of(each, fit.title, error="of frequencies") for each in _unit(fit.draws)]
-    of_sensor = [finding_of(each, fit.title, error="of shapes") for each in _faults_of_sensors(fit.draws)]
-    return found + (of_sensor or _check_shapes(fit.draws)) + pairs
+def check_modes(modes: Any, title: str) -> list[Finding]:
+    """Faults of data with a title, and modes without a counterpart, at draws of the prior."""
+    found = [finding_of(each, title, error="of frequencies") for each in _unit(modes)]
+    of_sensor = [finding_of(each, title, error="of shapes") for each in _faults_of_sensors(modes)]
+    return found + (of_sensor or _check_shapes(modes))
 
 
 def _unit(modes: Any) -> list[Fault]:
@@ -53,8 +48,8 @@ def _faults_of_sensors(modes: Any) -> list[Fault]:
     return [best._replace(before=before)] if best.after < BETTER * before else []
 
 
-def _number(modes: Any, k: int) -> str:
-    return f"{modes.data.mode_numbers[k]} ({modes.data.mean_frequencies[k]:.4g} Hz)"
+def _number(data: Any, k: int) -> str:
+    return f"{data.mode_numbers[k]} ({data.mean_frequencies[k]:.4g} Hz)"
 
 
 def _check_shapes(modes: Any) -> list[Finding]:
@@ -62,39 +57,24 @@ def _check_shapes(modes: Any) -> list[Finding]:
     found, resembling, numbers = [], np.median(modes.assurance, axis=0), modes.data.mode_numbers
     for k in np.flatnonzero(resembling < HALF):  # MAC; one shape cannot have more than a half with two orthogonal ones
         others = [number for number in numbers if number != numbers[k]]
-        text = f"No computed mode resembles the measured mode {_number(modes, k)}: its best MAC is {resembling[k]:.2f}."
+        text = f"No computed mode resembles the measured mode {_number(modes.data, k)}, whose best MAC is "
+        text += f"{resembling[k]:.2f}."
         action = f"Leave it out, data.select({others}) or modes = {others} in a TOML file; or compute more modes."
         found.append(Finding("A mode has no counterpart", CARE, text, action, {"mac": float(resembling[k])}, "data"))
     return found
 
 
-def _check_pairs(modes: Any) -> list[Finding]:
-    """Measured modes that are different computed modes in the posterior, which no result has to suffer from."""
-    found = []
-    for k, column in enumerate(modes.numbers.T):
-        numbers, counts = np.unique(column, return_counts=True)
-        if counts.max() < (1.0 - TAIL) * len(column):
-            shares = listed([f"{each} ({percent(n / len(column))})" for each, n in zip(numbers, counts, strict=True)])
-            text = f"The measured mode {_number(modes, k)} is paired with different computed modes: {shares}."
-            action = "Parameters may have several regions; more sensors tell the shapes apart."
-            found.append(Finding("The pairing of modes changes", NOTE, text, action))
-    return found
-
-
-def squares_of_modes(fit: Any) -> Iterator[tuple[str, dict[str, float], int]]:
-    """What is compared, squares of residuals by stated errors at the best sample, by name, and their number."""
-    likelihood, noise = fit.likelihood, fit.likelihood.noise
-    if fit.samples is None or noise.parameter_names or getattr(noise, "student", True):
-        return
-    sums = likelihood.simulator.statistics(fit.points[:, : len(likelihood.model.parameter_names)])
-    deviations = np.repeat(noise.deviations(np.zeros((1, 0))).reshape(1, -1), noise.n_sets, axis=1)
-    squares = sums[:, len(noise.channels) :] / np.square(deviations)
-    names = [
-        f"the {what} of mode {_number(fit.samples, mode)}{f' in set {k + 1}' if noise.n_sets > 1 else ''}"
-        for what in ("frequency", "shape")
-        for mode in range(fit.samples.data.n_modes)
-        for k in range(noise.n_sets)
-    ]
-    best = np.nan_to_num(squares[np.nanargmin(squares.sum(axis=1))]).tolist()
-    what = "At the best sample, frequencies and shapes"
-    yield what, dict(zip(names, best, strict=True)), int(noise.counts.sum())
+def squares_of_modes(fit: Any) -> tuple[dict[str, float], int]:
+    """Squares of residuals by stated errors at the centre of the samples, by name, and how many errors they are of."""
+    noise, data = fit.likelihood.noise, fit.likelihood.model.data
+    if fit.centre is None or noise.parameter_names or getattr(noise, "student", True):
+        return {}, 0
+    sums = fit.likelihood.simulator.statistics(fit.centre[None, : len(fit.likelihood.model.parameter_names)])
+    squares = (
+        sums[0, data.n_modes :].reshape(noise.counts.shape) / noise.deviations(np.zeros((1, 0)))[0, ..., None] ** 2
+    )
+    found = dict[str, float]()
+    for (what, k, number), square in np.ndenumerate(np.nan_to_num(squares)):
+        of_set = f" in set {number + 1}" if data.n_sets > 1 else ""
+        found[f"the {('frequency', 'shape')[what]} of mode {_number(data, k)}{of_set}"] = float(square)
+    return found, int(noise.counts.sum())

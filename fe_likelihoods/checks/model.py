@@ -8,12 +8,13 @@ deviations, the weights W = 1 / sigma^2 of the residuals, and the precision P of
 standard deviations. Simulations that a sampler has made cannot show this error, because all of them contain it.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from ..likelihood.likelihood import FELikelihood
 from ..likelihood.posterior import Posterior
 from ..signals.events import motions_of
 from ..signals.records import Record
@@ -22,6 +23,7 @@ from ..text_tables import listed
 from .finding import CARE, HALF, WRONG, Finding, percent
 
 __all__ = [
+    "at_mean",
     "check_chance",
     "check_motion",
     "check_same_response",
@@ -111,9 +113,10 @@ def check_same_response(difference: float | None, motion: str = "this motion") -
     return [Finding("The motion changes nothing", WRONG, text, action, {"difference": difference}, "input")]
 
 
-def check_chance(model: Any, theta: np.ndarray, response: np.ndarray, pool: Any) -> list[Finding]:
+def check_chance(likelihood: FELikelihood, theta: np.ndarray, response: np.ndarray) -> list[Finding]:
     """Whether later simulations of the same parameters give the same response (n_channels, n_steps)."""
-    batch, text, numbers = simulate_batch(model, np.tile(theta, (2, 1)), pool), "", dict[str, float]()
+    batch = simulate_batch(likelihood.model, np.tile(theta, (2, 1)), likelihood.simulator.pool)
+    text, numbers = "", dict[str, float]()
     for again, reason in zip(batch.response, batch.reasons, strict=True):
         if reason:
             text = f"The first simulation at the mean of the prior succeeded, a later one failed: {reason}."
@@ -124,15 +127,21 @@ def check_chance(model: Any, theta: np.ndarray, response: np.ndarray, pool: Any)
     return [Finding("The model is not repeatable", WRONG, text, action, numbers, "input")] if text else []
 
 
-def refuse_chance(posterior: Posterior) -> None:
-    """Simulate the mean of the prior again; ValueError if the responses differ. A failed simulation is no such case."""
+def at_mean(posterior: Posterior) -> Iterator[tuple[FELikelihood, np.ndarray, str, np.ndarray]]:
+    """Each data set at the mean of the prior: structural parameters, reason of a failure, and response."""
     mean = posterior.prior.mean()
     for likelihood, columns in posterior.likelihood.data_sets():
         theta = mean[columns][: len(likelihood.model.parameter_names)]
-        first, pool = likelihood.simulate(theta[None]), likelihood.simulator.pool
-        found = [] if first.reasons[0] else check_chance(likelihood.model, theta, first.response[0], pool)
-        if found and found[0].numbers:
-            raise ValueError(str(found[0]))
+        batch = likelihood.simulate(theta[None])
+        yield likelihood, theta, batch.reasons[0], batch.response[0]
+
+
+def refuse_chance(posterior: Posterior) -> None:
+    """Simulate the mean of the prior again; ValueError if the responses differ. A failed simulation is no such case."""
+    for likelihood, theta, reason, response in at_mean(posterior):
+        for found in [] if reason else check_chance(likelihood, theta, response):
+            if found.numbers:
+                raise ValueError(str(found))
 
 
 def relative_difference(difference: np.ndarray, reference: np.ndarray) -> float:

@@ -6,12 +6,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..likelihood.posterior import Posterior
-from ..signals.events import find_events
-from .compared import SECONDS, Fit, compare, data_sets_of, draws_to_compare, fit_data_sets
+from .compared import SECONDS, Fit, compare
 from .finding import CARE, NOTE, TAIL, WRONG, Finding, Judgement, in_order, judge
-from .fit import check_other_events, check_residuals, check_responses, check_stated_errors, check_supports
-from .model import STEP, check_chance, check_motion, halve_steps, motions_to_replace
-from .run import Failures, FinishedRun, ParameterRow, failures, read_run, rows_of
+from .fit import check_residuals, check_responses, check_stated_errors, check_supports
+from .model import STEP, at_mean, check_chance, check_motion, halve_steps, motions_to_replace
+from .run import Failures, FinishedRun, failures, read_run
 from .screening import check_data
 
 __all__ = ["JudgedRun", "ModelCheck", "check_failures", "check_model", "check_result", "judge_run"]
@@ -31,7 +30,6 @@ class ModelCheck(NamedTuple):
 class JudgedRun(NamedTuple):
     """A judgement of a run, and what it is made from."""
 
-    rows: list[ParameterRow]
     fits: tuple[Fit, ...]
     failures: Failures
     judgement: Judgement
@@ -65,21 +63,15 @@ def check_model(posterior: Posterior) -> ModelCheck:
     >>> [finding.kind for finding in checked.findings if finding.severity == "wrong"]
     ['A sign may be wrong']
     """
-    found, fits, likelihood = list[Finding](), list[Fit](), posterior.likelihood
-    mean, draws = posterior.prior.mean(), draws_to_compare(posterior)
-    for key, part, columns in data_sets_of(posterior):
-        theta = mean[columns][: len(part.model.parameter_names)]
-        batch = part.simulate(theta[None])
-        if batch.reasons[0]:
-            reason = batch.reasons[0]
-            raise ValueError(f"the simulation at the mean of the prior has failed: {reason}; check model, priors")
-        fits += compare(part, draws[:, columns], key)
-        # generators of workers have moved on meanwhile
-        chance = check_chance(part.model, theta, batch.response[0], part.simulator.pool)
-        # where responses differ by chance, other differences say nothing
-        found += chance or check_motion(part.model, theta, batch.response[0])
-    found += _check_inputs(likelihood, fits)
-    report, attempts = posterior.report(), sum(part.simulator.failures.outcomes for part, _ in likelihood.data_sets())
+    first = list(at_mean(posterior))
+    if failed := next((reason for _, _, reason, _ in first if reason), ""):
+        raise ValueError(f"the simulation at the mean of the prior has failed: {failed}; check model, priors")
+    fits = compare(posterior)
+    found = _check_inputs(posterior.likelihood, fits)
+    for part, theta, _, response in first:
+        # generators of workers have moved on meanwhile; where responses differ by chance, other differences say nothing
+        found += check_chance(part, theta, response) or check_motion(part.model, theta, response)
+    report, attempts = posterior.report(), sum(part.simulator.failures.outcomes for part, *_ in first)
     reasons = report["failure_reasons"]
     found += check_failures(report["failure_count"], attempts, max(reasons, key=reasons.get, default=""))
     return ModelCheck(in_order(found), tuple(fits))
@@ -125,19 +117,17 @@ def judge_run(run: FinishedRun) -> JudgedRun:
 
     A run that says nothing about the parameters gets no findings that compare its samples with prior, truth or noise.
     """
-    rows, fits, parts = rows_of(run), fit_data_sets(run), [] if run.likelihood is None else run.likelihood.data_sets()
+    parts = [] if run.likelihood is None else run.likelihood.data_sets()
+    fits = tuple(compare(run.posterior, run.samples, run.centre)) if parts else ()
     histories = not parts or any(part.measurements.is_history for part, _ in parts)
     found, tested = _check_steps(run) if parts and histories else ([], "")
     failed = failures(run)  # those of the fits included
     found += _check_inputs(run.likelihood, fits) + _check_samples(run)
-    found += check_failures(failed.count, failed.attempts, failed.rows[0].reason if failed.rows else "")
+    found += check_failures(failed.count, failed.attempts, failed.rows[0][0] if failed.rows else "")
     if not run.is_inconclusive and all(each.severity != WRONG for each in found):  # a fault explains the residuals
         found += check_residuals(fits) + check_stated_errors(fits)
-        events = [find_events(part.model) for part, _ in parts]
-        if len(parts) == 1 and histories and (events[0] is None or len(events[0].names) == 1):
-            found += check_other_events([row for row in rows if row.name in parts[0][0].model.parameter_names])
     checked = sum(each.checks is not None for fit in fits for each in fit.channels)
-    responses = max((len(each.modal.points if each.modal else each.draws) for each in fits), default=0)
+    responses = max((len(each.draws) for each in fits), default=0)
     alone = "the length of the chain alone: a Markov chain gives no verdict"
     tests = {
         "Sampling": "by the sampler" if run.tempered else alone,
@@ -146,7 +136,7 @@ def judge_run(run: FinishedRun) -> JudgedRun:
         "Residuals": f"channels: {checked}" if checked else "not tested: there are none",
     }
     tests |= {STEP: tested} if tested else {}
-    return JudgedRun(rows, fits, failed, judge(dict.fromkeys(found), tests.items()))  # data sets may share a motion
+    return JudgedRun(fits, failed, judge(dict.fromkeys(found), tests.items()))  # data sets may share a motion
 
 
 def _check_inputs(likelihood: Any, fits: Iterable[Fit]) -> list[Finding]:
@@ -182,9 +172,6 @@ def _check_steps(run: FinishedRun) -> tuple[list[Finding], str]:
 def _check_samples(run: FinishedRun) -> list[Finding]:
     """What the sampler has found, and whether samples, of a Markov chain too, are many enough and have one mode."""
     found, n, size = list(run.verdict.findings if run.verdict else ()), len(run.samples), run.effective_sample_size
-    if run.tempered and run.verdict is None:
-        text = "The file of this run holds no verdict, so nothing is known about its convergence."
-        found.append(Finding("No verdict", CARE, text, "Run it again with this version."))
     if run.is_inconclusive and not run.tempered:
         time = f"{run.autocorrelation_time:.0f} iterations" if np.isfinite(run.autocorrelation_time) else "not known"
         text = f"The chain has {run.sampler.iteration - run.discard} iterations, its autocorrelation time is {time}: "

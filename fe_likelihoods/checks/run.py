@@ -1,4 +1,4 @@
-"""What a report needs of a finished run, read from the sampler and the posterior in one place, and its two tables.
+"""What checks and a report need of a finished run, read from the sampler and the posterior in one place.
 
 A posterior of this package knows the units of its parameters, its prior and its data. A plain function knows none of
 them; what is missing is empty or NaN here, and the report leaves it out.
@@ -6,7 +6,6 @@ them; what is missing is empty or NaN here, and the report leaves it out.
 
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +19,7 @@ from ..likelihood.likelihood import FELikelihood
 from ..likelihood.parameters import Parameter
 from ..priors.priors import Prior
 
-__all__ = ["Failure", "Failures", "FinishedRun", "ParameterRow", "failures", "moments_of", "read_run", "rows_of"]
+__all__ = ["Failures", "FinishedRun", "failures", "read_run"]
 
 LONGEST_AUTOCORRELATION = 50.0  # iterations per autocorrelation time that emcee recommends
 
@@ -51,7 +50,7 @@ class FinishedRun(NamedTuple):
     def is_inconclusive(self) -> bool:
         """Whether nothing can be said about the parameters: the verdict is "not usable", or the chain is too short."""
         if self.tempered:
-            return self.verdict is not None and self.verdict.status == "not usable"
+            return self.verdict.status == "not usable"
         return not self.sampler.iteration - self.discard >= LONGEST_AUTOCORRELATION * self.autocorrelation_time
 
     @property
@@ -98,9 +97,7 @@ def read_run(
             f"the chain has {samples.shape[1]} parameters, but the posterior or names= has {len(parameters)} "
             f"({', '.join(each.name for each in parameters)}): give the posterior that was sampled"
         )
-    tempered, verdict = hasattr(sampler, "ladder") and bool(sampler.ladder), None
-    with suppress(ValueError):  # a file may hold no verdict
-        verdict = sampler.verdict if tempered else None
+    tempered = hasattr(sampler, "ladder") and bool(sampler.ladder)
     likelihood, prior = getattr(posterior, "likelihood", None), getattr(posterior, "prior", None)
     return FinishedRun(
         sampler,
@@ -112,7 +109,7 @@ def read_run(
         *_errors(sampler, samples, tempered, discard),
         discard,
         tempered,
-        verdict,
+        sampler.verdict if tempered else None,
     )
 
 
@@ -133,75 +130,11 @@ def _errors(
     return spread / np.sqrt(size), sd_error, float(size), time if np.isfinite(time) else np.nan
 
 
-def moments_of(run: FinishedRun) -> np.ndarray:
-    """Mean, its error, standard deviation, its error, and 5 %, 50 % and 95 % quantiles (7, ndim).
-
-    They are those of the chain, or of the signed sample if that has smaller errors and determines all deviations.
-    """
-    probabilities = (0.05, 0.5, 0.95)
-    if (signed := getattr(run.sampler, "signed_sample", None)) is not None:
-        mean, sd = signed.expectation(), signed.standard_deviation()
-        if np.all(mean.error < run.mean_error) and np.all(sd.value > 0.0):
-            return np.stack([*mean, *sd, *(signed.quantile(probability).value for probability in probabilities)])
-    quantiles = np.quantile(run.samples, probabilities, axis=0)
-    return np.stack([run.samples.mean(axis=0), run.mean_error, run.samples.std(axis=0), run.sd_error, *quantiles])
-
-
-class ParameterRow(NamedTuple):
-    """One parameter, all values in the unit of its label; texts are empty and numbers NaN where they are not known."""
-
-    name: str
-    label: str  # name with unit
-    unit: str
-    prior: str  # in words
-    prior_sd: float
-    mean: float
-    mean_error: float  # Monte Carlo standard error
-    sd: float
-    sd_error: float
-    low: float  # 5 % quantile
-    median: float
-    high: float  # 95 % quantile
-    nominal: float
-
-    @property
-    def cv(self) -> float:
-        """Coefficient of variation [-]; NaN for a mean of zero."""
-        return self.sd / abs(self.mean) if self.mean else np.nan
-
-
-def rows_of(run: FinishedRun) -> list[ParameterRow]:
-    """One row for each parameter."""
-    rows, moments = [], moments_of(run).T
-    priors = [("", np.nan, np.nan, -np.inf, np.inf)] * len(moments)
-    priors = priors if run.prior is None else [each[1:] for each in run.prior.table()[1]]
-    for parameter, (family, *of_prior), numbers in zip(run.parameters, priors, moments, strict=True):
-        mean, prior_sd, lower, upper = (float(each) for each in parameter.shown(of_prior))
-        family = family.split("(")[0]
-        text = f"{family}, mean {mean:.4g}, sd {prior_sd:.3g}" if family else ""
-        if family == "Uniform":
-            text = f"{family}, {lower:.4g} to {upper:.4g}"
-        elif family:
-            bounds = (("above", lower), ("below", upper))
-            text += "".join(f", {side} {bound:.4g}" for side, bound in bounds if np.isfinite(bound))
-        shown = (float(each) for each in parameter.shown([*numbers, parameter.nominal]))
-        unit = parameter.label.removeprefix(parameter.name).strip()
-        rows.append(ParameterRow(parameter.name, parameter.label, unit, text, prior_sd, *shown))
-    return rows
-
-
-class Failure(NamedTuple):
-    """Failures for one reason."""
-
-    reason: str  # with "#" for numbers
-    count: int
-    example: str  # parameters of one failure, after its reason where `reason` has "#"
-
-
 class Failures(NamedTuple):
     """All failures, with the number of attempts."""
 
-    rows: tuple[Failure, ...]  # by reason, the most frequent first
+    # the most frequent first: reason with "#" for numbers, count, and parameters of one (after its reason, if with "#")
+    rows: tuple[tuple[str, int, str], ...]
     count: int
     attempts: int
     unknown: str = ""  # what is not known about them
@@ -228,5 +161,5 @@ def failures(run: FinishedRun) -> Failures:
         examples.setdefault(reason, shown if text == reason else f"{text}: {shown}")
         rows[reason] += 1
     rows += Counter({"later ones, whose reasons are not kept": count - len(records)})  # if there are any
-    table = tuple(Failure(reason, each, examples.get(reason, "")) for reason, each in rows.most_common())
+    table = tuple((reason, each, examples.get(reason, "")) for reason, each in rows.most_common())
     return Failures(table, count, max(attempts, count), unknown)

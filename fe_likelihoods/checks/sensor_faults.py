@@ -5,6 +5,9 @@ units, sampling rates and kinds of structures do not matter. The limits were set
 without and with faults (``python -m benchmarks screening``); beside each limit is what right channels reach.
 """
 
+import json
+import math
+import re
 from typing import NamedTuple
 
 import numpy as np
@@ -26,11 +29,31 @@ WIDEST, AROUND = 3, 10  # samples of a spike, and samples around it that are loo
 
 
 class SensorFault(NamedTuple):
-    """A fault of one channel."""
+    """A fault of one channel; `fe_likelihoods.checks.screening` adds name, unit and times of the channel."""
 
     kind: str  # a key of `fe_likelihoods.checks.screening.FAULTS`
     spans: tuple[tuple[int, int], ...]  # first and last samples, both included
     level: tuple[float, ...] = ()  # offset, or drift at evenly spaced samples, the first and the last included
+    name: str = ""
+    unit: str = ""  # empty if it is not known
+    step: float = 1.0  # [s]
+    start: float = 0.0  # [s]
+    is_motion: bool = False
+
+    def time(self, sample: float) -> str:
+        """Time of a sample [s], to a tenth of a step."""
+        return f"{self.start + sample * self.step:.{max(0, 1 - math.floor(math.log10(self.step)))}f}"
+
+    @property
+    def line(self) -> str:
+        """The value in TOML that deals with it."""
+        name = json.dumps(self.name, ensure_ascii=False)
+        if not self.level:
+            return ", ".join(f"[{name}, {self.time(first)}, {self.time(last)}]" for first, last in self.spans)
+        key = self.name if re.fullmatch("[A-Za-z0-9_-]+", self.name) else name
+        places = np.linspace(0.0, self.spans[0][1], max(len(self.level), 2))
+        points = zip(map(self.time, places), self.level, strict=False)
+        return f"{key} = [" + ", ".join(f'[{at}, "{value:.4g} {self.unit or "?"}"]' for at, value in points) + "]"
 
 
 def find_sensor_faults(values: np.ndarray, dimension: str = "") -> tuple[SensorFault, ...]:
@@ -50,7 +73,7 @@ def find_sensor_faults(values: np.ndarray, dimension: str = "") -> tuple[SensorF
         if (seen := look(x)) and kind == "baseline":
             found.append(SensorFault("offset" if len(seen) == 1 else "drift", ((0, len(x) - 1),), seen))
         elif seen:
-            found.append(SensorFault(kind, seen))
+            found.append(SensorFault(kind, tuple(sorted(seen))))
             for first, last in seen:
                 x[first : last + 1] = np.nan
     return tuple(found)

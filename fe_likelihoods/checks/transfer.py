@@ -9,7 +9,6 @@ from .finding import CARE, Finding
 __all__ = [
     "check_bandwidth",
     "check_common",
-    "check_event",
     "check_final_values",
     "check_most",
     "check_peaks",
@@ -72,12 +71,6 @@ def check_final_values(ends: Mapping[str, Sequence[float]]) -> list[Finding]:
     text = f"The structure still moves in the last 2 s, by a part of its final value: {shares}."
     action = "Append rest to the record (record.followed_by), or take a mean, final_value(channel, samples=...)."
     return [Finding("A final value still moves", CARE, text, action, numbers)] if numbers else []
-
-
-def check_event(reason: str) -> Finding:
-    """An event that cannot be predicted, with the `reason` of the failures."""
-    action = "Mend the model for this motion; the samples stay as they are."
-    return Finding("An event is not predicted", CARE, f"It could not be predicted: {reason}.", action)
 
 
 def check_reweighting(shapes: Mapping[str, float], error: float, parameters: Sequence[str]) -> list[Finding]:

@@ -136,10 +136,11 @@ def write_summary(folder: Path, run: FinishedRun, judged: JudgedRun, said: Seque
 
     from samplers.reporting.summary import Summary
 
-    columns = {"label": "parameter", "mean": "mean", "mean_error": "mean_error", "sd": "sd", "sd_error": "sd_error"}
-    columns |= {"cv": "cv", "low": "q05", "median": "median", "high": "q95", "nominal": "nominal"}
-    rows = pd.DataFrame([{name: getattr(row, key) for key, name in columns.items()} for row in judged.rows])
-    rows.to_csv(folder / "summary.csv", index=False)
+    from ..reporting.contents import parameter_table
+
+    rows = parameter_table(run)
+    columns = ["parameter", "mean", "mean_error", "sd", "sd_error", "cv", "q05", "median", "q95", "nominal"]
+    rows.to_csv(folder / "summary.csv", index=False, columns=columns)
     pd.DataFrame([stage._asdict() for stage in run.sampler.ladder]).to_csv(folder / "stages.csv", index=False)
     moments = Summary(*(rows["parameter" if name == "names" else name] for name in Summary._fields))
     evidence = f"log-evidence {run.sampler.log_evidence:.2f} +- {run.sampler.log_evidence_error:.2g}"

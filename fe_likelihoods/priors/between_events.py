@@ -1,8 +1,6 @@
 """How much structural parameters differ between events of one structure, by the beginning of their names."""
 
-from collections.abc import Sequence
-
-__all__ = ["BETWEEN_EVENTS", "spread_of"]
+__all__ = ["BETWEEN_EVENTS"]
 
 BETWEEN_EVENTS = {"frequency": 0.02, "stiffness": 0.04, "damping": 0.2}
 """Standard deviations of the logarithms between events of one structure.
@@ -13,8 +11,3 @@ of the Seismological Society of America 96, 237-257); 2 % is assumed, and a stif
 ratios of a bridge scatter by 0.4 and more, most of which its fits make up for: 0.1 to 0.3 predicts its events best
 (docs/theory/prediction.rst).
 """
-
-
-def spread_of(names: Sequence[str]) -> dict[str, float]:
-    """The parameters whose names begin with one of these words, and their standard deviations."""
-    return {name: sd for name in names for kind, sd in BETWEEN_EVENTS.items() if name.startswith(kind)}

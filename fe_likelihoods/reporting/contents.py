@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import fields, is_dataclass
 from importlib.metadata import PackageNotFoundError, version
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -17,10 +17,13 @@ from samplers.smc import FEWEST_TO_RECYCLE
 from ..checks.compared import Fit
 from ..checks.finding import Judgement
 from ..checks.fit import describe_residuals
-from ..checks.run import FinishedRun, ParameterRow
+from ..checks.run import FinishedRun
 from ..likelihood.likelihood import FELikelihood
 from ..noise.protocol import noise_title
 from ..prediction.prediction import Prediction
+
+if TYPE_CHECKING:
+    import pandas
 
 __all__ = [
     "DataSet",
@@ -29,7 +32,9 @@ __all__ = [
     "evidence",
     "fingerprints",
     "how_to_repeat",
+    "moments_of",
     "names_of_values",
+    "parameter_table",
     "residual_sentences",
     "sampler_settings",
     "summary_sentences",
@@ -78,8 +83,43 @@ def _named(excitation: Any) -> str:
     return f"{excitation.name} ({source})" if source else excitation.name
 
 
+def moments_of(run: FinishedRun) -> np.ndarray:
+    """Mean, its error, standard deviation, its error, and 5 %, 50 % and 95 % quantiles (7, ndim).
+
+    They are those of the chain, or of the signed sample if that has smaller errors and determines all deviations.
+    """
+    probabilities = (0.05, 0.5, 0.95)
+    if (signed := getattr(run.sampler, "signed_sample", None)) is not None:
+        mean, sd = signed.expectation(), signed.standard_deviation()
+        if np.all(mean.error < run.mean_error) and np.all(sd.value > 0.0):
+            return np.stack([*mean, *sd, *(signed.quantile(probability).value for probability in probabilities)])
+    quantiles = np.quantile(run.samples, probabilities, axis=0)
+    return np.stack([run.samples.mean(axis=0), run.mean_error, run.samples.std(axis=0), run.sd_error, *quantiles])
+
+
+def parameter_table(run: FinishedRun) -> "pandas.DataFrame":
+    """A row for each parameter in the unit of its label; texts are empty and numbers NaN where they are not known."""
+    import pandas as pd  # slow to import
+
+    rows, nan = [], np.nan
+    numbers = ("mean", "mean_error", "sd", "sd_error", "q05", "median", "q95", "nominal")
+    priors = [("", nan, nan, -np.inf, np.inf)] * len(run.parameters)
+    priors = priors if run.prior is None else [each[1:] for each in run.prior.table()[1]]
+    for parameter, (family, *of_prior), found in zip(run.parameters, priors, moments_of(run).T, strict=True):
+        mean, prior_sd, lower, upper = (float(each) for each in parameter.shown(of_prior))
+        family, bounds = family.split("(")[0], (("above", lower), ("below", upper))
+        text = f"{family}, mean {mean:.4g}, sd {prior_sd:.3g}" * bool(family)
+        text += "".join(f", {side} {bound:.4g}" for side, bound in bounds if np.isfinite(bound))
+        text = f"{family}, {lower:.4g} to {upper:.4g}" if family == "Uniform" else text
+        unit = parameter.label.removeprefix(parameter.name).strip()
+        shown = parameter.shown([*found, parameter.nominal])
+        rows.append((parameter.label, parameter.name, unit, text, prior_sd, *map(float, shown)))
+    table = pd.DataFrame(rows, columns=["parameter", "name", "unit", "prior", "prior_sd", *numbers])
+    return table.assign(cv=table["sd"] / table["mean"].abs().where(table["mean"] != 0.0))
+
+
 def summary_sentences(
-    run: FinishedRun, rows: list[ParameterRow], fits: Sequence[Fit], judgement: Judgement | None = None
+    run: FinishedRun, rows: Sequence[Any], fits: Sequence[Fit], judgement: Judgement | None = None
 ) -> list[str]:
     """Whether to use the result, what was updated with which data, what was found, and from how many samples."""
     sets = data_sets(run)
@@ -102,7 +142,7 @@ def summary_sentences(
     return [*first, what, _finding([row for i, row in enumerate(rows) if i not in fast], fits), _worth(run)]
 
 
-def _finding(rows: list[ParameterRow], fits: Sequence[Fit]) -> str:
+def _finding(rows: Sequence[Any], fits: Sequence[Fit]) -> str:
     known = [(row.sd / row.prior_sd, row.name) for row in rows if row.prior_sd > 0.0]
     found = ""
     if known:

@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..checks.finding import Finding, percent
-from ..checks.transfer import check_event
 from ..prediction.prediction import Prediction
 from ..prediction.scores import HistoryScores, QuantityScores, central_interval, share_within
 from ..signals.channels import Measurements
@@ -56,7 +55,7 @@ class OtherEvent(NamedTuple):
     histories: tuple[HistoryScores, ...]
     values: tuple[QuantityScores, ...]
     sentence: str  # how it was predicted, and how the measurements compare with it
-    findings: tuple[Finding, ...]  # of the predictions, and failed samples
+    findings: tuple[Finding, ...] = ()  # of the predictions, and failed samples
 
 
 def as_events(events: Any) -> dict[str, EventPredictions | SimulationFailed]:
@@ -90,7 +89,8 @@ def describe_event(
 ) -> OtherEvent:
     """Describe and score the predictions of an event, or the error that `propagate` raises if all simulations fail."""
     if isinstance(predictions, SimulationFailed):
-        return OtherEvent(name, {}, measured, (), (), (), "There is no prediction.", (check_event(predictions.reason),))
+        text = f"It could not be predicted: {predictions.reason}. Mend the model for this motion; the samples stay."
+        return OtherEvent(name, {}, measured, (), (), (), text)
     findings = list(dict.fromkeys(found for each in predictions.values() for found in each.findings))
     first = next(iter(predictions.values()))
     reasons = "; ".join(f"{count}: {reason}" for reason, count in first.failure_reasons.items())

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..checks.result import JudgedRun, judge_run
-from ..checks.run import FinishedRun, moments_of, read_run
+from ..checks.run import FinishedRun, read_run
 from ..information.identifiability import of_samples
 from ..prediction.prediction import Prediction
 from ..signals.channels import Measurements
@@ -22,6 +22,8 @@ from .contents import (
     evidence,
     fingerprints,
     how_to_repeat,
+    moments_of,
+    parameter_table,
     residual_sentences,
     sampler_settings,
     summary_sentences,
@@ -145,7 +147,8 @@ def gather(
     judged: JudgedRun | None = None,
 ) -> dict[str, Any]:
     """What the template shows, by name; a run that was not judged is judged, which may simulate."""
-    rows, fits, failed, judgement = judge_run(run) if judged is None else judged
+    fits, failed, judgement = judge_run(run) if judged is None else judged
+    rows = list(parameter_table(run).itertuples())
     sets, after = data_sets(run), "posterior mean" if run.n_modes == 1 else "sample of highest posterior density"
     before, after = "before: mean of the prior", f"after: {after}"
     models = " and ".join(dict.fromkeys(each.model for each in sets)) or "a log-density"

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fe_likelihoods.checks.compared import compare, data_sets_of, draws_to_compare
+from fe_likelihoods.checks.compared import compare
 from fe_likelihoods.checks.fit import check_responses, check_stated_errors, check_supports
 from fe_likelihoods.emulation.modes import find_modes
 
@@ -16,11 +16,8 @@ def fitted(posterior, starts=1):
 
 def check_fit(posterior, samples=None):
     """Findings about the fit at the mean of samples (n, ndim); before a run, of draws of the prior alone."""
-    draws, fits, supports = draws_to_compare(posterior), [], []
-    for key, likelihood, columns in data_sets_of(posterior):
-        own = () if samples is None else (samples[:, columns], samples[:, columns].mean(axis=0))
-        fits += compare(likelihood, draws[:, columns], key, *own)
-        supports += check_supports(likelihood.model)
+    fits = compare(posterior, samples, None if samples is None else samples.mean(axis=0))
+    supports = [each for part, _ in posterior.likelihood.data_sets() for each in check_supports(part.model)]
     first = check_responses(fits)
     wrong = any(each.severity == "wrong" for each in first)
     return (*first, *([] if wrong else check_stated_errors(fits)), *supports)

@@ -128,22 +128,6 @@ def test_the_set_of_a_wrong_number_is_named():
     assert "The largest: the frequency of mode 2" in found.action and " in set 3" in found.action
 
 
-def test_a_pairing_that_changes_in_the_posterior_is_noted():
-    """As where frequencies cross; the result is none the worse."""
-
-    def crossing(theta):
-        return np.diag([1.0, theta[0]]), np.eye(2)
-
-    data = ModalData([0.155, 0.165], [[1.0, 0.1], [0.1, 1.0]], ("x", "y"))
-    likelihood = ModalLikelihood(FunctionModes(crossing, ("k",), {"x": 0, "y": 1}, 2), data)
-    prior = {"k": LogNormal(1.0, 0.3), "frequency_error": LogNormal(0.05, 0.5), "shape_error": LogNormal(0.05, 0.5)}
-    posterior = Posterior(likelihood, prior)
-    samples = np.column_stack([[0.9, 1.1, 1.2, 0.8] * 10, [0.05] * 40, [0.05] * 40])
-    found = [each for each in check_fit(posterior, samples) if each.kind == "The pairing of modes changes"]
-    assert len(found) == 2 and "1 (50 %) and 2 (50 %)" in found[0].text and found[0].severity == "note"
-    assert "The pairing of modes changes" not in kinds(posterior, samples[:1])
-
-
 def test_errors_that_are_numbers_among_the_priors_are_checked_as_those_of_the_data():
     data = identified(1)
     wrong = replace(data, frequencies=data.frequencies * [[1.0, 1.1, 1.0]])

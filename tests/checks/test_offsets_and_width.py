@@ -6,8 +6,7 @@ import pytest
 from fe_likelihoods import Channel, Measurements
 from fe_likelihoods.checks.compared import Fit
 from fe_likelihoods.checks.finding import judge
-from fe_likelihoods.checks.fit import check_other_events, check_residuals, check_responses, describe_residuals
-from fe_likelihoods.checks.run import ParameterRow
+from fe_likelihoods.checks.fit import check_residuals, check_responses, describe_residuals
 from fe_likelihoods.noise.residuals import residual_checks
 
 TOP, TIME = (Channel("top", "displacement", "mm"),), 0.02 * np.arange(400)
@@ -81,20 +80,3 @@ def test_correlated_errors_are_a_note_with_the_factor_in_the_first_sentence(rng)
     assert describe_residuals(residual_checks(white[None]))[0].startswith("White: ")
     assert describe_residuals(residual_checks(slow[None]))[0].startswith("Correlated (0.9")
     assert describe_residuals(residual_checks(np.array([[1.0, -2.0]])))[0].startswith("Not checked: 2 samples")
-
-
-def test_one_event_says_by_which_factor_its_errors_are_too_small_for_another_one():
-    """Two events differ by the square root of two times the spread between events; other parameters are not named."""
-    nan = float("nan")
-
-    def row(name, mean, sd):
-        return ParameterRow(name, name, "", "", 1.0, mean, nan, sd, nan, 0.0, 1.0, 2.0, nan)
-
-    (found,) = check_other_events([row("frequency", 4.0, 0.002), row("damping", 0.1, 0.01), row("share", 0.8, 0.01)])
-    expected = {
-        "frequency": np.sqrt(1.0 + 2.0 * (0.02 / 0.0005) ** 2),
-        "damping": np.sqrt(1.0 + 2.0 * (0.2 / 0.1) ** 2),
-    }
-    assert found.numbers == pytest.approx(expected) and found.severity == "note"
-    assert "frequency" in found.text and "(factor 57)" in found.text and "(factor 3)" in found.text
-    assert check_other_events([row("share", 0.8, 0.01)]) == check_other_events([row("damping", 0.1, 0.0)]) == []

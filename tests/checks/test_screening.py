@@ -21,17 +21,7 @@ def test_plausible_data_are_left_alone():
     assert kinds(record=Events([MOTION, MOTION.scale(0.5)], rest=1.0)) == []
 
 
-def test_gaps_are_notes_with_their_places():
-    """Single samples, and pauses between events, are none."""
-    gappy = VALUES.copy()
-    gappy[0, 10:20] = gappy[1, 7] = np.nan
-    (found,) = check_data(Measurements([TOP, DECK], 0.02, gappy), MOTION)
-    assert (found.kind, found.severity) == ("A channel has gaps", "note")
-    assert "no samples at 0.200 to 0.380 s" in found.text and 'missing = [["top", 0.200, 0.380]]' in found.action
-    assert kinds(gappy, Events([MOTION, MOTION.scale(0.5)], rest=1.0)) == []
-    gappy = VALUES.copy()
-    gappy[0, ::2] = np.nan
-    assert kinds(gappy) == []
+def test_straight_parts_are_gaps():
     straight = VALUES.copy()
     straight[1, 200:231] = np.linspace(straight[1, 200], straight[1, 230], 31)
     (found,) = check_data(Measurements([TOP, DECK], 0.02, straight))

