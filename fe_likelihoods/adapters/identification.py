@@ -16,8 +16,6 @@ from ..units import to_si
 
 __all__ = ["read_matlab", "read_modal_data"]
 
-_DAMPED = 0.1  # structures have damping ratios of 0.001 to 0.1: larger numbers without a unit may be percent
-
 
 def read_modal_data(
     source: str | Path | Any,
@@ -33,7 +31,7 @@ def read_modal_data(
     ----------
     source : path, or result of an identification
         * A CSV file, a text file or a workbook with a header line and a line for each mode: a column ``frequency`` with
-          its unit, such as ``frequency_Hz``; optional columns ``mode`` (its number), ``damping``, ``frequency_std``,
+          its unit, such as ``frequency_Hz``; optional columns ``mode`` (its number), ``damping_%``, ``frequency_std``,
           ``temperature`` [°C], and ``set``, or ``date`` and ``time`` (the identification, where there are several). All
           other columns of numbers are sensors. German names are read too; French, Italian, Spanish ones of frequency.
         * Frequencies alone with a line for each identification: ``f1_Hz``, ``f2_Hz``, ..., ``temperature``, and ``set``
@@ -46,7 +44,7 @@ def read_modal_data(
     unit : str, optional
         Unit of the frequencies, ``"Hz"`` or ``"rad/s"``, where the file does not state it.
     variables : mapping of str to str, optional
-        Names of the MATLAB variables that exist: ``{"frequencies": "f", "shapes": "Phi", "damping": "xi"}``.
+        Names of the MATLAB variables that exist: ``{"frequencies": "f", "shapes": "Phi"}``.
     **options
         Of `ModalData`, such as ``frequency_cv``.
 
@@ -87,11 +85,11 @@ def read_modal_data(
                 raise
             raise ValueError(f"{error}: give ModalData the real_shapes of complex numbers") from None
     content, names = read_matlab(source), dict(variables or {})
-    wanted = {"frequencies"} <= set(names) <= {"frequencies", "shapes", "damping"}
+    wanted = {"frequencies"} <= set(names) <= {"frequencies", "shapes"}
     if not wanted or not set(names.values()) <= set(content):
         raise ValueError(
-            f"{source}: name the variables, such as variables={{'frequencies': 'f', 'shapes': 'Phi'}}; got {names}, "
-            f"the file has {', '.join(content)}"
+            f"{source}: name the variables, variables={{'frequencies': 'f', 'shapes': 'Phi'}}, and give damping=, as "
+            f"ratios, since such a file states no unit; got {names}, the file has {', '.join(content)}"
         )
     values = {what: np.asarray(content[name]) for what, name in names.items()}
     for what, each in values.items():
@@ -99,8 +97,6 @@ def read_modal_data(
             kind = {"c": "complex numbers", "U": "text", "V": "a struct"}.get(each.dtype.kind, "no matrix of numbers")
             got = f"the variable {names[what]!r} is {kind}: name another one, or save real numbers"
             raise ValueError(f"{source}: expected {what} as an array of numbers; {got}")
-    damping, advice = np.ravel(values.get("damping", ())), "give damping=, as ratios, instead of the variable"
-    expect(not (damping > _DAMPED).any(), source, f"damping ratios up to {_DAMPED}", damping.tolist(), advice)
     unit = agree_on_unit(None, unit, "frequency", source, "unit")
     return _of_arrays(to_si(values.pop("frequencies"), unit, "frequency"), sensors, values, options)
 
@@ -145,9 +141,8 @@ def _of_table(path: str | Path, sensors: Sequence[str], unit: str | None, option
         lines["square"] = np.square(si_values(table, at["deviation"], "frequency", usual) / lines["frequency"])
     if "damping" in at:
         lines["damping"] = si_values(table, at["damping"], "dimensionless", "1")
-        clear = table.stated_unit(at["damping"]) is not None or not (lines["damping"] > _DAMPED).any()
-        advice = "state the unit, such as damping_% or damping [1]"
-        expect(clear, file, f"damping up to {_DAMPED} without a unit", f"{lines['damping'].max():g}", advice)
+        advice = "state it, such as damping_% or damping [1]: 0.5 may be a ratio or percent"
+        expect(table.stated_unit(at["damping"]), file, "a unit of damping", repr(names[at["damping"]]), advice)
     cells = [each.values if each.kind == "number" else each.cells for each in days]
     lines["set"] = pd.factorize(np.array([*map(repr, zip(*cells, strict=True))]))[0] if days else 0
     counted = 1.0 + np.arange(len(lines)) if lines["set"].nunique() == 1 else np.nan  # which mode was missed?

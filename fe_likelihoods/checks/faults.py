@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..likelihood.fits import FEWEST_DRAWS
 from ..signals.channels import Channel, Measurements
 from ..text_tables import listed
 from ..units import DIMENSIONS, UNITS, find_unit
@@ -31,7 +32,6 @@ EXPLAINED = 0.85  # error (RRMSE) above which a response explains nothing: a cor
 FLOOR = 0.02  # error below which smaller ones count as equal
 FACTOR = 1.5  # from which a factor may be one between units; from 1.67 on, 433 of 444 faults of supports for 442
 SAME_UNITS = 1.25  # ratio of a factor to one between units, up to which it is named after them
-FEWEST_DRAWS = 5  # of the prior
 AGREE = 0.1  # difference of a draw from the median, half of the draws: gains of 45 right fits are then 0.96 to 1.21
 SMOOTH = 7  # lines of the spectrum over which powers are averaged, and fewest lines of a band
 # Coherence from which gain and lag are looked at: 0.985 or more in 45 right fits of nine real structures. Two supports

@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtrc
 
+from ..likelihood.fits import MOST_DRAWS, Fit, checks_of
 from ..noise.residuals import ResidualChecks
 from ..signals.channels import Channel
 from ..signals.comparison import relative_errors
 from ..text_tables import listed
-from .compared import MOST_DRAWS, Fit, checks_of
 from .faults import EXPLAINED, find_faults, finding_of, supports_apart
 from .finding import CARE, CORRELATED, HALF, NOTE, SMALL_PROBABILITY, WRONG, Finding, percent
 from .modal import check_modes, squares_of_modes

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from .compared import MOST_DRAWS
+from ..likelihood.fits import MOST_DRAWS
 from .faults import BETTER, FACTOR, FLOOR, Fault, finding_of
 from .finding import CARE, HALF, Finding
 

@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..likelihood.fits import SECONDS, Fit, compare
 from ..likelihood.posterior import Posterior
-from .compared import SECONDS, Fit, compare
 from .finding import CARE, NOTE, TAIL, WRONG, Finding, Judgement, in_order, judge
 from .fit import check_residuals, check_responses, check_stated_errors, check_supports
 from .model import STEP, at_mean, check_chance, check_motion, halve_steps, motions_to_replace

@@ -6,10 +6,10 @@ from contextlib import suppress
 from datetime import datetime, timedelta
 from pathlib import Path
 
-from ..checks.compared import data_sets_of, draws_to_compare
 from ..checks.faults import FAULTS
 from ..checks.finding import labelled
 from ..checks.result import ModelCheck, check_model
+from ..likelihood.fits import data_sets_of, draws_to_compare
 from ..signals.comparison import rrmse
 from ..text_tables import number, text_table
 from .describe_files import describe

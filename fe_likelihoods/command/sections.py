@@ -94,7 +94,7 @@ class Modes(Section):
     file: Any = key("text", "Identified modes: CSV, Excel or MATLAB (`read_modal_data`)", ...)
     unit: Any = key("text", 'Unit of the frequencies, if the file does not state it: "Hz" or "rad/s"')
     columns: Any = key("table of text", "Sensor of the model = name of its column; by default the column of this name")
-    variables: Any = key("table of text", "Of a MATLAB file: frequencies, shapes and damping = names of the variables")
+    variables: Any = key("table of text", "Of a MATLAB file: frequencies and shapes = names of the variables")
     modes: Any = key("list of whole number", "Numbers of the modes to compare; by default all but those held out")
     held_out: Any = key("list of whole number", "Numbers of modes that are predicted instead of compared")
     mean: Any = key("yes or no", "Take the mean of several identifications, and their scatter as the errors", False)

@@ -14,10 +14,10 @@ import numpy as np
 
 from samplers.smc import FEWEST_TO_RECYCLE
 
-from ..checks.compared import Fit
 from ..checks.finding import Judgement
 from ..checks.fit import describe_residuals
 from ..checks.run import FinishedRun
+from ..likelihood.fits import Fit
 from ..likelihood.likelihood import FELikelihood
 from ..noise.protocol import noise_title
 from ..prediction.prediction import Prediction

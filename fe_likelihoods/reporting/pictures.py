@@ -11,8 +11,8 @@ import numpy as np
 
 from samplers import plot_corner, plot_marginals, plot_run
 
-from ..checks.compared import Fit
 from ..checks.run import FinishedRun
+from ..likelihood.fits import Fit
 from ..plots.fits import plot_fit
 from ..plots.modes_and_load_tests import plot_modes, plot_points
 from .other_events import OtherEvent

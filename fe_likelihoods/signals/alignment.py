@@ -9,6 +9,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
+from scipy.optimize import minimize_scalar
 
 from .channels import Measurements
 from .interpolation import interpolate, make_interpolation
@@ -51,30 +53,26 @@ class _Pair(NamedTuple):
 
     def fit(self, lag: float) -> tuple[float, float, float, float, float]:
         """Logarithm of the share of energy that is left, gain, correlation, effective samples, information [1/s²]."""
-        from scipy.ndimage import uniform_filter1d  # slow to import
-
         there, end = np.flatnonzero(np.isfinite(self.values)), self.step * (len(self.reference) - 1)
         there = there[np.abs(self.start + self.step * there - lag - 0.5 * end) <= 0.5 * end + 1e-9]
         at = make_interpolation(self.step, len(self.reference), self.start + self.step * there - lag)
-        slope = np.gradient(self.reference, self.step)
-        rows = np.stack([self.values[there], interpolate(self.reference, at), interpolate(slope, at)])
+        computed = (interpolate(each, at) for each in (self.reference, np.gradient(self.reference, self.step)))
+        rows = np.stack([self.values[there], *computed])
         y, r, slope = rows - rows.mean(axis=1, keepdims=True) if len(there) > 2 else np.zeros((3, 3))
         gain = float(y @ r) / max(float(r @ r), 1e-300)
         correlation = float(y @ r) / max(math.sqrt(float(y @ y) * float(r @ r)), 1e-300)
         errors, slopes = (np.abs(np.fft.fft(each)) ** 2 for each in (y - gain * r, gain * slope))
-        spectrum = uniform_filter1d(errors, max(1, round(_SMOOTH * len(errors))), mode="wrap") + 1e-300
+        spectrum = uniform_filter1d(errors, max(1, round(_SMOOTH * len(errors))), mode="wrap") + 1e-140
         # of slopes s and errors with the spectrum P, the variance of a lag is sum(|S|^2 P) / (n sum(s^2))^2
         information = (gain**2 * len(y) * (slope @ slope)) ** 2 / max(slopes @ spectrum, 1e-300)
-        spectrum /= spectrum.max()
         worth = float(spectrum.sum() ** 2 / (spectrum @ spectrum))
         return math.log1p(-min(correlation**2, _NEARLY_ONE)), gain, correlation, worth, float(information)
 
     def losses(self, lags: np.ndarray) -> np.ndarray:
         """The same logarithm on a grid of lags (n_lags,); a channel outside of the reference counts against."""
-        from scipy.signal import correlate  # slow to import
-
-        there, values, history = np.isfinite(self.values).astype(float), np.nan_to_num(self.values), self.reference
-        power, product = (correlate(*each, method="fft") for each in ((there, history**2), (values, history)))
+        there, values, history = np.isfinite(self.values), np.nan_to_num(self.values), self.reference[::-1]
+        n = len(values) + len(history) - 1  # of a correlation at all lags
+        power, product = np.fft.irfft(np.fft.rfft([there, values], n) * np.fft.rfft([history**2, history], n), n)
         squares = product**2 / ((values @ values) * np.maximum(power, _LEAST * power.max()))
         grid = self.start + self.step * np.arange(1 - len(history), len(there))
         return np.log1p(-np.interp(lags, grid, np.minimum(squares, _NEARLY_ONE), left=0.0, right=0.0))
@@ -83,15 +81,13 @@ class _Pair(NamedTuple):
 def align(reference: Measurements, measurements: Measurements, max_lag: float | None = None) -> Alignment:
     """Estimate lag, gain and sign of measurements by cross-correlation.
 
-    Channels with clocks of their own are aligned one by one, ``measurements.select([name])``.
-
     Parameters
     ----------
     reference : Measurements
         A simulated response, ``Measurements(model.channels, model.dt, model.simulate(x))``, or what excites a sensor at
         the base, ``Measurements([Channel("base", "acceleration", "g")], record.dt, [record.acceleration])``.
     measurements : Measurements
-        Channels that the reference has as well are compared. Missing samples are left out.
+        Channels that the reference has as well are compared; with clocks of their own one by one, ``select([name])``.
     max_lag : float, optional
         Largest lag in both directions [s]. Default: half of the shorter duration.
 
@@ -112,8 +108,6 @@ def align(reference: Measurements, measurements: Measurements, max_lag: float | 
     >>> round(found.lag, 2)
     -0.5
     """
-    from scipy.optimize import minimize_scalar  # slow to import
-
     pairs = _pairs(reference, measurements)
     shorter = min(each.step * (len(history) - 1) for each in pairs.values() for history in each[2:])
     reach, step = 0.5 * shorter if max_lag is None else max_lag, min(each.step for each in pairs.values())
@@ -130,16 +124,15 @@ def align(reference: Measurements, measurements: Measurements, max_lag: float | 
     lag, other = min(tops)[1], max(tops)[1]
     first, second = (np.array([each.fit(at) for each in pairs.values()]).T for at in (lag, other))
     alike = 0.5 * first[3] @ (second[0] - first[0]) < -math.log(1.0 / _SURE - 1.0)
-    error = 1.0 / math.sqrt(first[4].sum() or 1e-300)
-    gain, correlation = (dict(zip(pairs, each.tolist(), strict=True)) for each in first[1:3])
-    return Alignment(lag, error, gain, correlation, other if alike and other != lag else None)
+    error, second_lag = 1.0 / math.sqrt(first[4].sum() or 1e-300), other if alike and other != lag else None
+    return Alignment(lag, error, *(dict(zip(pairs, each.tolist(), strict=True)) for each in first[1:3]), second_lag)
 
 
 def _pairs(reference: Measurements, measurements: Measurements) -> dict[str, _Pair]:
     if not reference.complete or any(reference.starts):
         raise ValueError("the reference needs all its samples, from time zero; give a simulated response")
     known, pairs = [each.name for each in reference.channels], {}
-    for name in [each.name for each in measurements.channels if each.name in known]:
+    for name in (each.name for each in measurements.channels if each.name in known):
         one, other = measurements.select([name]), reference.select([name])
         values, history = (each.values[0] - np.nanmean(each.values) for each in (one, other))
         if (mine := one.channels[0].dimension) != (theirs := other.channels[0].dimension):
@@ -150,8 +143,8 @@ def _pairs(reference: Measurements, measurements: Measurements) -> dict[str, _Pa
         step, fine = one.dt / every, np.full(every * (len(values) - 1) + 1, np.nan)
         fine[::every] = values
         times = step * np.arange(int((len(history) - 1) * other.dt / step + 1e-9) + 1)
-        at = make_interpolation(other.dt, len(history), times)
-        pairs[name] = _Pair(one.start, step, fine, interpolate(history, at))
+        history = interpolate(history, make_interpolation(other.dt, len(history), times))
+        pairs[name] = _Pair(one.start, step, fine, history)
     if not pairs:
         raise ValueError(f"the reference has the channels {', '.join(known)}, the measurements none of them")
     return pairs

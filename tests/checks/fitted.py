@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from fe_likelihoods.checks.compared import compare
 from fe_likelihoods.checks.fit import check_responses, check_stated_errors, check_supports
 from fe_likelihoods.emulation.modes import find_modes
+from fe_likelihoods.likelihood.fits import compare
 
 
 def fitted(posterior, starts=1):

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import Channel, Measurements
-from fe_likelihoods.checks.compared import Fit
 from fe_likelihoods.checks.finding import judge
 from fe_likelihoods.checks.fit import check_residuals, check_responses, describe_residuals
+from fe_likelihoods.likelihood.fits import Fit
 from fe_likelihoods.noise.residuals import residual_checks
 
 TOP, TIME = (Channel("top", "displacement", "mm"),), 0.02 * np.arange(400)

@@ -15,10 +15,10 @@ from fe_likelihoods import (
     ShearFrame,
     Uniform,
 )
-from fe_likelihoods.checks.compared import Fit
 from fe_likelihoods.checks.faults import _spectra, slow_motion
 from fe_likelihoods.checks.finding import in_order
 from fe_likelihoods.checks.fit import check_responses, check_supports
+from fe_likelihoods.likelihood.fits import Fit
 
 STEP, TIME = 0.01, 0.01 * np.arange(2000)
 PRIOR = {"frequency": Uniform(0.5, 10.0), "damping": Uniform(0.005, 0.8), "share": Uniform(0.0, 1.0)}

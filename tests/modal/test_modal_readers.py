@@ -104,7 +104,7 @@ def test_errors_and_what_is_no_sensor(tmp_path):
         ("date,f1_Hz", "2021-01-01,2.9\nMean,2.9", "in each line of 'date', got 'Mean'; write"),
         ("date,f1_Hz,f2_Hz", "2021-01-01,2.1,9999\n2021-01-02,2.1,6.2", "9999 in 1 rows, which usually stands for a"),
         ("f_Hz,a,b", "2.1,1,-999\n6.2,1,-1", "-999 in 1 rows, which usually stands for a"),
-        ("f_Hz,Dämpfung", "2.1,0.5", "got 0.5; state the unit"),
+        ("f_Hz,Dämpfung", "2.1,0.01", "expected a unit of damping, got 'Dämpfung'; state it"),
         ("omega [Hz]", "2.1", "omega in rad/s, got Hz; correct"),
         ("mode,f_Hz", "2,1.0\n1,2.0", r"of the modes \[1, 2\]"),
     ],
@@ -172,11 +172,16 @@ def test_a_table_of_days(tmp_path):
 def test_a_matlab_file(tmp_path):
     path = tmp_path / "modes.mat"
     savemat(path, {"f": [1.0, 3.0], "Phi": SHAPES.T, "xi": [0.01, 0.02]})
-    names = {"frequencies": "f", "shapes": "Phi", "damping": "xi"}
-    data = read_modal_data(path, ["a", "b", "c"], unit="Hz", variables=names)
+    names = {"frequencies": "f", "shapes": "Phi"}
+    data = read_modal_data(path, ["a", "b", "c"], unit="Hz", variables=names, damping=[0.01, 0.02])
     np.testing.assert_allclose(data.shapes[0], UNIT, rtol=1e-12)
     assert data.damping.tolist() == [[0.01, 0.02]] and data.frequencies.tolist() == [[1.0, 3.0]]
-    for variables in ({}, {"frequencies": "fn"}, {"frequencies": "f", "modes": "Phi"}):
+    for variables in (
+        {},
+        {"frequencies": "fn"},
+        {"frequencies": "f", "modes": "Phi"},
+        {"frequencies": "f", "damping": "xi"},
+    ):
         with pytest.raises(ValueError, match="the file has f, Phi, xi"):
             read_modal_data(path, unit="Hz", variables=variables)
     for bad, text in (
@@ -191,10 +196,6 @@ def test_a_matlab_file(tmp_path):
         savemat(path, {"f": bad})
         with pytest.raises(ValueError, match=text):
             read_modal_data(path, unit="Hz", variables={"frequencies": "f"})
-    savemat(path, {"f": [1.0, 3.0], "xi": [0.5, 0.8]})
-    names = {"frequencies": "f", "damping": "xi"}
-    with pytest.raises(ValueError, match=r"damping ratios up to 0.1, got \[0.5, 0.8\]; give damping=, as ratios"):
-        read_modal_data(path, unit="Hz", variables=names)
     savemat(path, {"f": [1.0, 3.0], "Phi": SHAPES})
     with pytest.raises(ValueError, match="transpose them"):
         read_modal_data(path, ["a", "b", "c"], unit="Hz", variables={"frequencies": "f", "shapes": "Phi"})

@@ -11,8 +11,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..cache.verification import StaleCache
-from ..likelihood.likelihood import FELikelihood
-from ..likelihood.posterior import Posterior
 from ..noise.marginal import sampled_noise
 from ..noise.residuals import ResidualChecks, residual_checks
 from ..signals.channels import Channel, Measurements
@@ -21,13 +19,14 @@ from ..signals.events import find_events
 from ..simulation.failure_reasons import ChangedModel
 from ..simulation.model import SimulationFailed
 from ..text_tables import listed
-from .faults import FEWEST_DRAWS
+from .likelihood import FELikelihood
+from .posterior import Posterior
 
 __all__ = ["ChannelFit", "Fit", "ModalFit", "checks_of", "compare", "data_sets_of", "draws_to_compare"]
 
 logger = logging.getLogger(__name__)
 
-MOST_DRAWS, SECONDS = 100, 10.0  # of the prior, and of their simulations
+FEWEST_DRAWS, MOST_DRAWS, SECONDS = 5, 100, 10.0  # of the prior, and of their simulations
 
 
 class ModalFit(NamedTuple):
@@ -112,10 +111,7 @@ def draws_to_compare(posterior: Posterior) -> np.ndarray:
 
 
 def compare(posterior: Posterior, samples: np.ndarray | None = None, centre: np.ndarray | None = None) -> list[Fit]:
-    """The fits of all data sets and events, with draws of the prior.
-
-    After a run, also with its samples (n, ndim), at the mean of the prior and at the `centre` of the samples (ndim,).
-    """
+    """Data sets and events at draws of the prior, after a run at its samples (n, ndim), their centre, and before."""
     draws, start, fits = draws_to_compare(posterior), posterior.prior.mean(), list[Fit]()
     for key, likelihood, columns in data_sets_of(posterior):
         few, residuals = _simulate(likelihood, draws[:, columns])
@@ -144,9 +140,7 @@ def _simulate(likelihood: FELikelihood, draws: np.ndarray) -> tuple[np.ndarray, 
     return draws[:made], good
 
 
-def _responses(
-    likelihood: FELikelihood, key: str, good: list[np.ndarray], points: dict[str, np.ndarray]
-) -> Iterator[Fit]:
+def _responses(likelihood: FELikelihood, key: str, good: list, points: dict[str, np.ndarray]) -> Iterator[Fit]:
     """The fit of each event, from residuals at draws of the prior, and at points (ndim,) by their name in `Fit`."""
     measured, noise = likelihood.measurements, sampled_noise(likelihood.noise)
     found = {"draws": measured.values - np.reshape(good, (-1, *measured.values.shape))}
@@ -196,13 +190,13 @@ def _events(likelihood: FELikelihood, key: str) -> Iterator[tuple[str, Measureme
 
 def _modes(likelihood: Any, draws: np.ndarray, samples: np.ndarray | None, centre: np.ndarray | None) -> ModalFit:
     """Modes at draws of the prior, and at four times as many samples of the posterior (n, ndim)."""
-    found: list[Any] = []
-    for points in (draws, samples):
+
+    def predicted(points: np.ndarray) -> Any:
         try:
-            some = points is not None and len(points)
-            found.append(likelihood.predict_modes(points, most=4 * max(len(draws), FEWEST_DRAWS)) if some else None)
+            return likelihood.predict_modes(points, most=4 * max(len(draws), FEWEST_DRAWS))
         except (SimulationFailed, ChangedModel, StaleCache) as error:
             logger.warning("modes are not compared: %s", error)
-            found.append(None)
-    held_out = None if None in (found[1], likelihood.held_out) else found[1].against(likelihood.held_out)
-    return ModalFit(likelihood, found[0], centre, found[1], held_out)
+
+    prior, after = (None if each is None or not len(each) else predicted(each) for each in (draws, samples))
+    held_out = None if None in (after, likelihood.held_out) else after.against(likelihood.held_out)
+    return ModalFit(likelihood, prior, centre, after, held_out)
