@@ -14,8 +14,6 @@ from ..signals.tables import read_table
 from ..signals.text_files import agree_on_unit
 from ..units import to_si
 
-__all__ = ["read_matlab", "read_modal_data"]
-
 
 def read_modal_data(
     source: str | Path | Any,

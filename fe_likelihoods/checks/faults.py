@@ -25,8 +25,6 @@ from ..units import DIMENSIONS, UNITS, find_unit
 from .finding import HALF, TAIL, WRONG, Finding, percent
 from .sensor_faults import runs_of
 
-__all__ = ["Fault", "describe_unit", "find_faults", "finding_of", "slow_motion", "supports_apart"]
-
 BETTER = 0.6  # error with a fault taken into account, as a share of the error without: study `fit_gate`
 EXPLAINED = 0.85  # error (RRMSE) above which a response explains nothing: a correlation of a half
 FLOOR = 0.02  # error below which smaller ones count as equal

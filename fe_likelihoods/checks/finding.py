@@ -6,8 +6,6 @@ from typing import NamedTuple
 
 from samplers.finding import CARE, NOTE, WRONG, Finding, by_severity
 
-__all__ = ["Finding", "FindingWarning", "Judgement", "in_order", "judge", "labelled", "percent", "warn"]
-
 SMALL_PROBABILITY = 0.01  # that chance explains what was found; of 100 independent tests of right results, one fails
 TAIL = 0.05  # share of samples, draws or simulations that is as much as a tail of a 90 % interval
 HALF = 0.5  # of a power, or of what is inside a band: the other half is missed

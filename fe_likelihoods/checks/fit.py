@@ -16,8 +16,6 @@ from .finding import CARE, CORRELATED, HALF, NOTE, SMALL_PROBABILITY, WRONG, Fin
 from .modal import check_modes, squares_of_modes
 from .model import motions_to_replace
 
-__all__ = ["check_residuals", "check_responses", "check_stated_errors", "check_supports"]
-
 FEWEST = 10  # samples that the tests of correlation and distribution need
 FAR = 5.0  # mean square of residuals, relative to the stated one, from which on a result is not used
 

@@ -10,8 +10,6 @@ from ..likelihood.fits import MOST_DRAWS
 from .faults import BETTER, FACTOR, FLOOR, Fault, finding_of
 from .finding import CARE, HALF, Finding
 
-__all__ = ["check_modes", "squares_of_modes"]
-
 
 def check_modes(modes: Any, title: str) -> list[Finding]:
     """Faults of data with a title, and modes without a counterpart, at draws of the prior."""

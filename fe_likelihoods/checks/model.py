@@ -22,17 +22,6 @@ from ..simulation.model import simulate_batch
 from ..text_tables import listed
 from .finding import CARE, HALF, WRONG, Finding, percent
 
-__all__ = [
-    "at_mean",
-    "check_chance",
-    "check_motion",
-    "check_same_response",
-    "halve_steps",
-    "motions_to_replace",
-    "refuse_chance",
-    "relative_difference",
-]
-
 # A shift of a parameter by half a step is named from HALF a standard deviation on: the mean square of its error is then
 # 1.25 times the variance. For an oscillator with known parameters (eleven noises and steps, six seeds each), 90 %
 # intervals without it held the stiffness in 17 of 18 runs with shifts of 0.3 to 1.3, and in 0 of 36 with 5 to 60.

@@ -13,8 +13,6 @@ from .model import STEP, at_mean, check_chance, check_motion, halve_steps, motio
 from .run import Failures, FinishedRun, failures, read_run
 from .screening import check_data
 
-__all__ = ["JudgedRun", "ModelCheck", "check_failures", "check_model", "check_result", "judge_run"]
-
 # effective, below which the interval between the 5 % and 95 % quantiles of n samples, which holds a further sample with
 # the probability 0.9 (n - 1) / (n + 1), loses as much as a tail of it: 0.85; with 57 it is 0.87
 FEW_SAMPLES = 36.0

@@ -19,8 +19,6 @@ from ..likelihood.likelihood import FELikelihood
 from ..likelihood.parameters import Parameter
 from ..priors.priors import Prior
 
-__all__ = ["Failures", "FinishedRun", "failures", "read_run"]
-
 LONGEST_AUTOCORRELATION = 50.0  # iterations per autocorrelation time that emcee recommends
 
 

@@ -11,8 +11,6 @@ from ..units import from_si
 from .finding import CARE, Finding
 from .sensor_faults import SensorFault, find_sensor_faults
 
-__all__ = ["check_data", "check_sensors", "repair_lines", "screen"]
-
 LEAVE_OUT, SUBTRACT = "Leave these samples out", "Subtract it, unless the structure did move so"
 FAULTS = {  # kind, text and action
     "clipped": ("A sensor is clipped", "has its largest or smallest value for several samples in a row, {}", LEAVE_OUT),

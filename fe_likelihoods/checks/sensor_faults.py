@@ -14,8 +14,6 @@ import numpy as np
 
 from .finding import HALF
 
-__all__ = ["SensorFault", "find_sensor_faults", "runs_of"]
-
 FEWEST = 50  # samples that are judged, and for each spike
 MATTERS = 0.25  # of the peak, or of the standard deviation: smaller parts hardly change a sum of squares
 DIGITS = 3.0  # the steps beside, in smallest steps; without it, 10 of 181 right channels are named for 4

@@ -6,15 +6,6 @@ import numpy as np
 
 from .finding import CARE, Finding
 
-__all__ = [
-    "check_bandwidth",
-    "check_common",
-    "check_final_values",
-    "check_most",
-    "check_peaks",
-    "check_reweighting",
-]
-
 # of a predicted peak to the calibrated ones: named in 1 of 100 right runs, and in 96 of 100 at three times the strength
 PEAK_RATIO = 2.0
 NARROW = 0.2  # bandwidth of a motion by that of the calibration; earthquakes of one structure differ by 0.38 or more

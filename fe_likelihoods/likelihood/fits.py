@@ -22,8 +22,6 @@ from ..text_tables import listed
 from .likelihood import FELikelihood
 from .posterior import Posterior
 
-__all__ = ["ChannelFit", "Fit", "ModalFit", "checks_of", "compare", "data_sets_of", "draws_to_compare"]
-
 logger = logging.getLogger(__name__)
 
 FEWEST_DRAWS, MOST_DRAWS, SECONDS = 5, 100, 10.0  # of the prior, and of their simulations

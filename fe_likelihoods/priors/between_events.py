@@ -1,7 +1,5 @@
 """How much structural parameters differ between events of one structure, by the beginning of their names."""
 
-__all__ = ["BETWEEN_EVENTS"]
-
 BETWEEN_EVENTS = {"frequency": 0.02, "stiffness": 0.04, "damping": 0.2}
 """Standard deviations of the logarithms between events of one structure.
 

@@ -25,22 +25,6 @@ from ..prediction.prediction import Prediction
 if TYPE_CHECKING:
     import pandas
 
-__all__ = [
-    "DataSet",
-    "cost",
-    "data_sets",
-    "evidence",
-    "fingerprints",
-    "how_to_repeat",
-    "moments_of",
-    "names_of_values",
-    "parameter_table",
-    "residual_sentences",
-    "sampler_settings",
-    "summary_sentences",
-    "versions",
-]
-
 
 class DataSet(NamedTuple):
     """One data set: what was measured, and what it was compared with."""

@@ -13,8 +13,6 @@ from ..simulation.model import SimulationFailed
 from ..units import from_si
 from .contents import names_of_values
 
-__all__ = ["EventPredictions", "NumberRow", "OtherEvent", "as_events", "describe_event"]
-
 EventPredictions = Mapping[str, Prediction]
 """Predictions of one event by quantity, such as the result of `fe_likelihoods.propagate` for several quantities."""
 

@@ -20,16 +20,6 @@ from .other_events import OtherEvent
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = [
-    "Picture",
-    "draw_event",
-    "draw_fit",
-    "draw_posterior",
-    "draw_residuals",
-    "draw_run",
-    "draw_scores_of_events",
-    "save_picture",
-]
 
 SMOOTH = 4000  # draws with smooth contours of 50 and 90 %
 LEGIBLE = 80  # pixels per inch at which the smallest labels can be read

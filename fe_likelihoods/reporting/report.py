@@ -39,8 +39,6 @@ from .pictures import (
     draw_scores_of_events,
 )
 
-__all__ = ["report", "write_page"]
-
 
 def report(
     sampler: Any,

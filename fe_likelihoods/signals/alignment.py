@@ -15,8 +15,6 @@ from scipy.optimize import minimize_scalar
 from .channels import Measurements
 from .interpolation import interpolate, make_interpolation
 
-__all__ = ["Alignment", "align"]
-
 _LEAST = 1e-3  # energy of the reference at a lag, of the largest at any lag, below which nothing is compared
 _GOOD = 0.7  # correlation below which the reference does not explain the channel
 _SMOOTH = 0.02  # share of the lines over which the spectrum of errors is averaged
