@@ -19,8 +19,6 @@ import numpy as np
 
 from ..noise.sufficient_statistics import sums_of_squares
 
-__all__ = ["Archive", "check_quadratic"]
-
 _VALUES = 2**21  # of residuals that are multiplied together: 16 MiB
 _TOLERANCE = 1e-6
 

@@ -19,8 +19,6 @@ from ..signals.comparison import Comparison, measured_values
 from ..simulation.model import derivatives_batch, has_jacobian, most_responses
 from .archive import check_quadratic
 
-__all__ = ["DataSets"]
-
 _MANY = 10_000  # runs of a pool whose size is not known
 
 

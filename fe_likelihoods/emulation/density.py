@@ -21,8 +21,6 @@ from samplers.proposals.mixture import Mixture, draw, fit_mixture, invert_roots,
 from .emulator import ResponseEmulator
 from .target import ResponseTarget
 
-__all__ = ["EmulatedPosterior", "Region", "student_mixture", "tempered"]
-
 _FREEDOM = 6.0  # at least, else as many as parameters: 50 keep 86 % of draws of a normal density in 50, 6 keep 44 %
 _ROUNDS, _DRAWS = 6, 3000  # of the adaptation, and draws of each
 _SETTLED = 0.3  # share of effective draws in a round after which none follows

@@ -12,8 +12,6 @@ import numpy as np
 from .gaussian_process import fit_process, predict
 from .target import ResponseTarget
 
-__all__ = ["ResponseEmulator"]
-
 _MAX_COMPONENTS = 60
 _NEGLIGIBLE_VARIANCE = 1e-3  # of the left-out components together, per run, in units of the noise variance
 _SMALLEST_SHARE = 1e-10  # of the leading component
@@ -23,7 +21,7 @@ class ResponseEmulator:
     """Predicts statistics of responses near rows (m,) of the archive's runs, at least d + 4; LinAlgError if these do
     not span the parameters.
 
-    `target` has the scale of its inputs, centre (d,) and covariance (d, d) whiten them, and `slopes` (n_numbers,),
+    Centre (d,) and covariance (d, d) whiten them, and `slopes` (n_numbers,),
     derivatives of the log-likelihood by the statistics, are the metric in which components are in units of the noise;
     an `earlier` fit gives first length scales.
     """
@@ -83,7 +81,3 @@ class ResponseEmulator:
             for a in range(len(constant))
         ]
         return np.maximum(np.stack(columns, axis=1), np.finfo(float).tiny)
-
-    def left_out_statistics(self) -> tuple[np.ndarray, np.ndarray]:
-        """Statistics (m, n_numbers) of training runs, predicted from the other runs, and their true statistics."""
-        return self._at(self._coefficients - self.process.left_out), self._at(self._coefficients)

@@ -17,8 +17,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, qr, solve_triangular
 
-__all__ = ["GaussianProcess", "fit_process", "predict"]
-
 _NUGGETS = 10.0 ** np.array([-9.0, -7.0, -5.0, -3.0, -1.0, 1.0])
 _LOG_SCALES = -2.0, 4.0  # bounds of the logarithms of the length scales, in units of the inputs, and of the shape
 _TINY = 1e-300

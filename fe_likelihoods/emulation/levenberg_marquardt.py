@@ -11,8 +11,6 @@ import numpy as np
 
 from .target import NoiseFit, ResponseTarget, Runs
 
-__all__ = ["FIRST_DIFFERENCE", "TOLERANCE", "Ascent", "Climb", "Jacobians", "axes_of"]
-
 _FIRST_DAMPING = 1e-2
 _LARGEST_STEP = 2.0  # prior standard deviations
 FIRST_DIFFERENCE = 3e-3  # prior standard deviations
@@ -92,21 +90,18 @@ class Jacobians:
     """
 
     def __init__(self) -> None:
-        # coordinates (d,), derivatives (d, n) there, and the ascent that has made the differences
-        self.known: list[tuple[np.ndarray, np.ndarray, int]] = []
-        self._runs: list[tuple[np.ndarray, int, int]] = []
+        self.known: list[tuple[np.ndarray, np.ndarray]] = []  # coordinates (d,), and derivatives (d, n) there
+        self._runs: list[tuple[np.ndarray, int]] = []
 
-    def note(self, points: np.ndarray, runs: Runs, number: int) -> None:
-        """Enter runs of an ascent at points (n, d)."""
-        self._runs += [(points[k], int(runs.numbers[k]), number) for k in np.flatnonzero(~runs.failed)]
+    def note(self, points: np.ndarray, runs: Runs) -> None:
+        """Enter runs at points (n, d)."""
+        self._runs += [(points[k], int(runs.numbers[k])) for k in np.flatnonzero(~runs.failed)]
 
-    def at(self, coords: np.ndarray, run: int, number: int | None) -> np.ndarray:
-        """Derivatives (d, n) at coordinates (d,), where a run was made, from one ascent or, for None, from all."""
-        known = [each for each in self.known if number in (None, each[2])]
-        origin, slopes, _ = min(reversed(known), key=lambda each: float(np.square(each[0] - coords).sum()))
+    def at(self, coords: np.ndarray, run: int) -> np.ndarray:
+        """Derivatives (d, n) at coordinates (d,), where a run was made."""
+        origin, slopes = min(reversed(self.known), key=lambda each: float(np.square(each[0] - coords).sum()))
         far, d = float(np.square(origin - coords).sum()), len(coords)
-        made = [each for each in self._runs if number in (None, each[2])]
-        steps = np.array([point for point, *_ in made]) - coords
+        steps = np.array([point for point, _ in self._runs]) - coords
         squared = np.square(steps).sum(axis=1)
         rows = np.flatnonzero(squared > _TOO_CLOSE)
         rows = rows[np.argsort(squared[rows])[: _NEAREST_RUNS[0] * d + _NEAREST_RUNS[1]]]
@@ -114,7 +109,7 @@ class Jacobians:
             return slopes
         steps, weighted = steps[rows], steps[rows] / np.square(squared[rows])[:, None]
         solved = np.linalg.solve(weighted.T @ steps + np.eye(d) / far, weighted.T)
-        runs = np.array([made[row][1] for row in rows])
+        runs = np.array([self._runs[row][1] for row in rows])
         slopes = np.pad(slopes, ((0, 0), (0, max(0, max(run, *runs) + 1 - slopes.shape[1]))))
         return slopes + solved @ (_differences(runs, run, slopes.shape[1]) - steps @ slopes)
 
@@ -143,12 +138,11 @@ class Climb:
         found = self._heights(start[None], (yield start[None]), None)
         if not found:
             return -1
-        self._here, self._of = found[0], None
+        self._here = found[0]
         joined = self._explained()
         if joined is None and not (self.target.data.differentiable and (steps is None or not self.whole)):
             if steps is not None or not self.jacobians.known or len(start) <= OWN:
                 yield from self._difference(FIRST_DIFFERENCE * np.eye(len(start)) if steps is None else steps)
-                self._of = self.number
         if joined is None:
             first = max(tolerance, _DESIGN_FROM * len(start)) if self.whole else tolerance
             joined = yield from self._climb(True, first)
@@ -174,7 +168,7 @@ class Climb:
 
     def _heights(self, points: np.ndarray, runs: Runs, noise: np.ndarray | None) -> list[Ascent]:
         """The points that did not fail, with their log-densities; they are noted for secants."""
-        self.jacobians.note(points, runs, self.number)
+        self.jacobians.note(points, runs)
         found = []
         for k in np.flatnonzero(~runs.failed):
             fit = self.target.fit_noise(runs.statistics[k], noise)
@@ -187,7 +181,7 @@ class Climb:
         here = self._here
         if runs is None:
             runs = yield here.coords + steps
-            self.jacobians.note(here.coords + steps, runs, self.number)
+            self.jacobians.note(here.coords + steps, runs)
         ends, used = np.where(runs.failed, here.run, runs.numbers), steps.copy()
         for k in np.flatnonzero(runs.failed):
             for factor in _RETRIES:
@@ -196,7 +190,7 @@ class Climb:
                     ends[k], used[k] = again.numbers[0], factor * steps[k]
                     break
         changes = _differences(ends, here.run, max(here.run, *ends) + 1)
-        self.jacobians.known.append((here.coords, np.linalg.solve(used, changes), self.number))
+        self.jacobians.known.append((here.coords, np.linalg.solve(used, changes)))
 
     def _check(self, numbers: np.ndarray) -> Requests:
         """ValueError if derivatives, numbers (d,) in the archive, deny the residuals at a step along all coordinates.
@@ -231,7 +225,7 @@ class Climb:
     def _quadratic(self) -> Ascent:
         """The log-density around the present point."""
         archive = self.target.archive
-        slopes = self.jacobians.at(self._here.coords, self._here.run, self._of)
+        slopes = self.jacobians.at(self._here.coords, self._here.run)
         weights = self.target.slopes(self._here.statistics, self._here.noise.coords)
         forms = archive.forms(archive.weights([*slopes, self._here.run])) @ weights
         gradient = 2.0 * forms[:-1, -1] - (self._here.coords - self.centre)
@@ -253,7 +247,7 @@ class Climb:
                 if self.target.unchecked:  # the first derivatives are compared with a difference
                     self.target.unchecked.clear()
                     yield from self._check(numbers)
-                self.jacobians.known.append((self._here.coords, self.target.archive.weights(numbers), self.number))
+                self.jacobians.known.append((self._here.coords, self.target.archive.weights(numbers)))
             at = self._quadratic()
             if merging and (joined := self._explained()) is not None:
                 return joined
@@ -273,15 +267,11 @@ class Climb:
                 self._here = reached[0]
             if gain > max(_STALLED[0], _STALLED[1] * at.gain_left):
                 failures = 0
-                if gain > 0.5 * promised:
-                    damping *= 0.1
-                else:
-                    self._of = None  # from now on the other ascents help: on a rough density few arrive by themselves
+                damping *= 0.1 if gain > 0.5 * promised else 1.0
                 if gain < _MISLED * promised and not self.target.data.differentiable and not self.whole:
                     yield from self._own_differences(at, 1.0)
                 continue
             failures += 1
-            self._of = None
             damping = max(30.0 * damping, _FIRST_DAMPING)
             # the first time, the run that gained nothing has corrected the secants
             if failures > 1 and not self._known_here():
@@ -289,7 +279,7 @@ class Climb:
         return None
 
     def _known_here(self) -> bool:
-        return any(np.array_equal(self._here.coords, point) for point, *_ in self.jacobians.known)
+        return any(np.array_equal(self._here.coords, point) for point, _ in self.jacobians.known)
 
     def _own_differences(self, at: Ascent, factor: float) -> Requests:
         """Derivatives by differences with steps of a share of the standard deviations, times a factor."""

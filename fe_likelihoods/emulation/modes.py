@@ -9,25 +9,15 @@ centred on each start, so that starts keep their differences in parameters witho
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.special import ndtri
 
 from samplers.judgement.guides import DOUBTED_SHARE
 from samplers.tempering.guide import GuideSession
 
 from ..text_tables import text_table
-from .levenberg_marquardt import FIRST_DIFFERENCE, OWN, TOLERANCE, Ascent, Climb, Jacobians, axes_of
+from .levenberg_marquardt import FIRST_DIFFERENCE, TOLERANCE, Ascent, Climb, Jacobians, axes_of
 from .target import ResponseTarget, Runs, Steps, at_once, nothing_stored
-
-__all__ = [
-    "Mode",
-    "ModeSearch",
-    "Search",
-    "check_starts",
-    "draw_starts",
-    "expected_simulations",
-    "find_modes",
-    "laplace",
-]
 
 _NEGLIGIBLE = 15.0  # a mode whose log-evidence is lower than the largest by more than this is dropped
 _LOOSEST = 5.0  # largest tolerance of a short part of the record
@@ -124,41 +114,27 @@ class ModeSearch(NamedTuple):
 
 
 def laplace(target: ResponseTarget, end: Ascent) -> Mode:
-    """Laplace approximation at the end of an ascent, over structural and noise coordinates together, by central
-    differences of a third of a standard deviation. Residuals are taken as linear in the structural coordinates, so that
-    nothing is simulated.
+    """Laplace approximation at the end of an ascent: its Gauss-Newton Hessian, and differences of a third of a standard
+    deviation along the noise parameters, which hardly move the best structural ones. Nothing is simulated.
     """
     noise = max(end.noise, target.fit_noise(end.statistics), key=lambda fit: fit.log_density)
-    d, at = target.n_structural, np.concatenate([end.coords, noise.coords])
-    forms = target.archive.forms(target.archive.weights([*end.slopes, end.run]))
-
-    def log_density(coords: np.ndarray) -> np.ndarray:
-        step = np.column_stack([coords[:, :d] - end.coords, np.ones(len(coords))])
-        linear = np.einsum("nk,kla,nl->na", step, forms, step, optimize=True) + end.statistics - forms[-1, -1]
-        return target.log_likelihood(np.maximum(linear, 0.0), coords[:, d:]) + target.log_prior(coords)
-
-    steps = np.concatenate([1.0 / np.sqrt(np.diag(end.hessian)), np.ones(target.n_noise)]) / 3.0
-    for _ in range(4):  # noise parameters: the steps follow from the curvature itself
-        ahead, behind, here = (log_density(at + sign * np.diag(steps)) for sign in (1.0, -1.0, 0.0))
-        steps = 1.0 / np.sqrt(np.maximum((2.0 * here - ahead - behind) / np.square(steps), 0.1)) / 3.0
-    unit, moves = np.eye(target.ndim), np.diag(steps)
-    corners = [
-        a * b * log_density((at + a * moves[:, None] + b * moves).reshape(-1, target.ndim)).reshape(unit.shape)
-        for a, b in ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
-    ]
-    hessian = -sum(corners) / 4.0 / np.outer(steps, steps)
-    finite = bool(np.isfinite(hessian).all())
-    if not finite:  # an exact fit, or a likelihood beyond the range of numbers
-        hessian = unit
-        hessian[:d, :d] = np.where(np.isfinite(end.hessian), end.hessian, np.eye(d))
-    values, vectors = np.linalg.eigh(0.5 * (hessian + hessian.T))
+    n, steps = target.n_noise, np.full(target.n_noise, 1.0 / 3.0)
+    for _ in range(5):  # steps follow from the curvature itself
+        moves, curvature = np.diag(steps), np.zeros((n, n))
+        for a, b in ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)):
+            points = noise.coords + (a * moves[:, None] + b * moves).reshape(n * n, n)
+            curvature -= a * b / 4.0 * target.noise_density(end.statistics, points).reshape(n, n)
+        curvature /= np.outer(steps, steps)
+        steps = 1.0 / np.sqrt(np.maximum(np.diag(curvature), 0.1)) / 3.0
+    values, vectors = np.linalg.eigh(block_diag(end.hessian, 0.5 * (curvature + curvature.T)))
     values = np.maximum(values, _FLATTEST)
-    covariance, top = (vectors / values) @ vectors.T, float(log_density(at[None])[0])
+    at, covariance = np.concatenate([end.coords, noise.coords]), (vectors / values) @ vectors.T
+    top = noise.log_density + float(target.log_prior(end.coords))
     log_evidence = top + 0.5 * target.ndim * float(np.log(2.0 * np.pi)) - 0.5 * float(np.log(values).sum())
-    ahead, behind = (target.parameters(at + sign * _STEP * unit) for sign in (1.0, -1.0))
+    ahead, behind = (target.parameters(at + sign * _STEP * np.eye(target.ndim)) for sign in (1.0, -1.0))
     tangents = (ahead - behind) / (2.0 * _STEP)
     spread = tangents.T @ covariance @ tangents
-    return Mode(target.parameters(at[None])[0], spread, at, covariance, top, log_evidence, finite and end.converged)
+    return Mode(target.parameters(at[None])[0], spread, at, covariance, top, log_evidence, end.converged)
 
 
 class _OutOfBudget(Exception):
@@ -184,12 +160,7 @@ class Search:
         self._tolerance = tolerance
         parts = [*target.shortened(_SHARES), target]
         self._parts = [_Part(part, part.n_steps / target.n_steps, {}, Jacobians()) for part in parts]
-        self._standing_for: list[int] = []  # start that has taken the place of each; -1 for none
-
-    @property
-    def begun(self) -> int:
-        """Number of starts that have begun."""
-        return len(self._standing_for)
+        self.standing_for: list[int] = []  # start that has taken the place of each that has begun; -1 for none
 
     def run(self, starts: int) -> Steps:
         """Returns a `ModeSearch`; yields functions that simulate, and is sent their results, and None after each batch.
@@ -203,13 +174,13 @@ class Search:
             try:
                 if begin == starts:
                     yield from self._order(starts)
-                self._standing_for.extend(range(begin, following))
+                self.standing_for.extend(range(begin, following))
                 yield from self._ascend(range(begin, following))
             except _OutOfBudget:
                 finished = False
             if finished and len(self._parts) > 1 and not self._parts[0].ends:
                 del self._parts[:-1]
-                begin, self._standing_for = 0, []
+                begin, self.standing_for = 0, []
                 continue
             search = self._found(finished)
             half = (starts + 1) // 2
@@ -279,7 +250,7 @@ class Search:
                 try:
                     waiting[number] = ascents[number].send(answer)
                 except StopIteration as end:
-                    self._standing_for[number] = end.value
+                    self.standing_for[number] = end.value
             slopes = [number for number, each in waiting.items() if each.ndim == 1]
             points = [number for number in waiting if number not in slopes]
             answers, sizes = {}, [len(waiting[number]) for number in points]
@@ -302,23 +273,12 @@ class Search:
         modes = sorted(((laplace(self._target, end), k) for k, end in ends.items()), key=lambda m: -m[0].log_evidence)
         kept = [(mode, k) for mode, k in modes if mode.log_evidence > modes[0][0].log_evidence - _NEGLIGIBLE]
         led = []
-        for k in range(len(self._standing_for)):
-            for _ in self._standing_for:  # two starts may stand for each other, one of them on an earlier part
-                k = k if k < 0 or k in ends else self._standing_for[k]
+        for k in range(len(self.standing_for)):
+            for _ in self.standing_for:  # two starts may stand for each other, one of them on an earlier part
+                k = k if k < 0 or k in ends else self.standing_for[k]
             led.append(next((number for number, (_, start) in enumerate(kept) if start == k), -1))
         names, grown = tuple(self._target.posterior.parameter_names), len(self._parts) > 1
         return ModeSearch(tuple(mode for mode, _ in kept), tuple(led), self.spent, finished, grown, names)
-
-
-def expected_simulations(starts: int, n_structural: int) -> float:
-    """Simulations of a search from a number of starts, for progress bars.
-
-    Of 38 searches on 18 posteriors with 2 to 50 parameters, 26 took between half of these and twice as many, and 6 on
-    ridges 2.4 to 5 times as many.
-    """
-    if n_structural > OWN:  # starts share derivatives
-        return 3.0 * (starts + n_structural)
-    return starts * (3.0 + 1.5 * n_structural)
 
 
 def draw_starts(target: ResponseTarget, n: int, random: Any) -> np.ndarray:

@@ -4,7 +4,6 @@ In the coordinates z of `Prior.from_normal` the prior is the standard normal, so
 part of the least squares (its residuals are z), and every parameter has the same scale.
 """
 
-import copy
 import hashlib
 import json
 from collections.abc import Callable, Generator, Sequence
@@ -18,14 +17,11 @@ from ..signals.records import DisplacementHistory, growing_durations
 from .archive import Archive
 from .data_sets import DataSets
 
-__all__ = ["SCALES", "NoiseFit", "Remember", "ResponseTarget", "Runs", "Steps", "at_once", "nothing_stored"]
-
 Remember = Callable[..., Sequence[np.ndarray] | None]  # `samplers.tempering.guide.GuideSession.remember`
 Steps = Generator[Callable[[], Any] | None, Any, Any]  # functions to call; None after each batch of simulations
 
-SCALES = 1, 0, -1  # powers of parameters that the prior keeps away from zero: themselves, logarithms, reciprocals
 _LARGEST_FACTOR = 30.0  # between the ends of the prior's central 95 %, up to which a parameter is a factor
-_SMALLEST = 1e-300  # positive parameters are at least this before their logarithm or reciprocal is taken
+_SMALLEST = 1e-300  # positive parameters are at least this before their logarithm is taken
 _AT_BOUND = 8.5  # from about 8.3, parameters are rounded to a bound that is not zero
 _WIDTHS = 7.0, 3.0, 1.0, 0.3, 0.1  # half widths of the grids on which noise parameters are first searched
 _GRID = np.linspace(-1.0, 1.0, 41)
@@ -78,13 +74,12 @@ class ResponseTarget:
         self.archive = Archive(self.data.statistic, self.data.measured.shape)
         self._simulated: set[bytes] = set()
         self.unchecked = [True] if self.data.differentiable else []
-        self._power = self.in_scale(0)._power
-        self._median = self.parameters(np.zeros((1, self.ndim)))
-        self._noise_volume = 0.0  # of the noise coordinates over the noise parameters, at their medians
-        if self.n_noise:
-            noise = self._prior.subset(self._prior.names[self.n_structural :])
-            at_median = np.squeeze(noise.logpdf(self._median[:, self.n_structural :]))
-            self._noise_volume = float(at_median - self.log_prior(np.zeros(self.n_noise)))
+        self._structural = self._prior.subset(self._prior.names[: self.n_structural])
+        self._noise = self._prior.subset(self._prior.names[self.n_structural :]) if self.n_noise else None
+        at = np.array([[-_AT_BOUND], [-2.0], [2.0]]) * np.ones(self.n_structural)
+        least, low, high = self.structural_parameters(at)
+        factors = (least >= 0.0) & (low > 0.0) & (high < _LARGEST_FACTOR * low)
+        self._logarithmic = self._structural.logarithmic | factors
 
     def shortened(self, shares: Sequence[float]) -> list["ResponseTarget"]:
         """The same posterior for the first parts of the record, up to shares of the Arias intensity; none if the model
@@ -121,58 +116,43 @@ class ResponseTarget:
 
     def structural_parameters(self, coords: np.ndarray) -> np.ndarray:
         """Structural parameters (n, n_structural) at coordinates (n, n_structural)."""
-        return self.parameters(np.pad(coords, ((0, 0), (0, self.n_noise))))[:, : self.n_structural]
+        return self._structural.from_normal(coords)
 
     def coordinates(self, parameters: np.ndarray) -> np.ndarray:
-        """Coordinates (n, ndim) of parameters (n, ndim), finite also where these were rounded to a bound."""
-        coords = self._prior.to_normal(parameters)
+        """Coordinates of parameters (n, ndim), or of structural ones (n, n_structural), finite also where these were
+        rounded to a bound."""
+        prior = self._prior if parameters.shape[1] == self.ndim else self._structural
+        coords = prior.to_normal(parameters)
         return np.where(np.isinf(coords), np.copysign(_AT_BOUND, coords), coords)
 
     def with_volume(self, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Coordinates (n, ndim) of parameters, and the logarithm (n,) of their volume over the parameters' volume: the
-        log-density of parameters minus that of the coordinates; -inf outside the prior's support.
+        """Coordinates of parameters as `coordinates`, and the logarithm (n,) of their volume over the parameters'
+        volume: the log-density of parameters minus that of the coordinates; -inf outside the prior's support.
         """
-        coords, log_prior = self.coordinates(parameters), np.atleast_1d(self._prior.logpdf(parameters))
+        prior = self._prior if parameters.shape[1] == self.ndim else self._structural
+        coords, log_prior = self.coordinates(parameters), np.atleast_1d(prior.logpdf(parameters))
         inside = np.isfinite(coords).all(axis=1) & np.isfinite(log_prior)
         return coords, np.where(inside, log_prior - self.log_prior(np.where(inside[:, None], coords, 0.0)), -np.inf)
 
-    def in_scale(self, power: int) -> "ResponseTarget":
-        """The same target and archive, with `scaled` parameters of one of `SCALES`.
-
-        Parameters that may be zero are not transformed, except that those with a lognormal prior are logarithms.
-        """
-        other = copy.copy(self)
-        least, low, high = self._prior.from_normal(np.array([[-_AT_BOUND], [-2.0], [2.0]]) * np.ones(self.ndim))
-        # the prior keeps them away from zero, and excludes what has no logarithm
-        factors = (least >= 0.0) & (low > 0.0) & (high < _LARGEST_FACTOR * low)
-        powers = np.where(self._prior.logarithmic, np.where(factors, min(power, 0), 0), np.where(factors, power, 1))
-        other._power = powers[: self.n_structural]
-        return other
-
     def scaled(self, coords: np.ndarray) -> np.ndarray:
-        """Structural parameters, their logarithms or negative reciprocals, and noise coordinates, at coordinates (n, >=
-        d). Products, as E I, are linear in logarithms, springs in series in reciprocals, and responses smooth functions
-        of these, unlike of coordinates near a bound.
+        """Structural parameters, the logarithms of those that the prior keeps away from zero, and noise coordinates, at
+        coordinates (n, >= d). Products, as E I, are linear in logarithms, and responses smooth functions of these,
+        unlike of coordinates near a bound.
         """
         parameters = self.structural_parameters(coords[:, : self.n_structural])
-        positive = np.where(self._power < 1, np.maximum(parameters, _SMALLEST), 1.0)
-        found = np.select([self._power == 0, self._power < 0], [np.log(positive), -1.0 / positive], parameters)
-        return np.column_stack([found, coords[:, self.n_structural :]])
+        logarithms = np.log(np.where(self._logarithmic, np.maximum(parameters, _SMALLEST), 1.0))
+        return np.column_stack([np.where(self._logarithmic, logarithms, parameters), coords[:, self.n_structural :]])
 
     def unscaled(self, scaled: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Coordinates (n, ndim) of what `scaled` returns, and the logarithm (n,) of their volume over its volume.
 
         The logarithm is -inf outside the support of the prior.
         """
-        d, log, reciprocal = self.n_structural, self._power == 0, self._power < 0
-        full, structural = np.repeat(self._median, len(scaled), axis=0), scaled[:, :d]
-        possible = ~(structural[:, reciprocal] >= 0.0).any(axis=1)
-        structural = np.where(log, np.exp(np.clip(np.where(log, structural, 0.0), -690.0, 690.0)), structural)
-        full[:, :d] = structural = np.where(reciprocal, -1.0 / np.minimum(structural, -_SMALLEST), structural)
-        coords, volume = self.with_volume(full)
-        coords[:, d:] = scaled[:, d:]
-        volume += np.log(structural[:, log]).sum(axis=1) + 2.0 * np.log(structural[:, reciprocal]).sum(axis=1)
-        return coords, np.where(possible, volume - self._noise_volume, -np.inf)
+        d = self.n_structural
+        logarithms = np.where(self._logarithmic, scaled[:, :d], 0.0)
+        parameters = np.where(self._logarithmic, np.exp(np.clip(logarithms, -690.0, 690.0)), scaled[:, :d])
+        coords, volume = self.with_volume(parameters)
+        return np.column_stack([coords, scaled[:, d:]]), volume + logarithms.sum(axis=1)
 
     def line(self, first: np.ndarray, last: np.ndarray, shares: np.ndarray) -> np.ndarray:
         """Coordinates (n, n_structural) at shares (n,) of the way between two points, straight in scaled parameters."""
@@ -244,9 +224,12 @@ class ResponseTarget:
 
     def log_likelihood(self, statistics: np.ndarray, coords: np.ndarray) -> np.ndarray:
         """Log-likelihood (n,) of statistics (n, n_numbers) at coordinates (n, n_noise) of the noise parameters."""
-        if self.n_noise:
-            coords = self.parameters(np.pad(coords, ((0, 0), (self.n_structural, 0))))[:, self.n_structural :]
-        return self.data.log_likelihood(statistics, coords)
+        return self.data.log_likelihood(statistics, coords if self._noise is None else self._noise.from_normal(coords))
+
+    def noise_density(self, statistics: np.ndarray, coords: np.ndarray) -> np.ndarray:
+        """Log-density (n,) of coordinates (n, n_noise) of the noise parameters, for one row of statistics."""
+        repeated = np.broadcast_to(statistics, (len(coords), len(statistics)))
+        return np.nan_to_num(self.log_likelihood(repeated, coords) + self.log_prior(coords), nan=-1e300)
 
     def fit_noise(self, statistics: np.ndarray, start: np.ndarray | None = None) -> NoiseFit:
         """Noise parameters that fit statistics (n_numbers,) best: nothing is simulated.
@@ -255,19 +238,16 @@ class ResponseTarget:
         """
         from scipy.optimize import minimize  # slow to import
 
-        def density(coords: np.ndarray) -> np.ndarray:
-            repeated = np.broadcast_to(statistics, (len(coords), len(statistics)))
-            return np.nan_to_num(self.log_likelihood(repeated, coords) + self.log_prior(coords), nan=-1e300)
-
         coords = np.zeros(self.n_noise) if start is None else start
         if not self.n_noise:
-            return NoiseFit(coords, float(density(coords[None])[0]))
+            return NoiseFit(coords, float(self.noise_density(statistics, coords[None])[0]))
         for width in _WIDTHS if start is None else ():
             for k in range(self.n_noise):
                 trial = np.repeat(coords[None], len(_GRID), axis=0)
                 trial[:, k] += width * _GRID
-                coords = trial[np.argmax(density(trial))]
-        found = minimize(lambda z: -density(z[None])[0], coords, method="BFGS", options={"gtol": 1e-2, "eps": _STEP})
+                coords = trial[np.argmax(self.noise_density(statistics, trial))]
+        options = {"gtol": 1e-2, "eps": _STEP}
+        found = minimize(lambda z: -self.noise_density(statistics, z[None])[0], coords, method="BFGS", options=options)
         return NoiseFit(found.x, -float(found.fun))
 
     def slopes(self, statistics: np.ndarray, coords: np.ndarray) -> np.ndarray:

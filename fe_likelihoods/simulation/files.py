@@ -23,6 +23,7 @@ import signal
 import stat
 import subprocess
 import sys
+import sysconfig
 import tempfile
 import threading
 import time
@@ -313,7 +314,8 @@ def _counts(path: str) -> bool:
 def _installed() -> tuple[str, ...]:
     library = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
     prefixes = [os.path.join(prefix, "lib") for prefix in (sys.prefix, sys.base_prefix)]
-    return tuple(os.path.realpath(folder) + os.sep for folder in (library, *prefixes))
+    names = ("stdlib", "platstdlib", "purelib", "platlib")
+    return tuple(os.path.realpath(folder) + os.sep for folder in (library, *prefixes, *map(sysconfig.get_path, names)))
 
 
 def _full(path: Any) -> str | None:

@@ -109,8 +109,8 @@ def test_a_channel_with_an_offset_of_a_million_times_its_noise():
 
 
 @pytest.mark.slow
-def test_springs_in_series_are_emulated_in_flexibilities():
-    """The displacements are linear in the reciprocals of the stiffnesses, so few runs give the whole posterior."""
+def test_springs_in_series():
+    """The displacements are linear in the reciprocals of the stiffnesses."""
     n = 6
     force = np.random.default_rng(3).standard_normal((n, 40)) + 1.0
     model = FunctionModel(
@@ -128,9 +128,6 @@ def test_springs_in_series_are_emulated_in_flexibilities():
     prior |= {f"sigma_{c.name}": HalfNormal(1.0) for c in model.channels}
     posterior = Posterior(FELikelihood(model, measured, GaussianNoise(model.channels)), prior).marginal()
     sampler = guided(posterior, steps=0)
-    (emulator,) = sampler.guide.emulators
-    predicted, true = emulator.left_out_statistics()
-    assert np.abs(predicted - true).max() < 1e-6 * true.max()  # residuals are in single precision; with logarithms 0.1
     assert sampler.verdict.simulations < 250
     draws = posterior.sample_prior(40_000, 1)
     weights = np.exp(posterior(draws) - posterior.log_prior(draws) - sampler.log_evidence)
