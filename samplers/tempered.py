@@ -36,7 +36,7 @@ from .judgement.verdict import (
     independent_points,
     judge,
 )
-from .moves.population_moves import GuideMove, RandomWalkMove, describe, with_fast_sweeps, without_unfitted
+from .moves.population_moves import RandomWalkMove, describe, guide_move, with_fast_sweeps, without_unfitted
 from .record import BudgetExhausted, EvaluatedBatch, Incomplete, RunStart, as_limit
 from .reporting.progress import Progress
 from .reports import AnnealingResult, Report, Stage, warn
@@ -609,7 +609,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         ended = bool(result.ended)
         self._guided = population.coords.copy() if weighted is not None and weighted.guided and not ended else None
         if self._guided is not None:
-            moves = with_fast_sweeps([GuideMove(self._guide)], self._fast, self.ndim, self.settings.fast_sweeps)
+            moves = with_fast_sweeps([guide_move(self._guide)], self._fast, self.ndim, self.settings.fast_sweeps)
             schedule = MoveSchedule(moves, np.ones(1))
             schedule.calibrate(population.coords, np.full(self.nwalkers, 1.0 / self.nwalkers))
             self._moves, self._weights = schedule

@@ -12,14 +12,10 @@ import numpy as np
 
 from ..resampling import systematic
 from .genealogy import student_factor
-from .importance import KnownDensity, PooledRounds, Round, mixture_at_draws
+from .importance import KnownDensity, PooledRounds, Round
 
-__all__ = ["Expectation", "SignedSample", "signed_sample", "unreached_share"]
-
-# Smallest step of probability over which the slope of a quantile is taken, as a share of the tail probability.
-SMALLEST_STEP = 0.1
 # Variances from n draws are multiplied by 1 + FEW / n. Without it, two errors contain the standard deviations and outer
-# quantiles from 30 draws in 87 to 92 % of all trials.
+# probabilities from 30 draws in 87 to 92 % of all trials.
 FEW = 10.0
 # Smallest number of degrees of freedom of an error.
 FEWEST_CONTRIBUTIONS = 2.0
@@ -88,39 +84,20 @@ class SignedSample(NamedTuple):
         value = np.sqrt(np.where(variance > error, variance, np.nan))
         return Expectation(value, 0.5 * error / value)
 
-    def quantile(self, probability: float) -> Expectation:
-        """Quantiles (ndim,) of the parameters at a probability between 0 and 1."""
-        if np.ndim(probability) or not 0.0 < probability < 1.0:
-            raise ValueError(f"probability must be one number between 0 and 1; got {probability}")
-        value = np.array([_at(column, self.weights, probability) for column in self.coords.T])
-        error = self.expectation(lambda coords: (coords <= value).astype(float)).error
-        error = np.where(error > 0.0, error, np.inf)  # all points on one side
-        # the known density gives the slope of the distribution function, for which there are too few draws
-        known = self.rounds == 0
-        coords, weights = self.coords[known], self.weights[known] / self.weights[known].sum()
-        least = SMALLEST_STEP * min(probability, 1.0 - probability)
-        here, half = weights @ (coords <= value), np.maximum(error, least)
-        low, high = np.clip(here - half, 0.0, 1.0 - least), np.clip(here + half, least, 1.0)
-        ends = [_at(column, weights, np.array(pair)) for column, *pair in zip(coords.T, low, high, strict=True)]
-        return Expectation(value, error * np.diff(ends)[:, 0] / (high - low))
-
 
 def signed_sample(rounds: Sequence[Round], pooled: PooledRounds) -> SignedSample | None:
     """The signed sample of all rounds with a known density, from all draws `pooled`; None if there is none.
 
-    Each round, as `add_round` returns it, counts with the inverse of the mean square of its differences, which the
-    draws of all rounds give: few draws may have small differences by chance.
+    Each round, as `add_round` returns it, counts by the square of its effective share, which the draws of all rounds
+    give: few draws may have a large share by chance.
     """
     used = [k for k, r in enumerate(rounds) if r.known is not None and _meets_known(r)]
     if not used:
         return None
     found = [(rounds[k], *_differences(rounds[k])) for k in used]
-    log_evidence = pooled.log_evidence
-    known_at = {k: rounds[k].known.log_density(pooled.coords) for k in used}  # emulators take most of the time
-    for _ in range(2):  # the evidence that the differences are taken with becomes more accurate
-        log_shares = np.log([len(r.coords) for r, *_ in found]) - _log_mean_squares(rounds, known_at, log_evidence)
-        shares = np.exp(log_shares - np.logaddexp.reduce(log_shares))
-        log_evidence, error = _evidence(found, shares)
+    shares = pooled.shares[used] ** 2 / [len(r.coords) for r, *_ in found]
+    shares = shares / shares.sum()
+    log_evidence, error = _evidence(found, shares)
     coords, weights, numbers, known = [], [], [], {}
     for number, ((r, differences, _), share) in enumerate(zip(found, shares, strict=True), start=1):
         coords.append(r.coords)
@@ -132,22 +109,6 @@ def signed_sample(rounds: Sequence[Round], pooled: PooledRounds) -> SignedSample
         weights.append(share * density.weights)
         numbers.append(np.zeros(len(density.weights), dtype=int))
     return SignedSample(np.concatenate(coords), np.concatenate(weights), np.concatenate(numbers), log_evidence, error)
-
-
-def _log_mean_squares(rounds: Sequence[Round], known_at: dict[int, np.ndarray], log_evidence: float) -> np.ndarray:
-    """Logarithms (k,) of the mean squares of the differences that draws of some of the rounds have, whose log-densities
-    (n,) at all draws are `known_at`, by their numbers.
-    """
-    densities = np.concatenate([r.log_densities for r in rounds])
-    log_prob, mixture = mixture_at_draws(rounds)
-    posterior, found = log_prob - log_evidence, []
-    for k, known in known_at.items():
-        larger, smaller = np.maximum(posterior, known), np.minimum(posterior, known)
-        some = larger > -np.inf
-        larger, smaller = larger[some], smaller[some]
-        log_square = 2.0 * (larger + np.log1p(-np.exp(smaller - larger) * (1.0 - np.finfo(float).eps)))
-        found.append(np.logaddexp.reduce(log_square - densities[some, k] - mixture[some]))
-    return np.array(found)
 
 
 def unreached_share(log_density: Callable[[np.ndarray], np.ndarray], latest: KnownDensity | None) -> float:
@@ -185,13 +146,6 @@ def _evidence(found: Sequence[tuple[Round, np.ndarray, float]], shares: np.ndarr
     for (_, differences, _), part in zip(found, parts / parts.sum(), strict=True):
         variance += float(part**2 * _variance_of_sum(differences / len(differences)))
     return float(top + np.log(parts.sum())), float(np.sqrt(variance))
-
-
-def _at(values: np.ndarray, weights: np.ndarray, probability: float | np.ndarray) -> np.ndarray:
-    """Values (n,) at which their weighted distribution function reaches a probability."""
-    order = np.argsort(values)
-    below = np.maximum.accumulate(np.cumsum(weights[order]))  # negative weights let it fall by little
-    return values[order][np.minimum(np.searchsorted(below, probability), len(values) - 1)]
 
 
 def _variance_of_sum(parts: np.ndarray) -> np.ndarray:

@@ -11,8 +11,6 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.special import ndtri, stdtrit
 
-__all__ = ["standard_error_of_mean", "student_factor", "trace_founders"]
-
 MIN_FOUNDER_SHARE = 0.1
 # With few walkers, a tenth of them are too few groups for a variance: with 6 founders of 60 walkers, standard errors
 # were too small by a factor of up to ten.

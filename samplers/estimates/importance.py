@@ -11,27 +11,8 @@ import numpy as np
 from scipy.special import ndtr, stdtrit
 
 from ..proposals.mixture import Mixture, draw
-from .pareto import LARGEST_SHAPE, pareto_shape, tail_size
+from .pareto import LARGEST_SHAPE, pareto_shape
 from .weights import effective_sample_size, log_mean_weight, normalised_weights
-
-__all__ = [
-    "EvidenceCheck",
-    "KnownDensity",
-    "PooledRounds",
-    "Round",
-    "add_round",
-    "draw_inside",
-    "evidence_from_weights",
-    "fewest_points",
-    "log_mixture",
-    "mixture_at_draws",
-    "pool_rounds",
-    "tail_growth",
-    "tail_shape",
-    "tail_variance",
-    "tails_are_light",
-    "usable",
-]
 
 # Levels of a normal distribution one and two standard deviations above its median.
 ONE_AND_TWO_SD = (0.8413, 0.9772)
@@ -125,8 +106,6 @@ def evidence_from_weights(log_weights: np.ndarray, made: int) -> EvidenceCheck:
 # Pareto shape that is assumed for fewer weights than an estimate needs
 SHAPE_OF_FEW = 0.7
 FEWEST_EFFECTIVE = 5.0
-# share of the sum of weights by which the largest weights must exceed the others for their shape to matter
-SMALLEST_EXCESS = 0.05
 # Growth of the weights above which the tails of a proposal are too light, for each part of the draws with the lowest
 # posterior. Normal proposals with half the variance of a Student t (3 to 5 degrees of freedom) have 0.11 to 0.5, 0.3 to
 # 0.7 and 0.6 to 0.85; harmless ones, with 6 degrees on 4, 0.03, 0.08 and 0.12.
@@ -170,8 +149,8 @@ class Round(NamedTuple):
 
     @property
     def pareto_shape(self) -> float:
-        """`tail_shape` of the weights; inf for too few weights."""
-        return tail_shape(self.log_weights)
+        """Shape of the largest weights; inf for too few weights."""
+        return pareto_shape(self.log_weights)
 
 
 class PooledRounds(NamedTuple):
@@ -183,20 +162,8 @@ class PooledRounds(NamedTuple):
     log_evidence: float
     log_evidence_error: float
     effective_sample_size: float
-    pareto_shape: float  # `tail_shape` of the weights
-
-
-def tail_shape(log_weights: np.ndarray) -> float:
-    """Pareto shape of the largest weights, from log-weights (n,); 0 if they exceed the next one, in total, by less than
-    5 % of the sum: nearly equal weights have errors whose shape says nothing about the mean.
-    """
-    shape = pareto_shape(log_weights)
-    if not np.isfinite(shape):
-        return max(shape, 0.0)
-    ordered = np.sort(normalised_weights(log_weights))
-    count = tail_size(len(ordered))
-    excess = float((ordered[-count:] - ordered[-count - 1]).sum())
-    return shape if excess >= SMALLEST_EXCESS else 0.0
+    pareto_shape: float  # of the largest weights
+    shares: np.ndarray  # (n_rounds,) in the evidence, with sum 1
 
 
 def tail_growth(rounds: Sequence[Round], part: float = 0.5) -> tuple[float, float]:
@@ -232,7 +199,7 @@ def tail_variance(log_weights: np.ndarray) -> float:
     """Variance of the log-evidence due to weights larger than all drawn ones: the mean excess over the largest, by the
     Pareto shape, is a standard error, up to 1; infinite for a shape of 1 or an effective size below 5.
     """
-    shape = tail_shape(log_weights)
+    shape = pareto_shape(log_weights)
     shape = SHAPE_OF_FEW if shape == np.inf else shape
     if shape >= 1.0 or effective_sample_size(log_weights) < FEWEST_EFFECTIVE:
         return float("inf")
@@ -257,13 +224,6 @@ def log_mixture(rounds: Sequence[Round], coords: np.ndarray) -> np.ndarray:
     return np.logaddexp.reduce(parts)
 
 
-def mixture_at_draws(rounds: Sequence[Round]) -> tuple[np.ndarray, np.ndarray]:
-    """Log-probabilities (n,) of all draws, and the logarithms (n,) of the sums of numbers of draws times densities."""
-    log_prob = np.concatenate([r.records["log_prob"] for r in rounds])
-    sizes = np.log([len(r.coords) for r in rounds])
-    return log_prob, np.logaddexp.reduce(np.concatenate([r.log_densities for r in rounds]) + sizes, axis=1)
-
-
 def pool_rounds(rounds: Sequence[Round]) -> PooledRounds:
     """Combine rounds, as `add_round` returns them: each draw is weighted by the mixture of all densities
     (``docs/theory/guided``).
@@ -273,22 +233,23 @@ def pool_rounds(rounds: Sequence[Round]) -> PooledRounds:
     rounds.
     """
     coords, records = np.concatenate([r.coords for r in rounds]), np.concatenate([r.records for r in rounds])
-    log_prob, mixture = mixture_at_draws(rounds)
-    log_weights = log_prob - mixture
-    shape, effective = tail_shape(log_weights), effective_sample_size(log_weights)
+    log_prob, sizes = records["log_prob"], np.array([len(r.coords) for r in rounds])
+    densities = np.concatenate([r.log_densities for r in rounds])
+    log_weights = log_prob - np.logaddexp.reduce(densities + np.log(sizes), axis=1)
+    shape, effective = pareto_shape(log_weights), effective_sample_size(log_weights)
     total = np.logaddexp.reduce(log_weights)
     if total == -np.inf:
-        return PooledRounds(coords, records, log_weights, -np.inf, float("inf"), 0.0, shape)
-    sizes, alive = np.array([len(r.coords) for r in rounds]), log_prob > -np.inf
-    densities = np.concatenate([r.log_densities for r in rounds])[alive]
-    under = log_prob[alive, None] - np.maximum(densities, SMALLEST_LOG_DENSITY)
+        return PooledRounds(coords, records, log_weights, -np.inf, float("inf"), 0.0, shape, sizes / sizes.sum())
+    alive = log_prob > -np.inf
+    under = log_prob[alive, None] - np.maximum(densities[alive], SMALLEST_LOG_DENSITY)
     log_shares = np.log(sizes) - np.logaddexp.reduce(log_weights[alive, None] + under, axis=0)
     log_shares = log_shares - np.logaddexp.reduce(log_shares)
+    shares = np.exp(log_shares)
     parts = [r.log_weights + log_share - np.log(n) for r, log_share, n in zip(rounds, log_shares, sizes, strict=True)]
     own = np.concatenate(parts)
     log_evidence = np.logaddexp.reduce(own)
     within, between = 0.0, 0.0
-    for part, n, share in zip(parts, sizes, np.exp(log_shares), strict=True):
+    for part, n, share in zip(parts, sizes, shares, strict=True):
         weights = np.exp(part - log_evidence)
         within += n * float(np.var(weights, ddof=1)) if n > 1 else np.inf
         between += float(weights.sum() - share) ** 2
@@ -296,4 +257,4 @@ def pool_rounds(rounds: Sequence[Round]) -> PooledRounds:
     missed = max(float(total - log_evidence), 0.0)
     error = float(np.sqrt(max(within, between, missed**2) + tail_variance(own) + known**2))
     log_weights = log_weights + (log_evidence - total)
-    return PooledRounds(coords, records, log_weights, float(log_evidence), error, effective, shape)
+    return PooledRounds(coords, records, log_weights, float(log_evidence), error, effective, shape, shares)

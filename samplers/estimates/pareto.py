@@ -5,45 +5,30 @@ If the shape k is below 0.5, the weights have a variance; above 0.7, points that
 
 import numpy as np
 
-__all__ = ["LARGEST_SHAPE", "pareto_shape", "tail_size"]
-
 # Weights with a larger Pareto shape have no useful mean (Vehtari et al. 2024, section 3.2.4).
 LARGEST_SHAPE = 0.7
 # Fewer weights determine no shape.
 FEWEST_OF_TAIL = 5
-# Range of the largest weights, as a share of the largest, up to which they are equal.
-SMALLEST_RANGE = 1e-9
-
-
-def tail_size(n: int) -> int:
-    """Number of the largest of n weights whose shape is estimated."""
-    return int(min(n / 5.0, 3.0 * np.sqrt(n)))
+# Share of the sum of all weights by which the largest ones must exceed the next one for their shape to matter.
+SMALLEST_EXCESS = 0.05
 
 
 def pareto_shape(log_weights: np.ndarray) -> float:
-    """Shape of the tail of weights, given by their logarithms (n,), -inf allowed.
+    """Shape of the tail of weights, given by their logarithms (n,), -inf allowed; inf for too few weights.
 
-    It is -inf for weights without a tail, and inf for too few weights.
-    """
-    excess, shape = _excess(log_weights)
-    return shape if excess is None else _fit(excess)
-
-
-def _excess(log_weights: np.ndarray) -> tuple[np.ndarray | None, float]:
-    """Positive excesses of the largest weights over the next one, ascending, in units of the largest weight.
-
-    None, and the shape, if they have no distribution.
+    It is 0 for a tail of less than 5 % of the sum: nearly equal weights have errors whose shape says nothing about the
+    mean.
     """
     finite = log_weights[log_weights > -np.inf]
-    count = tail_size(len(log_weights))
+    count = int(min(len(log_weights) / 5.0, 3.0 * np.sqrt(len(log_weights))))
     if count < FEWEST_OF_TAIL or len(finite) <= count:
-        return None, float("inf")
+        return float("inf")
     ordered = np.sort(np.exp(finite - finite.max()))
-    tail = ordered[-count:] - ordered[-count - 1]
-    if tail[-1] <= SMALLEST_RANGE:
-        return None, float("-inf")
-    tail = tail[tail > 0.0]
-    return (tail, np.nan) if len(tail) >= FEWEST_OF_TAIL else (None, float("inf"))
+    excess = ordered[-count:] - ordered[-count - 1]
+    if excess.sum() < SMALLEST_EXCESS * ordered.sum():
+        return 0.0
+    excess = excess[excess > 0.0]
+    return _fit(excess) if len(excess) >= FEWEST_OF_TAIL else float("inf")
 
 
 def _fit(excess: np.ndarray) -> float:

@@ -6,17 +6,6 @@ magnitudes of thousands, and a constant added to them must not change anything.
 
 import numpy as np
 
-__all__ = [
-    "LOWEST",
-    "WHERE_TO_LOOK",
-    "EvidenceError",
-    "coarse_weights",
-    "effective_sample_size",
-    "log_mean_weight",
-    "next_beta",
-    "normalised_weights",
-]
-
 WHERE_TO_LOOK = (
     "check the model and the prior, and see the failures that the model reports (posterior.report() in fe_likelihoods)"
 )

@@ -8,12 +8,14 @@ problem. Acceptances are derived in ``docs/theory/tempering``.
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from numbers import Integral
 from typing import Any
 
 import numpy as np
 
 from ..emcee_names import DEMove, MHMove, Model, Move, State
+from ..estimates.importance import draw_inside
 from ..proposals.basins import find_basins, with_components
 from ..proposals.mixture import (
     Mixture,
@@ -28,16 +30,6 @@ from ..proposals.mixture import (
 )
 from ..proposals.transforms import SupportBounds, find_support_bounds, log_abs_det_jacobian
 
-__all__ = [
-    "GuideMove",
-    "MixtureMove",
-    "RandomWalkMove",
-    "WithFastSweeps",
-    "describe",
-    "with_fast_sweeps",
-    "without_unfitted",
-]
-
 # Probabilities of the three kernels of MixtureMove: independence, local walk, differences.
 KERNEL_PROBABILITIES = (0.5, 0.25, 0.25)
 # Acceptance of the local walk and of the differences; and acceptance of the independence kernel above which it is
@@ -48,8 +40,6 @@ KERNEL_PROBABILITIES_IF_ACCEPTED = (0.8, 0.1, 0.1)
 # The log-evidence of six runs was off by 1.9 stated errors in 20 dimensions, with 10 parts by 0.4; in 10 dimensions by
 # 0.4 without parts, which take a sixth more evaluations there.
 PARTS, FEWEST_DIMENSIONS = 10, 15
-# Attempts to replace independent draws outside the support of the prior; what is left then is rejected.
-REDRAWS = 20
 # Share of the difference steps with scale 1, which lead from mode to mode (ter Braak 2006). Without differences, the
 # means of 24 runs with two modes in 11 dimensions are off by 1.6 stated errors.
 UNIT_SCALE_SHARE = 0.1
@@ -220,28 +210,21 @@ class MixtureMove(_FittedMove):
         # A random choice, not a counter: a resumed run continues identically from the stored random state alone.
         shares = KERNEL_PROBABILITIES_IF_ACCEPTED if self._independence_accepted else KERNEL_PROBABILITIES
         self._current = 0 if self._current is None else random.choice(len(self._kernels), p=shares)
-        kernel, fitted = self._kernels[self._current], self._mixture
-        if not self._mixtures or self._part is None or len(self._part) != len(coords):
-            return kernel(coords, random)
-        proposed, log_ratios = np.empty_like(coords), np.empty(len(coords))
-        for part, mixture in enumerate(self._mixtures):
-            rows = self._part == part
-            if rows.any():
-                self._mixture = mixture
-                proposed[rows], log_ratios[rows] = kernel(coords[rows], random)
-        self._mixture = fitted
-        return proposed, log_ratios
+        return self._kernels[self._current](coords, random)
 
     def draw_independence(self, coords: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
         """Independent draws from the mixture for points (n, ndim), and log-ratios (n,) q(x | x') / q(x' | x)."""
-        proposed = draw(self._mixture, len(coords), random)
-        if self._inside is not None:
-            for _ in range(REDRAWS):
-                outside = np.flatnonzero(~self._inside(proposed))
-                if len(outside) == 0:
-                    break
-                proposed[outside] = draw(self._mixture, len(outside), random)
-        return proposed, log_density(self._mixture, coords) - log_density(self._mixture, proposed)
+        fits = [(self._mixture, np.arange(len(coords)))]
+        if self._mixtures and self._part is not None and len(self._part) == len(coords):
+            fits = [(mixture, np.flatnonzero(self._part == part)) for part, mixture in enumerate(self._mixtures)]
+        proposed, log_ratios = coords.copy(), np.full(len(coords), -np.inf)
+        for mixture, rows in (fit for fit in fits if len(fit[1])):
+            n, inside = len(rows), self._inside
+            drawn = draw(mixture, n, random) if inside is None else draw_inside(mixture, n, random, inside)[0]
+            rows = rows[: len(drawn)]  # those without a draw inside the support do not move
+            proposed[rows], before = drawn, log_density(mixture, coords[rows])
+            log_ratios[rows] = before - log_density(mixture, drawn)
+        return proposed, log_ratios
 
     def draw_local_walk(self, coords: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
         """Propose steps of the local random walk; parameters and results as in `draw_independence`."""
@@ -281,31 +264,16 @@ class MixtureMove(_FittedMove):
         return self._step(coords, steps)
 
 
-class GuideMove(MHMove):
-    """Propose one independent draw of a guide for each walker: independence Metropolis-Hastings.
-
-    A point x is replaced by a draw y of density q with the probability min(1, [p(y) / q(y)] / [p(x) / q(x)]), where p
-    is the posterior density (Tierney 1994, Annals of Statistics 22(4), doi:10.1214/aos/1176325750, section 2.3.3). This
-    is exact for any density q that does not change, since the normalising constants cancel. A walker at a point where
-    the density of the guide is zero does not move.
-
-    Parameters
-    ----------
-    guide : object with methods draw and log_density
-        The proposal distribution, which must not change.
+def guide_move(guide: Any) -> MHMove:
+    """The move that proposes one independent draw of a guide for each walker: exact for any density that does not
+    change (Tierney 1994, Annals of Statistics 22(4), doi:10.1214/aos/1176325750, section 2.3.3).
     """
+    return MHMove(partial(_draw_of_guide, guide))
 
-    def __init__(self, guide: Any):
-        super().__init__(self._draw)
-        self._guide = guide
 
-    def _draw(self, coords: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
-        proposed = self._guide.draw(len(coords), random)
-        here, there = self._guide.log_density(coords), self._guide.log_density(proposed)
-        possible = (here > -np.inf) & (there > -np.inf)
-        factors = np.full(len(coords), -np.inf)
-        factors[possible] = here[possible] - there[possible]
-        return proposed, factors
+def _draw_of_guide(guide: Any, coords: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+    proposed = guide.draw(len(coords), random)
+    return proposed, guide.log_density(coords) - guide.log_density(proposed)
 
 
 # ---------------------------------------------------------------- sweeps over fast parameters
@@ -322,14 +290,10 @@ class WithFastSweeps(MHMove):
     their covariance given the others. The reported acceptance is the move's.
     """
 
-    # optimal in two dimensions; it is 0.44 in one dimension and 0.23 in many: Gelman, Roberts & Gilks (1996), Efficient
-    # Metropolis jumping rules, Bayesian Statistics 5, 599-608
-    target = 0.35
-
     def __init__(self, move: Move, indices: Sequence[int], sweeps: int = 2):
         super().__init__(self._draw)
         self.move, self.indices, self.sweeps = move, tuple(indices), sweeps
-        self._root, self._log_factor, self._share = np.zeros((len(indices), len(indices))), 0.0, 0.0
+        self._root = np.zeros((len(indices), len(indices)))
 
     def calibrate(self, coords: np.ndarray, weights: np.ndarray, *others: Any) -> None:
         """Fit the walk, and the move if it can be fitted (`samplers.moves.population_moves`)."""
@@ -342,7 +306,7 @@ class WithFastSweeps(MHMove):
         self._root = root[len(slow) :, len(slow) :]
 
     def _draw(self, coords: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
-        proposed, scale = coords.copy(), 2.38 / math.sqrt(len(self.indices)) * math.exp(self._log_factor)
+        proposed, scale = coords.copy(), 2.38 / math.sqrt(len(self.indices))
         normal = random.standard_normal((len(coords), len(self.indices)))
         proposed[:, self.indices] += scale * normal @ self._root.T
         return proposed, np.zeros(len(coords))
@@ -350,17 +314,13 @@ class WithFastSweeps(MHMove):
     def propose(self, model: Model, state: State) -> tuple[State, np.ndarray]:
         """Make the move, then the fast sweeps; the accepted proposals (nwalkers,) belong to the move."""
         state, accepted = self.move.propose(model, state)
-        shares = []
         for _ in range(self.sweeps):
-            state, accepted_fast = super().propose(model, state)
-            shares.append(np.mean(accepted_fast))
-        self._share = float(np.mean(shares))
+            state, _ = super().propose(model, state)
         return state, accepted
 
     def tune(self, state: State, accepted: np.ndarray) -> None:
-        """Tune the move, and the scale of the fast sweeps that followed it."""
+        """Tune the move."""
         self.move.tune(state, accepted)
-        self._log_factor += self._share - self.target
 
 
 def with_fast_sweeps(moves: Sequence[Move], indices: Sequence[int], ndim: int, sweeps: int) -> list[Move]:

@@ -23,8 +23,6 @@ import numpy as np
 from .mixture import Mixture, invert_roots, log_components, to_component_space
 from .transforms import log_abs_det_jacobian
 
-__all__ = ["find_basins", "with_components"]
-
 # Points whose log-density is this far below the highest, per dimension, are left out. The only points of a narrow mode
 # may be low on its flank.
 DEPTH = 50.0

@@ -26,21 +26,6 @@ from .transforms import (
     to_unbounded,
 )
 
-__all__ = [
-    "Mixture",
-    "draw",
-    "fit_mixture",
-    "fit_normals",
-    "from_component_space",
-    "invert_roots",
-    "leave_out",
-    "location_and_root",
-    "log_components",
-    "log_density",
-    "log_responsibilities",
-    "to_component_space",
-]
-
 # Degrees of freedom: heavier tails than a Gaussian, and finite fourth moments.
 DOF = 6.0
 # Fewer degrees of freedom that are tried in this order, for points with heavier tails. They must be above 2. Standard
@@ -57,8 +42,8 @@ NEGLIGIBLE = 1e-3
 PARAMETERS_PER_SHEAR = 4
 # With fewer effective points per dimension, correlations are shrunk towards zero.
 MIN_POINTS_PER_DIMENSION = 5.0
-# Smallest diagonal entry accepted in the root of a correlation matrix.
-SMALLEST_PIVOT = 1e-7
+# Smallest such shrinkage, which keeps the matrix of correlations regular.
+SMALLEST_SHRINKAGE = 1e-12
 # Smallest standard deviation, for parameters that do not vary.
 SMALLEST_SD = 1e-150
 
@@ -401,21 +386,10 @@ def location_and_root(coords: np.ndarray, weights: np.ndarray) -> tuple[np.ndarr
     # a parameter that does not vary gets a tiny standard deviation, in its own unit
     sd = np.maximum(sd, np.maximum(1e-12 * coords.std(axis=0), np.maximum(np.spacing(np.abs(mean)), SMALLEST_SD)))
     standard = centred / sd
-    correlation = (standard * weights[:, None]).T @ standard
-
-    ndim = len(mean)
-    shrinkage = max(0.0, 1.0 - 1.0 / (weights @ weights) / (MIN_POINTS_PER_DIMENSION * ndim))
-    correlation *= 1.0 - shrinkage
+    few = 1.0 - 1.0 / (weights @ weights) / (MIN_POINTS_PER_DIMENSION * len(mean))
+    correlation = (1.0 - max(few, SMALLEST_SHRINKAGE)) * (standard * weights[:, None]).T @ standard
     np.fill_diagonal(correlation, 1.0)
-    jitter = 0.0
-    while True:
-        try:
-            root = np.linalg.cholesky((correlation + jitter * np.eye(ndim)) / (1.0 + jitter))
-            if root.diagonal().min() > SMALLEST_PIVOT:
-                return mean, sd[:, None] * root
-        except np.linalg.LinAlgError:
-            pass
-        jitter = max(10.0 * jitter, 1e-12)
+    return mean, sd[:, None] * np.linalg.cholesky(correlation)
 
 
 def invert_roots(roots: np.ndarray) -> np.ndarray:

@@ -1,9 +1,9 @@
 """Transformations that make a population nearly Gaussian: maps without bounds, and shears without curvature.
 
 A sampler knows only whether a point lies in the support, without a simulation, so each bound is bracketed and bisected
-along lines through several points. If the lines disagree, the support is not a box, and the parameter is treated as
-unbounded. A shear subtracts a parabola in one parameter from another one: its Jacobian determinant is 1, so densities
-carry over without a correction. Equations, sources and choices are in ``docs/theory/proposals``.
+along a line. If other points lie beyond it, the support is not a box, and the parameter is treated as unbounded. A
+shear subtracts a parabola in one parameter from another one: its Jacobian determinant is 1, so densities carry over
+without a correction. Equations, sources and choices are in ``docs/theory/proposals``.
 """
 
 import math
@@ -13,27 +13,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import expit
 
-__all__ = [
-    "Shear",
-    "SupportBounds",
-    "apply_shears",
-    "find_shears",
-    "find_support_bounds",
-    "from_unbounded",
-    "invert_shears",
-    "log_abs_det_jacobian",
-    "near_bounds",
-    "to_unbounded",
-]
-
-# Number of points through which the lines are laid.
-PROBES = 3
 # The search for a bound starts at the range of the points and doubles the distance; a factor of 2^30 means no bound.
 DOUBLINGS = 30
 # Halvings of the bracket, down to the rounding of a double.
 BISECTIONS = 55
-# Largest disagreement of the lines, as a share of the range of the points.
-AGREEMENT = 1e-9
 # A bound matters if it lies within so many standard deviations from the population mean.
 NEAR = 4.0
 
@@ -50,22 +33,20 @@ class SupportBounds(NamedTuple):
 
 
 def find_support_bounds(inside: Callable[[np.ndarray], np.ndarray], coords: np.ndarray) -> SupportBounds:
-    """Find the bounds of the support from points (n, ndim) in it, by about 85 calls of `inside`, (m, ndim) -> (m,).
-    Each finite bound lies at most one bisection step outside the support, never inside it.
+    """Find the bounds of the support along the axes through the first of points (n, ndim) in it, by about 85 calls of
+    `inside`, (m, ndim) -> (m,). Each finite bound lies at most one bisection step outside the support, and beyond all
+    points: otherwise the support is not a box.
     """
-    ndim = coords.shape[1]
-    span = np.ptp(coords, axis=0)
-    rows = coords[np.linspace(0, len(coords) - 1, PROBES).astype(int)]
-    # one search for each combination of row, parameter and direction
-    row, parameter, side = (a.ravel() for a in np.meshgrid(range(PROBES), range(ndim), (-1.0, 1.0), indexing="ij"))
-    start = rows[row, parameter]
+    ndim, span = coords.shape[1], np.ptp(coords, axis=0)
+    parameter, side = np.repeat(np.arange(ndim), 2), np.tile([-1.0, 1.0], ndim)
+    start = coords[0, parameter]
 
     def reaches(which: np.ndarray, distance: np.ndarray) -> np.ndarray:
-        probes = rows[row[which]]
+        probes = np.repeat(coords[:1], len(which), axis=0)
         probes[np.arange(len(which)), parameter[which]] = start[which] + side[which] * distance
         return inside(probes)
 
-    within, beyond = np.zeros(len(row)), np.full(len(row), np.inf)
+    within, beyond = np.zeros(2 * ndim), np.full(2 * ndim, np.inf)
     distance = span[parameter]
     for _ in range(DOUBLINGS):
         searching = np.flatnonzero(np.isinf(beyond))
@@ -75,19 +56,15 @@ def find_support_bounds(inside: Callable[[np.ndarray], np.ndarray], coords: np.n
         within[searching[found]] = distance[searching[found]]
         beyond[searching[~found]] = distance[searching[~found]]
         distance = 2.0 * distance
-    bounded = np.isfinite(beyond)
-    which = np.flatnonzero(bounded)
+    which = np.flatnonzero(np.isfinite(beyond))
     for _ in range(BISECTIONS if len(which) else 0):
         middle = 0.5 * (within[which] + beyond[which])
         found = reaches(which, middle)
         within[which[found]] = middle[found]
         beyond[which[~found]] = middle[~found]
-
-    bounds = np.where(bounded, start + side * beyond, side * np.inf).reshape(PROBES, ndim, 2)
-    with np.errstate(invalid="ignore"):
-        agree = np.ptp(bounds, axis=0) <= AGREEMENT * span[:, None]
-    low = np.where(agree[:, 0], bounds[:, :, 0].min(axis=0), -np.inf)
-    high = np.where(agree[:, 1], bounds[:, :, 1].max(axis=0), np.inf)
+    low, high = (start + side * beyond).reshape(ndim, 2).T
+    low = np.where(low < coords.min(axis=0), low, -np.inf)
+    high = np.where(high > coords.max(axis=0), high, np.inf)
     return SupportBounds(low, high, np.where(span > 0.0, span, 1.0))
 
 

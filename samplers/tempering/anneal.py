@@ -31,8 +31,6 @@ from .population import Density, Population, StoppedEarly
 from .recycling import Recycled, first_draws, recycle, submit_start
 from .smc_moves import anneal_by_moves
 
-__all__ = ["anneal", "check_population"]
-
 logger = logging.getLogger(__name__)
 
 Steps = Iterator[tuple[Population, Report]]
@@ -68,8 +66,7 @@ def anneal(
                 kernel.visited.add(coords, records)
             coords, records = start.arrived_part()
             population = population._replace(coords=coords, records=records)
-            population, stages = yield from anneal_by_moves(population, size, kernel)
-            log_evidence = sum(stage.log_evidence_increment for stage in stages)
+            population, log_evidence = yield from anneal_by_moves(population, size, kernel)
             try:
                 check, found = check_population(population, *kernel[:2], kernel.visited, log_evidence)
             except BudgetExhausted:

@@ -16,8 +16,6 @@ from ..estimates.importance import KnownDensity
 from ..finding import Finding
 from ..judgement.guides import find_missing_part
 
-__all__ = ["Guide", "GuideSession", "check_guide", "checked_density", "checked_draws"]
-
 
 class GuideSession(NamedTuple):
     """Functions and random numbers that a sampler provides to its guide.

@@ -44,9 +44,6 @@ from ..reports import GuidedRound, GuideTick, Report
 from .guide import Guide, GuideSession, checked_density, checked_draws
 from .population import Density, Population
 
-__all__ = ["draw_rounds", "lend"]
-
-
 # Draws in the first round, as a share of the number of walkers: few, since the guide may still be poor; and in each
 # later round. After a reliable round, a round has as many draws as are expected to suffice.
 FIRST_ROUND_SHARE, ROUND_SHARE = 0.3, 0.6
@@ -149,57 +146,55 @@ def draw_rounds(
             yield tick(f"round {len(rounds)}")
             outcome = _outcome(rounds, pooled, size)
         if refused or budget.refused:  # a search that was cut short goes on first, if the limit is raised
-            return _stopped(rounds, pooled, guide)
+            break
         # with the last round as well, a guide whose known density describes the posterior may learn that this is larger
-        if outcome is not None and (outcome.reason or guide.known_density is None or not is_reliable(rounds)):
-            return _with_signed(outcome)
+        if outcome is not None and (outcome[0] or guide.known_density is None or not is_reliable(rounds)):
+            return _ended(rounds, pooled, *outcome)
         yield from asked(guide.refine(latest.coords, latest.records["log_prob"], session), f"after round {len(rounds)}")
         if outcome is not None:
             unreached = unreached_share(partial(log_mixture, rounds), guide.known_density)
             if max(unreached, grown(pooled, latest.known, guide.known_density)) <= LARGEST_UNREACHED:
-                return _with_signed(outcome._replace(unreached=unreached))
+                return _ended(rounds, pooled, *outcome, unreached)
             if len(rounds) == MOST_ROUNDS:
-                return _with_signed(outcome._replace(findings=(find_unreached_part(UNSETTLED, WRONG),)))
+                return _ended(rounds, pooled, "", (find_unreached_part(UNSETTLED, WRONG),))
         if budget.refused:
-            return _stopped(rounds, pooled, guide)
+            break
+    unreached = 0.0 if pooled is None else unreached_share(partial(log_mixture, rounds), guide.known_density)
+    findings = () if unreached <= LARGEST_UNREACHED else (find_unreached_part(UNSETTLED, WRONG),)
+    return _ended(rounds, pooled, "", findings, unreached, True)
 
 
-def _stopped(rounds: Sequence[Round], pooled: PooledRounds | None, guide: Guide) -> RoundsOfGuide:
-    """The rounds that the limit of simulations has ended."""
-    if pooled is None:
-        return RoundsOfGuide("", (), None, rounds, True)
-    unreached = unreached_share(partial(log_mixture, rounds), guide.known_density)
-    found = () if unreached <= LARGEST_UNREACHED else (find_unreached_part(UNSETTLED, WRONG),)
-    return _with_signed(RoundsOfGuide("", found, pooled, rounds, True, None, unreached))
-
-
-def _with_signed(outcome: RoundsOfGuide) -> RoundsOfGuide:
-    """With the signed sample of all rounds, if its means are more accurate than those of the pooled draws."""
-    found, pooled = signed_sample(outcome.rounds, outcome.pooled), outcome.pooled
-    if found is not None:
+def _ended(
+    rounds: Sequence[Round],
+    pooled: PooledRounds | None,
+    reason: str,
+    findings: tuple[Finding, ...],
+    unreached: float = 0.0,
+    stopped: bool = False,
+) -> RoundsOfGuide:
+    """The result, with the signed sample if its means are more accurate than the means of the pooled draws."""
+    signed = None if pooled is None else signed_sample(rounds, pooled)
+    if signed is not None:
         weights = normalised_weights(pooled.log_weights)
         variance = weights @ np.square(pooled.coords - weights @ pooled.coords)
-        relative = np.square(found.expectation().error) / np.maximum(variance, np.finfo(float).tiny)
-        found = found if np.mean(relative) < 1.0 / pooled.effective_sample_size else None
-    return outcome._replace(signed=found)
+        relative = np.square(signed.expectation().error) / np.maximum(variance, np.finfo(float).tiny)
+        signed = signed if np.mean(relative) < 1.0 / pooled.effective_sample_size else None
+    return RoundsOfGuide(reason, findings, pooled, rounds, stopped, signed, unreached)
 
 
-def _outcome(rounds: Sequence[Round], pooled: PooledRounds, size: int) -> RoundsOfGuide | None:
-    """How the rounds end; None if they continue."""
+def _outcome(rounds: Sequence[Round], pooled: PooledRounds, size: int) -> tuple[str, tuple[Finding, ...]] | None:
+    """Why the draws cannot be used, empty if they can, and findings, if the rounds end; None if they continue."""
     last, enough = rounds[-1], pooled.effective_sample_size >= size
     if enough and is_reliable(rounds) and is_even(pooled):
         light = tails_are_light([r for r in rounds if r.effective_share >= RELIABLE_SHARE])
-        return RoundsOfGuide("", (find_unreached_part(LIGHT_TAILS, CARE),) if light else (), pooled, rounds)
+        return "", (find_unreached_part(LIGHT_TAILS, CARE),) if light else ()
     if len(rounds) >= 2 and all_impossible(rounds):
-        reason = f"none of their first {len(pooled.coords)} has a finite log-probability"
-        return RoundsOfGuide(reason, (), pooled, rounds)
+        return f"none of their first {len(pooled.coords)} has a finite log-probability", ()
     usable = enough and last.effective_share >= USABLE_SHARE and pooled.pareto_shape < LARGEST_SHAPE
     if len(rounds) < (PATIENT_ROUNDS if usable and is_even(pooled) else MOST_ROUNDS):
         return None
     shortfall = describe_rounds(last, pooled, len(rounds))
-    if usable:
-        return RoundsOfGuide("", (find_unreached_part(shortfall, CARE),), pooled, rounds)
-    return RoundsOfGuide(shortfall, (), pooled, rounds)
+    return ("", (find_unreached_part(shortfall, CARE),)) if usable else (shortfall, ())
 
 
 def _next_size(rounds: Sequence[Round], size: int) -> int:

@@ -1,6 +1,6 @@
 """Mutation at a fixed beta: moves of the ensemble, and the rule that ends them.
 
-Moving stops once the population is nearly uncorrelated with its resampled start (`StartCorrelation`). In chains of
+Moving stops once the population is nearly uncorrelated with its resampled start (`_correlation`). In chains of
 transitional Markov chain Monte Carlo, the leaders of long chains have large weights, so their first points have a bias,
 which decreases with steps before points count (burn-in). With many copies, the next fit sees too few distinct points
 (100 walkers, 12 parameters: means wrong by 1 to 6 standard deviations), so all points are swept together afterwards;
@@ -21,19 +21,6 @@ from ..record import BudgetExhausted
 from ..reports import Sweep
 from ..settings import Settings
 from .population import Density, Population
-
-__all__ = [
-    "Kernel",
-    "MoveSchedule",
-    "Mutated",
-    "StartCorrelation",
-    "VisitedPoints",
-    "check_moves",
-    "grow_chains",
-    "move_together",
-    "needs_many_walkers",
-    "tempered_log_prob",
-]
 
 STALL_SWEEPS = 3
 MOST_POINTS = 10_000  # kept by `VisitedPoints`
@@ -155,61 +142,52 @@ def _tempered_model(kernel: Kernel, beta: float) -> Model:
     return Model(density.evaluate, partial(density.evaluate, then=tempered), density.map, kernel.random)
 
 
-class StartCorrelation:
-    """Correlation over the walkers between points (n, ndim) after resampling and after each sweep: `values` are the
-    largest over all parameters and the log-likelihood, on which the next weights depend.
-    """
+def _centred(coords: np.ndarray, records: np.ndarray) -> np.ndarray:
+    """Parameters and log-likelihoods (n, ndim + 1) of points minus their means; the next weights depend on the last."""
+    log_likelihood = np.maximum(records["log_prob"] - records["log_prior"], LOWEST)  # whose squares are finite
+    columns = np.column_stack([coords, log_likelihood])
+    rounding = np.zeros(columns.shape[1])  # a constant log-likelihood differs by the rounding errors of log_prob
+    known = np.isfinite(records["log_prob"])
+    rounding[-1] = ROUNDING * np.abs(records["log_prob"][known]).max(initial=1.0)
+    return np.where(np.ptp(columns, axis=0) > rounding, columns - columns.mean(axis=0), 0.0)
 
-    def __init__(self, coords: np.ndarray, records: np.ndarray):
-        self._start = self._centred(coords, records)
-        self.values: list[float] = []
 
-    @staticmethod
-    def _centred(coords: np.ndarray, records: np.ndarray) -> np.ndarray:
-        log_likelihood = np.maximum(records["log_prob"] - records["log_prior"], LOWEST)  # whose squares are finite
-        columns = np.column_stack([coords, log_likelihood])
-        rounding = np.zeros(columns.shape[1])  # a constant log-likelihood differs by the rounding errors of log_prob
-        known = np.isfinite(records["log_prob"])
-        rounding[-1] = ROUNDING * np.abs(records["log_prob"][known]).max(initial=1.0)
-        return np.where(np.ptp(columns, axis=0) > rounding, columns - columns.mean(axis=0), 0.0)
+def _correlation(start: np.ndarray, now: np.ndarray) -> float:
+    """Largest correlation of centred columns (n, k) over the walkers, between points after resampling and later."""
+    scale = np.sqrt(np.sum(start**2, axis=0) * np.sum(now**2, axis=0))
+    varied = scale > 0.0
+    return float(np.max(np.abs(np.sum(start * now, axis=0)[varied] / scale[varied]), initial=0.0))
 
-    def update(self, coords: np.ndarray, records: np.ndarray) -> None:
-        """Enter the population after a sweep."""
-        now = self._centred(coords, records)
-        scale = np.sqrt(np.sum(self._start**2, axis=0) * np.sum(now**2, axis=0))
-        varied = scale > 0.0
-        correlation = np.abs(np.sum(self._start * now, axis=0)[varied] / scale[varied])
-        self.values.append(float(np.max(correlation, initial=0.0)))
 
-    def is_low_enough(self, settings: Settings) -> bool:
-        """Whether to stop moving: `max_moves` made, low correlation, or no decrease over the last three sweeps."""
-        values = self.values
-        if len(values) < settings.min_moves:
-            return False
-        if len(values) >= settings.max_moves or values[-1] < settings.max_correlation:
-            return True
-        return len(values) > STALL_SWEEPS and min(values[:-STALL_SWEEPS]) <= min(values[-STALL_SWEEPS:])
+def _moved_enough(correlations: list[float], settings: Settings) -> bool:
+    """Whether to stop moving: `max_moves` made, low correlation, or no decrease over the last three sweeps."""
+    if len(correlations) < settings.min_moves:
+        return False
+    if len(correlations) >= settings.max_moves or correlations[-1] < settings.max_correlation:
+        return True
+    return len(correlations) > STALL_SWEEPS and min(correlations[:-STALL_SWEEPS]) <= min(correlations[-STALL_SWEEPS:])
 
 
 def move_together(
-    population: Population, kernel: Kernel, made: int = 0, correlation: StartCorrelation | None = None
+    population: Population, kernel: Kernel, made: int = 0, start: np.ndarray | None = None
 ) -> Generator[tuple[Population, Sweep], None, Mutated]:
     """Move equally weighted points equally often, until they are nearly uncorrelated with their start; yields each
-    sweep. Chains may have `made` moves before, with a `correlation`.
+    sweep. Chains may have `made` moves before, from a `start` as `_centred` returns it.
     """
     beta, records = population.beta, population.records
     model = _tempered_model(kernel, beta)
-    correlation = StartCorrelation(population.coords, records) if correlation is None else correlation
+    now = _centred(population.coords, records)
+    start, correlations = (now, []) if start is None else (start, [_correlation(start, now)])
     state = State(population.coords, log_prob=tempered_log_prob(records, beta), blobs=records)
     acceptance = []
-    while not correlation.is_low_enough(kernel.settings):
+    while not _moved_enough(correlations, kernel.settings):
         move = kernel.schedule.choose(kernel.random)
         try:
             state, accepted = move.propose(model, state)
         except BudgetExhausted:
             return Mutated(population, float(np.mean(acceptance or 0.0)), made + len(acceptance), True)
         move.tune(state, accepted)
-        correlation.update(state.coords, state.blobs)
+        correlations.append(_correlation(start, _centred(state.coords, state.blobs)))
         acceptance.append(float(np.mean(accepted)))
         population = population._replace(coords=state.coords, records=state.blobs)
         yield population, Sweep(acceptance[-1])
@@ -228,9 +206,9 @@ def grow_chains(
     model, schedule, settings = _tempered_model(kernel, beta), kernel.schedule, kernel.settings
     _, first, owner, counts = np.unique(ancestors, return_index=True, return_inverse=True, return_counts=True)
     place = np.argsort(owner, kind="stable")
-    start = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    begin = np.concatenate([[0], np.cumsum(counts)[:-1]])
     chains = State(coords[first], log_prob=tempered_log_prob(records[first], beta), blobs=records[first])
-    correlation = StartCorrelation(coords, records)
+    start = _centred(coords, records)
     coords, records = coords.copy(), records.copy()
     population = population._replace(coords=coords, records=records)
     accepted_steps, steps = 0, 0
@@ -247,13 +225,12 @@ def grow_chains(
         chains.coords[growing], chains.log_prob[growing] = state.coords, state.log_prob
         chains.blobs[growing] = state.blobs
         if length >= 0:
-            rows = place[start[growing] + length]
+            rows = place[begin[growing] + length]
             coords[rows], records[rows] = state.coords, state.blobs
         accepted_steps, steps = accepted_steps + int(np.sum(accepted)), steps + len(growing)
         yield population, Sweep(float(np.mean(accepted)))
-    correlation.update(coords, records)
     grown = Mutated(population, accepted_steps / steps, settings.burn_in + 1)
-    if settings.burn_in == 0 or correlation.values[-1] < settings.max_correlation:
+    if settings.burn_in == 0 or _correlation(start, _centred(coords, records)) < settings.max_correlation:
         return grown
     schedule.follow(ancestors)
-    return (yield from move_together(population, kernel, grown.moves, correlation))
+    return (yield from move_together(population, kernel, grown.moves, start))

@@ -8,8 +8,6 @@ from ..estimates.importance import tail_variance
 from ..estimates.weights import effective_sample_size, log_mean_weight
 from ..reports import LIMIT
 
-__all__ = ["RECORD", "Density", "PendingPoints", "Population", "StoppedEarly", "check_size", "stop_at"]
-
 RECORD = [("log_prob", np.float64), ("log_prior", np.float64)]  # of an evaluated point without blobs
 
 

@@ -23,8 +23,6 @@ from ..reports import Report, Stage, Sweep
 from .mutation import tempered_log_prob
 from .population import Density, PendingPoints, Population, stop_at
 
-__all__ = ["Recycled", "first_draws", "recycle", "search_draws", "submit_start"]
-
 # Wanted effective sample size at each beta (the target), as a share of the number of starting points. A small target
 # allows large steps of beta; the fresh draws of a round then restore the effective sample size.
 TARGET_SHARE = 0.2

@@ -21,19 +21,17 @@ from ..reports import Stage, Sweep
 from .mutation import Kernel, grow_chains, move_together
 from .population import Population, stop_at
 
-__all__ = ["anneal_by_moves"]
-
 
 def anneal_by_moves(
     population: Population, n: int, kernel: Kernel
-) -> Generator[tuple[Population, Stage | Sweep], None, tuple[Population, list[Stage]]]:
+) -> Generator[tuple[Population, Stage | Sweep], None, tuple[Population, float]]:
     """Carry evaluated draws of the prior, as many or more than the `n` points of later stages, to beta = 1.
 
-    Yields the points as they are now with a report, and returns the points at beta = 1 and all stages; raises
-    StoppedEarly at the limit of simulations.
+    Yields the points as they are now with a report, and returns the points at beta = 1 and the
+    log-evidence. Raises StoppedEarly at the limit of simulations.
     """
     m, (density, random, schedule, settings, visited) = len(population.coords), kernel
-    target, stages, error = float(n), [], EvidenceError(m)
+    target, log_evidence, error = float(n), 0.0, EvidenceError(m)
     while population.beta < 1.0:
         log_likelihood = population.records["log_prob"] - population.records["log_prior"]
 
@@ -47,7 +45,7 @@ def anneal_by_moves(
 
         # 3. estimate the evidence
         increment, standard_error = log_mean_weight(log_weights), error.weigh(weights)
-        log_evidence = sum(stage.log_evidence_increment for stage in stages) + increment
+        log_evidence += increment
 
         # fit the moves to the weighted points, and to parts of the target that this fit does not cover
         schedule.calibrate(population.coords, coarse_weights(log_weights), density.inside)
@@ -70,9 +68,8 @@ def anneal_by_moves(
         population = moved.population
         if moved.stopped:
             raise stop_at(population, log_evidence, standard_error**2, log_evidence - increment)
-        stages.append(Stage(beta, ess, moved.acceptance, moved.moves, distinct, increment, standard_error))
-        yield population, stages[-1]
-    return population, stages
+        yield population, Stage(beta, ess, moved.acceptance, moved.moves, distinct, increment, standard_error)
+    return population, log_evidence
 
 
 def resample(population: Population, ancestors: np.ndarray, beta: float, ess: float) -> Population:

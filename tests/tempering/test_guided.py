@@ -9,15 +9,9 @@ import pytest
 from scipy import stats
 
 from samplers import SamplingWarning, SMCSampler, TMCMCSampler
-from samplers.estimates.importance import (
-    KnownDensity,
-    Round,
-    add_round,
-    pool_rounds,
-    tail_shape,
-    tail_variance,
-)
-from samplers.moves.population_moves import GuideMove
+from samplers.estimates.importance import KnownDensity, Round, add_round, pool_rounds, tail_variance
+from samplers.estimates.pareto import pareto_shape
+from samplers.moves.population_moves import guide_move
 from tests.contract.targets import Gaussian
 from tests.tempering.guides import DrawsOf, FixedGuide, LearningGuide, SearchingGuide
 
@@ -70,7 +64,7 @@ def test_sweeps_of_a_guide_leave_the_posterior_unchanged(rng):
     posterior = Gaussian(2)
     n = 4000
     start = posterior.mean + posterior.sd * rng.standard_normal((n, 2))
-    move = GuideMove(laplace(posterior, scale=1.5, shift=0.7))
+    move = guide_move(laplace(posterior, scale=1.5, shift=0.7))
     sampler = emcee.EnsembleSampler(n, 2, posterior, moves=move, vectorize=True)
     sampler.run_mcmc(start, 5)
     z = (sampler.get_chain()[-1] - posterior.mean) / posterior.sd
@@ -85,7 +79,7 @@ def test_control_a_density_that_is_not_that_of_the_draws_shows(rng):
     wrong = laplace(posterior, scale=1.5, shift=0.7)
     wrong.log_density = laplace(posterior, scale=1.5).log_density
     start = posterior.mean + posterior.sd * rng.standard_normal((n, 2))
-    sampler = emcee.EnsembleSampler(n, 2, posterior, moves=GuideMove(wrong), vectorize=True)
+    sampler = emcee.EnsembleSampler(n, 2, posterior, moves=guide_move(wrong), vectorize=True)
     sampler.run_mcmc(start, 5)
     z = (sampler.get_chain()[-1] - posterior.mean) / posterior.sd
     assert np.any(np.abs(z.mean(axis=0)) > 8.0 / np.sqrt(n))
@@ -241,14 +235,14 @@ def test_the_evidence_of_rounds_is_unbiased_and_its_error_covers(spreads, rng):
 def test_the_shape_of_the_tail_counts_only_where_the_tail_does():
     """Equal weights with tiny heavy-tailed errors have no tail; the same errors at full size do."""
     errors = np.random.default_rng(1).pareto(1.0, 300)
-    assert tail_shape(np.log1p(1e-4 * errors)) == 0.0
+    assert pareto_shape(np.log1p(1e-4 * errors)) == 0.0
     assert tail_variance(np.log1p(1e-4 * errors)) == 0.0
-    assert tail_shape(np.log1p(errors)) > 0.7
+    assert pareto_shape(np.log1p(errors)) > 0.7
     heavy = np.log1p(np.random.default_rng(1).pareto(2.0, 300))
-    shape, excess = tail_shape(heavy), np.exp(heavy).max() / np.exp(heavy).sum()
+    shape, excess = pareto_shape(heavy), np.exp(heavy).max() / np.exp(heavy).sum()
     assert 0.2 < shape < 0.8 and tail_variance(heavy) == pytest.approx((shape / (1.0 - shape) * excess) ** 2)
-    assert tail_shape(np.zeros(300)) == 0.0
-    assert tail_shape(np.zeros(3)) == np.inf
+    assert pareto_shape(np.zeros(300)) == 0.0
+    assert pareto_shape(np.zeros(3)) == np.inf
 
 
 class PartlyImpossible(Gaussian):
