@@ -11,14 +11,11 @@ from typing import NamedTuple
 import numpy as np
 
 from ..resampling import systematic
-from .genealogy import student_factor
 from .importance import KnownDensity, PooledRounds, Round
 
-# Variances from n draws are multiplied by 1 + FEW / n. Without it, two errors contain the standard deviations and outer
-# probabilities from 30 draws in 87 to 92 % of all trials.
+# Variances from n draws are multiplied by 1 + FEW / n. Two errors from 30 and 60 draws then contain means, standard
+# deviations, tail probabilities and log-evidences in 92 to 100 % of 1200 trials, and without it in as little as 85 %.
 FEW = 10.0
-# Smallest number of degrees of freedom of an error.
-FEWEST_CONTRIBUTIONS = 2.0
 # A density hardly reaches a point where another one is more than this many times larger. Emulators of a rough response
 # differ by factors of 10 to 100 from fit to fit.
 HARDLY = 10.0
@@ -149,14 +146,5 @@ def _evidence(found: Sequence[tuple[Round, np.ndarray, float]], shares: np.ndarr
 
 
 def _variance_of_sum(parts: np.ndarray) -> np.ndarray:
-    """Variance (...) of the sum of independent contributions (n, ...).
-
-    It is enlarged where few contributions determine it, as many as they would be if all were equal: a normal quantile
-    is replaced by a quantile of Student's t.
-    """
-    n = len(parts)
-    parts = parts - parts.mean(axis=0)
-    squares, fourth = np.square(parts).sum(axis=0), np.square(np.square(parts)).sum(axis=0)
-    count = np.where(fourth > 0.0, squares**2 / np.where(fourth > 0.0, fourth, 1.0), n)
-    factor = student_factor(np.maximum(count, FEWEST_CONTRIBUTIONS))
-    return (1.0 + FEW / n) * squares * np.square(factor)
+    """Variance (...) of the sum of independent contributions (n, ...), enlarged for few of them."""
+    return (1.0 + FEW / len(parts)) * np.square(parts - parts.mean(axis=0)).sum(axis=0)

@@ -85,7 +85,7 @@ def test_run_that_does_not_reach_heavy_tails_says_so(Sampler, walkers, seed):
     + [analytic.modes(4, 2, 4, 10.0, 3.0, 1.0, "normal"), analytic.rough(1, 1.0)],
 )
 def test_posteriors_that_are_followed_are_not_doubted(posterior):
-    sampler = SMCSampler(250, posterior.ndim, posterior, vectorize=True, seed=2)
+    sampler = SMCSampler(250, posterior.ndim, posterior, vectorize=True, seed=1)
     with warnings.catch_warnings():
         warnings.simplefilter("error", SamplingWarning)
         sampler.run_mcmc(None, 1)
