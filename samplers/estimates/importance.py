@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtr, stdtrit
 
-from ..proposals.mixture import Mixture, draw
 from .pareto import LARGEST_SHAPE, pareto_shape
 from .weights import effective_sample_size, log_mean_weight, normalised_weights
 
@@ -21,7 +20,6 @@ LARGEST_ERROR = 0.35
 # Fewer effective points, or fewer per parameter (and one more), do not determine means and covariances.
 FEWEST_POINTS, POINTS_PER_DIMENSION = 20.0, 3.0
 FEW_WEIGHTS = 10.0
-ROUNDS = 50
 
 
 class EvidenceCheck(NamedTuple):
@@ -62,25 +60,6 @@ def usable(effective_sample_size: float, pareto_shape: float, error: float, ndim
     """Whether the means and the evidence from weighted points have errors that can be stated."""
     enough = effective_sample_size >= fewest_points(ndim)
     return enough and pareto_shape < LARGEST_SHAPE and error <= LARGEST_ERROR
-
-
-def draw_inside(
-    mixture: Mixture, n: int, random: np.random.RandomState, inside: Callable[[np.ndarray], np.ndarray]
-) -> tuple[np.ndarray, int]:
-    """At most `n` draws (m, ndim) of a mixture inside a region, and the number of draws made to obtain them.
-
-    `inside` is a function of points (m, ndim) that returns (m,) bool; it is called up to 50 times.
-    """
-    kept, found, made = [], 0, 0
-    for _ in range(ROUNDS):
-        coords = draw(mixture, n, random)
-        good = np.flatnonzero(inside(coords))[: n - found]
-        kept.append(coords[good])
-        found += len(good)
-        if found == n:
-            return np.concatenate(kept), made + int(good[-1]) + 1
-        made += n
-    return np.concatenate(kept), made
 
 
 def evidence_from_weights(log_weights: np.ndarray, made: int) -> EvidenceCheck:

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 
 from ..emcee_names import DEMove, MHMove, Model, Move, State
-from ..estimates.importance import draw_inside
 from ..proposals.basins import find_basins, with_components
 from ..proposals.mixture import (
     Mixture,
     draw,
+    draw_inside,
     fit_mixture,
     from_component_space,
     leave_out,

@@ -7,6 +7,7 @@ effective number of points as sample size. Equations, constants and their reason
 """
 
 import math
+from collections.abc import Callable
 from functools import cache
 from typing import NamedTuple
 
@@ -26,6 +27,8 @@ from .transforms import (
     to_unbounded,
 )
 
+# Attempts to draw inside a region.
+ROUNDS = 50
 # Degrees of freedom: heavier tails than a Gaussian, and finite fourth moments.
 DOF = 6.0
 # Fewer degrees of freedom that are tried in this order, for points with heavier tails. They must be above 2. Standard
@@ -149,6 +152,25 @@ def draw(mixture: Mixture, n: int, random: np.random.RandomState) -> np.ndarray:
         rows = component == k
         coords[rows] = mixture.means[k] + z[rows] @ mixture.roots[k].T
     return from_component_space(mixture, coords[random.permutation(n)])
+
+
+def draw_inside(
+    mixture: Mixture, n: int, random: np.random.RandomState, inside: Callable[[np.ndarray], np.ndarray]
+) -> tuple[np.ndarray, int]:
+    """At most `n` draws (m, ndim) of a mixture inside a region, and the number of draws made to obtain them.
+
+    `inside` is a function of points (m, ndim) that returns (m,) bool; it is called up to 50 times.
+    """
+    kept, found, made = [], 0, 0
+    for _ in range(ROUNDS):
+        coords = draw(mixture, n, random)
+        good = np.flatnonzero(inside(coords))[: n - found]
+        kept.append(coords[good])
+        found += len(good)
+        if found == n:
+            return np.concatenate(kept), made + int(good[-1]) + 1
+        made += n
+    return np.concatenate(kept), made
 
 
 def fit_mixture(

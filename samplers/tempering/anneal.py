@@ -12,13 +12,13 @@ from collections.abc import Generator, Iterator
 
 import numpy as np
 
-from ..estimates.importance import EvidenceCheck, draw_inside, evidence_from_weights
+from ..estimates.importance import EvidenceCheck, evidence_from_weights
 from ..estimates.pareto import pareto_shape
 from ..estimates.weights import WHERE_TO_LOOK, coarse_weights, effective_sample_size, normalised_weights
 from ..finding import Finding
 from ..judgement.checks import check_shares
 from ..proposals.basins import find_basins, with_components
-from ..proposals.mixture import fit_mixture, log_density
+from ..proposals.mixture import draw_inside, fit_mixture, log_density
 from ..proposals.transforms import find_support_bounds
 from ..record import BudgetExhausted
 from ..reports import LIMIT, Report, Restart, Stage, Weighted

@@ -13,11 +13,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..estimates.importance import EvidenceCheck, draw_inside, evidence_from_weights
+from ..estimates.importance import EvidenceCheck, evidence_from_weights
 from ..estimates.weights import coarse_weights, effective_sample_size, log_mean_weight, next_beta, normalised_weights
 from ..judgement.rounds import doubt_recycling
 from ..proposals.basins import find_basins, with_components
-from ..proposals.mixture import Mixture, fit_mixture, log_density
+from ..proposals.mixture import Mixture, draw_inside, fit_mixture, log_density
 from ..proposals.transforms import find_support_bounds
 from ..reports import Report, Stage, Sweep
 from .mutation import tempered_log_prob
