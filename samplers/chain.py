@@ -3,7 +3,8 @@
 In an HDF5 file, the group of the chain has the attribute ``run``, the dataset ``tempering`` (JSON: ladder, check,
 verdict), and the group ``restart``: the state at beta = 1 from which a chain without steps continues. emcee writes in
 place, so a kill leaves half of a step, and HDF5 refuses a file that another program has open. So during a call a
-backend works on a copy in memory, which takes the place of the file about every second and at the end.
+backend works on a copy in memory, which takes the place of the file about every second and at the end; its attribute
+``checksum`` tells whether something else has changed it.
 """
 
 import io
@@ -12,6 +13,7 @@ import logging
 import os
 import time
 import uuid
+import zlib
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -33,6 +35,7 @@ logger = logging.getLogger(__name__)
 
 SECONDS_BETWEEN, SHARE = 1.0, 0.1  # shortest time between two replacements, and their largest share of the time
 DAMAGED = "damaged"
+CHECKSUM = "checksum"
 # attributes and datasets of every chain of emcee
 OF_EVERY_CHAIN = {"version", "nwalkers", "ndim", "has_blobs", "iteration", "chain", "log_prob", "accepted"}
 
@@ -95,6 +98,9 @@ class WholeFile:
                     f"{self._path} has been changed by another program since this run has read it: move it away, and "
                     "call run_mcmc again, which writes the chain of this run"
                 )
+            with self("a") as file:
+                group = file[self._backend.name]
+                group.attrs[CHECKSUM] = _checksum(group)
             try:
                 with open(new, "wb") as file:
                     file.write(self._copy.getbuffer())
@@ -132,9 +138,26 @@ def whole_file(backend: Backend) -> WholeFile | None:
     return backend.open
 
 
+def _checksum(group: h5py.Group) -> int:
+    """CRC-32 of all datasets and attributes of a chain, apart from this number."""
+    found = 0
+
+    def add(name: str, node: h5py.Group | h5py.Dataset) -> None:
+        nonlocal found
+        for key in sorted(node.attrs):
+            if key != CHECKSUM:
+                found = zlib.crc32(f"{name} {key}".encode() + np.asarray(node.attrs[key]).tobytes(), found)
+        if isinstance(node, h5py.Dataset):
+            found = zlib.crc32(name.encode() + node[...].tobytes(), found)
+
+    add("", group)
+    group.visititems(add)
+    return found
+
+
 def run_of_file(backend: HDFBackend) -> str | None:
-    """The run that the file of a backend belongs to: empty for a chain without a run, "damaged" for one that cannot be
-    read, None without a file or chain, or for one that never had a step.
+    """The run that the file of a backend belongs to: empty for a chain without a run, "damaged" for one that is not as
+    it was stored, None without a file or chain, or for one that never had a step.
     """
     if not os.path.exists(backend.filename) or os.path.getsize(backend.filename) == 0:
         return None
@@ -145,7 +168,10 @@ def run_of_file(backend: HDFBackend) -> str | None:
             group = file[backend.name]
             if not group.attrs.get("iteration", 0) and "run" not in group.attrs and "log_prob" not in group:
                 return None  # emcee was killed while it made the group
-            return group.attrs.get("run", "") if OF_EVERY_CHAIN <= {*group.attrs, *group} else DAMAGED
+            whole = OF_EVERY_CHAIN <= {*group.attrs, *group}
+            if "run" in group.attrs or "tempering" in group:  # else a chain of emcee
+                whole &= group.attrs.get(CHECKSUM) == _checksum(group)
+            return group.attrs.get("run", "") if whole else DAMAGED
     except Exception:  # HDF5 raises nearly anything
         return DAMAGED
 
@@ -188,7 +214,8 @@ def open_record(backend: Backend | None, nwalkers: int, ndim: int, slow: Sequenc
     stored = run_of_file(backend)
     if stored in (None, DAMAGED):
         if stored is not None:
-            logger.warning("%s is damaged: a copy of it is kept as %s", backend.filename, kept_aside(path))
+            said = "%s does not end with a step that this run has stored: it is damaged, or another program has added"
+            logger.warning(f"{said} steps. A copy of it is kept as %s", backend.filename, kept_aside(path))
         logger.warning("the chain of %s is made again from %s", backend.filename, record.path)
         whole_file(backend).make(*shape, run)
     elif stored != run:

@@ -348,7 +348,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
                 )
                 per_step = 1 if thin else int(thin_by)
                 sweeps = None if iterations is None else (iterations - new) * per_step
-                shown = Progress(bar, self._evaluator, self._target.function, "sweeps at beta = 1", "sweeps", sweeps)
+                shown = Progress(bar, self._evaluator, self._target.function, "sweeps at beta = 1", sweeps)
                 try:
                     with shown:
                         for advanced in steps:
@@ -573,7 +573,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         try:
             with (
                 closing(self._evaluator),
-                Progress(bar, self._evaluator, self._target.function, "annealing", "evaluations") as progress,
+                Progress(bar, self._evaluator, self._target.function, "annealing") as progress,
             ):
 
                 def take(population: Population, report: Report) -> None:

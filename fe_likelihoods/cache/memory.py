@@ -8,11 +8,21 @@ measurements. They are reused when a mode search is repeated, and by other likel
 import threading
 from collections import OrderedDict
 from collections.abc import Hashable, Iterable, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-__all__ = ["MemoryCache", "ResponseMemory", "distinct_keys", "statistics_in", "thetas_of"]
+__all__ = [
+    "MemoryCache",
+    "Requested",
+    "ResponseMemory",
+    "distinct_keys",
+    "outcomes_of",
+    "reason_in",
+    "statistics_in",
+    "thetas_of",
+]
 
 _NAN = np.array([np.nan]).tobytes()
 _ENTRY_BYTES = 250  # memory of one stored response, besides its numbers
@@ -36,6 +46,44 @@ def statistics_in(outcomes: Iterable[bytes | str | None], width: int) -> np.ndar
     # a bytearray makes a writable array
     filled = bytearray().join([each if isinstance(each, bytes) else unknown for each in outcomes])
     return np.frombuffer(filled, dtype=float).reshape(-1, width)
+
+
+def outcomes_of(keys: Sequence[bytes], statistics: np.ndarray, reasons: Sequence[str]) -> dict[bytes, bytes | str]:
+    """Outcomes of simulations with statistics (n, n_numbers), and reasons of failures; empty for others."""
+    return {key: reason or row.tobytes() for key, row, reason in zip(keys, statistics, reasons, strict=True)}
+
+
+def reason_in(outcome: Any) -> str:
+    """The reason of a failure; empty for others."""
+    return outcome if isinstance(outcome, str) else ""
+
+
+class Requested:
+    """Distinct simulations of a model that were requested, and what is known of them, by key (see `distinct_keys`).
+
+    `outcomes` are statistics in bytes, `responses` arrays (n_channels, n_steps) if `full` ones were requested; failures
+    have their reasons in both. `fingerprint` is the model's.
+    """
+
+    def __init__(self, keys: list[bytes], full: bool, model: Any) -> None:
+        self.keys, self.full, self._model = keys, full, model
+        self.outcomes: dict[bytes, bytes | str] = {}
+        self.responses: dict[bytes, np.ndarray | str] = {}
+
+    @cached_property
+    def fingerprint(self) -> str:
+        return self._model.fingerprint
+
+    @property
+    def left(self) -> list[bytes]:
+        """Keys that are to be simulated."""
+        done = self.responses if self.full else self.outcomes
+        return [key for key in self.keys if key not in done]
+
+    def enter(self, outcomes: dict[bytes, bytes | str]) -> None:
+        """Fill in outcomes."""
+        self.outcomes |= outcomes
+        self.responses |= {key: reason for key, reason in outcomes.items() if isinstance(reason, str)}
 
 
 class MemoryCache:

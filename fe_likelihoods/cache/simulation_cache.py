@@ -27,16 +27,11 @@ from ..simulation.failure_reasons import MisfitReason, TransientReason
 from .file import CacheFile, transaction
 
 __all__ = [
-    "LABEL_COLUMNS",
-    "STORE_LABEL",
     "TOLERANCE",
     "CacheInfo",
     "Row",
     "SimulationCache",
-    "is_undamaged_label",
-    "pack_label",
     "pack_rows",
-    "source_number",
 ]
 
 logger = logging.getLogger(__name__)
@@ -130,17 +125,6 @@ def is_undamaged(row: tuple) -> bool:
         return row[7] == _checksum(*row[:7]) and row[8] in (None, len(row[4]))
     except (TypeError, struct.error):  # damage may change the type of a value
         return False
-
-
-def pack_label(source: int, code: str, files: dict[str, str], generation: int) -> tuple:
-    """Values of `LABEL_COLUMNS`."""
-    values = source, code.encode(), json.dumps(files, sort_keys=True).encode(), generation
-    return *values, zlib.crc32(repr(values).encode())
-
-
-def is_undamaged_label(row: tuple) -> bool:
-    """Whether the values of `LABEL_COLUMNS` match their checksum."""
-    return row[4] == zlib.crc32(repr(row[:4]).encode())
 
 
 class CacheInfo(NamedTuple):
@@ -291,6 +275,22 @@ class SimulationCache:
         query = f"SELECT {COLUMNS} FROM rows WHERE id IN ({chosen}) ORDER BY random()"
         rows = self.file.select(query, (source_number(fingerprint), generation, 8 * width, *more, n))
         return [Row._make(row) for row in rows if is_undamaged(row)]
+
+    def labels_of(self, fingerprint: str) -> list[tuple[str, dict[str, str], int]]:
+        """Labels of a model with a declared identity, the earliest first: code, opened files, generation."""
+        query = f"SELECT {LABEL_COLUMNS} FROM labels WHERE source = ? ORDER BY rowid"
+        rows = self.file.select(query, (source_number(fingerprint),))
+        good = [row for row in rows if row[4] == zlib.crc32(repr(row[:4]).encode())]
+        return [(code.decode(), json.loads(files), generation) for _, code, files, generation, _ in good]
+
+    def store_label(self, fingerprint: str, label: tuple, before: tuple | None) -> None:
+        """Store a label of a model, see `labels_of`, in the place of an earlier one."""
+        source, rows = source_number(fingerprint), []
+        for code, files, *generation in filter(None, (before, label)):
+            values = source, code.encode(), json.dumps(files, sort_keys=True).encode(), *generation
+            rows.append((*values, zlib.crc32(repr(values).encode())))
+        delete = "DELETE FROM labels WHERE source = ? AND code = ? AND files = ?"
+        self.file.write((delete, [row[:3] for row in rows[:-1]]), (STORE_LABEL, rows[-1:]))
 
     # the file -----------------------------------------------------------------------------------------------------
 

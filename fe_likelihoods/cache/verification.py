@@ -18,7 +18,6 @@ code, values and opened files are compared after simulations, in about 1 % of th
 itself, such as a counter: the first and the latest simulation are repeated then, and must give the same results.
 """
 
-import json
 import logging
 import math
 import os
@@ -34,24 +33,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..noise.sufficient_statistics import Statistic, needs_response, statistic_width
+from ..noise.sufficient_statistics import Statistic, needs_response, relative_changes, statistic_width
 from ..signals.comparison import Comparison
 from ..simulation.failure_reasons import ChangedModel, TransientReason
 from ..simulation.files import digests_by_name, observing, read_again
 from ..simulation.label import ModelLabel
 from ..simulation.model import Model, SimulationBatch, misfit_of_responses, most_responses, simulate_batch
 from .memory import MemoryCache, ResponseMemory, thetas_of
-from .simulation_cache import (
-    LABEL_COLUMNS,
-    STORE_LABEL,
-    TOLERANCE,
-    Row,
-    SimulationCache,
-    is_undamaged_label,
-    pack_label,
-    pack_rows,
-    source_number,
-)
+from .simulation_cache import TOLERANCE, Row, SimulationCache, pack_rows
 
 __all__ = ["ROWS", "Simulated", "StaleCache", "Trust", "VerifiedModel", "difference_in_words"]
 
@@ -97,18 +86,18 @@ class StaleCache(ValueError):
 class Trust:
     """The label of a model, and which rows of a file this process trusts; likelihoods with one `key` share it.
 
-    `labels` has the rows of the file (see `pack_label`), `generations` the generations, by the source number of the
-    model; `used` counts rows that were used after a verification, by identity, apart from failures alone. Rows with the
-    number of the `session` were stored here and need no verification. `stale` is the error of a row that differed.
-    Simulations that run now are `running`. Hold the `lock` to use it.
+    `labels` has the labels in the file, `generations` the generations, by the model's fingerprint; `used` counts rows
+    that were used after a verification, by identity, apart from failures alone. Rows with the number of the `session`
+    were stored here and need no verification. `stale` is the error of a row that differed. Simulations that run now are
+    `running`. Hold the `lock` to use it.
     """
 
     _known: "OrderedDict[str, Trust]" = OrderedDict()  # of this process, the most recently used last
 
     def __init__(self, label: ModelLabel, key: str) -> None:
         self.label, self.key = label, key
-        self.labels: dict[int, tuple] = {}
-        self.generations: dict[int, int] = {}
+        self.labels: dict[str, tuple] = {}
+        self.generations: dict[str, int] = {}
         self.used: dict[str, int] = {}
         self.stale: StaleCache | None = None
         self.running: set[bytes] = set()
@@ -155,27 +144,13 @@ def difference_in_words(
     """How a simulation differs from an earlier one, in words and relative to the response norm; empty if it agrees.
 
     It agrees within the `tolerance` of a response, relative to its norm; zero is for equal bits. `names` are those of
-    the channels, whose sums of squares come first; further numbers have the channel order and the scale of the sums,
-    and contain sums of squared responses if `of_response`. If a response with norm r changes by t r, the sum of squared
-    residuals s^2 changes by at most 2 s t r + (t r)^2, and so does a sum over products of two residuals of the channel;
-    a sum of squared responses by at most 2 r t r + (t r)^2. Rounding errors in the sums do not count as changes.
+    the channels. See `relative_changes`.
     """
     if reason or new.reason:
         was, now = (f"failed ({text})" if text else "succeeded" for text in (reason, new.reason))
         return ("" if reason and new.reason else f"it {was}; simulated again, it {now}"), 0.0
-    if np.array_equal(earlier, new.misfit):
-        return "", 0.0
-    n, channels = len(names), np.arange(len(earlier)) % len(names)
-    s, r = np.sqrt(np.minimum(earlier[:n], new.misfit[:n]))[channels], new.norm[channels]
-    if of_response:
-        s[n:] = r[n:]
-    difference = np.abs(earlier - new.misfit)
-    if tolerance:
-        difference = np.where(difference <= ROUNDING * s**2, 0.0, difference)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        # the positive root of (t r)^2 + 2 s (t r) = difference, in a form without cancellation
-        change = np.where(difference == 0.0, 0.0, difference / (s + np.sqrt(s**2 + difference)) / r)
-    worst = int(np.argmax(np.nan_to_num(change, nan=np.inf)))
+    change = relative_changes(earlier, new.misfit, new.norm, of_response, ROUNDING if tolerance else 0.0)
+    worst, n = int(np.argmax(np.nan_to_num(change, nan=np.inf))), len(names)
     if change[worst] <= tolerance:
         return "", 0.0
     what = "sum of squared residuals" if worst < n else f"statistic {worst}"
@@ -371,7 +346,7 @@ class VerifiedModel:
         if {TransientReason}.issuperset(map(type, reasons)):
             return
         generation = self._generation(fingerprint)
-        self._use(source_number(fingerprint), generation)  # with the files that simulations have opened by now
+        self._use(fingerprint, generation)  # with the files that simulations have opened by now
         rows = pack_rows(self.simulation_key, thetas, misfit, reasons, generation, trust.session)
         values = np.zeros((len(thetas), 0)) if responses is None else responses
         # without a response, only failures; a failure of the statistic alone has one
@@ -400,12 +375,11 @@ class VerifiedModel:
 
     def _generation(self, fingerprint: str) -> int:
         """The generation of a known label, or of stored rows that agree; else a new one."""
-        known, source = self._trust.generations, source_number(fingerprint)
-        if source not in known:
-            known[source] = (
-                self._known_generation(source) or next(iter(known.values()), 0) or self._adopted(fingerprint)
-            )
-        return known[source]
+        known = self._trust.generations
+        if fingerprint not in known:
+            found = self._known_generation(fingerprint) or next(iter(known.values()), 0)
+            known[fingerprint] = found or self._adopted(fingerprint)
+        return known[fingerprint]
 
     def _adopted(self, fingerprint: str) -> int:
         """The generation that new simulations agree with, else a new one."""
@@ -421,7 +395,7 @@ class VerifiedModel:
             if other is None and compared >= ROWS / 2:
                 self._trust.used[identity] = -ROWS_PER_VERIFICATION * compared
                 self._say("%d stored simulations agree with new ones: all are used", compared)
-                self._use(source_number(fingerprint), generation)
+                self._use(fingerprint, generation)
                 return generation
         if stored:
             self._say("stored simulations differ from new ones, or are too few: they stay in the file, not used")
@@ -429,30 +403,26 @@ class VerifiedModel:
         text = f"{self.label.code} {sorted(digests_by_name(self.label.opened).items())} {stored}".encode()
         return int.from_bytes(blake2b(text, digest_size=8).digest()) >> 2 | 1
 
-    def _known_generation(self, source: int) -> int | None:
+    def _known_generation(self, fingerprint: str) -> int | None:
         """The generation of the label with the present contents of the files that simulations opened; None if unknown.
 
         Files that belong to other labels of the model count from now on.
         """
-        label, known = self.label, None
-        query = f"SELECT {LABEL_COLUMNS} FROM labels WHERE source = ? ORDER BY rowid"
-        rows = list(filter(is_undamaged_label, self.cache.file.select(query, (source,))))
-        for row in rows:
-            label.add(read_again(json.loads(row[2])))
-        for row in rows:
-            files = json.loads(row[2])
-            if row[1] == label.code.encode() and read_again(files) == files:
-                self._trust.labels[source], known = row, row[3]
+        known, labels = None, self.cache.labels_of(fingerprint)
+        for _, files, _ in labels:
+            self.label.add(read_again(files))
+        for label in labels:
+            code, files, generation = label
+            if code == self.label.code and read_again(files) == files:
+                self._trust.labels[fingerprint], known = label, generation
         return known
 
-    def _use(self, source: int, generation: int) -> None:
+    def _use(self, fingerprint: str, generation: int) -> None:
         """Store to which generation the label belongs, with the files that simulations have opened by now."""
-        label, trust = self.label, self._trust
-        row = pack_label(source, label.code, label.opened, generation)
-        before, trust.labels[source] = trust.labels.get(source), row
-        if before != row:
-            delete = "DELETE FROM labels WHERE source = ? AND code = ? AND files = ?"
-            self.cache.file.write((delete, [before[:3]] if before else []), (STORE_LABEL, [row]))
+        labels, label = self._trust.labels, (self.label.code, self.label.opened, generation)
+        if (before := labels.get(fingerprint)) != label:
+            labels[fingerprint] = label
+            self.cache.store_label(fingerprint, label, before)
 
     def _say(self, text: str, *values: Any) -> None:
         logger.warning(f"%s, {type(self.model).__name__}: {text}", self.cache.path, *values)
@@ -483,10 +453,10 @@ class VerifiedModel:
             text = "%d of %d stored simulations could not be verified, because the new simulation was stopped (%s)"
             self._say(text, len(stopped), len(stopped) + compared, stopped[0])
 
-    def _compare(self, rows: Iterable[Row], n: int) -> tuple[int, list[str], tuple[Row, Simulated] | None]:
+    def _compare(self, rows: Iterable[Row], n: int) -> tuple[int, list[str], tuple[Row, str, float] | None]:
         """Simulate rows again, in growing batches, until n are compared, one differs, or too many stop.
 
-        Returns how many agree, the reasons of new simulations that were stopped, and the row that differs.
+        Returns how many agree, the reasons of new simulations that were stopped, and how which row differs.
         """
         rows, compared, stopped = iter(rows), 0, []
         while compared < n and len(stopped) < max(MAX_ATTEMPTS, compared):
@@ -500,8 +470,8 @@ class VerifiedModel:
                 if isinstance(each.reason, TransientReason):
                     stopped.append(each.reason)
                     self.verifications, self.unverified = self.verifications - 1, self.unverified + 1
-                elif self._row_difference(row, each)[0]:
-                    return compared, stopped, (row, each)
+                elif (difference := self._row_difference(row, each))[0]:
+                    return compared, stopped, (row, *difference)
                 else:
                     compared += 1
         return compared, stopped, None
@@ -513,11 +483,10 @@ class VerifiedModel:
             (misfit,), (reason,) = self.statistics_of(misfit.reshape(1, len(self.model.channels), -1), [""])
         return self._difference(misfit, reason, new)
 
-    def _refuse(self, row: Row, new: Simulated, used: int) -> None:
+    def _refuse(self, row: Row, difference: str, change: float, used: int) -> None:
         """Raise `StaleCache`, now and for all rows until they are deleted."""
         trust, theta = self._trust, np.frombuffer(row.theta, dtype="<f8")
         trust.used, trust.session = {}, secrets.randbits(62)
-        difference, change = self._row_difference(row, new)
         point = ", ".join(f"{n} = {value:.17g}" for n, value in zip(self.model.parameter_names, theta, strict=True))
         text = f"{self.cache.path}: a stored simulation is not that of this {type(self.model).__name__}. At {point}: "
         text += f"{difference}. {CHANGED}" + (f", and discard this run, which has used {used} rows" if used > 0 else "")

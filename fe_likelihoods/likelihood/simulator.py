@@ -11,14 +11,22 @@ import os
 import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from samplers.interrupts import interrupts_end_the_run
 
-from ..cache.memory import MemoryCache, ResponseMemory, distinct_keys, statistics_in, thetas_of
+from ..cache.memory import (
+    MemoryCache,
+    Requested,
+    ResponseMemory,
+    distinct_keys,
+    outcomes_of,
+    reason_in,
+    statistics_in,
+    thetas_of,
+)
 from ..cache.simulation_cache import SimulationCache
 from ..cache.verification import StaleCache, VerifiedModel
 from ..noise.sufficient_statistics import Statistic, check_statistic, name_of_statistic
@@ -43,34 +51,6 @@ __all__ = ["Simulator"]
 
 _SECONDS_PER_CHUNK = 5.0  # simulation time between two writes to the cache on disk
 _ROUNDS_PER_CHUNK = 8  # simulations per worker and chunk: at the end of a chunk, workers idle half a round on average
-
-
-class _Request:
-    """Distinct simulations that were requested, and what is known of them, by key (see `distinct_keys`).
-
-    `outcomes` are statistics in bytes, `responses` arrays (n_channels, n_steps) if `full` ones were requested; failures
-    have their reasons in both. `fingerprint` is the model's.
-    """
-
-    def __init__(self, keys: list[bytes], full: bool, model: Model) -> None:
-        self.keys, self.full, self._model = keys, full, model
-        self.outcomes: dict[bytes, bytes | str] = {}
-        self.responses: dict[bytes, np.ndarray | str] = {}
-
-    @cached_property
-    def fingerprint(self) -> str:
-        return self._model.fingerprint
-
-    @property
-    def left(self) -> list[bytes]:
-        """Keys that are to be simulated."""
-        done = self.responses if self.full else self.outcomes
-        return [key for key in self.keys if key not in done]
-
-    def enter(self, outcomes: dict[bytes, bytes | str]) -> None:
-        """Fill in outcomes."""
-        self.outcomes |= outcomes
-        self.responses |= {key: reason for key, reason in outcomes.items() if isinstance(reason, str)}
 
 
 class Simulator(VerifiedModel):
@@ -108,6 +88,7 @@ class Simulator(VerifiedModel):
         self.n_structural = len(model.parameter_names)
         self.simulations = self.cache_hits = self.disk_hits = 0
         self._recalled: set[bytes] = set()
+        self._most = 1  # simulations between two writes to the cache on disk, adapted to their duration
         self.when_simulated: Callable[[int], None] | None = None
 
     def __getstate__(self) -> dict:
@@ -155,16 +136,16 @@ class Simulator(VerifiedModel):
             if wanted.any():
                 statistics[wanted] = self.run(thetas[wanted])
             return statistics
-        trust, size = self._trust, 1
-        with trust.lock:  # after what runs for other requests
-            trust.lock.wait_for(lambda: trust.running.isdisjoint(keys))
-            request = self._look_up(keys, which, full)
-            if left := (new := request.left):
-                self._check_before()  # so that finished simulations are stored
-                self._trust.running.update(new)  # of another label, if the check has made one
+        trust, new = self._trust, []
         try:
+            with trust.lock:  # after what runs for other requests
+                trust.lock.wait_for(lambda: trust.running.isdisjoint(keys))
+                request = self._look_up(keys, which, full)
+                if left := (new := request.left):
+                    self._check_before()  # so that finished simulations are stored
+                    self._trust.running.update(new)  # of another label, if the check has made one
             while left:
-                some, start = left[: self._chunk(len(left), size, full)], time.perf_counter()
+                some, start = left[: self._chunk(len(left), full)], time.perf_counter()
                 if self.pool is None or self._together:
                     with self._observed():
                         batch = simulate_batch(self.model, self._thetas(some), self.pool)
@@ -172,7 +153,8 @@ class Simulator(VerifiedModel):
                 else:
                     self._run_in_pool(request, some, start)
                 # grows by steps: the first simulations may be failures that took no time
-                size = min(4 * len(some), 1 + int(_SECONDS_PER_CHUNK * len(some) / (time.perf_counter() - start)))
+                rate = len(some) / (time.perf_counter() - start)
+                self._most = min(4 * len(some), 1 + int(_SECONDS_PER_CHUNK * rate))
                 left = request.left
         except BaseException:
             with self._trust.lock:
@@ -186,7 +168,7 @@ class Simulator(VerifiedModel):
         responses = np.full((len(found), len(self.model.channels), self.model.n_steps), np.nan)
         for row, each in zip(responses, found, strict=True):
             row[...] = np.nan if isinstance(each, str) else each
-        return SimulationBatch(responses, list(map(_reason, found)))
+        return SimulationBatch(responses, list(map(reason_in, found)))
 
     def _thetas(self, keys: Sequence[bytes]) -> np.ndarray:
         return thetas_of(keys, self.n_structural)
@@ -208,17 +190,18 @@ class Simulator(VerifiedModel):
 
     def reason(self, point: np.ndarray) -> str:
         """Reason of a failure that is cached at parameters (n,), the structural ones first; empty for others."""
-        return _reason(*self.memory_cache.look_up([(point[: self.n_structural] + 0.0).tobytes()]))
+        return reason_in(*self.memory_cache.look_up([(point[: self.n_structural] + 0.0).tobytes()]))
 
     # known simulations --------------------------------------------------------------------------------------------
 
-    def _look_up(self, keys: list[bytes], which: Sequence[int], full: bool) -> _Request:
+    def _look_up(self, keys: list[bytes], which: Sequence[int], full: bool) -> Requested:
         """What is known of distinct keys, which is counted; `which` has the key of every requested row.
 
         Some stored statistics are verified by runs.
         """
-        request, known = _Request(keys, full, self.model), zip(keys, self.memory_cache.look_up(keys), strict=True)
-        skipped = [key for key, theta in zip(keys, self._thetas(keys), strict=True) if not np.isfinite(theta).all()]
+        request, known = Requested(keys, full, self.model), zip(keys, self.memory_cache.look_up(keys), strict=True)
+        finite = np.isfinite(self._thetas(keys)).all(axis=1)
+        skipped = [key for key, fine in zip(keys, finite, strict=True) if not fine]
         outcomes = {key: outcome for key, outcome in known if outcome is not None}
         request.enter(outcomes | dict.fromkeys(skipped, "the parameters are not finite"))
         on_disk: set[bytes] = set()
@@ -236,7 +219,7 @@ class Simulator(VerifiedModel):
             self.disk_hits += sum(keys[place] in on_disk for place in which)
         return request
 
-    def _take_responses(self, request: _Request, on_disk: set[bytes]) -> None:
+    def _take_responses(self, request: Requested, on_disk: set[bytes]) -> None:
         """Fill in stored responses, and statistics that are not known; adds keys of responses that are `on_disk`."""
         left, size, fingerprint = request.left, most_responses(self.model), request.fingerprint
         for start in range(0, len(left), size):
@@ -253,11 +236,11 @@ class Simulator(VerifiedModel):
                 request.responses |= found
             if new := [key for key in found if key not in request.outcomes]:
                 statistics, reasons = self.statistics_of(*self._as_batch([found[key] for key in new]))
-                self._enter(request, _outcomes(new, statistics, reasons))
+                self._enter(request, outcomes_of(new, statistics, reasons))
                 if self.cache is not None:
                     self._store(self._thetas(new), statistics, reasons, None, fingerprint)
 
-    def _enter(self, request: _Request, outcomes: dict[bytes, bytes | str]) -> None:
+    def _enter(self, request: Requested, outcomes: dict[bytes, bytes | str]) -> None:
         """Fill in statistics and reasons of failures, count these, and cache both in memory."""
         if not outcomes:
             return
@@ -280,7 +263,7 @@ class Simulator(VerifiedModel):
     def _together(self) -> bool:
         return hasattr(self.model, "simulate_together")
 
-    def _chunk(self, n: int, size: int, full: bool) -> int:
+    def _chunk(self, n: int, full: bool) -> int:
         """Number of simulations, of n, between two writes to the cache on disk, or two reports of progress."""
         if self.streams:
             return n
@@ -290,10 +273,10 @@ class Simulator(VerifiedModel):
             return min(n, most)
         workers = (os.cpu_count() or 1) if self.pool is None else self.pool.n_workers or n
         together = self.pool is not None or hasattr(self.model, "simulate_batch")  # then all workers are to be busy
-        return min(max(_ROUNDS_PER_CHUNK * workers if together else 1, size), most)
+        return min(max(_ROUNDS_PER_CHUNK * workers if together else 1, self._most), most)
 
     @interrupts_end_the_run()
-    def _run_in_pool(self, request: _Request, keys: Sequence[bytes], start: float) -> None:
+    def _run_in_pool(self, request: Requested, keys: Sequence[bytes], start: float) -> None:
         """Run simulations in the pool, and record each as it arrives."""
         responses = self._returns_responses(request.full)
         shape = (len(self.model.channels), self.model.n_steps) if responses else (self.n_numbers,)
@@ -315,7 +298,7 @@ class Simulator(VerifiedModel):
         return full or self.stores_responses or has_jacobian(self.model)
 
     def _record(
-        self, request: _Request, keys: Sequence[bytes], values: np.ndarray, reasons: list[str], start: float
+        self, request: Requested, keys: Sequence[bytes], values: np.ndarray, reasons: list[str], start: float
     ) -> None:
         """Count new simulations, record failures, compare the model if that is due, and cache the results.
 
@@ -339,7 +322,7 @@ class Simulator(VerifiedModel):
                 self.response_memory.store(places, kept)
             if request.full:
                 request.responses |= zip(keys, values, strict=True)
-            self._enter(request, _outcomes(keys, statistics, why))
+            self._enter(request, outcomes_of(keys, statistics, why))
             if self.cache is not None:
                 stored = values if request.full or self.stores_responses or self.cache.responses else None
                 self._store(thetas, statistics, why, stored, request.fingerprint)
@@ -349,13 +332,3 @@ class Simulator(VerifiedModel):
         """Let requests go on that wait for simulations."""
         self._trust.running.difference_update(keys)
         self._trust.lock.notify_all()
-
-
-def _outcomes(keys: Sequence[bytes], statistics: np.ndarray, reasons: Sequence[str]) -> dict[bytes, bytes | str]:
-    """Outcomes of simulations with statistics (n, n_numbers), and reasons of failures; empty for others."""
-    return {key: reason or row.tobytes() for key, row, reason in zip(keys, statistics, reasons, strict=True)}
-
-
-def _reason(outcome: Any) -> str:
-    """The reason of a failure; empty for others."""
-    return outcome if isinstance(outcome, str) else ""

@@ -17,6 +17,7 @@ __all__ = [
     "name_of_statistic",
     "needs_response",
     "reduce_response",
+    "relative_changes",
     "samples_per_channel",
     "statistic_width",
     "sums_of_squares",
@@ -117,3 +118,23 @@ def distinct_gaps(places: Sequence[np.ndarray]) -> np.ndarray:
 def samples_per_channel(n_samples: int | SampleCounts) -> int | np.ndarray:
     """Number of samples per channel: one number for all channels, or (n_channels,) where samples are missing."""
     return n_samples.samples if isinstance(n_samples, SampleCounts) else n_samples
+
+
+def relative_changes(
+    earlier: np.ndarray, later: np.ndarray, norm: np.ndarray, of_response: bool, rounding: float
+) -> np.ndarray:
+    """Changes (n_numbers,) of a response, relative to its `norm` (n_channels,), which explain those of a statistic.
+
+    Further numbers than the sums of squares have the channel order and the scale of the sums, and contain sums of
+    squared responses if `of_response`. If a response with norm r changes by t r, the sum of squared residuals s^2
+    changes by at most 2 s t r + (t r)^2, and so does a sum over products of two residuals of the channel; a sum of
+    squared responses by at most 2 r t r + (t r)^2. Changes of `rounding` times s^2 do not count.
+    """
+    n, channels = len(norm), np.arange(len(earlier)) % len(norm)
+    s, r = np.sqrt(np.minimum(earlier[:n], later[:n]))[channels], norm[channels]
+    if of_response:
+        s[n:] = r[n:]
+    difference = np.where(np.abs(earlier - later) <= rounding * s**2, 0.0, np.abs(earlier - later))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # the positive root of (t r)^2 + 2 s (t r) = difference, in a form without cancellation
+        return np.where(difference == 0.0, 0.0, difference / (s + np.sqrt(s**2 + difference)) / r)

@@ -23,7 +23,6 @@ import signal
 import stat
 import subprocess
 import sys
-import sysconfig
 import tempfile
 import threading
 import time
@@ -314,8 +313,7 @@ def _counts(path: str) -> bool:
 def _installed() -> tuple[str, ...]:
     library = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
     prefixes = [os.path.join(prefix, "lib") for prefix in (sys.prefix, sys.base_prefix)]
-    names = ("stdlib", "platstdlib", "purelib", "platlib")
-    return tuple(os.path.realpath(folder) + os.sep for folder in (library, *prefixes, *map(sysconfig.get_path, names)))
+    return tuple(os.path.realpath(folder) + os.sep for folder in (library, *prefixes))
 
 
 def _full(path: Any) -> str | None:

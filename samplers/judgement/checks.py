@@ -44,18 +44,14 @@ def check_likelihood(log_prob: np.ndarray, log_prior: np.ndarray) -> list[Findin
     error = ROUNDING * (1.0 + np.abs([log_prob[known], log_prior[known]]).max())
     if np.ptp(values) > error or (not known.all() and np.abs(values).max() <= error):
         return []
-    others, indicator = "", ""
-    if not known.all():
-        others = f" (the other {len(known) - len(values)} failed or have -inf)"
-        indicator = " If errors are uniform, such a likelihood is right, and so is the result."
     text = (
-        f"The log-likelihood is {values[0]:.6g} at all {len(values)} points that the run began with{others}: it is a "
-        "penalty in place of a failure, or the model ignores its parameters, or the data are not used. The result is "
-        "the prior, and a posterior elsewhere was not found."
+        f"The log-likelihood is {values[0]:.6g} at all {len(values)} points that the run began with and that neither "
+        "failed nor have -inf: it is a penalty in place of a failure, or the model ignores its parameters, or the data "
+        "are not used. The result is the prior, and a posterior elsewhere was not found."
     )
     action = (
         "Look at responses to a few draws of the prior; let failed simulations raise an exception or return NaN, and "
-        f"narrow the prior to where the model works.{indicator}"
+        "narrow the prior to where the model works. Beside -inf, one value may be right, of uniform errors."
     )
     return [Finding("The likelihood tells nothing", WRONG if known.all() else CARE, text, action)]
 

@@ -226,18 +226,11 @@ def describe_early_stop(verdict: Verdict, limit: float | None, result: Annealing
     verdict = verdict._replace(reasons=tuple(reason for reason in verdict.reasons if reason not in warned))
     if result.ended not in ("", LIMIT):
         return str(verdict)
-    if result.ended:
-        ended = f"max_simulations={limit:g} ended the run"
-    else:
-        ended = f"max_simulations={limit:g} allowed {made} of {made + missing} steps at beta = 1"
-    if verdict.simulations > limit:
-        ended += f" (the stored run has made {verdict.simulations:.0f} simulations, which are kept)"
+    made_of = "ended the run" if result.ended else f"allowed {made} of {made + missing} steps at beta = 1"
+    ended = f"max_simulations={limit:g} {made_of}, with {verdict.simulations:.0f} simulations"
     if verdict.status == CONVERGED:
         return f"{ended}. The chain holds draws of the posterior: no further simulation is necessary"
-    return (
-        f"{ended}. {verdict} To go on from here, set max_simulations to a larger number and run again, "
-        "with the same file or folder"
-    )
+    return f"{ended}. {verdict} To go on from here, run again with a larger number, and the same file or folder"
 
 
 def _of_end(weighted: Weighted, error: float, ndim: int) -> Finding:

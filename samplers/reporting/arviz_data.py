@@ -20,11 +20,10 @@ _ORDER = (
     "Draws are ordered by founder, walker and step, so that dependent draws are neighbours; sample_stats has the step, "
     "the walker and the founder of each draw."
 )
-_ONE_RUN = (
-    "One run is one chain, so there is no r_hat: it compares independent runs. Make two or more runs with different "
-    "seeds and pass them as a list."
+_CHAINS = (
+    "Each chain is an independent run, so r_hat compares runs, and there is no r_hat of one run: pass a list of runs "
+    "with different seeds."
 )
-_RUNS = "Each chain is an independent run, so r_hat compares runs."
 
 
 def to_arviz(
@@ -73,7 +72,7 @@ def to_arviz(
         raise ValueError(f"expected samplers of {len(names)} parameters; got {[type(run).__name__ for run in runs]}")
     chains, stats = _ordered(runs, discard)
     described = {each.name: each for each in getattr(known, "parameters", ())}
-    notes = {"chains": _ONE_RUN if len(runs) == 1 else _RUNS, "order": _ORDER}
+    notes = {"chains": _CHAINS, "order": _ORDER}
     groups = {
         "posterior": _parameter_group(chains, names, described, notes),
         "sample_stats": xarray.Dataset(
@@ -81,7 +80,7 @@ def to_arviz(
                 name: (("chain", "draw", *(f"{name}_dim_{i}" for i in range(values.ndim - 2))), values)
                 for name, values in stats.items()
             },
-            _coordinates(*chains.shape[:2]),
+            {"chain": np.arange(len(runs)), "draw": np.arange(chains.shape[1])},
             _statistics_of_runs(runs),
         ),
     }
@@ -145,10 +144,6 @@ def _blobs(run: Any, discard: int) -> dict[str, np.ndarray]:
     return {f"blob_{k}" if k in ours else k: each for k, each in named.items() if each.dtype.kind in "fiubcUSmM"}
 
 
-def _coordinates(n_chains: int, draws: int) -> dict[str, np.ndarray]:
-    return {"chain": np.arange(n_chains), "draw": np.arange(draws)}
-
-
 def _parameter_group(
     samples: np.ndarray, names: Sequence[str], described: Mapping[str, Any], attributes: Mapping[str, Any]
 ) -> "xarray.Dataset":
@@ -162,7 +157,8 @@ def _parameter_group(
             about = {key: getattr(parameter, key) for key in ("factor", "nominal", "multiple_of")}
             about |= {"units": parameter.unit, "long_name": parameter.label}
         variables[name] = (("chain", "draw"), samples[:, :, column], about)
-    return xarray.Dataset(variables, _coordinates(*samples.shape[:2]), dict(attributes))
+    coordinates = {"chain": np.arange(len(samples)), "draw": np.arange(samples.shape[1])}
+    return xarray.Dataset(variables, coordinates, dict(attributes))
 
 
 def _prior_group(

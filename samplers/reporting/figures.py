@@ -285,11 +285,11 @@ def _legend_handles(drawn: _Drawn) -> list:
 def plot_run(sampler: Any) -> "Figure":
     """Plot what a sampler did: what was known after each step, against the evaluations.
 
-    From above: the exponent beta and the acceptance of each stage, if there are several; the effective sample size and
-    the number of distinct points; the log-evidence with two standard errors, after each round of a guide and each
-    stage; and the log-probability of the walkers at beta = 1, as median and 90 % range, if there are several steps. In
-    a converged run it has no trend. The idea is from the run plot of dynesty (Speagle 2020, Monthly Notices of the
-    Royal Astronomical Society 493(3), doi:10.1093/mnras/staa278).
+    From above: the exponent beta and the acceptance of each stage, if there are several; the effective sample size; the
+    log-evidence with two standard errors, after each round of a guide and each stage; and the log-probability of the
+    walkers at beta = 1, as median and 90 % range, if there are several steps. In a converged run it has no trend. The
+    idea is from the run plot of dynesty (Speagle 2020, Monthly Notices of the Royal Astronomical Society 493(3),
+    doi:10.1093/mnras/staa278).
 
     `sampler` is a tempered sampler that has run; ValueError if it has no stages.
 
@@ -314,16 +314,12 @@ def plot_run(sampler: Any) -> "Figure":
     if stages[-1].beta == 1.0:
         title += f", log Z = {sampler.log_evidence:.2f} ± {sampler.log_evidence_error:.2g}"
     figure.suptitle(title, fontsize="medium")
-    table = np.array([(s.evaluations, *s[:3], s.distinct_ancestors, *s[5:7]) for s in stages]).T
-    made, beta, ess, share, distinct, increments, errors = table
+    made, beta, ess, share, increments, errors = np.array([(s.evaluations, *s[:3], *s[5:7]) for s in stages]).T
     ends = np.cumsum(made)
     for axes in ladder:
-        axes.semilogy(ends, beta, "o-", color=BLUE, markersize=4)
-        axes.set_ylabel("exponent β [-]", color=BLUE)
-        acceptance = axes.twinx()
-        acceptance.plot(ends, share, "s--", color=ORANGE, markersize=4)
-        acceptance.set(ylim=(0, 1))
-        acceptance.set_ylabel("acceptance [-]", color=ORANGE)
+        axes.semilogy(ends, beta, "o-", color=BLUE, label="exponent β", markersize=4)
+        axes.semilogy(ends, share, "s--", color=ORANGE, label="acceptance", markersize=4)
+        axes.set_ylabel("share [-]")
     lines = [(ends, ess, np.cumsum(increments), errors, BLUE, "stages")] if several or not rounds else []
     if rounds:
         draws, *others = np.array([(r.draws, r.effective_sample_size, *r[3:5]) for r in rounds]).T
@@ -332,8 +328,6 @@ def plot_run(sampler: Any) -> "Figure":
         points.plot(at, effective, "o-", color=colour, label=f"effective sample size, {name}", markersize=4, zorder=3)
         style = {"fmt": "o-", "color": colour, "markersize": 4, "capsize": 3}
         evidence.errorbar(at, values, 2.0 * around, label=f"{name}, ± 2 standard errors", **style)
-    if several or not rounds:
-        points.plot(ends, distinct, "s--", color=BLUE, alpha=0.5, label="distinct points", markersize=4)
     points.axhline(sampler.nwalkers, color=GREY, linewidth=1, linestyle=":", label="walkers")
     points.set(ylim=(0.0, 1.3 * points.get_ylim()[1]), ylabel="number of points")
     if stages[-1].beta == 1.0:

@@ -12,7 +12,7 @@ from .summary import aligned, is_tempered, log_posterior_of
 
 
 class ModelComparison(NamedTuple):
-    """Comparison of models, one entry per model, in the order given. ``str`` gives `table`.
+    """Comparison of models, one entry per model, in the order given. ``str`` gives a table with the verdicts.
 
     Attributes
     ----------
@@ -36,18 +36,7 @@ class ModelComparison(NamedTuple):
     upper: np.ndarray
     summaries: tuple[str, ...]
 
-    @property
-    def best(self) -> str:
-        """Name of the model with the largest evidence."""
-        return self.names[int(np.argmax(self.log_evidence))]
-
-    @property
-    def probabilities(self) -> dict[str, float]:
-        """Posterior probabilities by name."""
-        return dict(zip(self.names, self.probability.tolist(), strict=True))
-
-    def table(self) -> str:
-        """Table with one line per model, the most probable first, and the verdict of each run."""
+    def __str__(self) -> str:
         table = [("model", "log evidence", "difference", "probability", "95 % interval")]
         for k in np.argsort(-self.probability, kind="stable"):
             table.append(
@@ -62,7 +51,7 @@ class ModelComparison(NamedTuple):
         said = [f"{name}: {text}" for name, text in zip(self.names, self.summaries, strict=True) if text]
         return "\n".join([*aligned(table), *said])
 
-    __str__ = __repr__ = table
+    __repr__ = __str__
 
 
 def compare_models(models: Mapping[str, Any]) -> ModelComparison:
@@ -75,23 +64,20 @@ def compare_models(models: Mapping[str, Any]) -> ModelComparison:
     models : mapping of str to (sampler or tuple of float)
         For each name a sampler that has run (any object with ``log_evidence`` and ``log_evidence_error``), or a pair
         (log-evidence, standard error). Prior and likelihood must be normalised, and the measurements the same.
+
     Returns
     -------
     ModelComparison
 
     Examples
     --------
-    >>> comparison = compare_models({"elastic": (-120.3, 0.1), "inelastic": (-118.9, 0.1)})
-    >>> comparison.best
-    'inelastic'
-    >>> print(comparison)
+    >>> print(compare_models({"elastic": (-120.3, 0.1), "inelastic": (-118.9, 0.1)}))
     model           log evidence  difference  probability      95 % interval
     inelastic  -118.900 +- 0.100       0.000       0.8022  0.7545 ... 0.8425
     elastic    -120.300 +- 0.100      -1.400       0.1978  0.1575 ... 0.2455
     """
     if not isinstance(models, Mapping) or len(models) < 2:
         raise ValueError(f"compare_models needs a mapping with two models or more, by name; got {models!r}")
-    names = tuple(models)
     digests = {name: getattr(log_posterior_of(model), "data_fingerprint", None) for name, model in models.items()}
     known = {name: digest for name, digest in digests.items() if digest is not None}
     if len(set(known.values())) > 1:
@@ -100,20 +86,17 @@ def compare_models(models: Mapping[str, Any]) -> ModelComparison:
             "models the same measurements"
         )
     log_evidence, error = np.array([_evidence(name, model) for name, model in models.items()]).T
-    probability = np.exp(log_evidence - logsumexp(log_evidence))
 
-    # d logit(p_k) / d log Z_j = delta_kj - (1 - delta_kj) p_j / (1 - p_k)
-    odds, odds_error = np.empty((2, len(names)))
-    for k in range(len(names)):
+    odds, odds_error = np.empty((2, len(models)))
+    for k in range(len(models)):  # d logit(p_k) / d log Z_j = delta_kj - (1 - delta_kj) p_j / (1 - p_k)
         rest = logsumexp(np.delete(log_evidence, k))
         odds[k] = log_evidence[k] - rest
         share = np.exp(np.delete(log_evidence, k) - rest)
         odds_error[k] = math.hypot(error[k], *(share * np.delete(error, k)))
     reach = ndtri(0.975) * odds_error
-    shares = probability, expit(odds - reach), expit(odds + reach)
-    known = [is_tempered(model) and model.ladder and model.iteration for model in models.values()]
-    said = (model.verdict.summary if has else "" for model, has in zip(models.values(), known, strict=True))
-    return ModelComparison(names, log_evidence, error, *shares, tuple(said))
+    said = (each.verdict.summary if is_tempered(each) and each.iteration else "" for each in models.values())
+    shares = expit(odds), expit(odds - reach), expit(odds + reach)
+    return ModelComparison(tuple(models), log_evidence, error, *shares, tuple(said))
 
 
 def _evidence(name: str, model: Any) -> tuple[float, float]:

@@ -1,12 +1,9 @@
 """Results of finished runs as tables: moments of the posterior."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-
-if TYPE_CHECKING:
-    import pandas
 
 
 def is_tempered(sampler: Any) -> bool:
@@ -59,19 +56,6 @@ class Summary(NamedTuple):
         return "\n".join(aligned(rows))
 
     __repr__ = __str__
-
-    def to_dataframe(self) -> "pandas.DataFrame":
-        """The numbers of the table as a `pandas.DataFrame`, whose index is the parameters.
-
-        Examples
-        --------
-        >>> summary(sampler.get_chain(flat=True), posterior.parameter_names).to_dataframe().columns.tolist()
-        ['mean', 'mean_error', 'sd', 'sd_error', 'cv']
-        """
-        import pandas
-
-        columns = {name: getattr(self, name) for name in ("mean", "mean_error", "sd", "sd_error", "cv")}
-        return pandas.DataFrame(columns, index=pandas.Index(self.names, name="parameter"))
 
 
 def names_of_parameters(names: Sequence[str] | None, ndim: int) -> tuple[str, ...]:

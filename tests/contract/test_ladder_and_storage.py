@@ -281,7 +281,6 @@ def test_summary_with_errors_of_mean_and_standard_deviation():
     result = summary(sampler.get_chain(flat=True), None, sampler.mean_error(), sampler.sd_error())
     assert np.array_equal(result.mean_error, sampler.mean_error())
     assert np.array_equal(result.sd_error, sampler.sd_error())
-    assert np.array_equal(result.to_dataframe()["sd_error"], result.sd_error)
     rows = str(result).splitlines()
     assert rows[0].count("MC error") == 2
     assert [rows[3].split()[column] for column in (2, 4)] == [

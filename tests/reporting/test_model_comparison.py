@@ -45,7 +45,6 @@ def test_conjugate_models_by_smc(seed, rng):
     assert np.all(found.probability - softmax(exact) < 2.5 * (found.probability - found.lower))
     assert np.all(softmax(exact) - found.probability < 2.5 * (found.upper - found.probability))
     assert found.probability.sum() == pytest.approx(1.0)
-    assert found.probabilities[found.best] == found.probability.max() and found.best in models
 
 
 @pytest.mark.parametrize("values", [(0.0, -1.0), (0.0, -0.3, -2.0), (5000.0, 4999.0, 4990.0)])
@@ -58,7 +57,6 @@ def test_errors_against_monte_carlo(values, rng):
     assert np.allclose(found.probability, softmax(values))
     low, high = np.quantile(probabilities, [0.025, 0.975], axis=0)
     assert np.allclose(found.upper - found.lower, high - low, rtol=0.07)
-    assert found.best == "m0"
 
 
 def test_the_interval_is_right_for_large_errors(rng):
