@@ -422,8 +422,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
             latest = self._record.latest(KEPT_POINTS)
             self._near = None if latest is None else judged_failures(latest, coords, self._target)
             numbers = self.nwalkers, self.ndim, self.simulations
-            others = self._record.of_guides, self._near, tuple(self._target.names)
-            self._verdict = judge(self._result, *numbers, missing, self._failed[0], *others)
+            names = tuple(self._target.names)
+            self._verdict = judge(self._result, *numbers, missing, self._failed[0], self._near, names)
         else:  # an annealing that could not be made again
             self._verdict = self._verdict._replace(simulations=self.simulations)
         self._chain.result, self._chain.verdict = self._result, self._verdict

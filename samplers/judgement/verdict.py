@@ -154,29 +154,20 @@ def judge(
     simulations: float,
     missing_steps: int = 0,
     failures: str = "",
-    searched: float = 0.0,
     near: NearFailures | None = None,
     names: Sequence[str] = (),
 ) -> Verdict:
-    """Judge an annealing that has reached beta = 1. `searched` of the `simulations` are of the guide's search,
-    `missing_steps` at beta = 1 were not allowed by the limit, `failures` says how many evaluations failed.
+    """Judge an annealing that has reached beta = 1. `missing_steps` at beta = 1 were not allowed by the limit, and
+    `failures` says how many evaluations failed.
     """
     stage = result.ladder[-1]
     found = [*result.findings, *(() if near is None else check_failed_region(near))]
     reasons: list[str] = []
-    if searched > 0.0:
-        reasons.append(f"the guide used {searched:.0f} of the {simulations:.0f} simulations for its search")
     weighted = result.weighted
     if weighted is not None and weighted.ended:
         found.append(_of_end(weighted, stage.log_evidence_error, ndim))
     if weighted is not None and weighted.guided:
         if not weighted.ended:
-            last = result.rounds[-1]
-            reasons.append(
-                f"the latest {last.draws} draws of the guide, which it was not fitted to, have an "
-                f"effective sample size of {100 * last.effective_share:.0f} % of their number; the Pareto shape of all "
-                f"weights is {weighted.pareto_shape:.2f}"
-            )
             found += _of_signed_sample(result, names)
         if all(each.kind != UNSEEN for each in found):
             reasons.append(result.basis or "parts of the posterior in which the guide makes no draws are not seen")

@@ -60,11 +60,6 @@ def to_arviz(
     import xarray
 
     runs = list(sampler) if isinstance(sampler, Sequence) else [sampler]
-    if len({id(run) for run in runs}) < len(runs):
-        raise ValueError(
-            "to_arviz: a sampler is given twice, and its chains would agree without being independent: pass runs of "
-            "different seeds"
-        )
     known = log_posterior_of(runs[0])
     names = parameter_names or getattr(known, "parameter_names", None) or _names_in_emcee(runs[0])
     names = names_of_parameters(names, runs[0].ndim)
