@@ -20,7 +20,7 @@ import contextlib, functools, io, json, sys, time
 from matplotlib.figure import Figure
 from fe_likelihoods.command import runs
 from fe_likelihoods.command.main import main
-from fe_likelihoods.reporting import pictures
+from fe_likelihoods.reporting import report
 
 spent = {}
 

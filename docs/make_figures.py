@@ -33,8 +33,6 @@ from fe_likelihoods import (
     moment_curvature,
     plot_fit,
     plot_hysteresis,
-    plot_material,
-    plot_moment_curvature,
     plot_residuals,
     plot_section,
     plot_sensors,
@@ -92,12 +90,18 @@ def model_figures() -> dict:
     sensors = plot_sensors(replace(column, outputs=outputs)).figure
     materials, (left, middle, right) = plt.subplots(1, 3, figsize=(12.8, 4.0), layout="constrained")
     core, cover, steel = material_curves(column, np.ones(5))
-    plot_material(core, cover, axes=left)
-    plot_material(steel, axes=middle)
+    for axes, drawn in ((left, (core, cover)), (middle, (steel,))):
+        for curve in drawn:
+            axes.plot(100.0 * curve.strain, 1e-6 * curve.stress, linewidth=1.2, label=curve.name)
+        axes.set(xlabel="strain [%]", ylabel="stress [MPa]")
     curvature = np.linspace(0.0, 0.05, 300)
     cases = {"nominal": np.ones(5), "posterior means": means}
-    curves = {name: moment_curvature(column, theta, curvature) for name, theta in cases.items()}
-    plot_moment_curvature(curves, right)
+    for name, theta in cases.items():
+        right.plot(curvature, 1e-3 * moment_curvature(column, theta, curvature).moment, linewidth=1.2, label=name)
+    right.set(xlabel="curvature [1/m]", ylabel="moment [kN m]")
+    for axes in (left, middle, right):
+        axes.grid(alpha=0.25)
+        axes.legend(frameon=False, fontsize="small")
     return {
         "column_sensors": sensors,
         "column_materials": materials,

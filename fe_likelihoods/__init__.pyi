@@ -30,12 +30,16 @@ from .models.sensor_errors import SensedModel, Sensor
 from .models.umbridge import UMBridgeModel
 from .noise.autoregressive import AutoregressiveNoise
 from .noise.gaussian import GaussianNoise
-from .noise.residuals import effective_samples, residual_checks
+from .noise.residuals import residual_checks
 from .plots.damage import plot_damage
-from .plots.fits import plot_fit
-from .plots.histories import plot_histories, plot_record, plot_residuals, plot_spectrum
-from .plots.materials import plot_material, plot_moment_curvature
-from .plots.predictions import plot_bands, plot_fragility
+from .plots.histories import (
+    plot_bands,
+    plot_fit,
+    plot_histories,
+    plot_record,
+    plot_residuals,
+    plot_spectrum,
+)
 from .plots.scores import plot_scores
 from .plots.sensors import plot_ranking
 from .plots.structures import plot_hysteresis, plot_section, plot_sensors
@@ -53,12 +57,10 @@ from .prediction.quantities import final_value, peak, rms
 from .prediction.scores import share_within
 from .priors.distributions import HalfNormal, LogNormal, TruncatedNormal, Uniform
 from .priors.mixture_prior import fit_mixture
-from .priors.multivariate import MultivariateNormal
 from .priors.priors import Prior
 from .reporting.report import report
 from .signals.alignment import align
 from .signals.channels import Channel, Measurements
-from .signals.comparison import rrmse
 from .signals.events import Events
 from .signals.read import read_columns, read_record
 from .signals.records import DisplacementHistory, Record
@@ -95,7 +97,6 @@ __all__ = [
     "ModalData",
     "ModalLikelihood",
     "ModalModel",
-    "MultivariateNormal",
     "OpenSeesModel",
     "Posterior",
     "Prior",
@@ -119,7 +120,6 @@ __all__ = [
     "damage",
     "damage_measures",
     "damage_outputs",
-    "effective_samples",
     "event_ratios",
     "exceedance",
     "final_value",
@@ -136,11 +136,8 @@ __all__ = [
     "plot_bands",
     "plot_damage",
     "plot_fit",
-    "plot_fragility",
     "plot_histories",
     "plot_hysteresis",
-    "plot_material",
-    "plot_moment_curvature",
     "plot_ranking",
     "plot_record",
     "plot_residuals",
@@ -158,7 +155,6 @@ __all__ = [
     "report",
     "residual_checks",
     "rms",
-    "rrmse",
     "sensitivity",
     "share_within",
     "stiffness_loss",

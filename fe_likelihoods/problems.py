@@ -46,19 +46,6 @@ from .signals.datasets import Dataset, read_dataset
 from .signals.records import Record
 from .units import to_si
 
-__all__ = [
-    "BRIDGE_COLUMN_MEANS",
-    "BRIDGE_COLUMN_NOISE",
-    "bridge_column",
-    "bridge_column_data",
-    "bridge_column_prior",
-    "free_vibration",
-    "isolated_bridge",
-    "isolated_bridge_data",
-    "isolated_bridge_prior",
-    "table_motion",
-]
-
 BRIDGE_COLUMN_MEANS = MappingProxyType({"Ec": 0.59, "Es": 0.96, "a0": 0.27, "a1": 4.78, "ft": 2.43})
 """Posterior means of Ramancha et al. (2022), Table 2, as multiples of the nominal values: the synthetic truth."""
 

@@ -2,8 +2,6 @@
 
 from collections.abc import Sequence
 
-__all__ = ["listed", "number", "text_table"]
-
 
 def text_table(rows: Sequence[Sequence[str]]) -> str:
     """Cells as aligned text, without spaces at the ends of lines; header first, the first column aligned to the left.

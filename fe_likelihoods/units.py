@@ -13,8 +13,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["DIMENSIONS", "G0", "UNITS", "Unit", "find_unit", "from_si", "to_si"]
-
 G0 = 9.80665
 """Standard acceleration of gravity [m/s²] (3rd General Conference on Weights and Measures, 1901)."""
 

@@ -1,5 +1,4 @@
 from . import presets
-from .moves.population_moves import MixtureMove, RandomWalkMove
 from .rare_events import subset_simulation
 from .reporting.arviz_data import to_arviz
 from .reporting.figures import plot_corner, plot_marginals, plot_run
@@ -12,8 +11,6 @@ from .tmcmc import TMCMCSampler
 
 __all__ = [
     "Guide",
-    "MixtureMove",
-    "RandomWalkMove",
     "SMCSampler",
     "SamplingWarning",
     "TMCMCSampler",

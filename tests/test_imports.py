@@ -55,7 +55,7 @@ def test_every_public_name_is_there(package):
     assert fresh(code).strip() == str(names)
 
 
-@pytest.mark.parametrize(("package", "most"), [(samplers, 14), (fe_likelihoods, 97)])
+@pytest.mark.parametrize(("package", "most"), [(samplers, 12), (fe_likelihoods, 91)])
 def test_the_stub_lists_what_it_imports(package, most):
     """`__all__` of the stub, which type checkers read, has the names that exist at run time."""
     tree = ast.parse((ROOT / package.__name__ / "__init__.pyi").read_text())

@@ -20,8 +20,6 @@ from ..priors.distributions import Distribution, HalfNormal, LogNormal, Truncate
 if TYPE_CHECKING:
     import bilby
 
-__all__ = ["BilbyProblem", "to_bilby"]
-
 # Probabilities at which translated priors are compared with the original ones, and the largest difference of quantiles
 # (in standard deviations) and of log densities.
 _LEVELS = np.linspace(0.001, 0.999, 21)

@@ -19,8 +19,6 @@ from ..priors.distributions import Distribution, HalfNormal, LogNormal, Truncate
 if TYPE_CHECKING:
     import pymc
 
-__all__ = ["to_pymc"]
-
 
 def to_pymc(posterior: Posterior) -> pymc.Model:
     """Convert a posterior to a PyMC model, with one free variable per parameter, of the same name.

@@ -34,7 +34,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..noise.sufficient_statistics import Statistic, needs_response, relative_changes, statistic_width
-from ..signals.comparison import Comparison
+from ..signals.channels import Comparison
 from ..simulation.failure_reasons import ChangedModel, TransientReason
 from ..simulation.files import digests_by_name, observing, read_again
 from ..simulation.label import ModelLabel

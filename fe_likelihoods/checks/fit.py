@@ -8,8 +8,7 @@ from scipy.special import chdtrc
 
 from ..likelihood.fits import MOST_DRAWS, Fit, checks_of
 from ..noise.residuals import ResidualChecks
-from ..signals.channels import Channel
-from ..signals.comparison import relative_errors
+from ..signals.channels import Channel, relative_errors
 from ..text_tables import listed
 from .faults import EXPLAINED, find_faults, finding_of, supports_apart
 from .finding import CARE, CORRELATED, HALF, NOTE, SMALL_PROBABILITY, WRONG, Finding, percent

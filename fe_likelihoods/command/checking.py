@@ -10,14 +10,12 @@ from ..checks.faults import FAULTS
 from ..checks.finding import labelled
 from ..checks.result import ModelCheck, check_model
 from ..likelihood.fits import data_sets_of, draws_to_compare
-from ..signals.comparison import rrmse
+from ..signals.channels import relative_errors
 from ..text_tables import number, text_table
 from .describe_files import describe
 from .job import Job, read_job
-from .models import Problem, make_problem
+from .make_posterior import Problem, make_problem
 from .runs import default_folder, make_sampler
-
-__all__ = ["check_job"]
 
 
 def check_job(file: Path, picture: Path, say: Callable[[str], None]) -> None:
@@ -44,10 +42,15 @@ def _say_data(problem: Problem, say: Callable[[str], None]) -> None:
     posterior, record, levels = problem.posterior, problem.record, dict[str, float]()
     if record is not None:
         say(f"Record: {record}" + (f"\n  from {record.source}" if record.source else ""))
-    for part, _ in posterior.likelihood.data_sets():
-        say("Measurements:\n" + (str(part.model.data) if part.is_modal else "\n".join(describe(part.measurements))))
-        rms = () if part.is_modal else part.measurements.root_mean_squares
-        levels |= {f"sigma_{each.name}": level for each, level in zip(part.measurements.channels, rms, strict=False)}
+    for data_set, _ in posterior.likelihood.data_sets():
+        say(
+            "Measurements:\n"
+            + (str(data_set.model.data) if data_set.is_modal else "\n".join(describe(data_set.measurements)))
+        )
+        rms = () if data_set.is_modal else data_set.measurements.root_mean_squares
+        levels |= {
+            f"sigma_{each.name}": level for each, level in zip(data_set.measurements.channels, rms, strict=False)
+        }
     rows = [("parameter", "prior mean", "standard deviation", "measured RMS", "")]
     for parameter in posterior.parameters:
         mean, sd = (parameter.shown(value) for value in posterior.prior.distributions[parameter.name].moments)
@@ -60,12 +63,12 @@ def _say_data(problem: Problem, say: Callable[[str], None]) -> None:
 def _say_simulation(problem: Problem, checked: ModelCheck, say: Callable[[str], None]) -> None:
     report, mean = problem.posterior.report(), problem.posterior.prior.mean()[None]
     say(f"One simulation takes {report['seconds'] / report['simulations']:.2g} s")
-    for part, columns in problem.posterior.likelihood.data_sets():
-        theta, measured = mean[:, columns[: len(part.model.parameter_names)]], part.measurements
-        if part.is_modal:
-            say(f"At the mean of the prior:\n{part.predict_modes(theta)}")
+    for data_set, columns in problem.posterior.likelihood.data_sets():
+        theta, measured = mean[:, columns[: len(data_set.model.parameter_names)]], data_set.measurements
+        if data_set.is_modal:
+            say(f"At the mean of the prior:\n{data_set.predict_modes(theta)}")
             continue
-        errors = rrmse(measured.values - part.residuals_of(part.simulate(theta).response[0]), measured.values)
+        errors = relative_errors(data_set.residuals_of(data_set.simulate(theta).response[0]), measured.values)
         fit = ", ".join(f"{c.name} {100 * e:.0f} %" for c, e in zip(measured.channels, errors, strict=True))
         say(f"At the mean of the prior the error of the response (RRMSE) is {fit}")
     for line in labelled(checked.findings):
@@ -76,9 +79,9 @@ def _zero_of(job: Job, problem: Problem, checked: ModelCheck) -> str:
     """The line of ``[measurements]`` that moves all channels by the time by which all are late, else empty."""
     found = [each for each in checked.findings if each.kind == FAULTS["lag"][0]]
     late, said = [each.numbers["lag"] for each in found], " ".join(each.text for each in found)
-    parts = [part.measurements for part, _ in problem.posterior.likelihood.data_sets()]
-    alike = late and max(late) - min(late) <= min(min(part.steps) for part in parts)
-    if not alike or any(channel.name not in said for part in parts for channel in part.channels):
+    sets = [data_set.measurements for data_set, _ in problem.posterior.likelihood.data_sets()]
+    alike = late and max(late) - min(late) <= min(min(data_set.steps) for data_set in sets)
+    if not alike or any(channel.name not in said for data_set in sets for channel in data_set.channels):
         return ""
     zero, shift = job.measurements.zero or 0.0, sum(late) / len(late)
     if not isinstance(zero, str):
@@ -92,23 +95,23 @@ def _zero_of(job: Job, problem: Problem, checked: ModelCheck) -> str:
 
 def _draw(problem: Problem, checked: ModelCheck, picture: Path) -> list[Path]:
     """The draws of the prior that a check has simulated, with the measurements, as a PNG file for each data set."""
+    from ..plots.histories import plot_bands  # slow to import
     from ..plots.modes_and_load_tests import plot_modes, plot_points
-    from ..plots.predictions import plot_bands  # slow to import
     from ..prediction.propagation import propagate
-    from ..reporting.pictures import save_picture
+    from ..reporting.report import save_picture
 
     posterior, files, modes = problem.posterior, [], {fit.title: fit.modal for fit in checked.fits}
     points = draws_to_compare(posterior)[: max(len(fit.draws) for fit in checked.fits)]  # as many as were simulated
-    for key, part, columns in data_sets_of(posterior):
-        measured = part.measurements
-        if part.is_modal:
+    for key, data_set, columns in data_sets_of(posterior):
+        measured = data_set.measurements
+        if data_set.is_modal:
             drawn = modes[key].draws
             if drawn is None:  # the log says why
                 continue
             figure = plot_modes(drawn, label=f"{len(drawn.frequencies)} draws of the prior, 90 %")
         else:
-            draws = points[:, columns[: len(part.model.parameter_names)]]
-            drawn = propagate(part.model, draws, quantiles=(0.05, 0.95), cache=part.simulator, progress=False)
+            draws = points[:, columns[: len(data_set.model.parameter_names)]]
+            drawn = propagate(data_set.model, draws, quantiles=(0.05, 0.95), cache=data_set.simulator, progress=False)
             figure = plot_bands(drawn, measured) if measured.is_history else plot_points(measured, prediction=drawn)
             figure.suptitle(f"{drawn.n_samples} draws of the prior and the measurements")
         files.append(picture.with_name(f"{picture.stem}-{key}{picture.suffix}") if key else picture)

@@ -23,8 +23,6 @@ from ..text_tables import number, text_table
 from ..units import from_si
 from .job import HDF5
 
-__all__ = ["describe", "describe_data"]
-
 _MOST_ERRORS = 3  # of a file, each of which advises an option
 _WRITE = '    # write what is "?": the file does not state it'
 _Parts = tuple[list[str], list[str]]  # text, and lines of [measurements]

@@ -14,8 +14,6 @@ from typing import Any
 
 import click
 
-__all__ = ["NOT_USABLE", "TEMPLATES", "main", "write_templates"]
-
 ERROR, NOT_USABLE, INTERRUPTED = 1, 3, 130
 _FILE = click.Path(path_type=Path)
 _DATA = ("synthetic_record.csv", "synthetic_measured.csv")

@@ -22,9 +22,7 @@ from ..checks.model import refuse_chance
 from ..checks.result import JudgedRun, judge_run
 from ..checks.run import FinishedRun, read_run
 from .job import Job, parse_job, read_job
-from .models import Problem, make_problem, runs_code_of_user
-
-__all__ = ["Outcome", "default_folder", "make_sampler", "report_run", "run_job"]
+from .make_posterior import Problem, make_problem, runs_code_of_user
 
 SETTINGS, ORIGIN, CHAIN, PAGE = "settings.toml", "origin.json", "run.h5", "report.html"
 CACHE = "simulations.sqlite"

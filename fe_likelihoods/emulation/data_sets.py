@@ -15,7 +15,7 @@ import numpy as np
 
 from ..noise.protocol import noise_title
 from ..noise.sufficient_statistics import needs_response, sums_of_squares
-from ..signals.comparison import Comparison, measured_values
+from ..signals.channels import Comparison, measured_values
 from ..simulation.model import derivatives_batch, has_jacobian, most_responses
 from .archive import check_quadratic
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..signals.comparison import Comparison
+from ..signals.channels import Comparison
 from ..signals.records import DisplacementHistory, growing_durations
 from .archive import Archive
 from .data_sets import DataSets

@@ -28,8 +28,6 @@ from ..priors.points import as_rows
 from ..priors.priors import Prior
 from ..text_tables import listed
 
-__all__ = ["Combination", "Identifiability", "compare_covariances", "identifiability", "of_mode", "of_samples"]
-
 DETERMINED = 0.3  # share of the prior's standard deviation up to which a parameter is determined
 KEPT = 0.9  # share from which the data say little
 MUCH_BETTER = 0.5  # share left of a combination, over the smallest one of its parameters

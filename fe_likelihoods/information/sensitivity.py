@@ -30,8 +30,6 @@ from ..text_tables import number, text_table
 if TYPE_CHECKING:
     import pandas
 
-__all__ = ["Sensitivity", "sensitivity"]
-
 FOLDS = 8  # of the jackknife
 DESIGN, DESIGNS = 2**10, 8  # points of the emulator per scrambled Sobol design, and designs
 

@@ -33,8 +33,6 @@ from ..signals.channels import Channel
 from ..simulation.model import Model, derivatives_batch, has_jacobian, most_responses, simulate_batch
 from ..text_tables import number, text_table
 
-__all__ = ["SensorRanking", "Slopes", "information_of", "rank_sensors", "slopes_at", "variance_of"]
-
 SHARE = 0.05  # of the channel's RMS, the default noise
 STEP = 0.1  # of differences, in standard deviations
 MAP_STEP = 1e-4  # of coordinates, for the derivatives of the parameters
@@ -253,7 +251,7 @@ def rank_sensors(
         precise.
     effective_samples : float or mapping of str to float, optional
         Number of independent samples that a channel is worth, if errors are correlated in time
-        (`fe_likelihoods.effective_samples`), for all channels or by name as for `noise`. Default: all samples.
+        (`residual_checks(...).n_effective`), for all channels or by name as for `noise`. Default: all samples.
     draws : int
         Number m of draws. It takes m (d + 1) simulations of d parameters, and as many of a `target_model`; of a model
         with a method ``jacobian``, m simulations and m calls of it, which count as simulations.

@@ -19,8 +19,7 @@ from ..noise.gaussian import GaussianNoise
 from ..noise.protocol import Noise, noise_of_part, noise_statistic, noise_under
 from ..noise.sufficient_statistics import count_samples
 from ..priors.points import as_rows, complete_repr
-from ..signals.channels import Measurements
-from ..signals.comparison import Comparison
+from ..signals.channels import Comparison, Measurements
 from ..signals.events import events_of
 from ..simulation.model import Model, SimulationBatch, first_part
 from .check_inputs import check_model, check_noise, match_measurements
@@ -44,7 +43,7 @@ class FELikelihood(SumOfDataSets):
         without measurements are not compared (`Events.join`). Otherwise measurements of the model's channels (matched
         by name, in any order), up to the end of the model's response. NaN marks missing samples, which are left out. A
         channel may have its own step and start: the response is interpolated at the times of its samples, without a
-        filter (`fe_likelihoods.signals.comparison`).
+        filter (`fe_likelihoods.signals.channels`).
     noise : Noise, optional
         `GaussianNoise`, `AutoregressiveNoise`, or any object with the protocol `Noise`. Default: `GaussianNoise` of the
         model's channels.

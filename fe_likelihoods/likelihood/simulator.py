@@ -31,8 +31,7 @@ from ..cache.simulation_cache import SimulationCache
 from ..cache.verification import StaleCache, VerifiedModel
 from ..noise.sufficient_statistics import Statistic, check_statistic, name_of_statistic
 from ..priors.points import as_rows
-from ..signals.channels import Measurements
-from ..signals.comparison import Comparison, compare_with
+from ..signals.channels import Comparison, Measurements, compare_with
 from ..simulation.executors import as_executor
 from ..simulation.files import Observed
 from ..simulation.model import (

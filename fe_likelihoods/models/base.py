@@ -24,8 +24,6 @@ from ..signals.sampling import array_digest
 from ..simulation.model import SimulationBatch, SimulationFailed
 from .validation import check_theta, check_thetas, invalid
 
-__all__ = ["BuiltInModel", "History", "StructuralModel", "digest", "remark_on_range"]
-
 logger = logging.getLogger(__name__)
 
 

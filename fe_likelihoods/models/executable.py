@@ -26,8 +26,6 @@ from ..units import find_unit
 from .user_model import UserModel, content_digest
 from .validation import positive_float
 
-__all__ = ["ExecutableModel", "read_table"]
-
 _WATCH_INTERVAL = 0.1  # [s] between checks of the output size
 _FREE_BYTES = 2**16  # less free space than this may be the reason of a failure
 _EXIT_CODES_OF_SHELLS = {126, 127, *range(129, 160)}  # no program, or a program killed by signal 1 to 31

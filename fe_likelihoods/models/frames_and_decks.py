@@ -18,8 +18,6 @@ from scipy.linalg import eigh
 from ..simulation.model import SimulationFailed
 from .validation import check_integer, check_number, described, structure
 
-__all__ = ["BridgeDeck", "LinearSystem", "ModalModel", "Structure", "ShearFrame"]
-
 _MOST_MODES = 50
 
 

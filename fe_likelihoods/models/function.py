@@ -23,8 +23,6 @@ from ..simulation.worker import Sandbox
 from .user_model import UserModel
 from .validation import check_theta, positive_float
 
-__all__ = ["FunctionModel"]
-
 
 class _Bound:
     """Function of theta that calls the user's function with the record and the number of samples, where it has them."""

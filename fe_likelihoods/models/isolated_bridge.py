@@ -41,8 +41,6 @@ from .validation import (
     structure,
 )
 
-__all__ = ["PARAMETERS", "IsolatedBridge"]
-
 PARAMETERS = ("fmin_1", "df_1", "a_1", "fmin_2", "df_2", "a_2", "Kd_1", "C0_1", "Kd_2", "C0_2")
 _NOMINAL_UNITS = {
     f"{name}_{pier}": unit

@@ -14,17 +14,6 @@ import numpy as np
 from ..signals.channels import Channel
 from .validation import check_described, check_integer, check_number, described, invalid, structure
 
-__all__ = [
-    "ALL_CHANNELS",
-    "CHANNELS",
-    "OF_A_PIER",
-    "Bearing",
-    "Damper",
-    "Pier",
-    "Rubber",
-    "at_pier",
-]
-
 
 @structure
 @dataclass(frozen=True)

@@ -26,8 +26,6 @@ from ..simulation.model import SimulationFailed
 from .isolated_bridge_bearings import OF_A_PIER, Damper, Pier, Rubber, at_pier
 from .validation import check_values
 
-__all__ = ["FORMS", "BridgeMatrices", "PreparedBridge", "channel_matrix", "prepare_bridge", "run_bridge"]
-
 GRAVITY = 9.81  # [m/s²]
 TOLERANCE = 1e-5  # largest last correction of the isolator forces, as a multiple of the smaller bearing load
 MAX_ITERATIONS = 50  # of Newton's method per step

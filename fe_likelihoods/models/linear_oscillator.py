@@ -18,8 +18,6 @@ from ..simulation.model import SimulationFailed
 from .base import StructuralModel, digest
 from .validation import check_theta, positive_float
 
-__all__ = ["LinearOscillator"]
-
 
 class LinearOscillator(StructuralModel):
     """Single-degree-of-freedom structure under a base acceleration, at rest at the first sample.

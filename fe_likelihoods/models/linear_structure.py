@@ -33,9 +33,6 @@ from .undamped_modes import Modes, undamped_modes
 from .user_model import ExternalModel
 from .validation import check_theta
 
-__all__ = ["LinearStructure", "Sensor"]
-
-
 _MOTIONS = ("displacement", "velocity", "relative_acceleration")
 _LARGEST_CONDITION = 1e8  # condition number of the complex modes at which half the digits are lost
 

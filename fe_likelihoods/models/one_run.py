@@ -15,8 +15,6 @@ from ..simulation.model import Model, SimulationBatch, SimulationFailed, simulat
 from .base import digest
 from .executable import read_table
 
-__all__ = ["PartOfRun", "one_run"]
-
 _MOST_BYTES = 2**28  # of responses that are kept for other parts
 
 

@@ -24,8 +24,6 @@ from ..signals.records import Record
 from ..simulation.model import SimulationFailed
 from .function import FunctionModel
 
-__all__ = ["OpenSeesModel"]
-
 
 class _Codes:
     """The codes that ``ops.analyze`` returns in one run.

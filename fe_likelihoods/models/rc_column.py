@@ -55,9 +55,6 @@ from .validation import (
     structure,
 )
 
-__all__ = ["PARAMETERS", "RCColumn"]
-
-
 _OF_FATIGUE = ("Cf", "Cd")
 _NOMINAL_UNITS = {
     **dict(Ec="GPa", Es="GPa", a0="1/s", a1="s", ft="MPa", fc="MPa", fy="MPa", fu="MPa", Esh="GPa"),

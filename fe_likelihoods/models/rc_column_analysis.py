@@ -25,8 +25,6 @@ from .rc_column_outputs import Output, Recording
 from .rc_column_section import gauss_lobatto
 from .validation import check_values, invalid
 
-__all__ = ["ColumnHistory", "PreparedColumn", "check_loading", "expect_fracture", "make_column", "run_column"]
-
 LARGEST_DRIFT = 0.5
 """Largest imposed displacement by the height; tested columns have failed at 0.05 to 0.15."""
 LOST_BARS = 0.5

@@ -1,7 +1,6 @@
 """Curves of a reinforced-concrete column: stress-strain curves of its materials, moment-curvature curve of its section.
 
-They show the behaviour of the laws at given parameters, before the column is simulated. `fe_likelihoods.plot_material`
-and `fe_likelihoods.plot_moment_curvature` draw them.
+They show the behaviour of the laws at given parameters, before the column is simulated.
 """
 
 from __future__ import annotations
@@ -18,8 +17,6 @@ from ..units import G0
 from .rc_column import RCColumn
 from .rc_column_analysis import make_column
 from .validation import check_theta, invalid
-
-__all__ = ["MaterialCurve", "MomentCurvature", "material_curves", "moment_curvature"]
 
 _LARGEST_STRAIN = 0.2
 _MAX_HALVINGS = 12

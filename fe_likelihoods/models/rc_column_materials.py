@@ -16,16 +16,6 @@ from ..kernels import reinforcing_steel
 from ..priors.distributions import LogNormal
 from .validation import check_described, check_integer, described, invalid, structure
 
-__all__ = [
-    "Bars",
-    "ColumnAnalysis",
-    "Concrete",
-    "Hoops",
-    "LowCycleFatigue",
-    "Steel",
-    "hardening_fault",
-]
-
 _MEDIAN_CF, _LOG_SD_CF = 0.20, 0.34  # of a new column, by study `failing_columns` of docs/results.rst
 
 

@@ -20,9 +20,6 @@ from ..units import find_unit
 from .rc_column_section import ReinforcedSection
 from .validation import invalid
 
-__all__ = ["Recording", "Output", "Sections", "check_units", "display_channels", "parse_outputs", "section_heights"]
-
-
 _ROWS = {
     "acceleration": ("absolute acceleration", "m/s2", "absolute acceleration", 1.0),
     "displacement": ("relative displacement", "m", "relative displacement", 1.0),

@@ -22,8 +22,6 @@ import numpy as np
 from .rc_column_materials import Bars, Hoops
 from .validation import invalid
 
-__all__ = ["Confinement", "ReinforcedSection", "gauss_lobatto"]
-
 
 def _slice_moments(radius: float, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Integrals of the chord 2 sqrt(r^2 - y^2), and of y^2 times the chord, from 0 to `y` (clipped to the circle)."""

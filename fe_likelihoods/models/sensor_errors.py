@@ -17,14 +17,12 @@ from numpy.typing import ArrayLike
 
 from ..priors.distributions import Distribution
 from ..signals.channels import Channel
-from ..signals.interpolation import interpolate, make_interpolation
 from ..signals.records import Record
+from ..signals.sampling import interpolate, make_interpolation
 from ..simulation.by_value import code_within, is_of_user
 from ..simulation.model import Model, SimulationBatch, first_part, simulate_batch
 from .base import digest
 from .validation import check_theta
-
-__all__ = ["SensedModel", "Sensor"]
 
 _OF_THE_MODEL = ("code_parts", "nominal", "nominal_units", "path_dependent", "range_remark", "time_limit")
 ENDS = np.array([1e-6, 1.0 - 1e-6])  # probabilities of the prior's shortest and longest lags

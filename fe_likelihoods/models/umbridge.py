@@ -18,8 +18,6 @@ from ..simulation.model import SimulationFailed, simulate_batch
 from .user_model import ExternalModel
 from .validation import check_integer, check_number, positive_float
 
-__all__ = ["UMBridgeModel", "UMBridgeServer", "serve"]
-
 
 def _package() -> Any:
     """The package, whose module `um` imports aiohttp.web and requests; ValueError if it is not installed."""

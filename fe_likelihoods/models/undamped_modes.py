@@ -26,8 +26,6 @@ from scipy.linalg import eigh
 
 from ..simulation.model import SimulationFailed
 
-__all__ = ["Modes", "mode_derivatives", "undamped_modes"]
-
 _ROUND_OFF = 1e-8  # of matrices that are symmetric, as a share of the largest element
 _CANCELS = 1e-14  # energy of the lowest mode, as a share of the sum of its terms' sizes: round-off of a free structure
 _MASSLESS = 1e-15  # eigenvalue 1 / lambda, as a share of the largest one: round-off

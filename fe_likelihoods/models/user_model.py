@@ -30,8 +30,6 @@ from ..simulation.model import SimulationFailed, real_response
 from .base import StructuralModel, digest
 from .validation import check_theta, positive_float
 
-__all__ = ["ExternalModel", "UserModel", "content_digest"]
-
 
 class ExternalModel(StructuralModel):
     """Model whose response comes from external code, and is therefore checked after each simulation.

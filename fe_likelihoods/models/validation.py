@@ -19,21 +19,6 @@ import numpy as np
 
 from ..simulation.model import SimulationFailed
 
-__all__ = [
-    "check_described",
-    "check_integer",
-    "check_names",
-    "check_nominal",
-    "check_number",
-    "check_theta",
-    "check_thetas",
-    "check_values",
-    "described",
-    "invalid",
-    "positive_float",
-    "structure",
-]
-
 _ADVICE = "give one number in SI units"
 
 

@@ -76,7 +76,7 @@ class GaussianNoise:
         left out. The parameters are then levels of the model error, and may be zero. ``shares_of="response"`` needs
         positive values: they are the standard deviations where the response is zero.
     effective_samples : mapping of channel names to float, or sequence of float, optional
-        Number of independent samples that each channel is worth (`fe_likelihoods.effective_samples`), at most the
+        Number of independent samples that each channel is worth (`residual_checks(...).n_effective`), at most the
         number of samples, which is also the default for names that are left out.
     scales, layout, events, measured, of_parts
         Root mean squares of the measured channels [SI], of which the level of ``groups="all"`` and the shares of

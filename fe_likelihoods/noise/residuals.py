@@ -2,11 +2,11 @@
 
 White noise treats the n samples of a channel as independent. Residuals of real measurements (measured minus simulated
 response) are correlated, because model errors change slowly and repeat from cycle to cycle. `residual_checks` measures
-this, `effective_samples` is for `fe_likelihoods.GaussianNoise`, and `innovations` shows whether
+this, its `n_effective` is for `fe_likelihoods.GaussianNoise`, and `innovations` shows whether
 `fe_likelihoods.AutoregressiveNoise` explains it::
 
     residuals = likelihood.residuals_of(model.simulate(best))
-    noise = GaussianNoise(model.channels, effective_samples=effective_samples(residuals))
+    noise = GaussianNoise(model.channels, effective_samples=residual_checks(residuals).n_effective)
 
 The equations are on the page ``docs/theory/noise.rst``.
 """
@@ -43,7 +43,7 @@ class ResidualChecks(NamedTuple):
     lag_one : ndarray
         Correlation of successive residuals [-], near zero for white noise.
     n_effective : ndarray
-        Number of independent samples (`effective_samples`).
+        Number of independent samples that the channel is worth.
     white : ndarray
         p-value of white noise: probability of a lag-one correlation at least as far from zero.
     normal : ndarray
@@ -150,41 +150,12 @@ def _pair_shares(missing: np.ndarray) -> np.ndarray:
 
 
 def effective_samples(residuals: np.ndarray) -> np.ndarray:
-    """Number of independent samples that the residuals of each channel are worth.
+    """Number of independent samples (n_channels,) that residuals (n_channels, n_steps) are worth for a mean square.
 
-    Parameters
-    ----------
-    residuals : (n_channels, n_steps) float
-        Measured minus simulated response at parameters that fit; any unit. NaN where a sample is missing.
-
-    Returns
-    -------
-    (n_channels,) float
-        Between one and the channel's number of samples.
-
-    Raises
-    ------
-    ValueError
-        If the residuals have another shape, fewer than two samples, non-finite values, or only zeros in a channel.
-
-    Notes
-    -----
     n_eff = n / (1 + 2 sum_k rho_k^2) with the autocorrelation rho_k of the errors, summed to the first lag of at least
-    five correlation times (Sokal's window); for AR(1) errors n (1 - rho^2) / (1 + rho^2). This is the number for the
-    variance of a mean square, that is for sigma, and for a parameter whose sensitivity varies as fast as the errors.
-    Intervals are too wide for a parameter whose sensitivity varies faster, and too narrow for one whose sensitivity
-    varies more slowly, such as an offset; `fe_likelihoods.AutoregressiveNoise` makes this distinction. The integrated
-    autocorrelation time of a mean is not suitable: it is less than one for oscillating residuals. Sources are on the
-    page ``docs/theory/noise.rst``.
-
-    Where samples are missing, n is the number of samples without them, and each lag is weighted by the share of
-    complete pairs.
-
-    Examples
-    --------
-    >>> residuals = likelihood.residuals_of(model.simulate([1.1, 0.9]))
-    >>> effective_samples(residuals).round()  # doctest: +SAMPLED
-    array([178., 180.])
+    five correlation times (Sokal's window). The integrated autocorrelation time of a mean is not suitable: it is less
+    than one for oscillating residuals. Where samples are missing, n is the number of samples without them, and each lag
+    is weighted by the share of complete pairs. See ``docs/theory/noise.rst``.
     """
     correlation, missing = autocorrelation(residuals), np.isnan(residuals)
     n = correlation.shape[1]
@@ -249,6 +220,11 @@ def residual_checks(residuals: np.ndarray, channels: Sequence[Channel] = ()) -> 
 
     Notes
     -----
+    The number of independent samples is n / (1 + 2 sum_k rho_k^2) with the autocorrelation rho_k: the one for sigma,
+    and for a parameter whose sensitivity varies as fast as the errors. Intervals are too wide for a parameter whose
+    sensitivity varies faster, and too narrow for one whose sensitivity varies more slowly, such as an offset;
+    `fe_likelihoods.AutoregressiveNoise` makes this distinction.
+
     The lag-one correlation of n white residuals is approximately normal with standard deviation 1 / sqrt(n). Normality
     is tested with the statistic of Jarque and Bera [1]_, with the effective number of samples instead of n, so that
     correlation alone does not make the test significant. If `white` or `normal` is below 0.01, look at the plots of

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..signals.comparison import Comparison
+from ..signals.channels import Comparison
 
 __all__ = [
     "SampleCounts",

@@ -12,8 +12,6 @@ if TYPE_CHECKING:
 
     from ..column_damage.damage import Damage
 
-__all__ = ["plot_damage"]
-
 _COLOURS = ("#eef1f4", "#fbdca6", "#e8893a", "#a81c1c")
 """Colours of the probabilities from 0 to 1."""
 

@@ -1,8 +1,11 @@
-"""Figures of records, response spectra, channel histories and residuals, in display units."""
+"""Figures against time in display units: records, channels, residuals, measured with simulated responses, bands.
+
+Beside the records are their response spectra.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from textwrap import fill
 from typing import TYPE_CHECKING
 
@@ -10,13 +13,15 @@ import numpy as np
 
 from ..checks.fit import describe_residuals
 from ..noise.residuals import autocorrelation, residual_checks
-from ..signals.channels import Channel, Measurements
+from ..signals.channels import Channel, Measurements, relative_errors
 from ..units import from_si
 from .style import (
     BLUE,
     GREY,
     ORANGE,
+    add_figure_legend,
     add_legend,
+    add_legend_row,
     channel_label,
     marker_of,
     new_axes,
@@ -29,9 +34,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from ..prediction.prediction import Prediction
+    from ..signals.channels import Measurements
     from ..signals.records import Record
-
-__all__ = ["plot_histories", "plot_record", "plot_residuals", "plot_spectrum"]
 
 _SHADES = (BLUE, ORANGE, "#5b8c5a", "#b03a48", GREY)
 
@@ -211,4 +216,159 @@ def plot_residuals(residuals: np.ndarray, channels: Sequence[Channel], dt: float
         quantiles.plot(normal, values, ".", color=BLUE, markersize=2)
     for axes, text in zip(rows[-1], ("time [s]", "lag [s]", "quantile of a standard normal [-]"), strict=True):
         axes.set_xlabel(text)
+    return figure
+
+
+_OF_RESPONSES = (ORANGE, BLUE, "#5b8c5a", "#b03a48", "#7b5ea7")
+_MEASURED = "0.45"
+_STRONGEST = 5.0  # length of the part that is drawn on a longer scale [s]
+
+
+def plot_fit(
+    measurements: Measurements,
+    responses: Mapping[str, np.ndarray] | np.ndarray,
+    title: str | None = None,
+) -> Figure:
+    """Plot measurements with the response of a model, such as before and after an update.
+
+    Each channel has a row: one axes per response with the whole history and the relative root mean square error (RRMSE)
+    in the title, then one axes with all responses in the strongest five seconds, unless these are more than two thirds
+    of every history.
+
+    Parameters
+    ----------
+    measurements : Measurements
+        The measured histories; ``measurements.select(names)`` has some of them.
+    responses : mapping of str to ndarray, or ndarray
+        Responses by their titles, with the samples and channels of ``measurements.values`` [SI], such as
+        ``measurements.values - likelihood.residuals_of(model.simulate(x))`` for parameters x.
+    title : str, optional
+        Title of the figure. Default: the description of the measurements.
+
+    Returns
+    -------
+    matplotlib Figure
+        With axes of shape (n_channels, n_responses + 1), or (n_channels, n_responses) without strongest parts.
+
+    Raises
+    ------
+    ValueError
+        If there is no response, or one has another shape than the measurements.
+
+    Examples
+    --------
+    >>> before = model.simulate([1.0, 1.0])
+    >>> after = model.simulate(samples.mean(axis=0)[:2])
+    >>> figure = plot_fit(measurements, {"before the update": before, "posterior mean": after})
+    """
+    given = responses if isinstance(responses, Mapping) else {"model": responses}
+    if not given:
+        raise ValueError("no response to draw: pass a mapping of titles to responses")
+    shown = {str(text): np.asarray(response, dtype=float) for text, response in given.items()}
+    for text, response in shown.items():
+        if response.shape != np.shape(measurements.values):
+            raise ValueError(
+                f"response {text!r}: expected the shape of the measured values, {np.shape(measurements.values)}; got "
+                f"{response.shape}"
+            )
+    times_of = {channel.name: measurements.times(channel.name) for channel in measurements.channels}
+    windows = {
+        name: strongest_window(times, measurements.channel(name), _STRONGEST)
+        for name, times in times_of.items()
+        if _STRONGEST <= (times[-1] - times[0]) / 1.5
+    }
+    n_columns = len(shown) + bool(windows)
+    size = (max(4.4 * n_columns, 6.5), 1.0 + 2.1 * len(times_of))
+    figure, rows = new_figure(len(times_of), n_columns, size)
+    whole = min(0.0, *(times[0] for times in times_of.values())), max(times[-1] for times in times_of.values())
+    for i, (row, channel) in enumerate(zip(rows, measurements.channels, strict=True)):
+        name, window, own = channel.name, windows.get(channel.name), measurements.channel(channel.name)
+        measured = from_si(own, channel.unit)
+        style = {"color": _MEASURED, "linewidth": 1.0, "label": "measured", "marker": marker_of(measured)}
+        for axes in row:
+            axes.plot(times_of[name], measured, markersize=2.0, **style)
+            axes.set_xlim(*whole)
+        for k, (text, response) in enumerate(shown.items()):
+            drawn = from_si(response[i], channel.unit)
+            shade = _OF_RESPONSES[k % len(_OF_RESPONSES)] if len(shown) > 1 else BLUE
+            for axes in (row[k], *row[len(shown) :]):
+                axes.plot(times_of[name], drawn, color=shade, linewidth=0.9, label=text)
+            error = relative_errors(response[i] - own, own)
+            row[k].set_title(text + (f", RRMSE {_percent(error)} %" if np.isfinite(error) else ""), fontsize="small")
+        row[0].set_ylabel(channel_label(channel))
+        for axes in row[1 : len(shown)]:
+            axes.sharey(row[0])
+            axes.tick_params(labelleft=False)
+        for axes in row[: len(shown)] if window else ():
+            axes.axvspan(*window, color="0.5", alpha=0.15, linewidth=0.0)
+        if window:
+            row[-1].set_xlim(*window)
+            row[-1].set_title("the strongest part (grey on the left)", fontsize="small")
+    for axes in rows[-1]:
+        axes.set_xlabel("time [s]")
+    add_figure_legend(figure, 4)
+    if text := measurements.description if title is None else title:
+        figure.suptitle(text, fontsize="small", wrap=True)
+    return figure
+
+
+def _percent(share: float) -> str:
+    """Per cent with one decimal below 10, for example "85" and "3.4"."""
+    return f"{100 * share:.1f}" if share < 0.1 else f"{100 * share:.0f}"
+
+
+def strongest_window(times: np.ndarray, values: np.ndarray, length: float) -> tuple[float, float]:
+    """Begin and end [s] of the part of this length [s] with the largest sum of squares; `values` (n,) are NaN where
+    missing, `times` (n,) [s] have equal steps.
+    """
+    step = times[1] - times[0]
+    size = min(len(times), max(1, round(length / step)))
+    total = np.concatenate([[0.0], np.cumsum(np.nan_to_num(values) ** 2)])
+    first = int(np.argmax(total[size:] - total[:-size]))
+    return float(times[first]), float(times[first] + length)
+
+
+def plot_bands(prediction: Prediction, measurements: Measurements | None = None) -> Figure:
+    """Plot the mean of predicted histories, the band between the outermost quantiles, and measurements.
+
+    Parameters
+    ----------
+    prediction : Prediction
+        Prediction of histories, such as the result of `fe_likelihoods.propagate`.
+    measurements : Measurements, optional
+        Measurements, drawn at their own times. Channels that were not measured are drawn without measurements.
+
+    Returns
+    -------
+    matplotlib Figure
+        The figure, one axes per channel.
+
+    Raises
+    ------
+    ValueError
+        If the prediction has no histories.
+
+    Examples
+    --------
+    >>> figure = plot_bands(prediction, measurements)
+    >>> figure.savefig("bands.png")
+    """
+    time = prediction.time
+    measured = () if measurements is None else {channel.name for channel in measurements.channels}
+    low, high = (min(prediction.probabilities), max(prediction.probabilities)) if prediction.probabilities else (0, 0)
+
+    figure, rows = stack_axes(len(prediction.channels))
+    for k, (axes, channel) in enumerate(zip(rows, prediction.channels, strict=True)):
+        if low < high:
+            band = [from_si(prediction.quantile(p)[k], channel.unit) for p in (low, high)]
+            label = f"{100 * low:g}-{100 * high:g} %" + (" with noise" if prediction.noise else "")
+            axes.fill_between(time, *band, color=BLUE, alpha=0.3, linewidth=0.0, label=label)
+        if channel.name in measured:
+            values = from_si(measurements.channel(channel.name), channel.unit)
+            drawn = {"color": ORANGE, "linewidth": 2.2, "alpha": 0.6, "label": "measured"}
+            axes.plot(measurements.times(channel.name), values, marker=marker_of(values), markersize=3.0, **drawn)
+        axes.plot(time, from_si(prediction.mean[k], channel.unit), color=BLUE, linewidth=0.8, label="mean")
+        axes.set_ylabel(channel_label(channel))
+    add_legend_row(rows[0], 3)
+    set_time_axis(rows, time[-1])
     return figure

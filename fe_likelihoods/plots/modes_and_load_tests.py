@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from ..prediction.prediction import Prediction
     from ..signals.channels import Channel, Measurements
 
-__all__ = ["plot_modes", "plot_points"]
-
 _MOST_BARS = 30  # in one panel
 _MOST_MODES = 12  # whose shapes are drawn
 _LETTERS = 11  # of small labels side by side in an inch

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
     from ..prediction.scores import QuantityScores
 
-__all__ = ["plot_scores"]
-
 _BAND = 0.9  # probability of the bands for calibrated predictions
 
 

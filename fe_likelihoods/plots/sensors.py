@@ -13,8 +13,6 @@ if TYPE_CHECKING:
 
     from ..information.sensors import SensorRanking
 
-__all__ = ["plot_ranking"]
-
 
 def plot_ranking(ranking: SensorRanking) -> Figure:
     """Plot the chosen sensors in rows, the best first, with standard errors.

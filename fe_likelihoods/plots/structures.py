@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from ..models.base import History
     from ..models.rc_column import RCColumn
 
-__all__ = ["plot_hysteresis", "plot_section", "plot_sensors"]
-
 _CORE = "#b9cfe4"
 
 

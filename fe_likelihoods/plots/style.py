@@ -12,21 +12,6 @@ if TYPE_CHECKING:
 
     from ..signals.channels import Channel
 
-__all__ = [
-    "BLUE",
-    "GREY",
-    "ORANGE",
-    "add_figure_legend",
-    "add_legend",
-    "add_legend_row",
-    "channel_label",
-    "marker_of",
-    "new_axes",
-    "new_figure",
-    "set_time_axis",
-    "stack_axes",
-]
-
 BLUE = "#1f5a8c"
 ORANGE = "#d9822b"
 GREY = "#8a8f98"

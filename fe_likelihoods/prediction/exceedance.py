@@ -25,16 +25,6 @@ from ..units import DIMENSIONS, find_unit, to_si
 from .prediction import Prediction
 from .scores import check_probability
 
-__all__ = [
-    "Estimate",
-    "Exceedance",
-    "estimate",
-    "exceedance",
-    "inputs",
-    "outcomes",
-    "warn_of_missing_error",
-]
-
 _DRAWS = 1000  # of the population of ratios
 
 

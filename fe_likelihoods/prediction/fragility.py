@@ -23,8 +23,6 @@ from ..text_tables import number, text_table
 from .exceedance import Estimate, Exceedance, estimate, inputs
 from .prediction import Prediction
 
-__all__ = ["Fragility", "FragilityCurve", "fit_fragility", "fragility"]
-
 logger = logging.getLogger(__name__)
 
 _REPLICATES = 100  # resamplings for the errors of the curve

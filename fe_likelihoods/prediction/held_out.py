@@ -14,8 +14,6 @@ from .prediction import Prediction
 from .quantities import Quantity
 from .scores import HistoryScores, QuantityScores, share_within
 
-__all__ = ["HeldOutScore", "HeldOutScores", "LeftOutTests", "leave_one_out"]
-
 _WALKERS, _STEPS = 500, 4  # of a new run; means of the hyper-parameters have errors of 0.05 standard deviations
 
 

@@ -26,12 +26,10 @@ from ..population.hierarchy import Hierarchy
 from ..priors.between_events import BETWEEN_EVENTS
 from ..signals.records import Record
 from ..simulation.model import SimulationFailed
-from .model_and_samples import read_source
+from .model_and_motion import read_source
 from .prediction import Prediction
 from .propagation import propagate
 from .quantities import ChannelQuantity, Quantity, evaluator, measured_quantity
-
-__all__ = ["event_ratios", "predict_new_event"]
 
 _IMPOSSIBLE = 0.05  # share of draws that may be left out: as much as a tail of a 90 % interval
 

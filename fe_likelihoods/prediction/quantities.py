@@ -19,22 +19,6 @@ from numpy.typing import ArrayLike
 from ..signals.channels import Channel, Measurements
 from ..units import G0
 
-__all__ = [
-    "ChannelQuantity",
-    "Evaluator",
-    "MeanOfLast",
-    "Quantity",
-    "arias_intensity",
-    "displacement_before_failure",
-    "dissipated_energy",
-    "evaluator",
-    "final_value",
-    "find_failure",
-    "measured_quantity",
-    "peak",
-    "rms",
-]
-
 _WORK = {"force": ("energy", "kJ"), "moment": ("energy", "kJ"), "stress": ("stress", "MPa")}  # dimension and unit
 
 _FAILED = 0.8  # of the largest force, below which a structure has failed

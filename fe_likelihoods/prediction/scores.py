@@ -23,25 +23,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import ndtr
 
-from ..signals.channels import Channel
-from ..signals.comparison import rrmse
+from ..signals.channels import Channel, relative_errors
 from ..text_tables import text_table
 from ..units import from_si
-
-__all__ = [
-    "HistoryScores",
-    "QuantityScores",
-    "Share",
-    "central_interval",
-    "check_probability",
-    "crps_normal",
-    "crps_samples",
-    "interval_score",
-    "pit_samples",
-    "score_histories",
-    "score_values",
-    "share_within",
-]
 
 
 def crps_normal(mean: ArrayLike, sd: ArrayLike, observed: ArrayLike) -> np.ndarray:
@@ -299,7 +283,9 @@ def score_histories(
     Moments are means and standard deviations; the band is central. ValueError if a channel has no sample or only
     zeros.
     """
-    error = rrmse(moments[0], measured, [channel.name for channel in channels])
+    error = relative_errors(moments[0] - measured, measured)
+    if zero := [channel.name for channel, each in zip(channels, error, strict=True) if np.isnan(each)]:
+        raise ValueError(f"score: expected measurements that are not zero; {', '.join(zero)} is zero at all samples")
     there = np.isfinite(measured)
     inside = (band[0] <= measured) & (measured <= band[1])
     return HistoryScores(

@@ -200,7 +200,7 @@ def as_multivariate(names: tuple[str, ...], distribution: Any) -> MultivariateDi
     if not isinstance(distribution, MultivariateDistribution):
         raise ValueError(
             f"Prior: the parameters {', '.join(names)} need a distribution of {len(names)} parameters, such as "
-            f"MultivariateNormal(mean, covariance); got {distribution!r}"
+            f"scipy.stats.multivariate_normal(mean, covariance); got {distribution!r}"
         )
     if distribution.dim != len(names):
         raise ValueError(

@@ -21,9 +21,9 @@ class Prior:
     ----------
     distributions : mapping of str to Distribution, and tuple of str to MultivariateDistribution
         Parameter names and their distributions, in the order of the parameters. A tuple of names has a distribution of
-        these parameters together, such as `MultivariateNormal` or the result of `fit_mixture`, which has names itself:
-        the tuple must have the same names, in any order. Frozen continuous distributions of `scipy.stats` are accepted
-        as well.
+        these parameters together: a frozen ``scipy.stats.multivariate_normal``, or the result of `fit_mixture`, which
+        has names itself: the tuple must have the same names, in any order. Frozen continuous distributions of
+        `scipy.stats` are accepted as well.
 
     Attributes
     ----------
@@ -49,7 +49,8 @@ class Prior:
     >>> independent = Prior({"stiffness": TruncatedNormal(1.0, 0.3), "sigma": HalfNormal(0.03)})
     >>> independent.rvs(1000, 42).shape
     (1000, 2)
-    >>> correlated = MultivariateNormal([1.0, 1.0], [[0.04, 0.01], [0.01, 0.09]])
+    >>> from scipy.stats import multivariate_normal
+    >>> correlated = multivariate_normal([1.0, 1.0], [[0.04, 0.01], [0.01, 0.09]])
     >>> Prior({("stiffness", "damping"): correlated, "sigma": HalfNormal(0.03)}).dim
     3
     """

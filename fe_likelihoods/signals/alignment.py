@@ -13,7 +13,7 @@ from scipy.ndimage import uniform_filter1d
 from scipy.optimize import minimize_scalar
 
 from .channels import Measurements
-from .interpolation import interpolate, make_interpolation
+from .sampling import interpolate, make_interpolation
 
 _LEAST = 1e-3  # energy of the reference at a lag, of the largest at any lag, below which nothing is compared
 _GOOD = 0.7  # correlation below which the reference does not explain the channel

@@ -19,8 +19,6 @@ from .events import Events
 from .records import Record
 from .sampling import expect
 
-__all__ = ["Dataset", "read_dataset", "write_dataset"]
-
 SCHEMA, SCHEMA_VERSION = "fe_likelihoods.dataset", 1
 
 

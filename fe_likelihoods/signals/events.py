@@ -18,8 +18,6 @@ from .channels import Channel, Measurements
 from .records import Record
 from .sampling import expect, rest_samples, same_step
 
-__all__ = ["EventWindow", "Events", "events_of", "find_events", "motions_of"]
-
 
 class EventWindow(NamedTuple):
     """Place of one event in the joined record."""

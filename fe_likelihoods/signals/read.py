@@ -12,14 +12,11 @@ import numpy as np
 
 from ..units import to_si
 from .channels import Channel, Measurements
-from .interpolation import uniform_times
 from .records import Record
-from .sampling import expect
+from .sampling import expect, uniform_times
 from .strong_motion import OF_OBSPY, Series, read_series, recognise
 from .tables import read_table
 from .text_files import WORKBOOKS, agree_on_unit
-
-__all__ = ["read_columns", "read_record", "units_of"]
 
 _TABLES = ("", ".csv", ".txt", ".dat", ".tsv", ".lvm", ".out", *WORKBOOKS)
 

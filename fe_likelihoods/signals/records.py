@@ -17,8 +17,6 @@ from ..units import from_si
 from .response_spectrum import ResponseSpectrum, spectrum_of
 from .sampling import array_digest, check_samples, check_step, expect, rest_samples, same_step, sample_window
 
-__all__ = ["DisplacementHistory", "Record", "growing_durations"]
-
 _APART = 1.3  # smallest ratio of successive durations
 _LARGEST_RATIO_TERM = 1000  # of the ratio of steps in `Record.resample`; the filter length grows with it
 

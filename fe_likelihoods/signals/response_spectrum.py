@@ -29,8 +29,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from .sampling import expect
 
-__all__ = ["OscillatorResponse", "ResponseSpectrum", "hold_integrals", "respond", "response_slopes", "spectrum_of"]
-
 _INSTANTS = 40  # instants per period at which the response is evaluated
 _SHORTEST = 0.1  # shortest period, in steps of the motion
 

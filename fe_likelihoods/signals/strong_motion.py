@@ -56,8 +56,6 @@ from .text_files import (
     read_statements,
 )
 
-__all__ = ["OF_OBSPY", "Found", "Series", "find_channels", "read_series", "recognise"]
-
 
 class Series(NamedTuple):
     """Samples (n_steps,) as they are in a file, before any conversion; unit None if the file states none."""

@@ -26,8 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..units import find_unit
-from .interpolation import uniform_times
-from .sampling import expect
+from .sampling import expect, uniform_times
 from .text_files import (
     WORKBOOKS,
     Statements,
@@ -43,8 +42,6 @@ from .text_files import (
     read_bytes,
     read_statements,
 )
-
-__all__ = ["Column", "Table", "is_clock", "read_table", "unit_in_name"]
 
 # clock times ----------------------------------------------------------------------------------------------------------
 # 03:19:53.010, 2019-07-06T03:19:53.010Z or 06.07.2019 03:19 PM, and dates: the year is first, or last after points.

@@ -18,24 +18,6 @@ from numpy.typing import NDArray
 from ..units import DIMENSIONS, UNITS, find_unit
 from .sampling import expect
 
-__all__ = [
-    "LINE_END",
-    "NUMBER",
-    "WORKBOOKS",
-    "Statements",
-    "agree_on_unit",
-    "check_count",
-    "check_peaks",
-    "decimals_of",
-    "decode_text",
-    "dimension_of",
-    "is_number",
-    "number_cells",
-    "parse_number",
-    "read_bytes",
-    "read_statements",
-]
-
 WORKBOOKS = (".xlsx", ".xlsm")
 """Endings of the names of Excel workbooks."""
 

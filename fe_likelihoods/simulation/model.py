@@ -23,8 +23,7 @@ from samplers.interrupts import (
 )
 
 from ..noise.sufficient_statistics import Statistic, reduce_response, statistic_width, sums_of_squares
-from ..signals.channels import Channel
-from ..signals.comparison import Comparison
+from ..signals.channels import Channel, Comparison
 from .failure_reasons import MisfitReason, SimulationFailed, is_transient, reason_of, shortened
 from .files import Observed, Opened, note, working_folder
 

@@ -41,7 +41,7 @@ def check_moves(moves: Sequence[Move], chains: str) -> None:
         raise ValueError(
             "emcee.moves.DESnookerMove is refused: its acceptance has half of the exponent that the snooker update "
             "needs, so its samples are too narrow (variance 0.79 for 1 with three normal parameters), and it divides "
-            "by zero between copies of a point. Use emcee.moves.DEMove or samplers.MixtureMove"
+            "by zero between copies of a point. Use emcee.moves.DEMove, or the default moves"
         )
     red_blue = [type(move).__name__ for move in moves if isinstance(move, RedBlueMove)]
     if red_blue and chains == "leaders":

@@ -4,14 +4,16 @@ import re
 from collections.abc import Collection, Iterable
 from pathlib import Path
 
-from fe_likelihoods.command.keys import FORMS, Key, keys_of
-from fe_likelihoods.command.sections import (
+from fe_likelihoods.command.keys import (
+    FORMS,
     MODEL_KINDS,
     SECTIONS,
     USER,
     USER_MODELS,
+    Key,
+    keys_of,
     model_keys,
-    part_keys,
+    table_keys,
 )
 from fe_likelihoods.units import DIMENSIONS
 
@@ -54,7 +56,7 @@ def key_tables() -> str:
         keys = model_keys(kind)
         blocks.append(_table(f'``[model] kind = "{kind}"``', _without(keys, USER if kind in USER_MODELS else ())))
         seen = {}
-        for part, keys in part_keys(kind).items():
+        for part, keys in table_keys(kind).items():
             seen.setdefault(keys, []).append(f"``[model.{part}]``")
         blocks += [_table(", ".join(parts), keys) for keys, parts in seen.items()]
     kinds = ", ".join(f'``"{kind}"``' for kind in USER_MODELS)

@@ -5,7 +5,7 @@ import pytest
 
 from fe_likelihoods import Record, problems
 from fe_likelihoods.command.job import parse_job, read_job
-from fe_likelihoods.command.models import make_problem
+from fe_likelihoods.command.make_posterior import make_problem
 from tests.command.test_command import ROOT
 
 COLUMN = """

@@ -17,7 +17,7 @@ from fe_likelihoods import Channel, LinearOscillator, SimulationCache, read_colu
 from fe_likelihoods.command.job import parse_job, read_job
 from fe_likelihoods.command.keys import parse_prior, read_quantity
 from fe_likelihoods.command.main import TEMPLATES, main
-from fe_likelihoods.command.models import make_problem
+from fe_likelihoods.command.make_posterior import make_problem
 from fe_likelihoods.models.rc_column_materials import LowCycleFatigue
 from samplers import SamplingWarning
 from tests.command.key_tables import PAGE, key_tables

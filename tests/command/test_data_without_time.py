@@ -9,7 +9,7 @@ import pytest
 from fe_likelihoods import BridgeDeck, LinearStructure, Record
 from fe_likelihoods.command.job import read_job
 from fe_likelihoods.command.main import write_templates
-from fe_likelihoods.command.models import make_problem
+from fe_likelihoods.command.make_posterior import make_problem
 from fe_likelihoods.command.runs import run_job
 from tests.command.test_command import call
 

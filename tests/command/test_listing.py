@@ -10,7 +10,7 @@ from scipy.io import savemat
 from fe_likelihoods import Channel, Measurements, Record, check_data, read_columns, read_record
 from fe_likelihoods.command.job import read_job
 from fe_likelihoods.command.main import main
-from fe_likelihoods.command.models import make_problem
+from fe_likelihoods.command.make_posterior import make_problem
 from fe_likelihoods.signals.datasets import write_dataset
 from tests.signals.logger_styles import READ
 from tests.signals.network_files import esm, geonet, smc

@@ -8,7 +8,7 @@ from click.testing import CliRunner
 from fe_likelihoods import AutoregressiveNoise, GaussianNoise
 from fe_likelihoods.command.job import read_job
 from fe_likelihoods.command.main import NOT_USABLE, main
-from fe_likelihoods.command.models import make_problem
+from fe_likelihoods.command.make_posterior import make_problem
 from tests.command.test_command import OSCILLATOR, ROOT, call, folder, write_oscillator  # noqa: F401
 
 SIGMAS = 'sigma_acceleration = "half-normal(0.1 g)"\nsigma_displacement = "half-normal(5 mm)"\n'

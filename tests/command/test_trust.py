@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from fe_likelihoods.command import models
+from fe_likelihoods.command import make_posterior
 from tests.command.test_command import call, folder, function_settings  # noqa: F401
 
 FUNCTION = """
@@ -40,7 +40,7 @@ def test_a_report_of_a_folder_of_a_stranger_runs_no_code(folder, monkeypatch):  
     for text in (OWN.replace(function, 'kind = "executable"\n' + command), stored):  # a program, then the function
         settings.write_text(text)
         with monkeypatch.context() as patched:
-            patched.setattr(models, "load_function", _refuse)
+            patched.setattr(make_posterior, "load_function", _refuse)
             for reader in ("load", "loads", "Unpickler"):
                 patched.setattr(pickle, reader, _refuse)
             assert "nothing was run: give --run-code if you trust" in " ".join(call("report", "r", code=1).split())

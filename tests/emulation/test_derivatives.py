@@ -15,7 +15,6 @@ from fe_likelihoods import (
     LinearOscillator,
     LogNormal,
     Measurements,
-    MultivariateNormal,
     Posterior,
     Record,
     TruncatedNormal,
@@ -23,6 +22,7 @@ from fe_likelihoods import (
 )
 from fe_likelihoods.emulation.modes import find_modes
 from fe_likelihoods.emulation.target import ResponseTarget, at_once
+from fe_likelihoods.priors.multivariate import MultivariateNormal
 from samplers import SMCSampler
 
 from .problems import CHANNELS, DT, N_STEPS, TRUTH, free_vibration, noisy

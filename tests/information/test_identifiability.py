@@ -11,11 +11,11 @@ from fe_likelihoods import (
     GaussianNoise,
     LogNormal,
     Measurements,
-    MultivariateNormal,
     Posterior,
     identifiability,
 )
 from fe_likelihoods.information.identifiability import compare_covariances
+from fe_likelihoods.priors.multivariate import MultivariateNormal
 
 TOP = (Channel("top", "displacement", "mm"),)
 TIME = np.linspace(0.0, 1.0, 60)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from fe_likelihoods import Channel, FunctionModel, MultivariateNormal, SimulationFailed, Uniform, peak, sensitivity
+from fe_likelihoods import Channel, FunctionModel, SimulationFailed, Uniform, peak, sensitivity
+from fe_likelihoods.priors.multivariate import MultivariateNormal
 
 TOP = (Channel("top", "displacement", "m"),)
 

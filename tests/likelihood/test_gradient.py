@@ -14,13 +14,13 @@ from fe_likelihoods import (
     Measurements,
     ModalData,
     ModalLikelihood,
-    MultivariateNormal,
     Posterior,
     Record,
     ShearFrame,
     TruncatedNormal,
     Uniform,
 )
+from fe_likelihoods.priors.multivariate import MultivariateNormal
 from tests.clients.problem import starts_of
 
 STEPS, WEIGHTS = np.array([-2.0, -1.0, 1.0, 2.0]), np.array([1.0, -8.0, 8.0, -1.0]) / 12.0

@@ -6,8 +6,8 @@ import pytest
 from emcee.model import Model
 from scipy import stats
 
-from samplers import RandomWalkMove, SMCSampler, TMCMCSampler
-from samplers.moves.population_moves import WithFastSweeps
+from samplers import SMCSampler, TMCMCSampler
+from samplers.moves.population_moves import RandomWalkMove, WithFastSweeps
 from tests.contract.targets import Gaussian
 from tests.statistics.test_posteriors import deviations, evidence_deviation, runs, within
 

@@ -3,7 +3,7 @@
 import emcee
 import pytest
 
-from samplers import MixtureMove, RandomWalkMove
+from samplers.moves.population_moves import MixtureMove, RandomWalkMove
 from tests.statistics.test_tails import StudentProduct
 
 

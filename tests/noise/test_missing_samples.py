@@ -19,12 +19,11 @@ from fe_likelihoods import (
     SimulationFailed,
     TruncatedNormal,
     Uniform,
-    effective_samples,
     residual_checks,
 )
 from fe_likelihoods.emulation.modes import find_modes
 from fe_likelihoods.noise.marginal import MarginalNoise
-from fe_likelihoods.noise.residuals import innovations
+from fe_likelihoods.noise.residuals import effective_samples, innovations
 from fe_likelihoods.noise.sufficient_statistics import count_samples
 from tests.emulation.problems import CHANNELS as MODES_CHANNELS
 from tests.emulation.problems import DT, N_STEPS, free_vibration

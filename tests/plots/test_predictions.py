@@ -1,4 +1,4 @@
-"""Figures of predictions: bands and fragility curves, against the values that they show."""
+"""Figures of predictions: bands against the values that they show."""
 
 import numpy as np
 import pytest
@@ -11,15 +11,12 @@ from fe_likelihoods import (
     Posterior,
     Prior,
     TruncatedNormal,
-    fragility,
     peak,
     plot_bands,
-    plot_fragility,
     propagate,
 )
 from fe_likelihoods.units import G0
-from tests.plots.reading import shows, texts
-from tests.prediction.flexible import strongest, under
+from tests.plots.reading import texts
 
 
 @pytest.fixture
@@ -61,20 +58,3 @@ def test_bands_beside_few_or_thinned_measurements(posterior, samples):
     np.testing.assert_array_equal(thinned.get_xdata(), measured.time[::2])
     with pytest.raises(ValueError, match="histories"):
         plot_bands(propagate(posterior, samples, quantity=peak("displacement"), progress=False))
-
-
-def test_fragility(posterior, record, rng):
-    samples = rng.normal(1.0, 0.2, size=(40, 2))
-    records = [record.scale(factor) for factor in (0.7, 0.9, 1.0, 1.1, 1.4)]
-    peaks = under(records, posterior, samples)
-    result = fragility(peaks, strongest(records), float(np.median(peaks[2].values)), noise=False)
-    (axes,) = plot_fragility(result).axes
-    points, curve = axes.lines
-    np.testing.assert_allclose(points.get_xdata(), result.intensity / G0)
-    np.testing.assert_allclose(points.get_ydata(), result.exceedance.probability)
-    np.testing.assert_allclose(curve.get_ydata(), result.curve.probability(G0 * curve.get_xdata()), atol=1e-12)
-    assert shows(axes, axes.lines)
-    assert axes.get_xlabel() == "peak ground acceleration [g]"
-    (axes,) = plot_fragility(result._replace(curve=None), "intensity", unit=None).axes
-    assert axes.get_xlabel() == "intensity" and len(axes.lines) == 1
-    np.testing.assert_allclose(axes.lines[0].get_xdata(), result.intensity)

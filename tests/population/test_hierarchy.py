@@ -14,7 +14,6 @@ from fe_likelihoods import (
     Hierarchy,
     LinearOscillator,
     LogNormal,
-    MultivariateNormal,
     Prior,
     Record,
     StoredPosterior,
@@ -23,6 +22,7 @@ from fe_likelihoods import (
     Varying,
     propagate,
 )
+from fe_likelihoods.priors.multivariate import MultivariateNormal
 
 DATA = np.array([[0.7, -0.2], [1.4, 0.1], [1.0, 0.4], [1.5, -0.1]])  # measured (a, b) of four tests
 ERRORS = np.array([[0.04, 0.03], [0.03, 0.09]])  # their covariance

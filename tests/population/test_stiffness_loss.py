@@ -14,7 +14,6 @@ from fe_likelihoods import (
     LinearStructure,
     LogNormal,
     Measurements,
-    MultivariateNormal,
     Posterior,
     Prior,
     Record,
@@ -24,6 +23,7 @@ from fe_likelihoods import (
 )
 from fe_likelihoods.checks.finding import CARE, Finding
 from fe_likelihoods.emulation.modes import find_modes
+from fe_likelihoods.priors.multivariate import MultivariateNormal
 from tests.emulation.problems import guided
 
 D, SD = 6, 0.02

@@ -17,7 +17,7 @@ from fe_likelihoods.population.hierarchy import Hierarchy
 from fe_likelihoods.population.stored_posterior import StoredPosterior
 from fe_likelihoods.prediction.exceedance import exceedance
 from fe_likelihoods.prediction.fragility import fragility
-from fe_likelihoods.prediction.model_error import model_error
+from fe_likelihoods.prediction.model_and_motion import model_error
 from fe_likelihoods.prediction.new_event import event_ratios, predict_new_event
 from fe_likelihoods.prediction.propagation import propagate
 from fe_likelihoods.prediction.quantities import peak

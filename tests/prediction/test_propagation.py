@@ -10,7 +10,7 @@ from scipy import stats
 from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.likelihood.posterior import Posterior
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
-from fe_likelihoods.prediction import accumulator
+from fe_likelihoods.prediction import prediction
 from fe_likelihoods.prediction.propagation import propagate
 from fe_likelihoods.prediction.quantities import ChannelQuantity, peak
 from fe_likelihoods.priors.distributions import HalfNormal, TruncatedNormal
@@ -95,10 +95,10 @@ def test_batches_agree_with_direct_computation_and_copies_count(rng, monkeypatch
     assert np.allclose(p.quantiles, np.quantile(responses, p.probabilities, axis=0, method="weibull"), rtol=1e-12)
     with ThreadPool(2) as pool:  # in other batches
         assert np.array_equal(quiet(model, samples, pool=pool).quantiles, p.quantiles)
-    monkeypatch.setattr(accumulator, "_IN_DOUBLE", 0)
+    monkeypatch.setattr(prediction, "_IN_DOUBLE", 0)
     single = quiet(model, samples)
     assert not np.array_equal(single.quantiles, p.quantiles) and np.allclose(single.quantiles, p.quantiles, rtol=1e-6)
-    monkeypatch.setattr(accumulator, "_MOST", 1000)
+    monkeypatch.setattr(prediction, "_MOST", 1000)
     model.runs = 0
     with pytest.raises(ValueError, match=r"need .* GB.*fewer channels.*or use quantiles=\(\)"):
         quiet(model, samples)
@@ -107,7 +107,7 @@ def test_batches_agree_with_direct_computation_and_copies_count(rng, monkeypatch
 
 @pytest.mark.parametrize("huge", [1e50, 1e200])
 def test_unstable_responses_give_numbers(rng, huge, monkeypatch):
-    monkeypatch.setattr(accumulator, "_IN_DOUBLE", 0)
+    monkeypatch.setattr(prediction, "_IN_DOUBLE", 0)
 
     class Unstable(Line):
         def simulate(self, theta):

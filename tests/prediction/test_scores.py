@@ -20,7 +20,7 @@ from fe_likelihoods.prediction.scores import (
 from fe_likelihoods.priors.distributions import HalfNormal, TruncatedNormal
 from fe_likelihoods.problems import table_motion
 from fe_likelihoods.signals.channels import Channel, Measurements
-from fe_likelihoods.signals.interpolation import interpolate, make_interpolation
+from fe_likelihoods.signals.sampling import interpolate, make_interpolation
 
 
 @pytest.mark.parametrize("y", (-3.0, 0.2, 1.7))

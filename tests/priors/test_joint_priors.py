@@ -4,15 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fe_likelihoods import (
-    HalfNormal,
-    MultivariateNormal,
-    Posterior,
-    Prior,
-    TruncatedNormal,
-    Uniform,
-    fit_mixture,
-)
+from fe_likelihoods import HalfNormal, Posterior, Prior, TruncatedNormal, Uniform, fit_mixture
+from fe_likelihoods.priors.multivariate import MultivariateNormal
 from samplers import SMCSampler
 from tests.likelihood.linear_gaussian import exact_log_evidence, likelihood_of
 

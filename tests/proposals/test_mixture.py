@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from samplers import MixtureMove
+from samplers.moves.population_moves import MixtureMove
 from samplers.proposals.mixture import Mixture, draw, fit_mixture, invert_roots, log_density, log_responsibilities
 from samplers.proposals.transforms import (
     apply_shears,

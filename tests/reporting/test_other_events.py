@@ -7,7 +7,7 @@ import pytest
 
 from fe_likelihoods import Measurements, peak, propagate, report
 from fe_likelihoods.checks.finding import CARE, Finding
-from fe_likelihoods.reporting.other_events import describe_event
+from fe_likelihoods.reporting.contents import describe_event
 from tests.reporting.report_page import read_page
 from tests.reporting.test_report import vibrating
 

@@ -14,9 +14,9 @@ from fe_likelihoods import (
     Record,
     plot_histories,
 )
-from fe_likelihoods.signals.comparison import Comparison, compare_with
+from fe_likelihoods.signals.channels import Comparison, compare_with
 from fe_likelihoods.signals.datasets import read_dataset, write_dataset
-from fe_likelihoods.signals.interpolation import interpolate, make_interpolation
+from fe_likelihoods.signals.sampling import interpolate, make_interpolation
 
 CHANNELS = (Channel("top", "acceleration", "g"), Channel("drift", "displacement", "mm"))
 DT, N_STEPS = 0.01, 401

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import Channel, read_columns
-from fe_likelihoods.signals.interpolation import uniform_times
 from fe_likelihoods.signals.read import read_record
+from fe_likelihoods.signals.sampling import uniform_times
 from fe_likelihoods.units import G0
 
 TOP = Channel("top", "acceleration", "g")

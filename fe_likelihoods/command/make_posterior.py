@@ -29,12 +29,8 @@ from ..priors.distributions import Distribution, HalfNormal, LogNormal, Truncate
 from ..signals.channels import Channel, Measurements
 from ..signals.records import Record
 from ..simulation.model import Model
-from .data import first_part, is_dataset, read_base_motion, read_measured, read_supports
-from .job import Job
-from .keys import check_known, did_you_mean, parse_prior, read_by_channel
-from .sections import USER_MODELS, part_keys
-
-__all__ = ["Problem", "make_problem", "runs_code_of_user"]
+from .job import Job, is_dataset, read_base_motion, read_measured, read_supports, within_duration
+from .keys import USER_MODELS, check_known, did_you_mean, parse_prior, read_by_channel, table_keys
 
 ERRORS_OF_MODES = {"frequency_error": 0.01, "shape_error": 0.03}  # medians of log-normal priors without one (assumed)
 TEMPERATURE_SLOPE = 2e-3  # [1/K], its sd without a prior (assumed): -1e-4 to -5e-4 in concrete, more if frozen
@@ -87,7 +83,7 @@ def _histories(job: Job, cache: SimulationCache | None) -> _DataSet:
     if not is_dataset(job, "measurements"):
         names = tuple((job.measurements and job.measurements.columns) or ()) or None
         channels = user_channels(job) if own else job.located("model", built_in, job, record, names).channels
-    measured, record = first_part(job, read_measured(job, channels, record)), first_part(job, record)
+    measured, record = within_duration(job, read_measured(job, channels, record)), within_duration(job, record)
 
     def make_model() -> Model:
         if own:
@@ -123,7 +119,7 @@ def _modes(job: Job, cache: SimulationCache | None) -> _DataSet:
 
     def make_model() -> Any:
         if job.kind in STRUCTURES:
-            return linear_parts(job)
+            return linear_matrices(job)
         return user_model(job, channels, make=make, **({} if make else {"dt": 1.0, "n_steps": n_modes}))
 
     def make_likelihood(model: Model, pool: Any) -> ModalLikelihood:
@@ -228,12 +224,12 @@ def _make_priors(
     job: Job, likelihood: FELikelihood | JointLikelihood, known: Mapping[str, float]
 ) -> tuple[dict[str, Any], dict[str, Distribution]]:
     """The priors of all parameters, numbers for `known` ones, and the assumed ones, which the file does not give."""
-    names, parts, where = likelihood.parameter_names, [part for part, _ in likelihood.data_sets()], job.where("priors")
+    names, sets, where = likelihood.parameter_names, [each for each, _ in likelihood.data_sets()], job.where("priors")
     channels, given, assumed = {}, dict[str, Any](known), {}  # of each parameter that is a noise level, its channel
-    for part in parts:
-        channels |= channels_of_deviations(part.noise, part.model.channels)
-    measured = {channel.name: part.measurements for part in parts for channel in part.model.channels}
-    structural = {name for part in parts for name in part.model.parameter_names if name != SLOPE}
+    for each in sets:
+        channels |= channels_of_deviations(each.noise, each.model.channels)
+    measured = {channel.name: each.measurements for each in sets for channel in each.model.channels}
+    structural = {name for each in sets for name in each.model.parameter_names if name != SLOPE}
     check_known(job.priors, names, where, "the model has no such parameter")
     for name, text in job.priors.items():
         if name in known:
@@ -276,8 +272,8 @@ def built_in(job: Job, record: Record, names: tuple[str, ...] | None) -> Model:
         usual = RCColumn.lhpost(record)
         analysis = {each.name: values.pop(each.name) for each in fields(usual.analysis) if each.name in values}
         values["analysis"] = replace(usual.analysis, **analysis)
-        for part in values.keys() & part_keys("column").keys():  # a section of fatigue switches it on
-            values[part] = _changed(job, part, getattr(usual, part) or LowCycleFatigue(), values[part])
+        for table in values.keys() & table_keys("column").keys():  # a section of fatigue switches it on
+            values[table] = _changed(job, table, getattr(usual, table) or LowCycleFatigue(), values[table])
         values["units"] = tuple((dict(usual.units) | values.get("units", {})).items())
         return RCColumn.lhpost(record, **values, outputs=names)
     if job.kind == "oscillator":
@@ -287,24 +283,24 @@ def built_in(job: Job, record: Record, names: tuple[str, ...] | None) -> Model:
     from ..models.linear_structure import LinearStructure
 
     deck = job.kind == "bridge deck"
-    motion = [first_part(job, each) for each in read_supports(job)] if deck else record
-    return LinearStructure(linear_parts(job), motion, outputs=names)
+    motion = [within_duration(job, each) for each in read_supports(job)] if deck else record
+    return LinearStructure(linear_matrices(job), motion, outputs=names)
 
 
-def linear_parts(job: Job) -> Any:
+def linear_matrices(job: Job) -> Any:
     """A shear frame, with groups of storeys or without, or a bridge deck."""
     from ..models.frames_and_decks import BridgeDeck, ShearFrame
 
     return job.located("model", ShearFrame if job.kind == "frame" else BridgeDeck, **job.model)
 
 
-def _changed(job: Job, part: str, usual: Any, changes: Mapping[str, Any]) -> Any:
-    """A part of the built-in structure with the values of the file; the area of bars is from a new diameter."""
-    area = {"area": None} if part in ("bars", "hoops") and "diameter" in changes else {}
+def _changed(job: Job, table: str, usual: Any, changes: Mapping[str, Any]) -> Any:
+    """A table of the built-in structure with the values of the file; the area of bars is from a new diameter."""
+    area = {"area": None} if table in ("bars", "hoops") and "diameter" in changes else {}
     try:
         return replace(usual, **area | dict(changes))
     except ValueError as error:
-        raise ValueError(f"{job.file.name}: [model.{part}] {error}") from error
+        raise ValueError(f"{job.file.name}: [model.{table}] {error}") from error
 
 
 def user_channels(job: Job) -> tuple[Channel, ...]:
