@@ -55,7 +55,6 @@ MAX_ATTEMPTS = 4  # simulations that may fail for other reasons than the model
 LARGEST_ROUNDING = 1e-4  # largest relative response difference that may come from rounding and iterations
 MAX_TRUSTS = 32
 SHARE_OF_TIME = 0.01  # for comparisons of the model
-NO_TIME = 5e-5  # [s]; a comparison that takes less is always made, since storing a row takes longer
 FINGERPRINT = "its fingerprint"
 OF_A_PROCESS = ("environment ", "library", "package ", "python", "source of ")  # items that differ between processes
 CHANGED = (
@@ -70,17 +69,10 @@ class StaleCache(ValueError):
     """A stored simulation differs from a new one with the same parameters. The message says what to do.
 
     It is raised again, for any row, as long as rows are stored. Samplers stop (`ends_run`), since no point can be
-    evaluated any more. `theta` (n_structural,) are the parameters.
+    evaluated any more.
     """
 
     ends_run = True
-
-    def __init__(self, message: str, theta: np.ndarray) -> None:
-        super().__init__(message)
-        self.theta = theta
-
-    def __reduce__(self) -> tuple:
-        return type(self), (str(self), self.theta)
 
 
 class Trust:
@@ -88,8 +80,8 @@ class Trust:
 
     `labels` has the labels in the file, `generations` the generations, by the model's fingerprint; `used` counts rows
     that were used after a verification, by identity, apart from failures alone. Rows with the number of the `session`
-    were stored here and need no verification. `stale` is the error of a row that differed. Simulations that run now are
-    `running`. Hold the `lock` to use it.
+    were stored here and need no verification. `stale` is the message on a row that differed, `running` are simulations
+    that run now. Hold the `lock` to use it.
     """
 
     _known: "OrderedDict[str, Trust]" = OrderedDict()  # of this process, the most recently used last
@@ -99,7 +91,7 @@ class Trust:
         self.labels: dict[str, tuple] = {}
         self.generations: dict[str, int] = {}
         self.used: dict[str, int] = {}
-        self.stale: StaleCache | None = None
+        self.stale = ""
         self.running: set[bytes] = set()
         self._owner = 0
 
@@ -304,7 +296,7 @@ class VerifiedModel:
             self._known |= {name: now.get(name) for name in changed}
         self._unchecked.clear()
         now = time.monotonic()
-        self._not_before = now + max(0.0, now - start - NO_TIME) / SHARE_OF_TIME
+        self._not_before = now + (now - start) / SHARE_OF_TIME
 
     def _drop_unchecked(self) -> None:
         self._clear()
@@ -435,8 +427,8 @@ class VerifiedModel:
         others = [row for row in rows if row is not None and row.session != trust.session]
         if not others:
             return
-        if trust.stale is not None:
-            raise StaleCache(str(trust.stale), trust.stale.theta)
+        if trust.stale:
+            raise StaleCache(trust.stale)
         latest, kind = [], identity
         if identity not in trust.used:
             latest = self.cache.some_rows(identity, generation, width, 1, other_than=trust.session)
@@ -495,5 +487,5 @@ class VerifiedModel:
                 ". If such a difference comes from rounding, for example on another machine, accept differences of "
                 f"this size, with SimulationCache(path, tolerance={2.0 * change:.1e})"
             )
-        trust.stale = StaleCache(text, theta)
-        raise trust.stale
+        trust.stale = text
+        raise StaleCache(text)

@@ -231,7 +231,7 @@ def test_versions_and_dependencies_are_declared(workshop):
 
 
 def test_a_value_that_is_set_between_two_batches_is_an_error(workshop, monkeypatch):
-    monkeypatch.setattr("fe_likelihoods.cache.verification.NO_TIME", np.inf)
+    monkeypatch.setattr("fe_likelihoods.cache.verification.SHARE_OF_TIME", np.inf)
     likelihood = workshop.run(points=POINTS[:10])
     sys.modules["helper"].E = 3.0
     with pytest.raises(ChangedModel, match=r"different: helper.E.*an earlier simulation gives another result"):
@@ -258,7 +258,7 @@ COUNTERS = {
 
 @pytest.mark.parametrize("helper", COUNTERS.values(), ids=COUNTERS)
 def test_a_model_may_change_its_own_values(workshop, helper, monkeypatch):
-    monkeypatch.setattr("fe_likelihoods.cache.verification.NO_TIME", np.inf)  # compared after every batch
+    monkeypatch.setattr("fe_likelihoods.cache.verification.SHARE_OF_TIME", np.inf)  # compared after every batch
     workshop.write(helper=helper)
     likelihood = workshop.run(points=POINTS[:10])
     for start in range(10, 300, 10):

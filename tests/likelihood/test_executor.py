@@ -161,7 +161,7 @@ class Changing(Treacherous):
 
 
 def test_a_model_that_has_changed_ends_the_run(monkeypatch):
-    monkeypatch.setattr("fe_likelihoods.cache.verification.NO_TIME", np.inf)  # compared before every batch
+    monkeypatch.setattr("fe_likelihoods.cache.verification.SHARE_OF_TIME", np.inf)  # compared before every batch
     with ThreadPoolExecutor(2) as pool:
         posterior = posterior_of(Changing(), pool=pool)
         values(submit(posterior, SHORT[:2]))
