@@ -102,14 +102,6 @@ class TemperedSampler(RunResults, EnsembleSampler):
         2 ndim walkers, no log-prior, or moves of emcee that need several walkers with ``chains="leaders"``.
     TypeError
         For a keyword that is not a setting.
-
-    Examples
-    --------
-    >>> from samplers.tempered import TemperedSampler
-    >>> isinstance(sampler, TemperedSampler)
-    True
-    >>> SMCSampler.setting_names[:3]
-    ('resampling', 'min_moves', 'max_moves')
     """
 
     setting_names: tuple[str, ...] = tuple(field.name for field in fields(Settings))
@@ -371,12 +363,12 @@ class TemperedSampler(RunResults, EnsembleSampler):
                 if self.evaluations > evaluations:  # not for an argument that was refused
                     if reasons := self._target.failure_reasons:
                         error.add_note(f"Failed simulations: {reasons}.")
-                    error.add_note(f"{self._kept} When the cause is removed, the same call goes on from there.")
+                    error.add_note(self._kept)
                 raise
             except (KeyboardInterrupt, SystemExit):
                 with deferred_interrupts():
                     self._undo(random_state)
-                logger.warning("interrupted: %s The same call goes on from there.", self._kept)
+                logger.warning("interrupted: %s", self._kept)
                 raise
         if self.failure_count > failures:
             warn(
@@ -385,16 +377,16 @@ class TemperedSampler(RunResults, EnsembleSampler):
             )
 
     @property
-    def _kept(self) -> str:
-        """What remains of a run that ends by an exception or an interrupt, and where."""
-        where = "this process" if self._record.path is None else f"{self._record.path} and {self.backend.filename}"
-        return f"{self._made} are kept in {where}."
-
-    @property
     def _made(self) -> str:
         """What a run has made so far, in words."""
         searched = f"{made:.0f} simulations of the guide, " if (made := self._record.of_guides) else ""
         return f"{searched}{self.evaluations} evaluations and {self.iteration} steps"
+
+    @property
+    def _kept(self) -> str:
+        """What remains of a run that ends by an exception or an interrupt, and where."""
+        where = "this process" if self._record.path is None else f"{self._record.path} and {self.backend.filename}"
+        return f"{self._made} are kept in {where}. The same call goes on from there."
 
     def _undo(self, random_state: tuple) -> None:
         """Remove incomplete results: a part of a step, and the draws of a run that has not begun."""
@@ -489,8 +481,6 @@ class TemperedSampler(RunResults, EnsembleSampler):
         close = {"rtol": 1e-9, "atol": 1e-9}
         if start is not None:
             stored, ours = start.header, self._header()
-            if stored["sampler"] != ours["sampler"]:  # most settings then differ as well
-                return [f"it was written by {stored['sampler']}, and this is a {ours['sampler']}"]
             if changed := [key for key in ours if stored.get(key) != ours[key]]:
                 found = [f"{key} was {stored.get(key)}, is {ours[key]}" for key in changed]
                 if changed[0] == "log_prob_fn":  # a guide has the same fingerprint

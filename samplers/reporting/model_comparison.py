@@ -3,58 +3,18 @@
 import math
 from collections.abc import Mapping
 from contextlib import suppress
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.special import expit, logsumexp, ndtri
 
-from .summary import aligned, is_tempered, log_posterior_of
+from .summary import is_tempered, log_posterior_of
+
+if TYPE_CHECKING:
+    import pandas
 
 
-class ModelComparison(NamedTuple):
-    """Comparison of models, one entry per model, in the order given. ``str`` gives a table with the verdicts.
-
-    Attributes
-    ----------
-    names : tuple of str
-        Names of the models.
-    log_evidence, log_evidence_error : ndarray, shape (n,)
-        Log-evidences and their standard errors.
-    probability : ndarray, shape (n,)
-        Posterior probabilities of the models, with equal prior probabilities.
-    lower, upper : ndarray, shape (n,)
-        95 % intervals of the posterior probabilities, from the log-odds.
-    summaries : tuple of str
-        ``sampler.verdict.summary`` of each model; empty for a pair of numbers.
-    """
-
-    names: tuple[str, ...]
-    log_evidence: np.ndarray
-    log_evidence_error: np.ndarray
-    probability: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-    summaries: tuple[str, ...]
-
-    def __str__(self) -> str:
-        table = [("model", "log evidence", "difference", "probability", "95 % interval")]
-        for k in np.argsort(-self.probability, kind="stable"):
-            table.append(
-                (
-                    self.names[k],
-                    f"{self.log_evidence[k]:.3f} +- {self.log_evidence_error[k]:.3f}",
-                    f"{self.log_evidence[k] - self.log_evidence.max():.3f}",
-                    f"{self.probability[k]:.4g}",
-                    f"{self.lower[k]:.4g} ... {self.upper[k]:.4g}",
-                )
-            )
-        said = [f"{name}: {text}" for name, text in zip(self.names, self.summaries, strict=True) if text]
-        return "\n".join([*aligned(table), *said])
-
-    __repr__ = __str__
-
-
-def compare_models(models: Mapping[str, Any]) -> ModelComparison:
+def compare_models(models: Mapping[str, Any]) -> "pandas.DataFrame":
     """Posterior probabilities of models for the same data, with equal prior probabilities.
 
     Other prior probabilities are added to the log-evidences of pairs, as logarithms.
@@ -67,15 +27,21 @@ def compare_models(models: Mapping[str, Any]) -> ModelComparison:
 
     Returns
     -------
-    ModelComparison
+    pandas.DataFrame
+        A row per model, the most probable one first: ``log_evidence`` and its standard ``error``, posterior
+        ``probability`` with the ends ``lower`` and ``upper`` of its 95 % interval, from the log-odds, and the
+        ``verdict`` on the run, empty for a pair of numbers.
 
     Examples
     --------
     >>> print(compare_models({"elastic": (-120.3, 0.1), "inelastic": (-118.9, 0.1)}))
-    model           log evidence  difference  probability      95 % interval
-    inelastic  -118.900 +- 0.100       0.000       0.8022  0.7545 ... 0.8425
-    elastic    -120.300 +- 0.100      -1.400       0.1978  0.1575 ... 0.2455
+               log_evidence  error  probability     lower     upper verdict
+    model
+    inelastic        -118.9    0.1     0.802184  0.754511  0.842531
+    elastic          -120.3    0.1     0.197816  0.157469  0.245489
     """
+    import pandas  # slow to import
+
     if not isinstance(models, Mapping) or len(models) < 2:
         raise ValueError(f"compare_models needs a mapping with two models or more, by name; got {models!r}")
     digests = {name: getattr(log_posterior_of(model), "data_fingerprint", None) for name, model in models.items()}
@@ -94,9 +60,16 @@ def compare_models(models: Mapping[str, Any]) -> ModelComparison:
         share = np.exp(np.delete(log_evidence, k) - rest)
         odds_error[k] = math.hypot(error[k], *(share * np.delete(error, k)))
     reach = ndtri(0.975) * odds_error
-    said = (each.verdict.summary if is_tempered(each) and each.iteration else "" for each in models.values())
-    shares = expit(odds), expit(odds - reach), expit(odds + reach)
-    return ModelComparison(tuple(models), log_evidence, error, *shares, tuple(said))
+    columns = {
+        "log_evidence": log_evidence,
+        "error": error,
+        "probability": expit(odds),
+        "lower": expit(odds - reach),
+        "upper": expit(odds + reach),
+        "verdict": [each.verdict.status if is_tempered(each) else "" for each in models.values()],
+    }
+    found = pandas.DataFrame(columns, index=pandas.Index(models, name="model"))
+    return found.sort_values("probability", ascending=False, kind="stable")
 
 
 def _evidence(name: str, model: Any) -> tuple[float, float]:

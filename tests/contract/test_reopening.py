@@ -244,7 +244,7 @@ def test_a_run_that_was_cut_short_refuses_other_draws(kind, tmp_path, whole_run)
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"kind": "TMCMCSampler"}, "it was written by SMCSampler, and this is a TMCMCSampler"),
+        ({"kind": "TMCMCSampler"}, "sampler was SMCSampler, is TMCMCSampler"),
         ({"nwalkers": N + 2}, f"a run of {N} walkers in {NDIM} dimensions; got nwalkers={N + 2}"),
         ({"recycle": False}, "recycle was True, is False"),
     ],
