@@ -24,8 +24,6 @@ from ..text_tables import text_table
 from ..units import DIMENSIONS, find_unit, from_si
 from .measures import DamageMeasures
 
-__all__ = ["Damage", "LimitState", "damage", "limit_states"]
-
 _UNITS = {"dissipated energy": "kJ"}  # in which measures are printed; the others are numbers
 
 

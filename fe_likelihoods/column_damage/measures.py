@@ -26,8 +26,6 @@ from .park_ang import ParkAng, park_ang_constants
 if TYPE_CHECKING:
     from ..models.rc_column import RCColumn
 
-__all__ = ["STRAIN_MEASURES", "DamageMeasures", "damage_measures", "damage_outputs"]
-
 # largest strains at the places of a column: the outermost bar and the surface at each side of a section
 STRAIN_MEASURES = ("bar tension", "cover compression")
 _NEEDED = {  # measures of the whole structure, and the outputs that they need

@@ -23,8 +23,6 @@ from ..text_tables import number
 if TYPE_CHECKING:
     from ..models.rc_column import RCColumn
 
-__all__ = ["ParkAng", "park_ang_constants"]
-
 _DRIFTS = (0.03, 0.06, 0.12, 0.2)  # of the static analyses; the next one is run only if the column survives
 _STEPS = 150
 _LOSS = 0.8  # share of the largest force at which the column has failed

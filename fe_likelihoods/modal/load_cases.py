@@ -15,8 +15,6 @@ from ..signals.tables import read_table
 from ..signals.text_files import dimension_of
 from ..units import to_si
 
-__all__ = ["LoadTest", "read_load_test"]
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LoadTest:

@@ -10,8 +10,6 @@ from ..models.base import digest
 from ..signals.sampling import array_digest
 from ..text_tables import text_table
 
-__all__ = ["ModalData", "close_groups", "real_shapes"]
-
 _LARGEST_SHARE = 0.5  # above it, an error was given in percent or in hertz
 _ABOVE_ZERO = np.finfo(float).tiny
 _OF_SETS = "frequencies", "damping", "temperatures"  # each has a value in each identification

@@ -21,8 +21,6 @@ from .modal_data import ModalData
 from .mode_models import StructureModes
 from .pairing import ModesWithSlope, PairedModes
 
-__all__ = ["ModalLikelihood", "ModalNoise", "PredictedModes"]
-
 _LEAST_ERRORS = 1e-4, 1e-3  # of frequencies and shapes, known where no error is stated
 
 _PROBABILITIES = (np.arange(32) + 0.5) / 32  # of an error, for each sample

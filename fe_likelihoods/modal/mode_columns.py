@@ -10,8 +10,6 @@ from ..signals.tables import Column, Table
 from ..signals.text_files import agree_on_unit, dimension_of
 from ..units import to_si
 
-__all__ = ["KINDS", "OF_MODE", "in_hertz", "kind_of", "sensor_places", "si_values"]
-
 # what a column is, by its name in lower case without a unit; all others of numbers are sensors
 KINDS = {
     "frequency": r"f|fn|freq\.?|(natural[ _]|eigen)?(frequency|frequenz|fr[eé]quence|fre[ck]uencia|frequenza)|omega",

@@ -19,8 +19,6 @@ from ..models.validation import check_theta
 from ..signals.channels import Channel
 from ..simulation.model import SimulationFailed
 
-__all__ = ["ABSENT", "FunctionModes", "StructureModes", "modal_channels", "modal_response", "opensees_modes"]
-
 ABSENT = 1e12  # [Hz], from here on modes that a structure does not have, whose shapes are zero
 _DAMPING = 0.05  # of a structure whose undamped modes are computed: without effect
 _STEP = 1e-4  # for central differences of matrices, as a share of a parameter

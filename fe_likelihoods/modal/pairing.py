@@ -15,8 +15,6 @@ from ..simulation.model import Model, SimulationBatch, SimulationFailed
 from .modal_data import ModalData, close_groups
 from .mode_models import ABSENT
 
-__all__ = ["SLOPE", "ModesWithSlope", "Paired", "PairedModes", "pair_modes"]
-
 SLOPE = "temperature_slope"
 _REFERENCE = 20.0  # [°C], of the stiffnesses of a model
 _FREQUENCY_WEIGHT = 0.1  # of |log(f / measured f)| beside 1 - MAC: decides only where the shapes hardly do

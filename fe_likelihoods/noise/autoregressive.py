@@ -14,8 +14,6 @@ from .option_checks import PerChannel, checked_channels, sensor_levels, shown, w
 from .residuals import innovations, lag_one_sums
 from .sufficient_statistics import SampleCounts
 
-__all__ = ["AutoregressiveNoise"]
-
 
 @dataclass(frozen=True, repr=False)
 class AutoregressiveNoise:

@@ -8,8 +8,6 @@ import numpy as np
 
 from .protocol import noise_title
 
-__all__ = ["SampleNoise", "sample_noise"]
-
 
 class SampleNoise(NamedTuple):
     """Noise of every parameter sample; steps outside the events have no noise.

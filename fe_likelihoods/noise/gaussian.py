@@ -41,8 +41,6 @@ from .option_checks import (
 from .response_level import events_of_parts, local_level, squared_levels
 from .sufficient_statistics import SampleCounts, samples_per_channel
 
-__all__ = ["HALF_LOG_TWO_PI", "GaussianNoise"]
-
 HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 _PARTS = 3  # parts of a window; the window moves by one part
 _ROUND_OFF = 1e-6  # of a step

@@ -11,8 +11,6 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-__all__ = ["EventSums", "GroupSums", "Layout", "PartSums", "split_sums"]
-
 _ROUND_OFF = 1e-6  # of a part
 
 

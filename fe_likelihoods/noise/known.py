@@ -10,8 +10,6 @@ from ..signals.channels import Channel
 from .option_checks import as_number
 from .protocol import Noise, noise_title
 
-__all__ = ["KnownNoise"]
-
 # methods of a noise, by the place of the parameters among their arguments
 _METHODS = {
     "log_likelihood": 2,

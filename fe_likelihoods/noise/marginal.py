@@ -22,8 +22,6 @@ from .gaussian import GaussianNoise
 from .protocol import Noise, noise_title
 from .sufficient_statistics import SampleCounts, samples_per_channel
 
-__all__ = ["MarginalNoise", "log_integral", "sampled_noise"]
-
 _HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 _FALL = 36.0  # decrease of the logarithm at which the integrand is negligible in double precision
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(48)

@@ -9,18 +9,6 @@ import numpy as np
 
 from ..signals.channels import Channel
 
-__all__ = [
-    "PerChannel",
-    "as_number",
-    "checked_channels",
-    "numbers",
-    "only_if",
-    "per_channel",
-    "sensor_levels",
-    "shown",
-    "weighted",
-]
-
 PerChannel = Mapping[str, float] | Sequence[float] | None
 
 

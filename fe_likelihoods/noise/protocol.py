@@ -8,16 +8,6 @@ import numpy as np
 from ..signals.channels import Channel, Measurements
 from .sufficient_statistics import SampleCounts
 
-__all__ = [
-    "Noise",
-    "follows_response",
-    "noise_channels",
-    "noise_of_part",
-    "noise_statistic",
-    "noise_title",
-    "noise_under",
-]
-
 
 class Noise(Protocol):
     """What a likelihood needs of a noise.

@@ -21,15 +21,6 @@ from ..text_tables import text_table
 from ..units import find_unit
 from .sufficient_statistics import distinct_gaps
 
-__all__ = [
-    "ResidualChecks",
-    "autocorrelation",
-    "effective_samples",
-    "innovations",
-    "lag_one_sums",
-    "residual_checks",
-]
-
 _WINDOW = 5.0  # length of the sums over lags, in correlation times
 
 

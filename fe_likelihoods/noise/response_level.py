@@ -14,8 +14,6 @@ import numpy as np
 
 from ..signals.events import find_events
 
-__all__ = ["events_of_parts", "local_level", "squared_levels"]
-
 _ROUND_OFF = 1e-6  # of a part
 
 

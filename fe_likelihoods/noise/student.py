@@ -21,8 +21,6 @@ from ..signals.channels import Channel
 from .option_checks import checked_channels
 from .sufficient_statistics import SampleCounts, samples_per_channel
 
-__all__ = ["StudentNoise", "check_degrees", "each_square", "student_constant"]
-
 
 def student_constant(degrees: float, dimensions: np.ndarray | float = 1.0) -> np.ndarray | float:
     """Logarithm of the density of a Student t distribution of a scale of 1 at its centre, in some dimensions."""

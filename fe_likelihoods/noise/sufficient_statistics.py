@@ -7,22 +7,6 @@ import numpy as np
 
 from ..signals.channels import Comparison
 
-__all__ = [
-    "SampleCounts",
-    "Statistic",
-    "apply_statistic",
-    "check_statistic",
-    "count_samples",
-    "distinct_gaps",
-    "name_of_statistic",
-    "needs_response",
-    "reduce_response",
-    "relative_changes",
-    "samples_per_channel",
-    "statistic_width",
-    "sums_of_squares",
-]
-
 Statistic = Callable[..., np.ndarray]
 """Function of residuals (n_channels, n_samples) that returns (n_numbers,), the sums of squares (n_channels,) first.
 

@@ -18,17 +18,6 @@ import numpy as np
 
 from .truncated_normal_integrals import quantile_of_normal, score_of_quantile, standard_moments
 
-__all__ = [
-    "Distribution",
-    "HalfNormal",
-    "LogNormal",
-    "RandomState",
-    "TruncatedNormal",
-    "Uniform",
-    "as_generator",
-    "probabilities_of",
-]
-
 RandomState = int | np.random.Generator | np.random.RandomState | None
 
 _HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)

@@ -19,8 +19,6 @@ from .points import as_points
 if TYPE_CHECKING:
     from .priors import Prior
 
-__all__ = ["MixtureDistribution", "fit_mixture"]
-
 _LOG_TWO_PI = np.log(2.0 * np.pi)
 _LARGEST_SCORE = 12.0  # samples at a bound of the prior have infinite scores
 _REFITS = 16

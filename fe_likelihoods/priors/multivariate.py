@@ -13,14 +13,6 @@ from numpy.typing import ArrayLike
 
 from .distributions import Distribution, RandomState, as_generator
 
-__all__ = [
-    "FrozenDistribution",
-    "MultivariateDistribution",
-    "MultivariateNormal",
-    "as_distribution",
-    "as_multivariate",
-]
-
 _LOG_TWO_PI = math.log(2.0 * math.pi)
 _LARGEST_ASYMMETRY = 1e-8  # of a covariance, in standard deviations of the two parameters
 

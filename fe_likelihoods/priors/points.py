@@ -7,8 +7,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["as_points", "as_rows", "complete_repr"]
-
 
 def as_points(x: Any, names: Sequence[str]) -> np.ndarray:
     """One point (ndim,) or several (n, ndim) as an array, from an array_like or a mapping with a value, or n values,

@@ -11,8 +11,6 @@ import numpy as np
 from .distributions import Distribution, RandomState, as_generator, probabilities_of
 from .multivariate import MultivariateDistribution, as_distribution, as_multivariate
 
-__all__ = ["Prior"]
-
 
 class Prior:
     """Independent distributions under the names of the parameters.

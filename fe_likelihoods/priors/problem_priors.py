@@ -7,8 +7,6 @@ from ..units import to_si
 from .distributions import HalfNormal, TruncatedNormal, Uniform
 from .priors import Prior
 
-__all__ = ["bridge_column_prior", "correlation_priors", "isolated_bridge_prior"]
-
 _NOISE_SCALE = 0.3  # half-normal prior of a sigma in root mean squares of the measured channels (assumed)
 
 

@@ -13,8 +13,6 @@ import math
 
 import numpy as np
 
-__all__ = ["quantile_of_normal", "score_of_quantile", "standard_moments"]
-
 _HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(20)
 
