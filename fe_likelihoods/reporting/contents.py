@@ -81,7 +81,11 @@ def moments_of(run: FinishedRun) -> np.ndarray:
     if (signed := getattr(run.sampler, "signed_sample", None)) is not None:
         mean, sd = signed.expectation(), signed.standard_deviation()
         if np.all(mean.error < run.mean_error) and np.all(sd.value > 0.0):
-            return np.stack([*mean, *sd, *(signed.quantile(probability).value for probability in probabilities)])
+            order = np.argsort(signed.coords, axis=0)
+            below = np.maximum.accumulate(np.cumsum(signed.weights[order], axis=0))  # falls by negative weights
+            columns = zip(np.take_along_axis(signed.coords, order, axis=0).T, below.T, strict=True)
+            quantiles = [values[np.searchsorted(share[:-1], probabilities)] for values, share in columns]
+            return np.stack([*mean, *sd, *np.transpose(quantiles)])
     quantiles = np.quantile(run.samples, probabilities, axis=0)
     return np.stack([run.samples.mean(axis=0), run.mean_error, run.samples.std(axis=0), run.sd_error, *quantiles])
 
