@@ -31,9 +31,7 @@ __all__ = ["PROBLEMS", "Problem", "oscillator"]
 class Problem(NamedTuple):
     """A posterior by seed, and what is known of it."""
 
-    what: str
     posterior: Callable[[int], Posterior]  # of the seed
-    goal: int  # simulations of the whole record in which 100 effective samples are wanted
     labels: Callable[[np.ndarray], np.ndarray] | None = None  # numbers (n,) of the modes of samples (n, ndim)
     exact: Callable[[Posterior], Any] | None = None  # `Reference` of the posterior by quadrature, at once
 
@@ -74,38 +72,21 @@ def _pier_with_more_friction(samples: np.ndarray) -> np.ndarray:
 
 
 PROBLEMS = {
-    "oscillator": Problem("linear oscillator, 2 parameters", oscillator, 100),
-    "twin": Problem("isolated bridge, 10 parameters", partial(bridge, "twin"), 280),
-    "means": Problem(
-        "isolated bridge, means of both piers: 10 parameters, 2 modes",
-        partial(bridge, "means"),
-        800,
-        labels=_pier_with_more_friction,
-    ),
-    "column4": Problem("bridge column, one sample in 4, 5 parameters", partial(column, every=4), 400),
-    "column": Problem("bridge column, all data, 5 parameters", column, 750),
+    "oscillator": Problem(oscillator),  # 2 parameters
+    "twin": Problem(partial(bridge, "twin")),  # 10 parameters
+    "means": Problem(partial(bridge, "means"), _pier_with_more_friction),  # 10 parameters, 2 modes
+    "column4": Problem(partial(column, every=4)),  # one sample in 4, 5 parameters
+    "column": Problem(column),
 }
 PROBLEMS |= {
-    f"shear{storeys}{suffix}": Problem(
-        f"shear building, {storeys} stiffnesses, 4 accelerations{', derivatives' if suffix else ''}",
-        partial(many_stiffnesses.shear_building, storeys, jacobian=bool(suffix)),
-        goal,
-    )
-    for storeys, goal in ((10, 200), (20, 400), (30, 600), (50, 1000))
+    f"shear{storeys}{suffix}": Problem(partial(many_stiffnesses.shear_building, storeys, jacobian=bool(suffix)))
+    for storeys in (10, 20, 30, 50)
     for suffix in ("", "_jacobian")
 }
-PROBLEMS |= {
-    f"tested_{name}": Problem(f"tested column {name}, 7 parameters", partial(tested_column.column, name), 800)
-    for name in tested_column.HISTORIES
-}
-PROBLEMS |= {name: Problem(case.what, case.posterior, 500, case.label) for name, case in CASES.items()}
-PROBLEMS |= {
-    name: Problem(
-        f"only the product E h^3 is identified, {name}",
-        partial(many_stiffnesses.ridge, name),
-        500,
-        exact=partial(many_stiffnesses.ridge_reference, name),
-    )
+PROBLEMS |= {f"tested_{name}": Problem(partial(tested_column.column, name)) for name in tested_column.HISTORIES}
+PROBLEMS |= {name: Problem(case.posterior, case.label) for name, case in CASES.items()}
+PROBLEMS |= {  # only the product E h^3 is identified
+    name: Problem(partial(many_stiffnesses.ridge, name), exact=partial(many_stiffnesses.ridge_reference, name))
     for name in many_stiffnesses.RIDGES
 }
 """All problems by name."""

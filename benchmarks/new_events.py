@@ -6,7 +6,7 @@ ones, for what is positive) stand for the population, and the other events are p
 
 Twins are oscillators whose stiffness differs between events by a known standard deviation of its logarithm, and whose
 damping differs by five times as much, at most 0.4. In 200 data sets, 1, 3 or 5 events predict one, with the usual
-``spread=`` and with the true one ("stated").
+``spread=`` and with the true one ("stated"). Columns are `tested_column.next_columns`.
 
 A row has the share of measured numbers in intervals of 90 %, as the mean over the subsets. Its note has the worst
 subset, the share in intervals of 50 %, the ratio of the ends of the intervals of 90 % (median), and the interval score
@@ -28,6 +28,7 @@ from fe_likelihoods.priors.between_events import BETWEEN_EVENTS
 from .badge import STRUCTURES, Deck, best_mode, posterior_of
 from .rows import Row
 from .targets import SHARED
+from .tested_column import next_columns
 
 __all__ = ["new_events"]
 
@@ -41,13 +42,13 @@ _OF_TWINS = 0.02, 0.05, 0.1, 0.2  # standard deviations of log stiffnesses
 
 def new_events(
     repeats: int = 1,
-    structures: tuple[str, ...] = (*STRUCTURES, *_MORE, "twins"),
+    structures: tuple[str, ...] = (*STRUCTURES, *_MORE, "twins", "columns"),
     sizes: tuple[int, ...] = (1, 3, 5),
     subsets: int = 11,
     twins: int = 200,
 ) -> Iterator[Row]:
     """Coverage of peaks and Arias intensities of events that are left out, from `sizes` events of a structure."""
-    for name in (each for each in structures if each != "twins"):
+    for name in (each for each in structures if each not in ("twins", "columns")):
         fitted = [(posterior, best_mode(posterior)) for posterior in map(posterior_of, _events(name))]
         fitted = [(posterior.likelihood, mode.parameters) for posterior, mode in fitted if mode is not None]
         if not fitted:
@@ -63,6 +64,8 @@ def new_events(
             sets = [_twins(spread, size + 1, seed) for seed in range(twins)]
             for said, stated in ("", BETWEEN_EVENTS), (", stated", spread):
                 yield from _rows(f"twins of {sd:g}, {size} events{said}", [_predicted(t, size, stated) for t in sets])
+    if "columns" in structures:
+        yield from next_columns()
 
 
 def _events(name: str) -> list[Any]:

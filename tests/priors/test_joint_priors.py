@@ -186,7 +186,7 @@ def test_bad_input_is_refused():
     samples = np.abs(np.random.default_rng(1).normal(size=(200, 2)))
     for message, arguments in {
         "one value for each of the 2 parameters": (samples[:, :1], prior),
-        "needs 40 different samples or more": (samples[:10], prior),
+        "needs 10 different samples or more": (samples[:9], prior),
         "impossible under the prior": (-samples, prior),
         "no parameters m; it has k, c": (samples, prior, ["m"]),
         "the samples of k, c are linearly dependent": (samples[:, [0, 0]], prior),
