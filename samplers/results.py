@@ -220,7 +220,7 @@ class RunResults:
     def verdict(self) -> Verdict:
         """Verdict on the result, with reasons; ``print(sampler.verdict)`` gives sentences.
 
-        Its attributes `modes` and `unknown` are computed on first use, from the present chain.
+        Its attribute `modes` is computed on first use, from the present chain.
         """
         if self._verdict is None:
             raise ValueError("there is no verdict before a run: call run_mcmc first")

@@ -3,7 +3,7 @@
 Every default is defined only here. Constants that no user changes are beside their use.
 """
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import dataclass
 from numbers import Integral
 from typing import Any
@@ -12,9 +12,6 @@ import numpy as np
 
 from .emcee_names import Backend
 from .resampling import RESAMPLING
-
-# settings of annealing by moves that every sampler has
-MOVES = ("resampling", "min_moves", "max_moves", "max_correlation", "fast_sweeps", "max_failure_share")
 
 
 def as_whole_number(name: str, value: Any) -> int:
@@ -89,13 +86,9 @@ class Settings:
     def __post_init__(self):
         for name in ("min_moves", "max_moves", "burn_in", "fast_sweeps"):
             object.__setattr__(self, name, as_whole_number(name, vars(self)[name]))
-        for name, allowed in (("asynchronous", "True or False"), ("recycle", "True, False or None")):
-            value = vars(self)[name]
-            if isinstance(value, np.bool_):
-                object.__setattr__(self, name, bool(value))
-            elif not isinstance(value, bool) and (value is not None or name == "asynchronous"):
-                raise ValueError(f"{name} must be {allowed}; got {value!r}")
         for name, possible, wanted in (
+            ("asynchronous", isinstance(self.asynchronous, bool), "True or False"),
+            ("recycle", isinstance(self.recycle, bool | None), "True, False or None"),
             ("ess_ratio", 0.0 < self.ess_ratio < 1.0, "between 0 and 1 (both excluded)"),
             ("ess_rule", self.ess_rule in ("constant", "declining"), '"constant" or "declining"'),
             ("ess_floor", self.ess_floor >= 0.0, "non-negative"),
@@ -122,15 +115,6 @@ class Settings:
     def target(self, last_target: float, n_walkers: int) -> float:
         """Wanted effective sample size of a stage, from the previous target (n_walkers before the first stage)."""
         return max(self.ess_ratio * (n_walkers if self.ess_rule == "constant" else last_target), self.ess_floor)
-
-
-def check_names(sampler: str, names: Collection[str], given: Collection[str], arguments: Collection[str]) -> None:
-    """Raise TypeError for a keyword that is neither a setting (one of `names`) nor one of the other `arguments`."""
-    if unknown := set(given) - set(names):
-        raise TypeError(
-            f"{sampler}() got an unexpected keyword argument {min(unknown)!r}; arguments, besides those in emcee, are "
-            f"{', '.join(arguments)}; settings are {', '.join(sorted(names))}"
-        )
 
 
 def check_arguments(pool: Any, backend: Any, seed: Any) -> None:

@@ -8,12 +8,10 @@ Huber 2009, doi:10.1214/EJP.v14-638). If such modes are possible, use more walke
 from typing import Any
 
 from .moves.population_moves import MixtureMove
-from .settings import MOVES
 from .tempered import TemperedSampler
 
 FEWEST_TO_RECYCLE = 150
-# settings for the choice of beta
-_OF_WEIGHTS = ("ess_ratio", "ess_rule", "ess_floor")
+OF_MOVES = {"ess_ratio", "ess_rule", "ess_floor", "resampling", "min_moves", "max_moves", "max_correlation"}
 
 
 class SMCSampler(TemperedSampler):
@@ -40,7 +38,7 @@ class SMCSampler(TemperedSampler):
     ValueError
         For an impossible value, or for `asynchronous` without recycling.
     TypeError
-        For a keyword that is not a setting of this sampler.
+        For a keyword that is not a setting.
 
     Examples
     --------
@@ -54,11 +52,9 @@ class SMCSampler(TemperedSampler):
     376.1 +- 0.089
     """
 
-    setting_names = (*MOVES, *_OF_WEIGHTS, "recycle", "asynchronous")
-
     @classmethod
     def _chosen(cls, settings: dict[str, Any], moves: Any, nwalkers: int) -> tuple[dict[str, Any], Any]:
         if settings.get("recycle") is None:
-            of_moves = set(settings) & {*_OF_WEIGHTS, *MOVES[:4]}
-            settings = settings | {"recycle": moves is None and not of_moves and nwalkers >= FEWEST_TO_RECYCLE}
+            recycle = moves is None and not OF_MOVES & set(settings) and nwalkers >= FEWEST_TO_RECYCLE
+            settings = settings | {"recycle": recycle}
         return settings, MixtureMove() if moves is None else moves

@@ -15,7 +15,7 @@ import time
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -41,7 +41,7 @@ from .record import BudgetExhausted, EvaluatedBatch, Incomplete, RunStart, as_li
 from .reporting.progress import Progress
 from .reports import AnnealingResult, Report, Stage, warn
 from .results import RunResults
-from .settings import Settings, as_whole_number, check_arguments, check_names
+from .settings import Settings, as_whole_number, check_arguments
 from .tempering.anneal import anneal
 from .tempering.guide import Guide, check_guide
 from .tempering.guided import lend
@@ -49,8 +49,6 @@ from .tempering.mutation import MoveSchedule, check_moves
 from .tempering.population import Population, check_size
 
 logger = logging.getLogger(__name__)
-
-ARGUMENTS = ("log_prior_fn", "log_likelihood_fn", "guide", "max_simulations", "seed")
 
 
 class TemperedSampler(RunResults, EnsembleSampler):
@@ -64,9 +62,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         them (not with a `pool` and ``vectorize=False``, since workers do not cache simulations). A point for which
         `log_prob_fn` raises an exception or returns NaN counts as -inf and is recorded (`failures`). Points outside the
         support of the prior are not evaluated. Blobs that are numbers are stored as floats, others as objects, or as
-        `blobs_dtype` says. With an emcee `HDFBackend`, a record of all evaluations is kept beside the file, and a
-        killed run continues without repeating an evaluation (`run_mcmc`). The file is replaced as a whole, about every
-        second and at the end of a call.
+        `blobs_dtype` says. With an emcee `HDFBackend`, a killed run continues (`run_mcmc`).
     log_prior_fn : callable, optional
         Log-density of the normalised prior. It takes the same kind of argument as `log_prob_fn` (a point; a batch with
         `vectorize`; a dict with `parameter_names`) but not `args` and `kwargs`. By default ``log_prob_fn.log_prior``.
@@ -104,8 +100,6 @@ class TemperedSampler(RunResults, EnsembleSampler):
         For a keyword that is not a setting.
     """
 
-    setting_names: tuple[str, ...] = tuple(field.name for field in fields(Settings))
-
     def __init__(
         self,
         nwalkers,
@@ -127,7 +121,6 @@ class TemperedSampler(RunResults, EnsembleSampler):
         seed: int | None = None,
         **settings: Any,
     ):
-        check_names(type(self).__name__, self.setting_names, settings, ARGUMENTS)
         nwalkers, ndim = as_whole_number("nwalkers", nwalkers), as_whole_number("ndim", ndim)
         check_arguments(pool, backend, seed)
         functions = log_prob_fn, log_likelihood_fn, log_prior_fn

@@ -9,7 +9,6 @@ gives separate modes wrong shares.
 from typing import Any
 
 from .moves.population_moves import MixtureMove
-from .settings import MOVES
 from .tempered import TemperedSampler
 from .tempering.mutation import needs_many_walkers
 
@@ -39,7 +38,7 @@ class TMCMCSampler(TemperedSampler):
     ValueError
         For an impossible value, or for a setting that cannot act, such as ``max_moves=5`` with ``burn_in=0``.
     TypeError
-        For a keyword that is not a setting of this sampler.
+        For a keyword that is not a setting.
 
     Examples
     --------
@@ -48,8 +47,6 @@ class TMCMCSampler(TemperedSampler):
     >>> sampler.get_chain().shape  # steps, walkers, parameters
     (3, 100, 4)
     """
-
-    setting_names = (*MOVES, "ess_ratio", "chains", "burn_in")
 
     @classmethod
     def _chosen(cls, settings: dict[str, Any], moves: Any, nwalkers: int) -> tuple[dict[str, Any], Any]:

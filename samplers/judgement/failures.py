@@ -12,8 +12,7 @@ from ..finding import CARE, WRONG, Finding
 
 # A failure adjoins the samples if it is one of the evaluated points that are nearest to a sample. With 20 points and at
 # least 5 failures, those 6 standard deviations beside a bent ridge rarely count, and those at an edge do.
-NEAREST = 20
-NEAREST_PER_SAMPLE = 1.0  # at least, in units of the evaluated points per sample
+NEAREST = 20  # or all evaluated points per sample, if these are more
 FEWEST_ADJOINING = 5
 LEAST_ADJOINING = 0.08  # of the failures in the ellipsoid, relative to the share of all points there
 LARGE_SHARE_NEAR = 0.02  # of the evaluated points among the samples
@@ -101,7 +100,7 @@ def failures_near(samples: np.ndarray, failed: np.ndarray, succeeded: np.ndarray
 
     tree = cKDTree(points)
     # long chains evaluate many points per sample, all of them closer than the next sample
-    count = max(NEAREST, int(NEAREST_PER_SAMPLE * evaluated / len(distinct)))
+    count = max(NEAREST, evaluated // len(distinct))
     nearest = np.unique(tree.query(white(distinct), k=min(count + 1, len(points)))[1])
     adjoining = nearest[has_failed[nearest]]
     if len(adjoining) == 0:
