@@ -26,36 +26,19 @@ KEPT_POINTS = 20_000  # the latest points are those near the posterior
 
 
 class NearFailures(NamedTuple):
-    """Evaluated points in the region of the posterior.
+    """Evaluated points in the region of the posterior, without repetitions."""
 
-    Attributes
-    ----------
-    failed : int
-        Number of failures in the ellipsoid about the mean of the samples that holds 99 % of the samples.
-    evaluated : int
-        Number of all distinct points there.
-    adjoining : int
-        Number of failures, in the ellipsoid or not, among the 20 (more after a long chain) evaluated points that are
-        nearest to a sample.
-    scattered : bool
-        Whether the points about these failures fail no more often than other points among the samples.
-    nearest : int
-        Number of distinct points, failed or not, among the points nearest to the samples.
-    """
-
-    failed: int
-    evaluated: int
-    adjoining: int = 0
-    scattered: bool = False
-    nearest: int = 0
+    failed: int  # in the ellipsoid about the mean of the samples that holds 99 % of the samples
+    evaluated: int  # all points there
+    adjoining: int = 0  # failures, there or not, among the points nearest to the samples
+    scattered: bool = False  # the points about these failures fail no more often than other points among the samples
+    nearest: int = 0  # points, failed or not, that are nearest to the samples
 
     @property
     def place(self) -> Literal["away", "beside", "border"]:
-        """Where the failures are.
-
-        "away" from the samples: fewer than 5 failures adjoin the samples, or failures are scattered among successful
-        points and at most 2 % of the points in the ellipsoid. "border": more than 2 % failed, not scattered and not by
-        chance, and enough failures adjoin the samples to end the posterior. "beside": other adjoining failures.
+        """Where the failures are: "away" from the samples, if fewer than 5 failures adjoin them, or failures are
+        scattered among successful points and at most 2 % of the points in the ellipsoid; at their "border", if more
+        than 2 % failed, not scattered and not by chance, and enough failures adjoin the samples; else "beside" them.
         """
         if self.adjoining < FEWEST_ADJOINING:
             return "away"

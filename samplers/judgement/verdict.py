@@ -96,15 +96,6 @@ class Verdict(_Stored):
             raise ValueError("this verdict has no run: read it from a sampler, as sampler.verdict")
         return self._sampler
 
-    @property
-    def near_failures(self) -> NearFailures | None:
-        """Failures in the region of the last walkers, on which the verdict depends; None for a chain read from a file.
-
-        Values of -inf inside the support of the prior are failures if ``log_prob_fn.report()`` has a "failure_count",
-        except if ``log_prob_fn.possible(points)`` is False: parameters that need no simulation are impossible there.
-        """
-        return self._run._near
-
     @cached_property
     def modes(self) -> tuple[Cluster, ...]:
         """Modes in which the run has points, with shares and their standard errors, the largest first."""

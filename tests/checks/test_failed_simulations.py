@@ -64,10 +64,7 @@ def test_a_run_that_is_piled_up_against_failures_is_not_called_good():
     assert note.severity == "wrong" and contents["status"] == "do not use"
     # one place decides: the sampler
     assert sampler.verdict.status == "not usable"
-    assert (
-        f"{sampler.verdict.near_failures.failed} of {sampler.verdict.near_failures.evaluated} evaluated points in"
-        in note.text
-    )
+    assert f"{sampler._near.failed} of {sampler._near.evaluated} evaluated points in" in note.text
     assert (
         contents["summary"][0].startswith("Do not use: ") and "failures border on the samples" in contents["summary"][0]
     )

@@ -51,7 +51,7 @@ def test_a_run_that_is_piled_up_against_failures_says_so(way, options):
     """Control: -inf without a count of failures means impossible parameters."""
     posterior = (Counting if way == "counted" else Cut)(0.7, way)
     sampler = run(posterior, **options)
-    near = sampler.verdict.near_failures
+    near = sampler._near
     assert (near.place == "border") == (sampler.verdict.status == "not usable") == (way != "inf")
     said = [r for r in sampler.verdict.reasons if "end the posterior there" in r]
     assert [f"{near.failed} of {near.evaluated} evaluated points" in r for r in said] == [True] * (way != "inf")
@@ -68,14 +68,14 @@ def test_a_run_that_is_piled_up_against_failures_says_so(way, options):
 def test_control_failures_away_from_the_posterior_are_no_concern(way):
     posterior = (Counting if way == "counted" else Cut)(0.9, way)
     sampler = run(posterior)
-    assert posterior.failed > 10 and sampler.verdict.near_failures.place == "away"
+    assert posterior.failed > 10 and sampler._near.place == "away"
     assert sampler.verdict.status == "converged"
 
 
 def test_control_a_bound_of_the_prior_is_no_failure():
     """The posterior leans against a corner of the box, outside of which nothing is evaluated."""
     sampler = run(Box([0.0, 0.0], [1.0, 1.0], lambda x: -20.0 * np.sum(x, axis=-1)))
-    assert sampler.verdict.near_failures == NearFailures(0, 0) and sampler.verdict.status == "converged"
+    assert sampler._near == NearFailures(0, 0) and sampler.verdict.status == "converged"
 
 
 class RulesOut(Cut):
@@ -98,9 +98,9 @@ class CountingRulesOut(RulesOut, Counting):
 @pytest.mark.parametrize("Posterior", [RulesOut, CountingRulesOut])
 def test_what_is_known_to_be_impossible_is_no_failure(Posterior):
     sampler = run(Posterior(5.0, "inf"))
-    assert sampler.verdict.near_failures.failed == 0 and sampler.verdict.status == "converged"
+    assert sampler._near.failed == 0 and sampler.verdict.status == "converged"
     # failures beside it still count
-    near = run(Posterior(0.7, "inf")).verdict.near_failures
+    near = run(Posterior(0.7, "inf"))._near
     assert (near.place == "border") == (Posterior is CountingRulesOut)
 
 
@@ -172,7 +172,7 @@ def test_the_place_of_the_failures(log_likelihood, fails, place, status, seed):
     posterior = Plane(log_likelihood, fails)
     sampler = run(posterior, nwalkers=200, seed=seed, recycle=False)
     assert posterior.failed > 10
-    assert (sampler.verdict.near_failures.place, sampler.verdict.status) == (place, status)
+    assert (sampler._near.place, sampler.verdict.status) == (place, status)
     words = {"beside": "if these failures are scattered", "border": "end the posterior there"}
     assert [each for each in words if words[each] in str(sampler.verdict)] == [place] * (place in words)
 

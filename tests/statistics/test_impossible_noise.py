@@ -60,7 +60,7 @@ def test_impossible_noise_is_no_failure(joint):
     posterior = make_posterior(joint=joint)
     sampler = run(posterior)
     assert shares_beyond_one(sampler) > 100
-    assert posterior.report()["failure_count"] == sampler.verdict.near_failures.failed == 0
+    assert posterior.report()["failure_count"] == sampler._near.failed == 0
     assert sampler.verdict.status == "converged"
 
 
@@ -69,7 +69,7 @@ def test_failures_are_told_from_impossible_noise(vectorize):
     """Both border on the samples, and the failures alone are counted as such."""
     posterior = make_posterior(limit=1.0)
     sampler = run(posterior, vectorize=vectorize)
-    near = sampler.verdict.near_failures
+    near = sampler._near
     assert shares_beyond_one(sampler) > 100 and near.place == "border"
     assert near.failed <= posterior.report()["failure_count"] and sampler.verdict.status == "not usable"
 
@@ -93,7 +93,7 @@ def test_a_run_that_goes_on_from_its_file_says_the_same(tmp_path, limit):
     first._record.close()
     sampler = run(make_posterior(limit), backend=emcee.backends.HDFBackend(path))
     assert np.array_equal(sampler.get_chain(), whole.get_chain())
-    assert (sampler.verdict, sampler.verdict.near_failures) == (whole.verdict, whole.verdict.near_failures)
+    assert (sampler.verdict, sampler._near) == (whole.verdict, whole._near)
 
 
 def test_what_is_possible_is_known_without_a_simulation():
