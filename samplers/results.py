@@ -14,8 +14,6 @@ from .record import as_limit
 from .reports import GuidedRound, Stage
 from .tempering.guide import Guide
 
-KEPT_FAILURES = 1000
-
 
 class RunResults:
     """Base class of `samplers.tempered.TemperedSampler`: results after a run, and the limit to go on with."""
@@ -51,11 +49,11 @@ class RunResults:
 
     @property
     def failures(self) -> list[dict]:
-        """``{"parameters": array (ndim,), "reason": str}`` of the first thousand failed points.
+        """``{"parameters": array (ndim,), "reason": str}`` of the failed points.
 
         Failed simulations of a posterior are among them, but not those of a guide's search (``posterior.report()``).
         """
-        failed = (self._record.failed + self._record.counted)[:KEPT_FAILURES]
+        failed = self._record.failed + self._record.counted
         return [{"parameters": parameters, "reason": reason} for parameters, reason in failed]
 
     @property
@@ -114,14 +112,12 @@ class RunResults:
     def mean_error(self, discard: int = 0, thin: int = 1) -> np.ndarray:
         """Monte Carlo standard errors (ndim,) of the mean over ``get_chain(discard, thin)``, from this run alone.
 
-        Copies made by the latest resamplings and the autocorrelation of the chain are accounted for
-        (`samplers.estimates.genealogy`), and so are the errors of the shares of modes (`samplers.judgement.clusters`).
-        The variance of a mean is estimated from as many groups of walkers as there are `founders`. With few founders,
-        this estimate is uncertain, so the errors are multiplied by a quantile of Student's t: two errors then contain
-        the true mean with 95 % probability. Groups of unequal size count as 1 / sum(share^2) groups. If `founders` are
-        not known, each walker counts as independent. The dependence between walkers that some moves introduce, such as
-        emcee's stretch move, is not accounted for. A single run cannot detect a mode that it lost, or moves that did
-        not move: after a `SamplingWarning` the errors are too small.
+        Copies made by the latest resamplings, the autocorrelation of the chain (`samplers.estimates.genealogy`) and the
+        errors of the shares of modes (`samplers.judgement.clusters`) are accounted for. The variance of a mean is
+        estimated from as many groups of walkers as there are `founders`; for few groups, the errors are multiplied by a
+        quantile of Student's t, so that two errors contain the true mean with 95 % probability. If `founders` are not
+        known, each walker counts as independent. Dependence between walkers, as by emcee's stretch move, a lost mode,
+        and moves that did not move are not accounted for: after a `SamplingWarning` the errors are too small.
 
         Examples
         --------

@@ -213,13 +213,11 @@ class Target:
             )
         if is_drawn or not (reason := not_of_the_prior(coords, self.log_prior)):
             return log_prior
-        draws = getattr(self.function, "sample_prior", None) is not None
-        known = "None, so that the sampler draws the prior" if draws else "draws of the prior"
         raise ValueError(
             f"initial_state must consist of draws of the prior; got points that cannot be: {reason}. The evidence "
-            f"would be wrong. Pass {known}, not points near the posterior. If they are draws of the prior, its "
-            "log-density is another one: a constant without bounds has no draws. To continue a chain, pass None, or "
-            "the State that run_mcmc returned"
+            "would be wrong. Pass draws of the prior, or None if the function has sample_prior. If they are draws of "
+            "the prior, its log-density is another one: a constant without bounds has no draws. To continue a chain, "
+            "pass None, or the State that run_mcmc returned"
         )
 
 
