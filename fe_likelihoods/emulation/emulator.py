@@ -21,19 +21,12 @@ class ResponseEmulator:
     """Predicts statistics of responses near rows (m,) of the archive's runs, at least d + 4; LinAlgError if these do
     not span the parameters.
 
-    Centre (d,) and covariance (d, d) whiten them, and `slopes` (n_numbers,),
-    derivatives of the log-likelihood by the statistics, are the metric in which components are in units of the noise;
-    an `earlier` fit gives first length scales.
+    Centre (d,) and covariance (d, d) whiten its inputs, and `slopes` (n_numbers,), derivatives of the log-likelihood by
+    the statistics, are the metric in which components are in units of the noise.
     """
 
     def __init__(
-        self,
-        target: ResponseTarget,
-        rows: np.ndarray,
-        centre: np.ndarray,
-        covariance: np.ndarray,
-        slopes: np.ndarray,
-        earlier: "ResponseEmulator | None" = None,
+        self, target: ResponseTarget, rows: np.ndarray, centre: np.ndarray, covariance: np.ndarray, slopes: np.ndarray
     ) -> None:
         self.target, archive, n, d = target, target.archive, len(rows), len(centre)
         centred = np.eye(n) - 1.0 / n
@@ -45,7 +38,7 @@ class ResponseEmulator:
         enough = 1 + int(np.argmax(values.sum() - np.cumsum(values) < _NEGLIGIBLE_VARIANCE * n))
         k = max(1, min(enough, _MAX_COMPONENTS, int((values > _SMALLEST_SHARE * values[0]).sum()), n - 1))
         lengths = np.sqrt(values[:k])
-        self._coefficients = vectors[:, :k] * lengths
+        coefficients = vectors[:, :k] * lengths
         histories = np.zeros((1 + k, len(archive)))  # the mean residual and the components, as weights of runs
         histories[:, archive.numbers[rows]] = np.concatenate([np.full((1, n), 1.0 / n), vectors[:, :k].T @ centred])
         histories[1:] /= lengths[:, None]
@@ -57,8 +50,7 @@ class ResponseEmulator:
         self._centre = target.scaled(centre[None])[0]
         self._whitening = np.linalg.inv(np.linalg.cholesky(covariance * np.outer(stretch, stretch))).T
         importance = np.minimum(1.0, values[:k] / values[0] * 1e3)
-        log_scales = None if earlier is None else earlier.process.log_scales
-        self.process = fit_process(self._inputs(archive.coords[rows]), self._coefficients, importance, log_scales)
+        self._process = fit_process(self._inputs(archive.coords[rows]), coefficients, importance)
         self._forms = archive.forms(histories)
 
     def _inputs(self, coords: np.ndarray) -> np.ndarray:
@@ -70,14 +62,11 @@ class ResponseEmulator:
 
     def log_likelihood(self, coords: np.ndarray) -> np.ndarray:
         """Logarithm (n,) of the emulated likelihood at coordinates (n, ndim)."""
-        statistics = self._at(predict(self.process, self._inputs(coords)))
-        return self.target.log_likelihood(statistics, coords[:, self.target.n_structural :])
-
-    def _at(self, mean: np.ndarray) -> np.ndarray:
-        """Statistics (n, n_numbers) at coefficients (n, k)."""
+        mean = predict(self._process, self._inputs(coords))
         constant, linear, quadratic = self._forms[0, 0], self._forms[1:, 0], self._forms[1:, 1:]
         columns = [
             constant[a] + 2.0 * mean @ linear[:, a] + ((mean @ quadratic[:, :, a]) * mean).sum(axis=1)
             for a in range(len(constant))
         ]
-        return np.maximum(np.stack(columns, axis=1), np.finfo(float).tiny)
+        statistics = np.maximum(np.stack(columns, axis=1), np.finfo(float).tiny)
+        return self.target.log_likelihood(statistics, coords[:, self.target.n_structural :])

@@ -19,7 +19,7 @@ from scipy.linalg import cho_factor, cho_solve, qr, solve_triangular
 
 _NUGGETS = 10.0 ** np.array([-9.0, -7.0, -5.0, -3.0, -1.0, 1.0])
 _LOG_SCALES = -2.0, 4.0  # bounds of the logarithms of the length scales, in units of the inputs, and of the shape
-_TINY = 1e-300
+_ITERATIONS, _TINY = 8, 1e-300
 
 
 class GaussianProcess(NamedTuple):
@@ -73,16 +73,12 @@ def _restricted(
 
 
 def fit_process(
-    inputs: np.ndarray,
-    outputs: np.ndarray,
-    importance: np.ndarray,
-    log_scales: np.ndarray | None = None,
-    iterations: int = 8,
+    inputs: np.ndarray, outputs: np.ndarray, importance: np.ndarray, log_scales: np.ndarray | None = None
 ) -> GaussianProcess:
     """Fit a process to outputs (m, k) at m >= d + 3 inputs (m, d) of about unit spread, by restricted likelihood.
 
-    `importance` (k,) weights the outputs in the search for the length scales, which starts at `log_scales` (d + 1,),
-    such as those of an earlier fit; 0 iterations keep the start.
+    `importance` (k,) weights the outputs in the search for the length scales; `log_scales` (d + 1,) of another fit are
+    kept.
     """
     m, d = inputs.shape
     basis, share = _basis(inputs), importance / importance.sum()
@@ -93,15 +89,14 @@ def fit_process(
         losses, gradient = _restricted(scales, *fixed)
         return float(losses.min(axis=0) @ share), gradient
 
-    if log_scales is None:  # one common scale first: cheap, and a good start for the others
-        starts = (np.append(np.full(d, scale), 1.0) for scale in np.arange(0.2, 3.4, 0.4))
-        log_scales = min(starts, key=lambda scales: loss(scales)[0])
-    log_scales = np.asarray(log_scales, dtype=float)
-    if iterations > 0:
+    if log_scales is None:
         from scipy.optimize import minimize  # slow to import
 
-        bounds, options = [_LOG_SCALES] * (d + 1), {"maxiter": iterations}
-        log_scales = minimize(loss, log_scales, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
+        # one common scale first: cheap, and a good start for the others
+        starts = (np.append(np.full(d, scale), 1.0) for scale in np.arange(0.2, 3.4, 0.4))
+        start, bounds = min(starts, key=lambda scales: loss(scales)[0]), [_LOG_SCALES] * (d + 1)
+        options = {"maxiter": _ITERATIONS}
+        log_scales = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
     nuggets = _NUGGETS[_restricted(log_scales, *fixed)[0].argmin(axis=0)]
     covariance = _covariance(inputs, inputs, log_scales)
     linear, weights, left_out = np.empty((d + 1, outputs.shape[1])), np.empty_like(outputs), np.empty_like(outputs)

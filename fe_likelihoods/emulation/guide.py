@@ -254,9 +254,7 @@ class ResponseGuide(Guide):
         best = archive.statistics[rows[np.argmax(density[rows])]]
         slopes = target.slopes(best, target.fit_noise(best, mode.coords[d:]).coords)
         try:
-            emulator = ResponseEmulator(
-                target, rows, region.centre[:d], region.covariance[:d, :d], slopes, region.emulator
-            )
+            emulator = ResponseEmulator(target, rows, region.centre[:d], region.covariance[:d, :d], slopes)
         except np.linalg.LinAlgError as error:  # runs that do not span the parameters: the earlier fit stays
             logger.info("no emulator could be fitted to %d runs: %s", len(rows), error)
             return region

@@ -175,7 +175,7 @@ def sensitivity(
     without = []
     for fold in range(FOLDS):
         kept = numbers != fold
-        part = fit_process(inputs[kept], outputs[kept], np.ones(len(sd)), process.log_scales, iterations=0)
+        part = fit_process(inputs[kept], outputs[kept], np.ones(len(sd)), process.log_scales)
         without.append(_indices(known, designs[0], part))
     errors = np.hypot(np.sqrt(FOLDS - 1) * np.std(without, axis=0), np.std(found, axis=0, ddof=1) / np.sqrt(DESIGNS))
     unexplained = np.square(process.left_out).mean(axis=0)

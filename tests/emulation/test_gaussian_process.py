@@ -25,8 +25,8 @@ def test_left_out_errors_are_those_of_processes_without_the_point():
     process = fit_process(inputs, outputs, np.ones(2))
     for i in (0, 7, 24):
         rest = np.delete(np.arange(25), i)
-        # iterations=0 keeps the length scales, and the choice of nuggets is clear
-        again = fit_process(inputs[rest], outputs[rest], np.ones(2), process.log_scales, iterations=0)
+        # the length scales are kept, and the choice of nuggets is clear
+        again = fit_process(inputs[rest], outputs[rest], np.ones(2), process.log_scales)
         left_out = outputs[i] - predict(again, inputs[i : i + 1])[0]
         np.testing.assert_allclose(process.left_out[i], left_out, rtol=1e-5, atol=1e-8)
 
@@ -34,6 +34,6 @@ def test_left_out_errors_are_those_of_processes_without_the_point():
 def test_inputs_far_apart_are_a_linear_regression():
     rng = np.random.default_rng(5)
     inputs, outputs = 30.0 * rng.standard_normal((12, 2)), rng.standard_normal((12, 1))
-    process = fit_process(inputs, outputs, np.ones(1), np.array([0.0, 0.0, 4.0]), iterations=0)
+    process = fit_process(inputs, outputs, np.ones(1), np.array([0.0, 0.0, 4.0]))
     solved = np.linalg.lstsq(np.column_stack([np.ones(12), inputs]), outputs, rcond=None)[0]
     np.testing.assert_allclose(process.linear, solved, rtol=1e-6)
