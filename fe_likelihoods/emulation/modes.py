@@ -26,7 +26,9 @@ _APART = 0.25  # prior standard deviations in one coordinate that part ends on a
 _FEW = 6  # parameters whose differences cost about as much as two steps
 _MOST_STARTS, _DRAWN = 2, 4  # times the number asked for: that begin, and of which the highest begin
 _STEP = 1e-4  # of the derivatives of parameters by coordinates
-_SHARES = 0.03, 0.1, 0.3, 0.6  # of the Arias intensity, at which the parts of the record end
+# Shares of the Arias intensity at which the parts of the record end. On whole records alone, two runs on the isolated
+# bridge took 308 and 306 simulations instead of 153 and 152.
+_SHARES = 0.03, 0.1, 0.3, 0.6
 
 
 class Mode(NamedTuple):
