@@ -230,18 +230,20 @@ def supports_apart(motions: Sequence[np.ndarray], names: Sequence[str], step: fl
     return found
 
 
-OF_MODES = {  # ratios of frequencies; of stiffness or mass, the square roots
-    2.0 * math.pi: "rad/s instead of Hz",
-    60.0: "1/min instead of Hz",
-    1000.0: "kHz instead of Hz",
-    1000.0**0.5: "a stiffness in kN instead of N, or a mass in t instead of kg",
+OF_MODES = {  # ratios of measured to computed frequencies
+    2.0 * math.pi: "rad/s read as Hz",
+    0.5 / math.pi: "rad/s in the model",
+    60.0: "1/min read as Hz",
+    1e-3: "kHz read as Hz",
+    1000.0**0.5: "a stiffness in kN, or a mass in kg beside a stiffness in kN",
+    1000.0**-0.5: "a mass in t",
     9.81**0.5: "a weight instead of a mass",
 }
 FAULTS = {  # kind, text and action
     "factor": (
         "A {what} may be wrong",
         "{measured} are {value} times {computed}",
-        "Look up unit and gain of the channel, base motion, loads and stiffnesses; a model must return SI units.",
+        "Look up unit and gain of the channel, base motion, loads and stiffnesses; a model must return SI units, frequencies in Hz.",
     ),
     "sign": (
         "A sign may be wrong",
@@ -251,8 +253,8 @@ FAULTS = {  # kind, text and action
     "lag": (
         "Clocks may differ",
         "{measured} are {value} s {late} than {computed}",
-        "If all channels are as {late}, the clock of their logger or of the motion is wrong: {add} `zero` in "
-        "[measurements], or use measurements.shift({shift}). The lag of one sensor can be sampled (`Sensor`).",
+        "If all channels are {late} by the same time, the clock of their logger or of the motion is wrong: {add} `zero` "
+        "in [measurements], or use measurements.shift({shift}). The lag of one sensor can be sampled (`Sensor`).",
     ),
     "swap": (
         "Channels may be swapped",
@@ -260,7 +262,7 @@ FAULTS = {  # kind, text and action
         "Look up which cable or column (of a file or of a program's output) belongs to which; exchange the wrong ones.",
     ),
 }
-OF_SUPPORTS = "Check unit, sign and clock of its file: slow motions of one site are alike, but for waves and slips."
+OF_SUPPORTS = "Check unit, sign and clock of its file: slow motions of one site are alike, except for waves and slips."
 
 
 def finding_of(
@@ -271,7 +273,7 @@ def finding_of(
     kinds = [("frequency", "")] if modes else [(each.dimension, each.unit) for each in channels]
     near = [describe_unit(fault.value, *each) for each in kinds] if fault.kind == "factor" else []
     units = " or ".join(filter(None, dict.fromkeys(near)))
-    words = {"measured": "slow motions", "computed": "other supports"} if of_supports else {}
+    words = {"measured": "its slow motions", "computed": "the slow motions of other supports"} if of_supports else {}
     words = {"measured": "measured values", "computed": "the computed ones"} | words
     words |= {"value": f"{value:.0f}" if value >= 1e3 else f"{value:.3g}", "what": "unit" if units or modes else "gain"}
     late, add = ("later", f"add {value:.3g} s to") if fault.value > 0.0 else ("earlier", f"subtract {value:.3g} s from")
@@ -293,9 +295,9 @@ def describe_unit(factor: float, dimension: str, unit: str = "") -> str:
 
     One of the two is the SI unit or the `unit` of the channel, or they are m/s2 and g of the base motion.
     """
-    bases, special = (unit, DIMENSIONS[dimension]), {9.80665: "m/s2 and g of the base motion"}
-    special = {"acceleration": {}, "frequency": OF_MODES}.get(dimension, special)
-    ratios = {ratio**sign: words for ratio, words in special.items() for sign in (1, -1)}
+    bases = unit, DIMENSIONS[dimension]
+    of_motion = {ratio: "m/s2 and g of the base motion" for ratio in (9.80665, 1.0 / 9.80665)}
+    ratios = dict({"acceleration": {}, "frequency": OF_MODES}.get(dimension, of_motion))
     units = sorted((each for each in UNITS.values() if each.dimension == dimension), key=lambda u: u.name not in bases)
     for one, other in () if dimension == "frequency" else combinations(units, 2):
         if one.name in bases:  # of two names of a unit, the first

@@ -45,7 +45,7 @@ def test_right_data_are_not_blamed():
 
 
 @pytest.mark.parametrize(
-    ("factor", "text"), [(2 * np.pi, "as with rad/s instead of Hz"), (1000**-0.5, "a stiffness in kN instead of N")]
+    ("factor", "text"), [(2 * np.pi, "as with rad/s read as Hz"), (1000**-0.5, "as with a mass in t")]
 )
 def test_units_are_named(factor, text):
     for seed in range(5):
