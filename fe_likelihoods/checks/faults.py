@@ -243,7 +243,8 @@ FAULTS = {  # kind, text and action
     "factor": (
         "A {what} may be wrong",
         "{measured} are {value} times {computed}",
-        "Look up unit and gain of the channel, base motion, loads and stiffnesses; a model must return SI units, frequencies in Hz.",
+        "Look up unit and gain of the channel, base motion, loads and stiffnesses; a model must return SI units, "
+        "frequencies in Hz.",
     ),
     "sign": (
         "A sign may be wrong",
@@ -253,8 +254,9 @@ FAULTS = {  # kind, text and action
     "lag": (
         "Clocks may differ",
         "{measured} are {value} s {late} than {computed}",
-        "If all channels are {late} by the same time, the clock of their logger or of the motion is wrong: {add} `zero` "
-        "in [measurements], or use measurements.shift({shift}). The lag of one sensor can be sampled (`Sensor`).",
+        "If all channels are {late} by the same time, the clock of their logger or of the motion is wrong: {add} "
+        "`zero` in [measurements], or use measurements.shift({shift}). "
+        "The lag of one sensor can be sampled (`Sensor`).",
     ),
     "swap": (
         "Channels may be swapped",

@@ -288,14 +288,19 @@ def _unwhitened(mixture: Mixture, mean: np.ndarray, root: np.ndarray) -> Mixture
 def _with_heavier_tails(
     best: Mixture, best_criterion: float, white: np.ndarray, weights: np.ndarray, effective: float
 ) -> tuple[Mixture, float]:
-    """Lower the fitted degrees of freedom as long as the criterion improves."""
+    """Lower the fitted degrees of freedom as long as the criterion improves, also with a single component, whose tails
+    several may have represented.
+    """
     penalty = math.log(max(effective, 2.0))
     for dof in HEAVIER:
-        found, value = _maximise(white, weights, effective, np.exp(log_responsibilities(best, white)), dof)
-        criterion = _criterion(len(found.weights), white.shape[1], effective, value) + penalty
-        if criterion >= best_criterion:
+        starts = [np.ones((len(white), 1))]
+        if len(best.weights) > 1:
+            starts.append(np.exp(log_responsibilities(best, white)))
+        tried = [_maximise(white, weights, effective, responsibilities, dof) for responsibilities in starts]
+        criteria = [_criterion(len(m.weights), white.shape[1], effective, value) + penalty for m, value in tried]
+        if min(criteria) >= best_criterion:
             break
-        best, best_criterion = found, criterion
+        best, best_criterion = tried[int(np.argmin(criteria))][0], min(criteria)
     return best, best_criterion
 
 
@@ -306,8 +311,8 @@ def _criterion(count: int, ndim: int, effective: float, log_likelihood: float) -
 
 
 def _splits(mixture: Mixture, white: np.ndarray, weights: np.ndarray) -> list[np.ndarray]:
-    """Starting assignments (n, K + 1) with one more component: each component is split at its mean, along the direction
-    of the smallest fourth moment (invariant coordinate selection: Tyler et al. 2009, J. R. Stat. Soc. B 71(3),
+    """Starting assignments (n, K + 1) with one more component: each component is split in two, along the directions of
+    smallest and largest fourth moments (invariant coordinate selection: Tyler et al. 2009, J. R. Stat. Soc. B 71(3),
     doi:10.1111/j.1467-9868.2009.00706.x).
     """
     owner = log_responsibilities(mixture, white).argmax(axis=1)
@@ -321,11 +326,22 @@ def _splits(mixture: Mixture, white: np.ndarray, weights: np.ndarray) -> list[np
         mean, root = location_and_root(white[rows], own)
         z = (white[rows] - mean) @ invert_roots(root[None])[0].T
         _, directions = np.linalg.eigh((z * (own * np.sum(z**2, axis=1))[:, None]).T @ z)
-        new = owner.copy()
-        new[rows[z @ directions[:, 0] > 0.0]] = count
-        if np.any(new == k) and np.any(new == count):
-            starts.append((new[:, None] == np.arange(count + 1)) * 1.0)
+        for direction in {0, ndim - 1}:
+            projected = z @ directions[:, direction]
+            new = owner.copy()
+            new[rows[projected > _cut(projected, own)]] = count
+            if np.any(new == k) and np.any(new == count):
+                starts.append((new[:, None] == np.arange(count + 1)) * 1.0)
     return starts
+
+
+def _cut(values: np.ndarray, weights: np.ndarray) -> float:
+    """Threshold that splits weighted numbers (n,) in two parts with the smallest sum of squares within the parts."""
+    order = np.argsort(values, kind="stable")
+    mass, moment = np.cumsum(weights[order])[:-1], np.cumsum((weights * values)[order])
+    between = (moment[-1] * mass - moment[:-1]) ** 2 / (mass * np.maximum(1.0 - mass, 1e-300))
+    best = int(between.argmax())
+    return 0.5 * (values[order[best]] + values[order[best + 1]])
 
 
 def _maximise(

@@ -70,14 +70,17 @@ def find_support_bounds(inside: Callable[[np.ndarray], np.ndarray], coords: np.n
 
 def near_bounds(bounds: SupportBounds, coords: np.ndarray, weights: np.ndarray) -> SupportBounds:
     """Keep the bounds within four standard deviations from the mean of a weighted population (n, ndim), (n,). The scale
-    of a single one is the standard deviation of the parameter.
+    of a single one is the variance of the parameter over the distance between mean and bound.
     """
     mean = weights @ coords
-    sd = np.sqrt(weights @ (coords - mean) ** 2)
-    low = np.where(mean - bounds.low < NEAR * sd, bounds.low, -np.inf)
-    high = np.where(bounds.high - mean < NEAR * sd, bounds.high, np.inf)
-    one_sided = (np.isfinite(low) != np.isfinite(high)) & (sd > 0.0)
-    return SupportBounds(low, high, np.where(one_sided, sd, bounds.span))
+    reach = NEAR * np.sqrt(weights @ (coords - mean) ** 2)
+    low = np.where(mean - bounds.low < reach, bounds.low, -np.inf)
+    high = np.where(bounds.high - mean < reach, bounds.high, np.inf)
+    distance = np.where(np.isfinite(low), mean - low, high - mean)
+    one_sided = (np.isfinite(low) != np.isfinite(high)) & (reach > 0.0) & (distance > 0.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = (reach / NEAR) ** 2 / distance
+    return SupportBounds(low, high, np.where(one_sided, scale, bounds.span))
 
 
 def _bounded_parameters(bounds: SupportBounds) -> list[tuple[int, float, float, float, float]]:

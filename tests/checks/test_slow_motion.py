@@ -130,7 +130,7 @@ def test_a_support_with_another_gain_sign_or_clock_is_named():
         assert each.text.startswith('motion "support 1": ')
         assert factor < 0.0 or each.numbers == {"factor": pytest.approx(factor, rel=0.2)}
     (each,) = check_supports(deck_of(first, Record(second.name, STEP, later(second.acceleration, 10)), third))
-    assert (each.kind, each.severity) == ("Clocks may differ", "care") and 'support 1": slow motions' in each.text
+    assert (each.kind, each.severity) == ("Clocks may differ", "care") and 'support 1": its slow motions' in each.text
     own = [motions(np.random.default_rng(800 + k))[k].acceleration for k in range(3)]
     noisy = [Record(x.name, STEP, x.acceleration + 0.3 * own[k]) for k, x in enumerate((first, second, third))]
     assert check_supports(deck_of(*noisy)) == []  # clocks are not known so well

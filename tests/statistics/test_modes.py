@@ -77,11 +77,11 @@ def test_moves_keep_the_narrow_mode():
 
 
 @pytest.mark.parametrize(("explores", "found"), [(True, True), (False, False)])
-def test_a_mode_that_few_draws_meet_is_explored(explores, found, monkeypatch):
-    """Without the draws that search for narrow modes, a few draws hit its flank."""
+def test_a_mode_that_is_met_at_the_end_is_explored(explores, found, monkeypatch):
+    """One draw of the last round before the check hits the flank of the narrow mode."""
     monkeypatch.setattr(anneal, "first_draws", lambda size: size)
     monkeypatch.setattr(recycling, "search_draws", lambda size: 0)
     if not explores:
         monkeypatch.setattr(recycling, "find_basins", lambda *points: None)
-    result = analytic_runs.run(analytic_runs.Cell("two", 100.0, "SMC", 500), 16, 1, {})
+    result = analytic_runs.run(analytic_runs.Cell("two", 100.0, "SMC", 500), 4, 1, {})
     assert (min(result["shares"]) > 0.15) == found
