@@ -11,7 +11,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from fe_likelihoods.checks.sensor_faults import find_sensor_faults
+from fe_likelihoods.checks.screening import find_sensor_faults
 from tests.checks.real_channels import RealChannel, real_channels
 
 from .rows import Row

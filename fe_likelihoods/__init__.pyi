@@ -61,9 +61,8 @@ from .priors.priors import Prior
 from .reporting.report import report
 from .signals.alignment import align
 from .signals.channels import Channel, Measurements
-from .signals.events import Events
 from .signals.read import read_columns, read_record
-from .signals.records import DisplacementHistory, Record
+from .signals.records import DisplacementHistory, Events, Record
 from .simulation.model import SimulationFailed
 from .units import from_si, to_si
 

@@ -23,7 +23,7 @@ from ..signals.channels import Channel, Measurements
 from ..text_tables import listed
 from ..units import DIMENSIONS, UNITS, find_unit
 from .finding import HALF, TAIL, WRONG, Finding, percent
-from .sensor_faults import runs_of
+from .screening import runs_of
 
 BETTER = 0.6  # error with a fault taken into account, as a share of the error without: study `fit_gate`
 EXPLAINED = 0.85  # error (RRMSE) above which a response explains nothing: a correlation of a half

@@ -19,8 +19,7 @@ import numpy as np
 
 from ..prediction.quantities import ChannelQuantity, MeanOfLast, dissipated_energy, peak
 from ..signals.channels import Channel
-from ..signals.events import Events
-from ..signals.records import Record
+from ..signals.records import Events, Record
 from .park_ang import ParkAng, park_ang_constants
 
 if TYPE_CHECKING:

@@ -19,8 +19,7 @@ import samplers
 from ..cache.simulation_cache import SimulationCache
 from ..checks.finding import NOTE, FindingWarning, labelled
 from ..checks.model import refuse_chance
-from ..checks.result import JudgedRun, judge_run
-from ..checks.run import FinishedRun, read_run
+from ..checks.result import FinishedRun, JudgedRun, judge_run, read_run
 from .job import Job, parse_job, read_job
 from .make_posterior import Problem, make_problem, runs_code_of_user
 

@@ -14,7 +14,7 @@ from ..cache.verification import StaleCache
 from ..noise.marginal import sampled_noise
 from ..noise.residuals import ResidualChecks, residual_checks
 from ..signals.channels import Channel, Measurements, relative_errors
-from ..signals.events import find_events
+from ..signals.records import find_events
 from ..simulation.failure_reasons import ChangedModel
 from ..simulation.model import SimulationFailed
 from ..text_tables import listed

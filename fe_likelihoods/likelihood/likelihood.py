@@ -20,7 +20,7 @@ from ..noise.protocol import Noise, noise_of_part, noise_statistic, noise_under
 from ..noise.sufficient_statistics import count_samples
 from ..priors.points import as_rows, complete_repr
 from ..signals.channels import Comparison, Measurements
-from ..signals.events import events_of
+from ..signals.records import events_of
 from ..simulation.model import Model, SimulationBatch, first_part
 from .check_inputs import check_model, check_noise, match_measurements
 from .simulator import Simulator

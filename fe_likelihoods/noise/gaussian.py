@@ -26,7 +26,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ..signals.channels import Channel, Measurements
-from ..signals.events import EventWindow, events_of, find_events
+from ..signals.records import EventWindow, events_of, find_events
 from .groups import EventSums, GroupSums, Layout, PartSums, split_sums
 from .option_checks import (
     PerChannel,

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..signals.events import find_events
+from ..signals.records import find_events
 
 _ROUND_OFF = 1e-6  # of a part
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..checks.fit import describe_residuals
+from ..checks.model import describe_residuals
 from ..noise.residuals import autocorrelation, residual_checks
 from ..signals.channels import Channel, Measurements, relative_errors
 from ..units import from_si

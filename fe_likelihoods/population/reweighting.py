@@ -7,7 +7,7 @@ import numpy as np
 from samplers.estimates.pareto import pareto_shape
 
 from ..checks.finding import Finding
-from ..checks.transfer import check_reweighting
+from ..checks.population import check_reweighting
 from ..text_tables import text_table
 from .population_marginal import draw_products, inverse_prior, population_marginal
 from .stored_posterior import resampled_description

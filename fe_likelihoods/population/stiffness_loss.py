@@ -15,7 +15,7 @@ from scipy import special
 from samplers.resampling import systematic
 
 from ..checks.finding import Finding, judge, labelled
-from ..checks.transfer import check_common, check_most
+from ..checks.population import check_common, check_most
 from ..priors.distributions import Distribution, HalfNormal, LogNormal
 from ..text_tables import text_table
 from .stored_posterior import NormalLikelihood, StoredPosterior, normal_likelihood

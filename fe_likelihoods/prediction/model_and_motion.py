@@ -25,8 +25,7 @@ from ..noise.gaussian import GaussianNoise
 from ..noise.marginal import sampled_noise
 from ..noise.protocol import follows_response, noise_channels, noise_title, noise_under
 from ..priors.points import as_points
-from ..signals.events import find_events
-from ..signals.records import Record
+from ..signals.records import Record, find_events
 from ..simulation.executors import as_executor
 from ..simulation.model import Model, SimulationBatch, simulate_batch
 

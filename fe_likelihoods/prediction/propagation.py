@@ -9,7 +9,7 @@ A quantity :math:`g` of the response (a history, a peak, or any function of it) 
 
 estimated from samples :math:`\theta_j` of the posterior. The samples are simulated in batches, and equal samples once,
 because resampling makes many copies. Failed simulations are counted by reason and left out. Peaks, bandwidths
-and ends of histories are compared with the calibration: `fe_likelihoods.checks.transfer` judges the numbers.
+and ends of histories are compared with the calibration: `fe_likelihoods.checks.model` judges the numbers.
 
 See ``docs/theory/prediction.rst``.
 """
@@ -28,14 +28,12 @@ from samplers.evaluation.values import most_common_reasons
 from ..cache.simulation_cache import SimulationCache
 from ..cache.verification import StaleCache
 from ..checks.finding import warn
-from ..checks.model import check_same_response, relative_difference
-from ..checks.transfer import check_bandwidth, check_final_values, check_peaks
+from ..checks.model import check_bandwidth, check_final_values, check_peaks, check_same_response, relative_difference
 from ..likelihood.joint import JointLikelihood
 from ..likelihood.simulator import Simulator
 from ..noise.protocol import noise_under
 from ..signals.channels import Measurements
-from ..signals.events import find_events, motions_of
-from ..signals.records import Record
+from ..signals.records import Record, find_events, motions_of
 from ..simulation.failure_reasons import ChangedModel
 from ..simulation.model import Model, SimulationFailed
 from .model_and_motion import (

@@ -16,8 +16,8 @@ import numpy as np
 from samplers.smc import FEWEST_TO_RECYCLE
 
 from ..checks.finding import Finding, Judgement, percent
-from ..checks.fit import describe_residuals
-from ..checks.run import FinishedRun
+from ..checks.model import describe_residuals
+from ..checks.result import FinishedRun
 from ..likelihood.fits import Fit
 from ..likelihood.likelihood import FELikelihood
 from ..noise.protocol import noise_title

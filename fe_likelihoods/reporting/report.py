@@ -17,8 +17,7 @@ import numpy as np
 
 from samplers import plot_corner, plot_marginals, plot_run
 
-from ..checks.result import JudgedRun, judge_run
-from ..checks.run import FinishedRun, read_run
+from ..checks.result import FinishedRun, JudgedRun, judge_run, read_run
 from ..information.identifiability import of_samples
 from ..likelihood.fits import Fit
 from ..plots.histories import plot_fit

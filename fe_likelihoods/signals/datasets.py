@@ -15,8 +15,7 @@ import numpy as np
 
 from ..units import DIMENSIONS
 from .channels import Channel, Measurements
-from .events import Events
-from .records import Record
+from .records import Events, Record
 from .sampling import expect
 
 SCHEMA, SCHEMA_VERSION = "fe_likelihoods.dataset", 1

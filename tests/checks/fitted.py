@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fe_likelihoods.checks.fit import check_responses, check_stated_errors, check_supports
+from fe_likelihoods.checks.model import check_responses, check_stated_errors, check_supports
 from fe_likelihoods.emulation.modes import find_modes
 from fe_likelihoods.likelihood.fits import compare
 

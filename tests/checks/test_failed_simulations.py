@@ -18,7 +18,7 @@ from fe_likelihoods import (
     TruncatedNormal,
     report,
 )
-from fe_likelihoods.checks.run import failures, read_run
+from fe_likelihoods.checks.result import failures, read_run
 from fe_likelihoods.reporting.report import gather
 from samplers import SMCSampler
 from tests.contract.targets import Gaussian

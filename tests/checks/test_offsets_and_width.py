@@ -5,7 +5,7 @@ import pytest
 
 from fe_likelihoods import Channel, Measurements
 from fe_likelihoods.checks.finding import judge
-from fe_likelihoods.checks.fit import check_residuals, check_responses, describe_residuals
+from fe_likelihoods.checks.model import check_residuals, check_responses, describe_residuals
 from fe_likelihoods.likelihood.fits import Fit
 from fe_likelihoods.noise.residuals import residual_checks
 

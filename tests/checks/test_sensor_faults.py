@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import Channel, Measurements, Record, check_data
-from fe_likelihoods.checks.screening import repair_lines, screen
-from fe_likelihoods.checks.sensor_faults import find_sensor_faults
+from fe_likelihoods.checks.screening import find_sensor_faults, repair_lines, screen
 from tests.checks.real_channels import real_channels
 
 STEP, N = 0.01, 3000

@@ -17,7 +17,7 @@ from fe_likelihoods import (
 )
 from fe_likelihoods.checks.faults import _spectra, slow_motion
 from fe_likelihoods.checks.finding import in_order
-from fe_likelihoods.checks.fit import check_responses, check_supports
+from fe_likelihoods.checks.model import check_responses, check_supports
 from fe_likelihoods.likelihood.fits import Fit
 
 STEP, TIME = 0.01, 0.01 * np.arange(2000)

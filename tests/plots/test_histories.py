@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import plot_histories, plot_record, plot_residuals, plot_spectrum
-from fe_likelihoods.checks.fit import describe_residuals
+from fe_likelihoods.checks.model import describe_residuals
 from fe_likelihoods.noise.residuals import autocorrelation, residual_checks
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record

@@ -25,8 +25,7 @@ from fe_likelihoods import (
     report,
 )
 from fe_likelihoods.checks.finding import Finding, judge
-from fe_likelihoods.checks.result import check_failures, check_result
-from fe_likelihoods.checks.run import read_run
+from fe_likelihoods.checks.result import check_failures, check_result, read_run
 from fe_likelihoods.likelihood.fits import compare
 from fe_likelihoods.reporting.contents import evidence, moments_of, residual_sentences
 from samplers import SamplingWarning, SMCSampler, TMCMCSampler, plot_run

@@ -6,8 +6,7 @@ import pytest
 
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.datasets import read_dataset, write_dataset
-from fe_likelihoods.signals.events import Events
-from fe_likelihoods.signals.records import Record
+from fe_likelihoods.signals.records import Events, Record
 
 TOP = Channel("top", "absolute acceleration", "g")
 DRIFT = Channel("drift", "relative displacement", "in")
