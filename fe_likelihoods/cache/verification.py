@@ -1,21 +1,16 @@
 """A model with simulations in a cache: whether it is still the same, and which stored simulations are its own.
 
-Code and files cannot prove that the model with a declared identity still computes the same results. The model's label
-(`fe_likelihoods.simulation.label`) decides how many stored rows are simulated again before others are used (powers:
-``docs/parallel.rst``). Rows belong to a generation, the simulations of one state of a model; the file says to which
-generation a label belongs.
+Rows belong to a generation, the simulations of one state of a model; the file says to which generation a label
+(`fe_likelihoods.simulation.label`) belongs.
 
-* The label is known: the row stored last and a random one before a likelihood uses its first row, and a random one of
-  every 100 rows used. A difference is an error, `StaleCache`.
+* The label is known: the row stored last and a random one are simulated again before a likelihood uses its first row,
+  and a random one of every 100 rows used. A difference is an error, `StaleCache`. If the new simulations do not end,
+  for example without a licence, rows are used with a warning.
 * The label is unknown: `ROWS` random rows. If all agree, the label is added to their generation (adoption). If one
   differs, or there are fewer rows, a new generation begins: the earlier rows stay in the file and are not used.
 
-A success is always among the rows, since a changed model often fails at the same points. Rows of a known label are used
-without verification, with a warning, if the new simulations do not end, for example without a licence.
-
-Results from two states of a model must not be mixed either, as when a value is set between two batches. So fingerprint,
-code, values and opened files are compared after simulations, in about 1 % of the time. User code may change values
-itself, such as a counter: the first and the latest simulation are repeated then, and must give the same results.
+The model is also compared after simulations, since results from two of its states must not be mixed. User code may
+change values itself, such as a counter: the first and the latest simulation are repeated then, and must be the same.
 """
 
 import logging
@@ -39,10 +34,10 @@ from ..simulation.failure_reasons import ChangedModel, TransientReason
 from ..simulation.files import digests_by_name, observing, read_again
 from ..simulation.label import ModelLabel
 from ..simulation.model import Model, SimulationBatch, misfit_of_responses, most_responses, simulate_batch
-from .memory import MemoryCache, ResponseMemory, thetas_of
+from .memory import thetas_of
 from .simulation_cache import TOLERANCE, Row, SimulationCache, pack_rows
 
-__all__ = ["ROWS", "Simulated", "StaleCache", "Trust", "VerifiedModel", "difference_in_words"]
+__all__ = ["ROWS", "Simulated", "StaleCache", "Trust", "VerifiedModel"]
 
 logger = logging.getLogger(__name__)
 
@@ -78,18 +73,16 @@ class StaleCache(ValueError):
 class Trust:
     """The label of a model, and which rows of a file this process trusts; likelihoods with one `key` share it.
 
-    `labels` has the labels in the file, `generations` the generations, by the model's fingerprint; `used` counts rows
-    that were used after a verification, by identity, apart from failures alone. Rows with the number of the `session`
-    were stored here and need no verification. `stale` is the message on a row that differed, `running` are simulations
-    that run now. Hold the `lock` to use it.
+    `labels` has code, files and generation by the model's fingerprint; `used` counts rows that were used after a
+    verification, by identity, apart from failures alone. Rows with the number of the `session` were stored here and
+    need no verification. `stale` is the message on a row that differed, `running` are simulations that run now.
     """
 
     _known: "OrderedDict[str, Trust]" = OrderedDict()  # of this process, the most recently used last
 
     def __init__(self, label: ModelLabel, key: str) -> None:
         self.label, self.key = label, key
-        self.labels: dict[str, tuple] = {}
-        self.generations: dict[str, int] = {}
+        self.labels: dict[str, tuple[str, dict[str, str], int]] = {}
         self.used: dict[str, int] = {}
         self.stale = ""
         self.running: set[bytes] = set()
@@ -130,39 +123,14 @@ class Simulated(NamedTuple):
     norm: np.ndarray  # (n_channels,) of the response [SI]
 
 
-def difference_in_words(
-    earlier: np.ndarray, reason: str, new: Simulated, names: Sequence[str], tolerance: float, of_response: bool
-) -> tuple[str, float]:
-    """How a simulation differs from an earlier one, in words and relative to the response norm; empty if it agrees.
-
-    It agrees within the `tolerance` of a response, relative to its norm; zero is for equal bits. `names` are those of
-    the channels. See `relative_changes`.
-    """
-    if reason or new.reason:
-        was, now = (f"failed ({text})" if text else "succeeded" for text in (reason, new.reason))
-        return ("" if reason and new.reason else f"it {was}; simulated again, it {now}"), 0.0
-    change = relative_changes(earlier, new.misfit, new.norm, of_response, ROUNDING if tolerance else 0.0)
-    worst, n = int(np.argmax(np.nan_to_num(change, nan=np.inf))), len(names)
-    if change[worst] <= tolerance:
-        return "", 0.0
-    what = "sum of squared residuals" if worst < n else f"statistic {worst}"
-    values = f"stored {earlier[worst]:.17g}, simulated again {new.misfit[worst]:.17g}"
-    return f"channel {names[worst % n]!r}, {what}: {values}", float(change[worst])
-
-
 class VerifiedModel:
     """A model compared with measurements, whose simulations may be stored in a `SimulationCache`.
 
-    `measured` are values (n_channels, n_steps) or a `Comparison`, `simulation_key` identifies stored statistics, and
-    `label` the model when it was first simulated, with the statistic's code. Derived likelihoods and copies share its
-    `Trust`. `verifications` counts simulations that were made again, `unverified` rows whose new simulation was
-    stopped (not by the model), `seconds` is the wall time of simulations [s]; `has_results` says whether results are
-    known in this process. Methods take the model's `fingerprint`, which is one for a request.
+    `label` identifies the model when it was first simulated. Derived likelihoods and copies share its `Trust`.
+    `verifications` counts simulations that were made again, `unverified` rows whose new simulation was stopped (not by
+    the model), `seconds` is the wall time of simulations [s]; `has_results` says whether results are known in this
+    process. A subclass has the measurements, and memories; methods take the model's `fingerprint`, one for a request.
     """
-
-    simulation_key: str
-    memory_cache: MemoryCache
-    response_memory: ResponseMemory
 
     def __init__(
         self,
@@ -173,7 +141,7 @@ class VerifiedModel:
         cache: SimulationCache | str | os.PathLike | None,
     ) -> None:
         self.model, self.measured, self.statistic, self.pool = model, measured, statistic, pool
-        self.n_numbers = statistic_width(measured, statistic)
+        self.n_numbers, self._of_response = statistic_width(measured, statistic), needs_response(statistic)
         self.cache = cache if cache is None or isinstance(cache, SimulationCache) else SimulationCache(cache)
         self.verifications = self.unverified = 0
         self.seconds = 0.0
@@ -190,10 +158,9 @@ class VerifiedModel:
         self._points: list[tuple[np.ndarray, np.ndarray]] = []  # first and latest success: parameters, statistics
         self._unchecked: list[np.ndarray] = []  # parameters (n, n_structural) simulated since the last comparison
         self._not_before = self._counted_until = 0.0  # times of the next comparison, and of the last end of a run [s]
-        self._random = np.random.default_rng()  # separate, so that the user's random numbers do not change
 
     def __getstate__(self) -> dict:
-        dropped = {"pool": None, "_points": [], "_unchecked": [], "_random": None}
+        dropped = {"pool": None, "when_simulated": None, "_points": [], "_unchecked": []}
         return vars(self) | dropped | {"_was_sent": os.getpid()}
 
     def __setstate__(self, state: dict) -> None:
@@ -242,10 +209,21 @@ class VerifiedModel:
         return rows
 
     def _difference(self, earlier: np.ndarray, reason: str, new: Simulated) -> tuple[str, float]:
-        """How a simulation differs from an earlier one, see `difference_in_words`."""
-        names = [channel.name for channel in self.model.channels]
+        """How a simulation differs from an earlier one, in words and relative to the response norm; empty if it agrees.
+
+        It agrees within the tolerance of the cache, relative to the norm; zero is for equal bits.
+        """
+        if reason or new.reason:
+            was, now = (f"failed ({text})" if text else "succeeded" for text in (reason, new.reason))
+            return ("" if reason and new.reason else f"it {was}; simulated again, it {now}"), 0.0
         tolerance = TOLERANCE if self.cache is None else self.cache.tolerance
-        return difference_in_words(earlier, reason, new, names, tolerance, needs_response(self.statistic))
+        change = relative_changes(earlier, new.misfit, new.norm, self._of_response, ROUNDING if tolerance else 0.0)
+        worst, n = int(np.argmax(np.nan_to_num(change, nan=np.inf))), len(new.norm)
+        if change[worst] <= tolerance:
+            return "", 0.0
+        what = "sum of squared residuals" if worst < n else f"statistic {worst}"
+        values = f"stored {earlier[worst]:.17g}, simulated again {new.misfit[worst]:.17g}"
+        return f"channel {self.measurements.channels[worst % n].name!r}, {what}: {values}", float(change[worst])
 
     # changes of the model -----------------------------------------------------------------------------------------
 
@@ -283,7 +261,10 @@ class VerifiedModel:
             # the first simulation may change values itself
             is_own = FINGERPRINT not in changed and ((is_first and self.pool is None) or self._repeats())
             if not is_own:
-                self._drop_unchecked()
+                self._clear()
+                for *_, generation in self._trust.labels.values():
+                    places = self.simulation_key, self.model.fingerprint
+                    self.cache.discard(np.concatenate(self._unchecked), *places, generation=generation)
                 raise ChangedModel(
                     f"the {type(self.model).__name__} has changed since the likelihood was made (different: "
                     f"{', '.join(sorted(changed)[:3])}): a value or file that it uses was changed, so that an earlier "
@@ -297,12 +278,6 @@ class VerifiedModel:
         self._unchecked.clear()
         now = time.monotonic()
         self._not_before = now + (now - start) / SHARE_OF_TIME
-
-    def _drop_unchecked(self) -> None:
-        self._clear()
-        for generation in self._trust.generations.values():
-            places = self.simulation_key, self.model.fingerprint
-            self.cache.discard(np.concatenate(self._unchecked), *places, generation=generation)
 
     def _clear(self) -> None:
         self.memory_cache.clear()
@@ -338,7 +313,7 @@ class VerifiedModel:
         if {TransientReason}.issuperset(map(type, reasons)):
             return
         generation = self._generation(fingerprint)
-        self._use(fingerprint, generation)  # with the files that simulations have opened by now
+        self._use(fingerprint, generation)
         rows = pack_rows(self.simulation_key, thetas, misfit, reasons, generation, trust.session)
         values = np.zeros((len(thetas), 0)) if responses is None else responses
         # without a response, only failures; a failure of the statistic alone has one
@@ -366,12 +341,20 @@ class VerifiedModel:
     # generations --------------------------------------------------------------------------------------------------
 
     def _generation(self, fingerprint: str) -> int:
-        """The generation of a known label, or of stored rows that agree; else a new one."""
-        known = self._trust.generations
+        """The generation of a label with the present contents of its files, or of rows that agree; else a new one.
+
+        Files that belong to other labels of the model count from now on.
+        """
+        known = self._trust.labels
         if fingerprint not in known:
-            found = self._known_generation(fingerprint) or next(iter(known.values()), 0)
-            known[fingerprint] = found or self._adopted(fingerprint)
-        return known[fingerprint]
+            stored = self.cache.labels_of(fingerprint)
+            for _, files, _ in stored:
+                self.label.add(read_again(files))
+            same = [each for each in stored if each[0] == self.label.code and read_again(each[1]) == each[1]]
+            if not same:  # it is stored with the first row
+                same = [("", {}, next((each[2] for each in known.values()), 0) or self._adopted(fingerprint))]
+            known.setdefault(fingerprint, same[-1])
+        return known[fingerprint][2]
 
     def _adopted(self, fingerprint: str) -> int:
         """The generation that new simulations agree with, else a new one."""
@@ -395,26 +378,12 @@ class VerifiedModel:
         text = f"{self.label.code} {sorted(digests_by_name(self.label.opened).items())} {stored}".encode()
         return int.from_bytes(blake2b(text, digest_size=8).digest()) >> 2 | 1
 
-    def _known_generation(self, fingerprint: str) -> int | None:
-        """The generation of the label with the present contents of the files that simulations opened; None if unknown.
-
-        Files that belong to other labels of the model count from now on.
-        """
-        known, labels = None, self.cache.labels_of(fingerprint)
-        for _, files, _ in labels:
-            self.label.add(read_again(files))
-        for label in labels:
-            code, files, generation = label
-            if code == self.label.code and read_again(files) == files:
-                self._trust.labels[fingerprint], known = label, generation
-        return known
-
     def _use(self, fingerprint: str, generation: int) -> None:
         """Store to which generation the label belongs, with the files that simulations have opened by now."""
         labels, label = self._trust.labels, (self.label.code, self.label.opened, generation)
-        if (before := labels.get(fingerprint)) != label:
+        if (before := labels.get(fingerprint, ("",))) != label:
             labels[fingerprint] = label
-            self.cache.store_label(fingerprint, label, before)
+            self.cache.store_label(fingerprint, label, before if before[0] else None)
 
     def _say(self, text: str, *values: Any) -> None:
         logger.warning(f"%s, {type(self.model).__name__}: {text}", self.cache.path, *values)
@@ -432,8 +401,8 @@ class VerifiedModel:
         latest, kind = [], identity
         if identity not in trust.used:
             latest = self.cache.some_rows(identity, generation, width, 1, other_than=trust.session)
-        shuffled = [others[place] for place in self._random.permutation(len(others))]
-        shuffled.sort(key=lambda row: bool(row.reason))  # failures last
+        # at random, failures last; the user's random numbers do not change
+        shuffled = sorted(others, key=lambda row: (bool(row.reason), secrets.randbits(62)))
         chosen = latest + [row for row in shuffled if row not in latest]
         if chosen[0].reason and identity not in trust.used:
             kind += " failures"  # alone, they verify no successes, which may be used later
@@ -462,18 +431,14 @@ class VerifiedModel:
                 if isinstance(each.reason, TransientReason):
                     stopped.append(each.reason)
                     self.verifications, self.unverified = self.verifications - 1, self.unverified + 1
-                elif (difference := self._row_difference(row, each))[0]:
+                    continue
+                misfit, reason = np.frombuffer(row.value, dtype="<f8"), row.outcome if row.reason else ""
+                if not reason and row.size is not None:  # a response
+                    (misfit,), (reason,) = self.statistics_of(misfit.reshape(1, len(self.model.channels), -1), [""])
+                if (difference := self._difference(misfit, reason, each))[0]:
                     return compared, stopped, (row, *difference)
-                else:
-                    compared += 1
+                compared += 1
         return compared, stopped, None
-
-    def _row_difference(self, row: Row, new: Simulated) -> tuple[str, float]:
-        """How a simulation differs from a stored one, as `_difference`."""
-        misfit, reason = np.frombuffer(row.value, dtype="<f8"), row.outcome if row.reason else ""
-        if not reason and row.size is not None:  # a response
-            (misfit,), (reason,) = self.statistics_of(misfit.reshape(1, len(self.model.channels), -1), [""])
-        return self._difference(misfit, reason, new)
 
     def _refuse(self, row: Row, difference: str, change: float, used: int) -> None:
         """Raise `StaleCache`, now and for all rows until they are deleted."""

@@ -9,7 +9,7 @@ be submitted there is one chunk, so that nothing waits for a batch. Several thre
 import hashlib
 import os
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from typing import Any
 
@@ -88,10 +88,8 @@ class Simulator(VerifiedModel):
         self.simulations = self.cache_hits = self.disk_hits = 0
         self._recalled: set[bytes] = set()
         self._most = 1  # simulations between two writes to the cache on disk, adapted to their duration
+        self._together = hasattr(model, "simulate_together")
         self.when_simulated: Callable[[int], None] | None = None
-
-    def __getstate__(self) -> dict:
-        return super().__getstate__() | {"when_simulated": None}
 
     # counts and identity ------------------------------------------------------------------------------------------
 
@@ -140,37 +138,31 @@ class Simulator(VerifiedModel):
             with trust.lock:  # after what runs for other requests
                 trust.lock.wait_for(lambda: trust.running.isdisjoint(keys))
                 request = self._look_up(keys, which, full)
-                if left := (new := request.left):
+                if new := request.left:
                     self._check_before()  # so that finished simulations are stored
                     self._trust.running.update(new)  # of another label, if the check has made one
-            while left:
+            while left := request.left:
                 some, start = left[: self._chunk(len(left), full)], time.perf_counter()
                 if self.pool is None or self._together:
                     with self._observed():
-                        batch = simulate_batch(self.model, self._thetas(some), self.pool)
+                        batch = simulate_batch(self.model, thetas_of(some, self.n_structural), self.pool)
                     self._record(request, some, *batch, start)
                 else:
                     self._run_in_pool(request, some, start)
                 # grows by steps: the first simulations may be failures that took no time
                 rate = len(some) / (time.perf_counter() - start)
                 self._most = min(4 * len(some), 1 + int(_SECONDS_PER_CHUNK * rate))
-                left = request.left
-        except BaseException:
+        finally:
             with self._trust.lock:
-                self._let_go(new)
-            raise
+                self._trust.running.difference_update(new)
+                self._trust.lock.notify_all()
         statistics = statistics_in([request.outcomes[key] for key in keys], self.n_numbers)[which]
         return (statistics, self._as_batch([request.responses[keys[place]] for place in which])) if full else statistics
 
     def _as_batch(self, found: Sequence[np.ndarray | str]) -> SimulationBatch:
         """Responses or reasons of failures as a batch."""
-        responses = np.full((len(found), len(self.model.channels), self.model.n_steps), np.nan)
-        for row, each in zip(responses, found, strict=True):
-            row[...] = np.nan if isinstance(each, str) else each
-        return SimulationBatch(responses, list(map(reason_in, found)))
-
-    def _thetas(self, keys: Sequence[bytes]) -> np.ndarray:
-        return thetas_of(keys, self.n_structural)
+        outcomes = [(None, each) if isinstance(each, str) else (each, "") for each in found]
+        return SimulationBatch(*gathered(outcomes, (len(self.model.channels), self.model.n_steps)))
 
     def recall(self, thetas: np.ndarray, statistics: np.ndarray | None, reasons: Sequence[str]) -> None:
         """Cache statistics (n, n_numbers) of an earlier run in memory, at structural parameters (n, n_structural).
@@ -194,32 +186,27 @@ class Simulator(VerifiedModel):
     # known simulations --------------------------------------------------------------------------------------------
 
     def _look_up(self, keys: list[bytes], which: Sequence[int], full: bool) -> Requested:
-        """What is known of distinct keys, which is counted; `which` has the key of every requested row.
-
-        Some stored statistics are verified by runs.
-        """
+        """What is known of distinct keys, which is counted; `which` has the key of every requested row."""
         request, known = Requested(keys, full, self.model), zip(keys, self.memory_cache.look_up(keys), strict=True)
-        finite = np.isfinite(self._thetas(keys)).all(axis=1)
+        finite = np.isfinite(thetas_of(keys, self.n_structural)).all(axis=1)
         skipped = [key for key, fine in zip(keys, finite, strict=True) if not fine]
         outcomes = {key: outcome for key, outcome in known if outcome is not None}
         request.enter(outcomes | dict.fromkeys(skipped, "the parameters are not finite"))
-        on_disk: set[bytes] = set()
         try:
             if self.cache is not None and not full and (left := request.left):
-                self._enter(request, found := self._stored(left, request.fingerprint, False))
-                on_disk.update(found)
+                self._enter(request, read := self._stored(left, request.fingerprint, False))
+                self.disk_hits += len(read)
             if self.cache is not None or len(self.response_memory):
-                self._take_responses(request, on_disk)
+                self._take_responses(request)
         except StaleCache:  # results in memory may belong to another model
             self._clear()
             raise
-        if found := set(keys).difference(skipped, request.left):
-            self.cache_hits += sum(keys[place] in found for place in which)
-            self.disk_hits += sum(keys[place] in on_disk for place in which)
+        found = set(keys).difference(skipped, request.left)
+        self.cache_hits += sum([keys[place] in found for place in which])
         return request
 
-    def _take_responses(self, request: Requested, on_disk: set[bytes]) -> None:
-        """Fill in stored responses, and statistics that are not known; adds keys of responses that are `on_disk`."""
+    def _take_responses(self, request: Requested) -> None:
+        """Fill in stored responses, and statistics that are not known."""
         left, size, fingerprint = request.left, most_responses(self.model), request.fingerprint
         for start in range(0, len(left), size):
             keys = left[start : start + size]
@@ -228,7 +215,7 @@ class Simulator(VerifiedModel):
             missing = [key for key in keys if key not in found]
             if self.cache is not None and missing:
                 found |= (read := self._stored(missing, fingerprint, True))
-                on_disk.update(read)
+                self.disk_hits += len(read)
                 if request.full:
                     self.response_memory.store([(fingerprint, key) for key in read], read.values())
             if request.full:
@@ -237,19 +224,16 @@ class Simulator(VerifiedModel):
                 statistics, reasons = self.statistics_of(*self._as_batch([found[key] for key in new]))
                 self._enter(request, outcomes_of(new, statistics, reasons))
                 if self.cache is not None:
-                    self._store(self._thetas(new), statistics, reasons, None, fingerprint)
+                    self._store(thetas_of(new, self.n_structural), statistics, reasons, None, fingerprint)
 
     def _enter(self, request: Requested, outcomes: dict[bytes, bytes | str]) -> None:
         """Fill in statistics and reasons of failures, count these, and cache both in memory."""
-        if not outcomes:
-            return
-        self.failures.outcomes += len(outcomes)
-        for key, outcome in outcomes.items():
-            if isinstance(outcome, str):
-                self.failures.add(np.frombuffer(key), outcome)
-        request.enter(outcomes)
-        self.memory_cache.store(outcomes, outcomes.values())
-        self.has_results = True
+        if outcomes:
+            thetas = thetas_of(list(outcomes), self.n_structural)
+            self.failures.count_outcomes(thetas, list(map(reason_in, outcomes.values())))
+            request.enter(outcomes)
+            self.memory_cache.store(outcomes, outcomes.values())
+            self.has_results = True
 
     # simulations --------------------------------------------------------------------------------------------------
 
@@ -258,15 +242,11 @@ class Simulator(VerifiedModel):
         """Whether simulations can be submitted to the pool one by one, and not for several data sets at once."""
         return bool(getattr(self.pool, "submits", False)) and not self._together
 
-    @property
-    def _together(self) -> bool:
-        return hasattr(self.model, "simulate_together")
-
     def _chunk(self, n: int, full: bool) -> int:
         """Number of simulations, of n, between two writes to the cache on disk, or two reports of progress."""
         if self.streams:
             return n
-        in_memory = self.pool is None or self._together or self._returns_responses(full)
+        in_memory = self.pool is None or self._together or self._keeps_responses(full)
         most = most_responses(self.model) if in_memory else n
         if self.cache is None and (self.when_simulated is None or self.pool is not None):
             return min(n, most)
@@ -277,11 +257,11 @@ class Simulator(VerifiedModel):
     @interrupts_end_the_run()
     def _run_in_pool(self, request: Requested, keys: Sequence[bytes], start: float) -> None:
         """Run simulations in the pool, and record each as it arrives."""
-        responses = self._returns_responses(request.full)
+        responses = self._keeps_responses(request.full)
         shape = (len(self.model.channels), self.model.n_steps) if responses else (self.n_numbers,)
         function = sent_simulation(self.model, *(() if responses else (self.measured, self.statistic)))
         function = Observed(function, self.pool.n_workers == 1)
-        with closing(self.pool.as_they_end(function, list(self._thetas(keys)))) as arriving:
+        with closing(self.pool.as_they_end(function, list(thetas_of(keys, self.n_structural)))) as arriving:
             for found in arriving:
                 outcomes, ended = list(map(unpack, found.values())), [keys[number] for number in found]
                 for _, opened in outcomes:
@@ -289,22 +269,16 @@ class Simulator(VerifiedModel):
                 if ended:
                     self._record(request, ended, *gathered([outcome for outcome, _ in outcomes], shape), start)
 
-    def _returns_responses(self, full: bool) -> bool:
-        return self._keeps_responses(full) or (self.cache is not None and self.cache.responses)
-
     def _keeps_responses(self, full: bool) -> bool:
-        """Whether responses are kept in memory: they were requested, or gradients or predictions may follow."""
-        return full or self.stores_responses or has_jacobian(self.model)
+        """Whether responses are kept in memory: they were requested, are stored, or gradients may follow."""
+        stored = self.stores_responses or (self.cache is not None and self.cache.responses)
+        return full or stored or has_jacobian(self.model)
 
     def _record(
         self, request: Requested, keys: Sequence[bytes], values: np.ndarray, reasons: list[str], start: float
     ) -> None:
-        """Count new simulations, record failures, compare the model if that is due, and cache the results.
-
-        The values are responses or statistics; responses are kept if they were requested, if a gradient may follow, or
-        if they are stored on disk.
-        """
-        thetas, statistics, why = self._thetas(keys), values, reasons
+        """Count new simulations (responses or statistics), compare the model if that is due, and cache the results."""
+        thetas, statistics, why = thetas_of(keys, self.n_structural), values, reasons
         if values.ndim == 3:
             statistics, why = self.statistics_of(values, reasons)
         with self._trust.lock:
@@ -325,9 +299,3 @@ class Simulator(VerifiedModel):
             if self.cache is not None:
                 stored = values if request.full or self.stores_responses or self.cache.responses else None
                 self._store(thetas, statistics, why, stored, request.fingerprint)
-            self._let_go(keys)
-
-    def _let_go(self, keys: Iterable[bytes]) -> None:
-        """Let requests go on that wait for simulations."""
-        self._trust.running.difference_update(keys)
-        self._trust.lock.notify_all()

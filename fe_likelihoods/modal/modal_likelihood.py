@@ -6,8 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import ndtri, stdtrit
 
-from ..cache.simulation_cache import TOLERANCE
-from ..cache.verification import Simulated, difference_in_words
+from ..cache.verification import Simulated
 from ..likelihood.likelihood import FELikelihood
 from ..likelihood.simulator import Simulator
 from ..models.linear_structure import LinearStructure
@@ -235,12 +234,11 @@ class _ModesSimulator(Simulator):
         modes = paired.model
         anything = Measurements(modes.channels, modes.dt, np.ones((len(modes.channels), modes.n_steps)))
         super().__init__(modes, anything, paired, **options)
-        self.measurements = paired.measurements
+        self.measurements, self._of_response = paired.measurements, False
 
     def _difference(self, earlier: np.ndarray, reason: str, new: Simulated) -> tuple[str, float]:
-        measured, tolerance = self.measurements, TOLERANCE if self.cache is None else self.cache.tolerance
-        names, norm = [each.name for each in measured.channels], np.linalg.norm(measured.values, axis=1)
-        return difference_in_words(earlier, reason, new._replace(norm=norm), names, tolerance, False)
+        norm = np.linalg.norm(self.measurements.values, axis=1)
+        return super()._difference(earlier, reason, new._replace(norm=norm))
 
 
 class PredictedModes(NamedTuple):

@@ -1,17 +1,8 @@
 """Label of a model: the code, files and versions that its results depend on, besides its declared identity.
 
-Stored simulations belong to a declared identity, the fingerprint of the model: class, parameters, channels, excitation,
-``version=`` and ``depends_on=``. The label only sets how many of them are verified by new ones
-(`fe_likelihoods.cache.verification`), so it may be incomplete, and may change without need. It contains
-
-* user functions, classes and values by value: the parts of the model, and everything that their code names,
-* the source files of the user modules among them, without comments, and the versions of installed packages,
-* environment variables whose names occur in this code,
-* the source files of this library,
-* what simulations of the model opened while they ran (`fe_likelihoods.simulation.files`).
-
-Pickles by cloudpickle are not used, because their bytes differ between processes: they contain random class
-identifiers, sets in varying order, and file names of notebook cells.
+It sets how many stored simulations of a declared identity are verified (`fe_likelihoods.cache.verification`), so it may
+be incomplete, and may change without need. Digests of pickles would differ between processes: cloudpickle's contain
+random class identifiers, sets in varying order, and file names of notebook cells.
 """
 
 import ast
@@ -49,12 +40,10 @@ _sources: dict[str, tuple] = {}  # by name of a module: the module and its spec,
 
 
 class ModelLabel:
-    """Label of a model in its present state, completed by its simulations.
+    """Label of a model in its present state: digests `items` of its code and values, and what simulations `opened`.
 
-    Its code is the mapping ``code_parts()`` if the model has this method; for other user models, the object itself; and
-    the residual statistic that is stored, if the user has defined one. `items` are digests of everything that is known
-    without a simulation, `opened` is what simulations opened; `observes` says whether they are observed, since they may
-    run user code.
+    The code is what ``code_parts()`` returns, and the model and the residual statistic if the user has defined them.
+    Simulations that may run user code are observed (`observes`).
     """
 
     def __init__(self, model: Any, statistic: Any = None) -> None:
@@ -89,10 +78,7 @@ class ModelLabel:
         return self._present(model) | digests_by_name(read_again(self.opened))
 
     def has_changed_itself(self, names: Iterable[str]) -> None:
-        """Record that simulations change some items; later labels of this process keep their first digests.
-
-        After an edit, the source of the module is another item.
-        """
+        """Record that simulations change some items; later labels of this process keep their first digests."""
         _first.update({name: self.items[name] for name in self.items.keys() & set(names) - _PARTS - self.changing})
 
     @property
@@ -277,14 +263,10 @@ def _name_of(module: str) -> str:
 
 
 def _state(value: Any) -> list[tuple[str, Any]]:
-    """Attributes of an object in alphabetical order, including slots."""
-    found = dict(attribute(value, "__dict__") or {})
-    for cls in type(value).__mro__:
-        slots = vars(cls).get("__slots__", ())
-        for name in (slots,) if isinstance(slots, str) else slots:
-            private = name.startswith("__") and not name.endswith("__")
-            found[name] = attribute(value, f"_{cls.__name__.lstrip('_')}{name}" if private else name)
-    return sorted(found.items())
+    """Attributes of an object in alphabetical order, including slots, whatever its class says that pickles contain."""
+    state = object.__getstate__(value)
+    own, slots = state if isinstance(state, tuple) else (state, None)
+    return sorted(((own or {}) | (slots or {})).items())
 
 
 def _source(module: types.ModuleType) -> tuple[str, frozenset[str]]:
