@@ -1,16 +1,8 @@
 """A model with simulations in a cache: whether it is still the same, and which stored simulations are its own.
 
-Rows belong to a generation, the simulations of one state of a model; the file says to which generation a label
-(`fe_likelihoods.simulation.label`) belongs.
-
-* The label is known: the row stored last and a random one are simulated again before a likelihood uses its first row,
-  and a random one of every 100 rows used. A difference is an error, `StaleCache`. If the new simulations do not end,
-  for example without a licence, rows are used with a warning.
-* The label is unknown: `ROWS` random rows. If all agree, the label is added to their generation (adoption). If one
-  differs, or there are fewer rows, a new generation begins: the earlier rows stay in the file and are not used.
-
-The model is also compared after simulations, since results from two of its states must not be mixed. User code may
-change values itself, such as a counter: the first and the latest simulation are repeated then, and must be the same.
+The table in ``docs/parallel.rst`` says which stored rows are simulated again. Rows belong to a generation, the
+simulations of one state of a model; the file says to which generation a label (`fe_likelihoods.simulation.label`)
+belongs, and unknown labels are added to one (adoption) or begin another one.
 """
 
 import logging
@@ -151,21 +143,17 @@ class VerifiedModel:
         label = ModelLabel(self.model, self.statistic)
         self._trust = Trust.of(label, secrets.token_hex(16))
         self._known: dict[str, str | None] = label.items | {FINGERPRINT: self.model.fingerprint}
-        self._begin()
-
-    def _begin(self) -> None:
         self.has_results = self._was_sent = False  # from another process
         self._points: list[tuple[np.ndarray, np.ndarray]] = []  # first and latest success: parameters, statistics
         self._unchecked: list[np.ndarray] = []  # parameters (n, n_structural) simulated since the last comparison
         self._not_before = self._counted_until = 0.0  # times of the next comparison, and of the last end of a run [s]
 
     def __getstate__(self) -> dict:
-        dropped = {"pool": None, "when_simulated": None, "_points": [], "_unchecked": []}
-        return vars(self) | dropped | {"_was_sent": os.getpid()}
+        begun = {"pool": None, "when_simulated": None, "has_results": False, "_points": [], "_unchecked": []}
+        return vars(self) | begun | {"_not_before": 0.0, "_counted_until": 0.0, "_was_sent": os.getpid()}
 
     def __setstate__(self, state: dict) -> None:
         vars(self).update(state)
-        self._begin()
         self._was_sent = state["_was_sent"] != os.getpid()
 
     @property
@@ -175,8 +163,7 @@ class VerifiedModel:
 
     def share_trust(self, other: "VerifiedModel") -> None:
         """Trust rows that another object has verified or stored, if its model is the same, or has the same code."""
-        is_same = self.model is other.model or other.label.code == self.label.code
-        if self.cache is not None and other.cache is not None and is_same:
+        if self.model is other.model or other.label.code == self.label.code:
             self._trust = other._trust
 
     def statistics_of(self, responses: np.ndarray, reasons: list[str]) -> tuple[np.ndarray, list[str]]:
@@ -239,9 +226,8 @@ class VerifiedModel:
         if self._was_sent and found:
             raise ChangedModel(
                 f"the {type(self.model).__name__} in this process is not the one that was sent ({', '.join(found[:3])} "
-                "differ): a module that is imported here has other contents or values than where the likelihood was "
-                "made. Give the pool to the likelihood, FELikelihood(..., pool=...), which sends code and values, or "
-                "make a new likelihood"
+                "differ): modules have other contents or values here. Give the pool to the likelihood, "
+                "FELikelihood(..., pool=...), which sends code and values, or make a new likelihood"
             )
         if changed:
             self._label_model()
@@ -267,10 +253,9 @@ class VerifiedModel:
                     self.cache.discard(np.concatenate(self._unchecked), *places, generation=generation)
                 raise ChangedModel(
                     f"the {type(self.model).__name__} has changed since the likelihood was made (different: "
-                    f"{', '.join(sorted(changed)[:3])}): a value or file that it uses was changed, so that an earlier "
-                    "simulation gives another result, or another model was set. Its simulations cannot be stored with "
-                    "the earlier ones. Make a new model and a new likelihood; what varies during a run has to be a "
-                    "parameter"
+                    f"{', '.join(sorted(changed)[:3])}): another model was set, or a value or file that it uses, so "
+                    "that an earlier simulation gives another result. Make a new model and a new likelihood; what "
+                    "varies during a run has to be a parameter"
                 )
             self.label.has_changed_itself(changed)
             now = self.label.present(self.model)
@@ -290,7 +275,10 @@ class VerifiedModel:
         return {name for name in known.keys() | now.keys() if known.get(name) != now.get(name)}
 
     def _repeats(self) -> bool:
-        """Whether the repeated simulations give the earlier results, or the model is not repeatable."""
+        """Whether the first and latest simulation give the earlier results again, or the model is not repeatable.
+
+        So what has changed is user code's own, such as a counter.
+        """
         thetas, earlier = np.array([theta for theta, _ in self._points]), [misfit for _, misfit in self._points]
         for is_original in (True, False):
             new = self._simulate_again(thetas)

@@ -86,7 +86,6 @@ class Simulator(VerifiedModel):
         self.simulation_key = hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
         self.n_structural = len(model.parameter_names)
         self.simulations = self.cache_hits = self.disk_hits = 0
-        self._recalled: set[bytes] = set()
         self._most = 1  # simulations between two writes to the cache on disk, adapted to their duration
         self._together = hasattr(model, "simulate_together")
         self.when_simulated: Callable[[int], None] | None = None
@@ -142,7 +141,7 @@ class Simulator(VerifiedModel):
                     self._check_before()  # so that finished simulations are stored
                     self._trust.running.update(new)  # of another label, if the check has made one
             while left := request.left:
-                some, start = left[: self._chunk(len(left), full)], time.perf_counter()
+                some, start = left[: self._chunk(len(left))], time.perf_counter()
                 if self.pool is None or self._together:
                     with self._observed():
                         batch = simulate_batch(self.model, thetas_of(some, self.n_structural), self.pool)
@@ -170,12 +169,10 @@ class Simulator(VerifiedModel):
         Failures (with a reason) are recorded. Rows that are cached already are not changed. Nothing is written to the
         cache on disk. Without statistics, only failures are cached.
         """
-        for row, theta in enumerate(thetas + 0.0):
-            key = theta.tobytes()
-            if self.memory_cache.look_up([key]) == [None] and np.isfinite(theta).all():
-                if key not in self._recalled:
-                    self._recalled.add(key)
-                    self.failures.count_outcomes([theta], [reasons[row]])
+        rows = {theta.tobytes(): row for row, theta in enumerate(thetas + 0.0) if np.isfinite(theta).all()}
+        for (key, row), known in zip(rows.items(), self.memory_cache.look_up(rows), strict=True):
+            if known is None:
+                self.failures.count_outcomes(thetas[row : row + 1], [reasons[row]])
                 if reasons[row] or statistics is not None:
                     self.memory_cache.store([key], [reasons[row] or statistics[row].tobytes()])
 
@@ -242,14 +239,13 @@ class Simulator(VerifiedModel):
         """Whether simulations can be submitted to the pool one by one, and not for several data sets at once."""
         return bool(getattr(self.pool, "submits", False)) and not self._together
 
-    def _chunk(self, n: int, full: bool) -> int:
+    def _chunk(self, n: int) -> int:
         """Number of simulations, of n, between two writes to the cache on disk, or two reports of progress."""
         if self.streams:
             return n
-        in_memory = self.pool is None or self._together or self._keeps_responses(full)
-        most = most_responses(self.model) if in_memory else n
+        most = min(n, most_responses(self.model))
         if self.cache is None and (self.when_simulated is None or self.pool is not None):
-            return min(n, most)
+            return most
         workers = (os.cpu_count() or 1) if self.pool is None else self.pool.n_workers or n
         together = self.pool is not None or hasattr(self.model, "simulate_batch")  # then all workers are to be busy
         return min(max(_ROUNDS_PER_CHUNK * workers if together else 1, self._most), most)
@@ -290,11 +286,10 @@ class Simulator(VerifiedModel):
                 self.when_simulated(len(thetas))
             self._check_after(thetas, statistics, why)
             if self._keeps_responses(request.full):
-                places = [(request.fingerprint, key) for key in keys]
                 kept = [reason or response.copy() for reason, response in zip(reasons, values, strict=True)]
-                self.response_memory.store(places, kept)
+                self.response_memory.store([(request.fingerprint, key) for key in keys], kept)
             if request.full:
-                request.responses |= zip(keys, values, strict=True)
+                request.responses |= zip(keys, kept, strict=True)
             self._enter(request, outcomes_of(keys, statistics, why))
             if self.cache is not None:
                 stored = values if request.full or self.stores_responses or self.cache.responses else None
