@@ -20,8 +20,11 @@ from ..likelihood.joint import JointLikelihood
 from ..likelihood.likelihood import FELikelihood
 from ..likelihood.parameters import Parameter
 from ..likelihood.posterior import Posterior
+from ..priors.between_events import BETWEEN_EVENTS
 from ..priors.priors import Prior
-from .finding import CARE, NOTE, TAIL, WRONG, Finding, Judgement, in_order, judge
+from ..signals.records import find_events
+from ..text_tables import listed
+from .finding import CARE, NOTE, TAIL, WRONG, Finding, Judgement, in_order, judge, percent
 from .model import (
     STEP,
     at_mean,
@@ -289,6 +292,9 @@ def judge_run(run: FinishedRun) -> JudgedRun:
     found += check_failures(failed.count, failed.attempts, failed.rows[0][0] if failed.rows else "")
     if not run.is_inconclusive and all(each.severity != WRONG for each in found):  # a fault explains the residuals
         found += check_residuals(fits) + check_stated_errors(fits)
+        events = [find_events(part.model) for part, _ in parts]
+        if len(parts) == 1 and histories and (events[0] is None or len(events[0].names) == 1):
+            found += _check_other_events(run, len(parts[0][0].model.parameter_names))
     checked = sum(each.checks is not None for fit in fits for each in fit.channels)
     responses = max((len(each.draws) for each in fits), default=0)
     alone = "the length of the chain alone: a Markov chain gives no verdict"
@@ -330,6 +336,20 @@ def _check_steps(run: FinishedRun) -> tuple[list[Finding], str]:
     if needed > TAIL * report["simulations"] and needed * seconds > SECONDS:
         return [], f"not tested: the test takes about {needed} simulations of {seconds:.2g} s"
     return halve_steps(run.posterior, run.centre, run.samples.std(axis=0))
+
+
+def _check_other_events(run: FinishedRun, n: int) -> list[Finding]:
+    """By which factors the standard deviations of the first n parameters, from one event, are too small for another."""
+    factors, differing = dict[str, float](), list[str]()
+    for parameter, values in zip(run.parameters[:n], run.samples.T, strict=False):
+        spread = next((sd for kind, sd in BETWEEN_EVENTS.items() if parameter.name.startswith(kind)), 0.0)
+        if spread and values.std() > 0.0:
+            # both events differ from the structure's median, each by the spread
+            factors[parameter.label] = float(np.hypot(1.0, np.sqrt(2.0) * spread * abs(values.mean()) / values.std()))
+            differing.append(f"{parameter.label} by about {percent(spread)} (factor {factors[parameter.label]:.2g})")
+    text = f"For another event the standard deviations are too small: parameters differ, {listed(differing)}."
+    action = "Predict another event with this spread (in Python, predict_new_event), or calibrate several events."
+    return [Finding("Another event differs", NOTE, text, action, factors)] if factors else []
 
 
 def _check_samples(run: FinishedRun) -> list[Finding]:

@@ -247,3 +247,5 @@ def test_the_most_severe_finding_decides_and_is_the_first_sentence(page, vibrati
     judgement = check_result(sampler, posterior)
     assert {finding.kind for finding in judgement.findings} >= set(page.notes)
     assert str(judgement) in page.text and judgement.status in page.text
+    (other,) = (each for each in judgement.findings if each.kind == "Another event differs")
+    assert other.numbers["damping"] > 1.0 and "For another event the standard deviations are too small" in page.text
