@@ -136,7 +136,7 @@ GUIDE = FixedGuide(POSTERIOR, POSTERIOR.mean, [np.diag(POSTERIOR.sd**2)])
         (SMCSampler, {"pool": 1, "guide": GUIDE}, ValueError, "guides wait"),
         (SMCSampler, {"pool": 1, "recycle": False}, ValueError, "moves and guides wait"),
         (SMCSampler, {"vectorize": True, "asynchronous": 1}, ValueError, "True or False"),
-        (TMCMCSampler, {"pool": 1, "guide": GUIDE}, TypeError, "asynchronous"),
+        (TMCMCSampler, {"pool": 1, "guide": GUIDE}, ValueError, "asynchronous"),
     ],
 )
 def test_what_cannot_be_asynchronous_is_refused(Sampler, settings, error, word):
