@@ -19,14 +19,23 @@ _EXIT = (
 _names: dict[int, bytes] = {}
 
 
+class _RaisesKeyboardInterrupt(NamedTuple):
+    """Handler of SIGINT that calls another one, and raises KeyboardInterrupt in place of what that one raises."""
+
+    handler: Callable[..., Any]
+
+    def __call__(self, *arguments: Any) -> None:
+        global _interrupts
+        try:
+            self.handler(*arguments)
+        except BaseException as error:
+            _interrupts += 1
+            if isinstance(error, KeyboardInterrupt):
+                raise
+            raise KeyboardInterrupt from error
+
+
 _interrupts = 0
-
-
-def _count_and_raise(*arguments: Any) -> None:
-    """Handler of SIGINT in `interrupts_end_the_run`."""
-    global _interrupts
-    _interrupts += 1
-    raise KeyboardInterrupt
 
 
 def interrupts() -> int:
@@ -35,24 +44,28 @@ def interrupts() -> int:
 
 
 def raise_if_interrupted(before: int) -> None:
-    """Raise KeyboardInterrupt if there were more `interrupts` than `before`: the user's code may have caught it."""
+    """Raise KeyboardInterrupt if there were more `interrupts` than `before`: a bare ``except`` may have caught it."""
     if _interrupts != before:
         raise KeyboardInterrupt
 
 
 @contextlib.contextmanager
 def interrupts_end_the_run() -> Iterator[None]:
-    """Context in which `interrupts` counts Ctrl-C, unless somebody has set another handler than Python's."""
-    in_main = threading.current_thread() is threading.main_thread()
-    if not in_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+    """Context in which Ctrl-C raises KeyboardInterrupt in the main thread, whichever handler of SIGINT is set. A
+    handler that raises something else, as `dask_jobqueue` sets one, is called; one that returns has dealt with Ctrl-C.
+    """
+    handler = signal.getsignal(signal.SIGINT)
+    is_ours = isinstance(handler, _RaisesKeyboardInterrupt)
+    if threading.current_thread() is not threading.main_thread() or not callable(handler) or is_ours:
         yield
         return
+    ours = _RaisesKeyboardInterrupt(handler)
     try:
-        signal.signal(signal.SIGINT, _count_and_raise)
+        signal.signal(signal.SIGINT, ours)
         yield
     finally:
-        if signal.getsignal(signal.SIGINT) is _count_and_raise:  # else the user's code has set another one meanwhile
-            signal.signal(signal.SIGINT, signal.default_int_handler)
+        if signal.getsignal(signal.SIGINT) is ours:  # else the user's code has set another one meanwhile
+            signal.signal(signal.SIGINT, handler)
 
 
 @contextlib.contextmanager
@@ -72,17 +85,33 @@ def deferred_interrupts() -> Iterator[None]:
             handler(*received[0])
 
 
-def raise_if_it_ends_the_run(error: BaseException) -> None:
+def raise_if_it_ends_the_run(error: BaseException, before: BaseException | None = None) -> None:
     """Raise what must not become a failed evaluation: an error with ``ends_run``, KeyboardInterrupt and, but for
-    workers, SystemExit.
+    workers, SystemExit, even as cause or context of `error`. What was handled `before` (``sys.exception()`` at the call
+    of the function) is no cause.
     """
-    if isinstance(error, SystemExit) and not is_worker():
-        if _EXIT not in getattr(error, "__notes__", ()):
-            error.add_note(_EXIT)
-            logger.warning(_EXIT)
+    if getattr(error, "ends_run", False):
         raise error
-    if isinstance(error, KeyboardInterrupt) or getattr(error, "ends_run", False):
-        raise error
+    causes = _causes(error, before)
+    for kind in (KeyboardInterrupt,) if is_worker() else (KeyboardInterrupt, SystemExit):
+        for cause in causes:
+            if isinstance(cause, kind):
+                if isinstance(cause, SystemExit) and _EXIT not in getattr(cause, "__notes__", ()):
+                    cause.add_note(_EXIT)
+                    logger.warning(_EXIT)
+                raise cause
+
+
+def _causes(error: BaseException, before: BaseException | None) -> list[BaseException]:
+    """An exception with its causes and contexts, apart from what was handled `before`."""
+    found: list[BaseException] = []
+    left = [error]
+    while left:
+        each = left.pop()
+        if each is not before and all(each is not other for other in found):
+            found.append(each)
+            left += [other for other in (each.__cause__, each.__context__) if other is not None]
+    return found
 
 
 _is_worker = False

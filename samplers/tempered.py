@@ -15,7 +15,7 @@ import time
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from typing import Any
 
 import numpy as np
@@ -35,6 +35,8 @@ from .judgement.verdict import (
     describe_early_stop,
     independent_points,
     judge,
+    lost_simulations,
+    with_lost_record,
 )
 from .moves.population_moves import RandomWalkMove, describe, guide_move, with_fast_sweeps, without_unfitted
 from .record import BudgetExhausted, EvaluatedBatch, Incomplete, RunStart, as_limit
@@ -50,6 +52,8 @@ from .tempering.population import Population, check_size
 
 logger = logging.getLogger(__name__)
 
+ARGUMENTS = ("log_prior_fn", "log_likelihood_fn", "guide", "max_simulations", "seed")
+
 
 class TemperedSampler(RunResults, EnsembleSampler):
     """emcee's ensemble sampler, preceded by annealing from the prior to the posterior.
@@ -62,7 +66,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
         them (not with a `pool` and ``vectorize=False``, since workers do not cache simulations). A point for which
         `log_prob_fn` raises an exception or returns NaN counts as -inf and is recorded (`failures`). Points outside the
         support of the prior are not evaluated. Blobs that are numbers are stored as floats, others as objects, or as
-        `blobs_dtype` says. With an emcee `HDFBackend`, a killed run continues (`run_mcmc`).
+        `blobs_dtype` says; blobs that this type cannot hold exactly are refused. With an emcee `HDFBackend`, a killed
+        run continues (`run_mcmc`).
     log_prior_fn : callable, optional
         Log-density of the normalised prior. It takes the same kind of argument as `log_prob_fn` (a point; a batch with
         `vectorize`; a dict with `parameter_names`) but not `args` and `kwargs`. By default ``log_prob_fn.log_prior``.
@@ -123,6 +128,9 @@ class TemperedSampler(RunResults, EnsembleSampler):
     ):
         nwalkers, ndim = as_whole_number("nwalkers", nwalkers), as_whole_number("ndim", ndim)
         check_arguments(pool, backend, seed)
+        if unknown := settings.keys() - (names := [each.name for each in fields(Settings)]):
+            text = f"{type(self).__name__}() got an unexpected keyword argument {min(unknown)!r}; settings are "
+            raise TypeError(f"{text}{', '.join(names)}, other arguments are those of emcee and {', '.join(ARGUMENTS)}")
         functions = log_prob_fn, log_likelihood_fn, log_prior_fn
         self._target = target = Target(*functions, ndim, args, kwargs, vectorize, blobs_dtype)
         self.log_prior_fn = target.log_prior_fn
@@ -151,6 +159,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._chain = Chain(self.backend)
         self._result, self._verdict = self._chain.result, self._chain.verdict
         self._must_compare = reopened or self.backend.iteration > 0
+        known = np.inf if self._record.path is None else self._record.simulations
+        self._lost = lost_simulations(self._verdict, known)
         check_moves(self._moves, given.chains)
         self._fast = target.fast_parameters if pool is None or vectorize else ()
         followed = with_fast_sweeps(self._moves, self._fast, ndim, given.fast_sweeps)
@@ -231,8 +241,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
         Raises
         ------
         KeyboardInterrupt
-            At Ctrl-C, also if a bare ``except`` of the function hides it. A handler of SIGINT that somebody has set
-            stays in use.
+            At Ctrl-C, even if a library has set a handler that raises something else, as dask_jobqueue does. The
+            handler is called; one that returns has dealt with Ctrl-C.
         SystemExit
             If the function calls ``sys.exit`` in this process. In a worker process this is a failed evaluation.
 
@@ -411,6 +421,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
             self._verdict = judge(self._result, *numbers, missing, self._failed[0], self._near, names)
         else:  # an annealing that could not be made again
             self._verdict = self._verdict._replace(simulations=self.simulations)
+        self._verdict = with_lost_record(self._verdict, self._lost)
         self._chain.result, self._chain.verdict = self._result, self._verdict
         self._chain.write()
 

@@ -300,7 +300,8 @@ class VerifiedModel:
         trust = self._trust
         if {TransientReason}.issuperset(map(type, reasons)):
             return
-        generation = self._generation(fingerprint)
+        if not (generation := self._generation(fingerprint)):
+            return
         self._use(fingerprint, generation)
         rows = pack_rows(self.simulation_key, thetas, misfit, reasons, generation, trust.session)
         values = np.zeros((len(thetas), 0)) if responses is None else responses
@@ -341,6 +342,8 @@ class VerifiedModel:
             same = [each for each in stored if each[0] == self.label.code and read_again(each[1]) == each[1]]
             if not same:  # it is stored with the first row
                 same = [("", {}, next((each[2] for each in known.values()), 0) or self._adopted(fingerprint))]
+            if not same[-1][2]:  # it is not known which rows agree
+                return 0
             known.setdefault(fingerprint, same[-1])
         return known[fingerprint][2]
 
@@ -351,15 +354,22 @@ class VerifiedModel:
         if stored:
             what = f"are used if {ROWS} of them agree with new simulations"
             self._say("the code, a file, a package or the machine is not that of stored simulations, which %s", what)
-        for generation, identity in stored:
-            width = len(self.model.channels) * self.model.n_steps if identity == fingerprint else self.n_numbers
-            rows = self.cache.some_rows(identity, generation, width, ROWS)
-            compared, _, other = self._compare(rows, ROWS) if len(rows) == ROWS else (0, [], None)
+        waits = False
+        for generation in dict.fromkeys(each for each, _ in stored):
+            compared, other = 0, None
+            for identity in identities:
+                width = len(self.model.channels) * self.model.n_steps if identity == fingerprint else self.n_numbers
+                rows = self.cache.some_rows(identity, generation, width, ROWS)
+                if other is None and compared < ROWS / 2 and len(rows) == ROWS and not all(row.reason for row in rows):
+                    compared, stopped, other = self._compare(rows, ROWS)
+                    waits |= other is None and bool(stopped)
             if other is None and compared >= ROWS / 2:
-                self._trust.used[identity] = -ROWS_PER_VERIFICATION * compared
+                self._trust.used |= {identity: -ROWS_PER_VERIFICATION * compared for identity in identities}
                 self._say("%d stored simulations agree with new ones: all are used", compared)
                 self._use(fingerprint, generation)
                 return generation
+        if waits:  # as without a licence: later simulations decide
+            return 0
         if stored:
             self._say("stored simulations differ from new ones, or are too few: they stay in the file, not used")
         # the one that another process begins under the same label

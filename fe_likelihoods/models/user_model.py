@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 import json
 import os
+import sys
 from collections.abc import Iterable, Sequence
 from hashlib import blake2b
 from pathlib import Path
@@ -91,13 +92,15 @@ class ExternalModel(StructuralModel):
         Raises SimulationFailed if the external code raises an exception, or its response has a wrong shape, is complex
         or is not finite; the reason is a `TransientReason` if the cause is not the model (see
         `fe_likelihoods.simulation.failure_reasons`). Raises ValueError if `theta` has another shape. KeyboardInterrupt
-        and SystemExit of the code in this process are no failed simulation: they end the run.
+        and SystemExit of the code in this process, even as the cause of another exception, are no failed simulation:
+        they end the run.
         """
         theta = check_theta(theta, self.parameter_names).copy()
+        before = sys.exception()
         try:
             return self._check_response(self._respond(theta))
         except BaseException as error:  # external code may raise anything
-            raise_if_it_ends_the_run(error)
+            raise_if_it_ends_the_run(error, before)
             raise SimulationFailed(reason_of(error)) from error
 
     def _digest(self, *parts: Any) -> str:

@@ -10,6 +10,7 @@ notebook functions work. The worker imports this library, installed packages and
 * A worker refuses everything if its version of this library has different source code.
 """
 
+import dis
 import functools
 import importlib.machinery
 import importlib.metadata
@@ -220,17 +221,27 @@ class _Pickler(cloudpickle.Pickler):
 @functools.lru_cache(maxsize=4096)
 def names_in(code: types.CodeType) -> frozenset[str]:
     """Names in a code object and in the code objects inside it."""
-    inner = [names_in(each) for each in code.co_consts if isinstance(each, types.CodeType)]
-    return frozenset(code.co_names).union(*inner)
+    return frozenset(name for each in _codes(code) for name in each.co_names)
+
+
+@functools.lru_cache(maxsize=4096)
+def _imported_in(code: types.CodeType) -> frozenset[str]:
+    """Modules of import statements in the code, without the dots of relative ones."""
+    steps = [step for each in _codes(code) for step in dis.get_instructions(each)]
+    return frozenset(step.argval for step in steps if step.opname == "IMPORT_NAME")
+
+
+def _codes(code: types.CodeType) -> list[types.CodeType]:
+    inner = [each for each in code.co_consts if isinstance(each, types.CodeType)]
+    return [code, *(each for part in inner for each in _codes(part))]
 
 
 def _possible_modules(code: types.CodeType, package: str) -> list[str]:
-    """Full names of modules that the code of a package may import: those that are imported are among its names."""
-    names, parts = names_in(code), package.split(".")
-    packages = [".".join(parts[:n]) for n in range(1, len(parts) + 1)]
-    found = names | {f"{each}.{name}".rstrip(".") for each in packages for name in names | {""}}
-    found |= {f"{each}.{name}" for each in found & sys.modules.keys() for name in names}
-    return sorted(found & sys.modules.keys())
+    """Full names of modules that the code of a package may import."""
+    imported, parts = _imported_in(code), package.split(".")
+    packages = [".".join(parts[:n]) for n in range(1, len(parts) + 1)] if imported else []
+    found = imported | {f"{each}.{name}".rstrip(".") for each in packages for name in imported}
+    return sorted(found | {f"{each}.{name}" for each in found & sys.modules.keys() for name in names_in(code)})
 
 
 class _Namespace(NamedTuple):

@@ -7,6 +7,7 @@ are no failures.
 """
 
 import logging
+import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import cycle
@@ -142,13 +143,13 @@ def simulate_batch(model: Model, thetas: np.ndarray, pool: Any = None) -> Simula
         if getattr(model, "simulate_together", None) is not None:
             return model.simulate_together(thetas, pool)
         if pool is None and hasattr(model, "simulate_batch"):
-            known = interrupts()
+            before, known = sys.exception(), interrupts()
             try:
                 batch = SimulationBatch(*_checked_batch(model, model.simulate_batch(thetas), (len(thetas), *shape)))
                 raise_if_interrupted(known)
                 return batch
             except BaseException as error:  # which must not make all parameter sets fail
-                raise_if_it_ends_the_run(error)
+                raise_if_it_ends_the_run(error, before)
                 text = "A batch method of %s failed; its parameter sets are run one by one: %s: %s"
                 logger.warning(text, type(model).__name__, type(error).__name__, error)
         return SimulationBatch(*run_each(sent_simulation(model), thetas, shape, pool))
@@ -229,7 +230,7 @@ def real_response(response: Any, channels: Sequence[Channel], n_steps: int) -> n
                 f"the response of {which} is complex, expected real numbers; return its real part if that is the "
                 "response"
             )
-        response = response.astype(float, copy=False)
+        response = response.astype(float)  # a copy: the model may use its array again for the next simulation
     except (TypeError, ValueError) as error:
         raise SimulationFailed(f"the response is not an array of numbers: {error}") from error
     if (got := response.shape) != (expected := (len(channels), n_steps)):
@@ -247,10 +248,11 @@ def _misfit(measured: np.ndarray | Comparison, reduce: Statistic, model: Model, 
 
 def _reduced(measured: np.ndarray | Comparison, reduce: Statistic, _model: Model, response: np.ndarray) -> np.ndarray:
     """Statistic of a response; `SimulationFailed` if it cannot be computed."""
+    before = sys.exception()
     try:
         return reduce_response(response, measured, reduce)
     except Exception as error:
-        raise_if_it_ends_the_run(error)
+        raise_if_it_ends_the_run(error, before)
         raise SimulationFailed(reason_of(error) if is_transient(error) else MisfitReason(reason_of(error))) from error
 
 
@@ -268,11 +270,11 @@ def _attempt(
     run: Callable[[Model, np.ndarray], np.ndarray], model: Model, theta: np.ndarray
 ) -> tuple[np.ndarray | None, str]:
     """Run one simulation; returns its result and an empty reason, or None and the reason. Called in the worker."""
-    known = interrupts()
+    before, known = sys.exception(), interrupts()
     try:
         result = run(model, theta)
     except BaseException as error:  # a model may raise anything
-        raise_if_it_ends_the_run(error)
+        raise_if_it_ends_the_run(error, before)
         raise_if_interrupted(known)
         return None, reason_of(error)
     raise_if_interrupted(known)

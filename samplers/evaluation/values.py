@@ -1,11 +1,13 @@
 """Arrays of log-densities and blobs from what a user's function returns, or an error that says what is wrong.
 
 emcee's conventions hold: one number per point, or a sequence of the number and blobs. Unlike in emcee, a point fails by
-NaN; blobs that are numbers are floats, all others Python objects, unless the user declares a type.
+NaN; blobs that are numbers are floats, all others Python objects, unless the user declares a type, and a value that it
+cannot hold is refused: text and numbers are never cut, except floats of fewer declared digits.
 """
 
 import copy
 import logging
+import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
@@ -15,6 +17,8 @@ import numpy as np
 from ..interrupts import interrupts, raise_if_interrupted, raise_if_it_ends_the_run
 
 logger = logging.getLogger(__name__)
+
+LARGEST_EXACT = 2**53  # integers above are rounded in a float, and stay Python's
 
 
 def most_common_reasons(reasons: Iterable[str] | Mapping[str, int], number: int = 3) -> str:
@@ -38,7 +42,7 @@ class Caught:
         self.function, self.args, self.kwargs, self.vectorize = function, args or (), kwargs or {}, vectorize
 
     def __call__(self, points: Any) -> Any:
-        known = interrupts()
+        before, known = sys.exception(), interrupts()
         try:
             # a copy, since the points are needed after a function that changes them
             result = self.function(copy.deepcopy(points), *self.args, **self.kwargs)
@@ -47,7 +51,7 @@ class Caught:
             fault = "" if self.vectorize or not hasattr(owner, "fault") else owner.fault(points)
             return Failed(fault) if fault else result
         except (Exception, SystemExit) as error:
-            raise_if_it_ends_the_run(error)
+            raise_if_it_ends_the_run(error, before)
             raise_if_interrupted(known)
             if not self.vectorize:
                 return Failed(error)
@@ -140,18 +144,39 @@ def _number(value: Any, name: str) -> float:
 def _stacked(blobs: list, dtype: Any, name: str) -> np.ndarray:
     """Blobs of several points, a sequence for each, as one array (n, ...), as emcee stores them.
 
-    ValueError if a declared dtype cannot hold them.
+    ValueError if a declared dtype cannot hold a value.
     """
     try:
-        found = np.array(blobs, dtype)
-        if dtype is None:
-            numbers = found.dtype.kind in "biufc"
-            found = found.astype(np.result_type(found.dtype, float)) if numbers else np.array(blobs, object)
+        with np.errstate(all="ignore"):
+            if dtype is None:
+                found = np.array(blobs)
+                found = found.astype(np.result_type(found.dtype, float)) if found.dtype.kind in "biufc" else None
+                if found is None or (np.any(np.abs(found) >= LARGEST_EXACT) and not _holds(found.tolist(), blobs)):
+                    found = np.array(blobs, object)
+            else:
+                found = np.array(blobs, dtype)
     except (TypeError, ValueError, OverflowError) as error:  # no type holds all values, or rows of several lengths
         if dtype is not None and np.dtype(dtype).kind != "O":
             raise ValueError(f"{name} must return blobs of the declared type, blobs_dtype={dtype}: {error}") from error
         found = np.empty(len(blobs), dtype=object)
         for place, row in enumerate(blobs):
             found[place] = row
+    lost = [] if dtype is None else [i for i, kept in enumerate(found.tolist()) if not _holds(kept, blobs[i])]
+    if lost:
+        raise ValueError(
+            f"{name} must return blobs of the declared type, blobs_dtype={dtype}; got {blobs[lost[0]]!r}, which this "
+            "type cannot hold. Declare a wider one"
+        )
     single = tuple(axis for axis in range(1, found.ndim) if found.shape[axis] == 1)
     return np.squeeze(found, single) if single else found
+
+
+def _holds(kept: Any, given: Any) -> bool:
+    """Whether an item of an array, as Python's value, is what was given; a float may have fewer digits."""
+    kept, given = (each.tolist() if isinstance(each, np.ndarray | np.generic) else each for each in (kept, given))
+    if isinstance(given, list | tuple):
+        return all(map(_holds, kept if isinstance(kept, list | tuple) else [kept], given))
+    if isinstance(given, float | complex) and isinstance(kept, float | complex):
+        return bool(np.isfinite(kept) or not np.isfinite(given))
+    given = given.encode() if isinstance(given, str) and isinstance(kept, bytes) else given
+    return given is kept or kept == given or (kept != kept and given is None)

@@ -31,6 +31,7 @@ LONGEST_REASON = 200  # characters
 CONVERGED = "converged"
 USABLE = "usable"
 NOT_USABLE = "not usable"
+INCOMPLETE = "The record is incomplete"
 STATUSES = (CONVERGED, USABLE, NOT_USABLE)
 SEVERITIES = (NOTE, CARE, WRONG)
 
@@ -178,6 +179,26 @@ def judge(
         _sample(result, nwalkers),
         tuple(found),
     )
+
+
+def lost_simulations(stored: Verdict | None, simulations: float) -> float:
+    """How many simulations a record has lost, by the verdict stored with its chain and the number that it has now."""
+    if stored is None:
+        return 0.0
+    before = sum(each.numbers.get("lost", 0.0) for each in stored.findings if each.kind == INCOMPLETE)
+    return before + max(stored.simulations - simulations, 0.0)
+
+
+def with_lost_record(verdict: Verdict, lost: float) -> Verdict:
+    """The verdict on a run whose record has lost a number of simulations."""
+    text = f"The record of the run has lost {lost:.0f} simulations: failures among them are not judged."
+    action = "The chain is whole; repeat the run in new files if simulations fail."
+    finding = Finding(INCOMPLETE, CARE, text, action, {"lost": lost})
+    if lost < 1.0 or finding in verdict.findings:
+        return verdict
+    status = STATUSES[max(STATUSES.index(verdict.status), SEVERITIES.index(finding.severity))]
+    reasons, findings = (finding.message.rstrip("."), *verdict.reasons), (*verdict.findings, finding)
+    return verdict._replace(status=status, reasons=reasons, findings=findings)
 
 
 def _sample(result: AnnealingResult, nwalkers: int) -> str:

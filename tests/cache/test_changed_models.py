@@ -256,6 +256,33 @@ COUNTERS = {
 }
 
 
+FAILS = MODEL.replace("    x = ", "    if theta[0] > 0.5: raise ValueError('no convergence')\n    x = ")
+CHANGED_BELOW = FAILS.replace("law(x)", "law(x) * (1.1 if theta[0] < 0.3 else 1.0)")
+
+
+def test_failures_alone_are_no_reason_to_adopt(workshop):
+    """The edited model fails at the same points, which says nothing about the others."""
+    workshop.write(model=FAILS)
+    workshop.run()
+    workshop.write(model=CHANGED_BELOW)
+    likelihood = workshop.run()
+    fresh = FELikelihood(FunctionModel(workshop.module.f, ("a",), CHANNELS, 0.01, 20), MEASURED)
+    np.testing.assert_array_equal(likelihood.simulator.statistics(POINTS), fresh.simulator.statistics(POINTS))
+
+
+def test_adoption_waits_while_simulations_are_stopped(workshop):
+    """As without a licence: the stored rows count once simulations end again."""
+    workshop.run()
+    licence = "import os\nif os.path.exists('stopped'): raise OSError('no licence')\n"
+    workshop.write(model=MODEL.replace("    x = ", textwrap.indent(licence, "    ") + "    x = "))
+    (workshop.folder / "stopped").touch()
+    likelihood = workshop.run(points=POINTS[:20])
+    assert not np.isfinite(likelihood.simulator.statistics(POINTS[:20])).any()
+    (workshop.folder / "stopped").unlink()
+    np.testing.assert_array_equal(likelihood.simulator.statistics(POINTS), true_values(workshop))
+    assert likelihood.simulator.disk_hits >= 300
+
+
 @pytest.mark.parametrize("helper", COUNTERS.values(), ids=COUNTERS)
 def test_a_model_may_change_its_own_values(workshop, helper, monkeypatch):
     monkeypatch.setattr("fe_likelihoods.cache.verification.SHARE_OF_TIME", np.inf)  # compared after every batch

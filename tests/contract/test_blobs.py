@@ -1,4 +1,4 @@
-"""Blobs are stored as floats, objects or what is declared, or refused, in memory and in a file.
+"""Blobs are stored as floats, objects or what is declared, or refused: never cut or rounded, in memory and in a file.
 
 The function returns other types of blobs where the first parameter is large: in the first evaluations, which are draws
 of the prior, or only near the posterior.
@@ -14,7 +14,7 @@ import pytest
 from samplers import SMCSampler
 from tests.contract.targets import Gaussian
 
-N, NDIM = 24, 2
+N, NDIM, BIG = 24, 2, 2**60 + 1
 FIRST, LATER = -0.6, 1.9  # places that draws of the prior reach, and that only the posterior reaches
 pytestmark = pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")  # 24 walkers are few
 
@@ -64,6 +64,7 @@ def exact(sampler, as_stored=lambda value: value):
 ints, floats = (lambda x: int(100 * x[0])), (lambda x: float(x[0]))
 PAIRS = {
     "float after int": (ints, floats),
+    "int after float": (floats, lambda x: BIG),
     "larger int": (ints, lambda x: 2**70),
     "longer text": (lambda x: "a", lambda x: f"text of {x[0]!r}"),
     "None": (floats, lambda x: None),
@@ -100,7 +101,17 @@ def test_another_declared_type_is_another_run(tmp_path):
 
 @pytest.mark.parametrize(
     ("pair", "dtype"),
-    [((floats, lambda x: {}), float), ((lambda x: [1.0, 2.0], lambda x: [1.0]), float), ((ints, lambda x: "a"), int)],
+    [
+        ((ints, floats), int),
+        ((floats, lambda x: 1e300), np.float32),
+        ((lambda x: "a", lambda x: "abcdef"), "S5"),
+        ((lambda x: "a", lambda x: 1.5), "S9"),
+        ((ints, lambda x: BIG), np.int32),
+        ((floats, lambda x: BIG), float),
+        ((floats, lambda x: {}), float),
+        ((lambda x: True, ints), bool),
+        ((lambda x: [1.0, 2.0], lambda x: [1.0]), float),
+    ],
 )
 @pytest.mark.parametrize("place", [FIRST, LATER])
 def test_a_value_that_a_declared_type_cannot_hold_is_refused(pair, dtype, place, tmp_path):

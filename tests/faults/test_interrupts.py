@@ -64,17 +64,21 @@ def leaves(*arguments):
     sys.exit()
 
 
-def test_ctrl_c_that_the_model_hides(tmp_path):
-    def hides():
-        try:
-            press_ctrl_c()
-        except:  # noqa: E722
-            pass
+def raises(*arguments):
+    raise KeyboardInterrupt
 
-    likelihood = likelihood_of(hides, tmp_path / "cache.db")
+
+def raises_another(*arguments):
+    raise RuntimeError("stop")
+
+
+@pytest.mark.parametrize("handler", [signal.default_int_handler, leaves, raises, raises_another])
+def test_ctrl_c_is_a_keyboard_interrupt_with_every_handler_that_raises(handler, tmp_path):
+    signal.signal(signal.SIGINT, handler)
+    likelihood = likelihood_of(press_ctrl_c, tmp_path / "cache.db")
     with pytest.raises(KeyboardInterrupt):
         likelihood.misfit(THETAS)
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(signal.SIGINT) is handler
     assert likelihood.report()["failure_count"] == 0
     check_nothing_is_stored(tmp_path / "cache.db")
 
@@ -93,6 +97,7 @@ def test_a_handler_that_a_model_sets_stays():
 
 
 def test_deferred_ctrl_c_is_a_keyboard_interrupt_at_the_end():
+    signal.signal(signal.SIGINT, leaves)
     done = []
 
     def function(x):
@@ -105,7 +110,7 @@ def test_deferred_ctrl_c_is_a_keyboard_interrupt_at_the_end():
     sampler = SMCSampler(20, 2, None, log_likelihood_fn=function, log_prior_fn=Gaussian().log_prior, seed=1)
     with pytest.raises(KeyboardInterrupt):
         sampler.run_mcmc(Gaussian(2).sample_prior(20, np.random.RandomState(1)), 1)
-    assert done == [1]
+    assert done == [1] and signal.getsignal(signal.SIGINT) is leaves
 
 
 # pools ---------------------------------------------------------------------------------------------------------------
@@ -151,6 +156,7 @@ def test_interrupts_in_pools_of_a_likelihood(pool, tmp_path):
 def test_ctrl_c_while_the_pool_works(pool, tmp_path):
     """The terminal sends SIGINT to the main thread, which waits for a pool."""
     name, pool = pool
+    signal.signal(signal.SIGINT, leaves)
     likelihood = likelihood_of(partial(os.kill, os.getpid(), signal.SIGINT), tmp_path / "cache.db", pool)
     with pytest.raises(KeyboardInterrupt):
         likelihood.misfit(THETAS)
@@ -178,6 +184,7 @@ class Once(Gaussian):
 @pytest.mark.parametrize("sampler", [SMCSampler, TMCMCSampler])
 @pytest.mark.parametrize("act", [interrupt, press_ctrl_c, leave])
 def test_a_run_of_a_plain_function_goes_on_from_its_file(sampler, act, tmp_path):
+    signal.signal(signal.SIGINT, leaves)
     whole = sampler(40, 2, Gaussian(2), seed=3)
     whole.run_mcmc(None, 2)
 
@@ -187,6 +194,7 @@ def test_a_run_of_a_plain_function_goes_on_from_its_file(sampler, act, tmp_path)
     first = Once(act)
     with pytest.raises(SystemExit if act is leave else KeyboardInterrupt):
         make(first).run_mcmc(None, 2)
+    assert signal.getsignal(signal.SIGINT) is leaves
     second = Once(None)
     again = make(second)
     again.run_mcmc(None, 2)
@@ -195,14 +203,14 @@ def test_a_run_of_a_plain_function_goes_on_from_its_file(sampler, act, tmp_path)
     assert again.log_evidence == whole.log_evidence
 
 
-def wrapped():
+def wrapped(act):
     try:
-        press_ctrl_c()
+        act()
     except BaseException as error:
         raise ValueError("the solver stopped") from error
 
 
-@pytest.mark.parametrize("act", [interrupt, leave, wrapped])
+@pytest.mark.parametrize("act", [interrupt, leave, partial(wrapped, interrupt), partial(wrapped, leave)])
 @pytest.mark.parametrize("vectorize", [False, True])
 def test_interrupts_of_a_plain_function_are_no_failed_evaluations(act, vectorize):
     target = Once(act, at=3)
@@ -257,6 +265,7 @@ def guided_evidence(tmp_path_factory):
 
 @pytest.mark.parametrize("act", [press_ctrl_c, pytest.param(leave, marks=pytest.mark.slow)])
 def test_a_guided_run_goes_on_after_an_interrupt_in_the_search(act, guided_evidence, tmp_path, monkeypatch):
+    signal.signal(signal.SIGINT, leaves)
     simulate, calls = guided_run.Vibration.simulate, []
 
     def interrupted(model, theta):
@@ -268,7 +277,7 @@ def test_a_guided_run_goes_on_after_an_interrupt_in_the_search(act, guided_evide
     monkeypatch.setattr(guided_run.Vibration, "simulate", interrupted)
     with pytest.raises(SystemExit if act is leave else KeyboardInterrupt):
         guided_run.make(tmp_path / "cache.db")[0].run_mcmc(None, 0)
-    assert len(calls) == 8
+    assert len(calls) == 8 and signal.getsignal(signal.SIGINT) is leaves
     again, _ = guided_run.make(tmp_path / "cache.db")
     again.run_mcmc(None, 0)
     assert again.failure_count == 0 and any(np.array_equal(calls[7], theta) for theta in calls[8:])

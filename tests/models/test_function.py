@@ -14,6 +14,7 @@ import pytest
 
 from fe_likelihoods import Channel, FunctionModel, Record, SimulationFailed
 from fe_likelihoods.simulation.label import ModelLabel, value_digest
+from fe_likelihoods.simulation.model import simulate_batch
 from tests.faults import treacherous as bad
 from tests.faults.treacherous import CHANNELS, DT, N_STEPS, line, treacherous
 
@@ -51,6 +52,17 @@ def test_same_bits_in_process_and_isolated(guarded):
 def test_a_forgotten_return_is_named():
     with pytest.raises(SimulationFailed, match=r"shape \(\), expected .* = \(1, 20\): is it None"):
         model_of(lambda theta: None).simulate(THETA)
+
+
+def test_an_array_that_the_function_uses_again_is_copied():
+    array = np.zeros((len(CHANNELS), N_STEPS))
+
+    def reuses(theta):
+        array[:] = line(theta)
+        return array
+
+    thetas = np.array([THETA, 2.0 * THETA])
+    np.testing.assert_array_equal(simulate_batch(model_of(reuses), thetas).response, [line(THETA), line(2.0 * THETA)])
 
 
 def test_theta_of_the_caller_is_not_changed():
