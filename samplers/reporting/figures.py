@@ -319,7 +319,7 @@ def plot_run(sampler: Any) -> "Figure":
     for axes in ladder:
         axes.semilogy(ends, beta, "o-", color=BLUE, label="exponent β", markersize=4)
         axes.semilogy(ends, share, "s--", color=ORANGE, label="acceptance", markersize=4)
-        axes.set_ylabel("share [-]")
+        axes.set_ylabel("β, acceptance [-]")
     lines = [(ends, ess, np.cumsum(increments), errors, BLUE, "stages")] if several or not rounds else []
     if rounds:
         draws, *others = np.array([(r.draws, r.effective_sample_size, *r[3:5]) for r in rounds]).T
