@@ -288,8 +288,9 @@ class Simulator(VerifiedModel):
             if self._keeps_responses(request.full):
                 kept = [reason or response.copy() for reason, response in zip(reasons, values, strict=True)]
                 self.response_memory.store([(request.fingerprint, key) for key in keys], kept)
+                del kept  # the memory may be too small for them
             if request.full:
-                request.responses |= zip(keys, kept, strict=True)
+                request.responses |= zip(keys, [reasons[k] or values[k] for k in range(len(keys))], strict=True)
             self._enter(request, outcomes_of(keys, statistics, why))
             if self.cache is not None:
                 stored = values if request.full or self.stores_responses or self.cache.responses else None

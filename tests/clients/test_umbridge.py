@@ -170,7 +170,7 @@ def test_load_balancer_without_a_free_server_is_asked_again_and_other_pages_are_
 @pytest.mark.parametrize("kind", ["misfits", pytest.param("draws", marks=pytest.mark.slow)])
 def test_killed_server_is_waited_for_and_nothing_is_lost(kind):
     """The draws of the posterior, too, are those with the model in this process."""
-    prior = {name: TruncatedNormal(1.0, 0.5, lower=0.0, upper=4.0) for name in NAMES}
+    prior = {name: TruncatedNormal(1.0, 1.5, lower=0.0, upper=4.0) for name in NAMES}
     prior = Prior(prior | {"sigma_top": HalfNormal(0.3), "sigma_base": HalfNormal(0.3)})
 
     def values(likelihood):
