@@ -216,12 +216,12 @@ def _response(model: Model, theta: np.ndarray) -> np.ndarray:
 
 
 def real_response(response: Any, channels: Sequence[Channel], n_steps: int) -> np.ndarray:
-    """A model's response as floats (n_channels, n_steps) [SI], which may be infinite or NaN.
+    """A model's response as floats (n_channels, n_steps) [SI], which may be infinite or NaN, as where it is masked.
 
     `SimulationFailed` if it is complex, has another shape, or is not an array of numbers.
     """
     try:
-        response = np.asarray(response)
+        response = np.ma.filled(response, np.nan)
         if np.iscomplexobj(response):
             rows = response if response.ndim == 2 else np.zeros((0, 0))
             named = [channel.name for channel, row in zip(channels, rows, strict=False) if row.imag.any()]

@@ -280,3 +280,11 @@ def test_a_complex_response_is_refused():
         assert [bool(reason) for reason in batch.reasons] == [False, True, False]
         assert batch.reasons[1].startswith("the response of channel 'a' is complex, expected real numbers")
         assert not isinstance(batch.reasons[1], TransientReason)
+
+
+def test_a_masked_sample_is_no_number():
+    def simulate(theta):
+        return np.ma.masked_where((theta[0] == 0.4) & (np.arange(N_STEPS) == 2)[None], line(theta))
+
+    batch = simulate_batch(FunctionModel(simulate, NAMES, CHANNELS, DT, N_STEPS), THETAS)
+    assert [bool(reason) for reason in batch.reasons] == [False, True, False]
