@@ -56,7 +56,8 @@ print(sampler.verdict)
 samples = sampler.get_chain(flat=True)
 moments = summary(samples, posterior.parameter_names)
 print(moments)
-print("(mean - truth) / sd: " + ", ".join(f"{z:+.1f}" for z in (moments.mean - truth) / moments.sd))
+means = moments["mean"].to_numpy()
+print("(mean - truth) / sd: " + ", ".join(f"{z:+.1f}" for z in (means - truth) / moments["sd"]))
 plot_run(sampler).savefig("run.png")
 
 # %%
@@ -76,10 +77,10 @@ plot_corner(draws, posterior, truths=truth).savefig("corner.png")
 #
 # RRMSE is the relative root-mean-square error of a channel. At the right is the strongest part of the motion.
 
-points = {"Before updating (nominal values)": np.ones(5), "After updating (posterior mean)": moments.mean[:5]}
+points = {"Before updating (nominal values)": np.ones(5), "After updating (posterior mean)": means[:5]}
 responses = {title: model.simulate(theta) for title, theta in points.items()}
 plot_fit(data, responses, title="synthetic data").savefig("fit.png")
-plot_hysteresis(model, moments.mean[:5]).savefig("hysteresis.png")
+plot_hysteresis(model, means[:5]).savefig("hysteresis.png")
 
 # %%
 # Two model classes

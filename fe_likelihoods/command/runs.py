@@ -131,17 +131,18 @@ def write_summary(folder: Path, run: FinishedRun, judged: JudgedRun, said: Seque
     """Write ``summary.txt`` (judgement, moments of the parameters, fit, what else is `said`) and ``summary.csv``."""
     import pandas as pd  # slow to import
 
-    from samplers.reporting.summary import Summary
-
     from ..reporting.contents import parameter_table
+    from ..text_tables import text_table
 
     rows = parameter_table(run)
     columns = ["parameter", "mean", "mean_error", "sd", "sd_error", "cv", "q05", "median", "q95", "nominal"]
     rows.to_csv(folder / "summary.csv", index=False, columns=columns)
     pd.DataFrame([stage._asdict() for stage in run.sampler.ladder]).to_csv(folder / "stages.csv", index=False)
-    moments = Summary(*(rows["parameter" if name == "names" else name] for name in Summary._fields))
+    forms = ("", ".5g", ".2g", ".4g", ".2g", ".3g")
+    cells = [map(format, row, forms) for row in rows[columns[:6]].itertuples(index=False)]
+    moments = text_table([columns[:6], *map(list, cells)])
     evidence = f"log-evidence {run.sampler.log_evidence:.2f} +- {run.sampler.log_evidence_error:.2g}"
-    lines = [str(judged.judgement), "", str(moments), "", evidence, str(run.verdict), ""]
+    lines = [str(judged.judgement), "", moments, "", evidence, str(run.verdict), ""]
     for fit in judged.fits:
         title = f" ({fit.title})" if fit.title else ""
         errors = [f"  {each.channel.name}: {100 * each.after:.1f} %" for each in fit.channels]

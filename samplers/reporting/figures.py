@@ -4,7 +4,7 @@ Units, labels and nominal values come from ``posterior.parameters``; otherwise l
 or x0, x1, ... matplotlib and corner are imported inside the functions.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from importlib import util
 from pathlib import Path
@@ -18,8 +18,6 @@ from .summary import is_tempered
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-Values = Sequence[float] | np.ndarray | Mapping[str, float]  # one per parameter (NaN: none), or by name
 
 BLUE = "#1f5a8c"
 ORANGE = "#d9822b"
@@ -60,7 +58,7 @@ def plot_corner(
     samples: np.ndarray,
     posterior: Any = None,
     *,
-    truths: Values | None = None,
+    truths: Sequence[float] | None = None,
     names: Sequence[str] | None = None,
 ) -> "Figure":
     """Plot the posterior for all pairs of parameters by `corner.corner`, with the prior on the diagonal.
@@ -75,7 +73,7 @@ def plot_corner(
     posterior : Posterior, optional
         Gives units, labels and nominal values (``posterior.parameters``, as grey dashed lines) and the prior
         (``posterior.prior``). An object of your own may have ``parameter_names`` and ``prior``.
-    truths : sequence of float, shape (ndim,), or mapping of str to float, optional
+    truths : sequence of float, shape (ndim,), optional
         True values in the units of the samples, as red lines; NaN for none. The panels are widened to show a true or
         nominal value if that is near.
     names : sequence of str, optional
@@ -126,7 +124,7 @@ def plot_corner(
     return figure
 
 
-def plot_marginals(samples: np.ndarray, posterior: Any = None, *, truths: Values | None = None) -> "Figure":
+def plot_marginals(samples: np.ndarray, posterior: Any = None, *, truths: Sequence[float] | None = None) -> "Figure":
     """Plot the prior and posterior density of each parameter, which shows what the data have changed.
 
     A panel shows the prior, but is at most 2.5 times as wide as the range of the samples. If the prior is wider, the
@@ -166,7 +164,7 @@ def plot_marginals(samples: np.ndarray, posterior: Any = None, *, truths: Values
 
 
 def _choose(
-    samples: Any, posterior: Any, truths: Values | None, names: Sequence[str] | None = None, most: int | None = None
+    samples: Any, posterior: Any, truths: Any, names: Sequence[str] | None = None, most: int | None = None
 ) -> _Drawn:
     """Check the arguments of a figure, and convert what it shows to the units of its labels."""
     samples = np.asarray(samples, dtype=float)
@@ -197,26 +195,13 @@ def _choose(
     factors = np.array([each.factor for each in shown])
     samples = samples[:, columns] / factors
     nominal = np.array([each.nominal for each in shown], dtype=float) / factors
-    truths = _true_values(truths, known)[columns] / factors
+    truths = np.full(ndim, np.nan) if truths is None else np.array(truths, dtype=float)
+    if truths.shape != (ndim,):
+        raise ValueError(f"truths must have one value for each of {ndim} parameters (NaN for no mark); got {truths}")
+    truths = truths[columns] / factors
     limits = _limits(samples, np.stack([truths, nominal]))
     priors = _priors(posterior, wanted, columns, factors)
     return _Drawn([each.label for each in shown], samples, truths, nominal, *priors, limits, note)
-
-
-def _true_values(given: Values | None, known: list[str]) -> np.ndarray:
-    """True values to mark, one per parameter, NaN for none."""
-    if given is None or isinstance(given, Mapping):
-        given = given or {}
-        if unknown := [name for name in given if name not in known]:
-            raise ValueError(f"truths: unknown parameters {', '.join(unknown)}; known are {', '.join(known)}")
-        given = [given.get(name) for name in known]
-    values = np.array([np.nan if value is None else value for value in given], dtype=float)
-    if values.shape != (len(known),):
-        raise ValueError(
-            f"truths must have one value for each of {len(known)} parameters (NaN for no mark), or be a mapping of "
-            f"names to values; got shape {values.shape}"
-        )
-    return values
 
 
 def _priors(posterior: Any, names: Sequence[str], columns: list[int], factors: np.ndarray) -> tuple[list, Any]:

@@ -9,6 +9,8 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from tqdm import tqdm as terminal_bar
+
 from ..emcee_names import get_progress_bar
 from ..evaluation.evaluator import Evaluator
 from ..reports import AnnealingResult, GuideTick, Report, Restart, Stage, Sweep
@@ -38,13 +40,14 @@ class _Lines:
 
 
 def _open_bar(display: bool | str, total: int | None, **kwargs: Any) -> Any:
-    """Return a bar of tqdm for `display` True, no bar for False, and emcee's bar of this name for a str.
+    """A bar of tqdm, disabled if `display` is False; emcee's bar of this name for a str.
 
     Where stderr is neither a terminal nor a notebook, the bar writes at most one line per minute and the last state.
     """
-    if display is not True:
+    if isinstance(display, str):
         return get_progress_bar(display, total, **kwargs)
-    from tqdm import tqdm as terminal_bar
+    if not display:
+        return terminal_bar(disable=True)
     from tqdm.auto import tqdm
 
     options = {"miniters": 0, "bar_format": WITH_TOTAL if total else WITHOUT_TOTAL}
@@ -78,24 +81,23 @@ class Progress:
         self._text = ""  # what the run does at present; empty before it is known
         self._search: GuideTick | None = None  # the latest one of the search of a guide
         self._announce: Callable = getattr(function, "when_simulated", lambda callback: None)
-        self._silent = not hasattr(self._bar, "set_postfix")  # emcee's silent bar has only update
         self._figures: dict[str, Any] = {}
         self._drawn = time.perf_counter()
 
     def __enter__(self) -> "Progress":
         self._bar.__enter__()
         self._evaluator.running, self._begun = 0, self._evaluator.done
-        if not self._silent:
+        if not self._bar.disable:
             self._evaluator.observer = self._draw_now_and_then
             if not self._evaluator.asynchronous:
                 self._announce(self._simulated)
         return self
 
     def __exit__(self, *error: object) -> None:
-        if not self._silent:
+        if not self._bar.disable:
             self._evaluator.observer = None
             self._announce(None)
-            self._draw()
+            self.step(0)
         self._bar.__exit__(*error)
 
     def _simulated(self, points: float, waits: str = "") -> None:
@@ -109,7 +111,7 @@ class Progress:
 
     def show(self, result: AnnealingResult, population: Population, report: Report) -> None:
         """Show a report of the annealing."""
-        if self._silent or not isinstance(report, Sweep | Stage | GuideTick | Restart):
+        if not isinstance(report, Sweep | Stage | GuideTick | Restart):
             return
         begins, effective = not self._text, f"{population.effective_sample_size:.0f}"
         if isinstance(report, GuideTick):
@@ -123,22 +125,15 @@ class Progress:
                 self._figures["log Z"] = f"{sum(stage.log_evidence_increment for stage in result.ladder):.2f}"
                 self._text = f"stage {len(result.ladder)}"
             self._figures |= {"ESS": effective, "acceptance": f"{getattr(report, 'acceptance', 0.0):.2f}"}
-        self._draw()
+        self.step(0)
         if begins and self._search:  # the first simulation may take long
             self._bar.refresh()
 
-    def step(self, steps: int) -> None:
-        """Advance a bar of sweeps."""
-        if self._silent:
-            self._bar.update(steps)
-        else:
-            self._draw(steps)
-
     def _draw_now_and_then(self) -> None:
         if time.perf_counter() - self._drawn >= SECONDS_BETWEEN_FIGURES:
-            self._draw()
+            self.step(0)
 
-    def _draw(self, steps: int = 0) -> None:
+    def step(self, steps: int) -> None:
         """Show the figures, and advance a bar of sweeps."""
         self._drawn, evaluator = time.perf_counter(), self._evaluator
         counts = {"failures": len(evaluator.record.failed + evaluator.record.counted), "running": evaluator.running}

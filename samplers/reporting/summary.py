@@ -1,9 +1,12 @@
-"""Results of finished runs as tables: moments of the posterior."""
+"""Moments of the posterior as a table, and what a sampler tells about itself."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+if TYPE_CHECKING:
+    import pandas
 
 
 def is_tempered(sampler: Any) -> bool:
@@ -14,48 +17,6 @@ def is_tempered(sampler: Any) -> bool:
 def log_posterior_of(sampler: Any) -> Any:
     """The user's function in a sampler (emcee wraps it); None for an object that is no sampler."""
     return getattr(getattr(sampler, "log_prob_fn", None), "f", None)
-
-
-def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a table, from its cells: the first column is aligned to the left, others to the right."""
-    columns = []
-    for column in zip(*rows, strict=True):
-        width, side = max(map(len, column)), ">" if columns else "<"
-        columns.append([f"{cell:{side}{width}}" for cell in column])
-    return ["  ".join(row) for row in zip(*columns, strict=True)]
-
-
-class Summary(NamedTuple):
-    """Moments of the posterior, one entry per parameter. ``str`` gives a table.
-
-    Attributes
-    ----------
-    names : tuple of str
-        Names of the parameters.
-    mean, sd : ndarray, shape (ndim,)
-        Mean and standard deviation.
-    cv : ndarray, shape (ndim,)
-        Coefficient of variation ``sd / |mean|`` [-]; inf where the mean is zero and the standard deviation is not.
-    mean_error, sd_error : ndarray, shape (ndim,)
-        Monte Carlo standard errors of `mean` and `sd`; NaN if they are not known.
-    """
-
-    names: tuple[str, ...]
-    mean: np.ndarray
-    sd: np.ndarray
-    cv: np.ndarray
-    mean_error: np.ndarray
-    sd_error: np.ndarray
-
-    def __str__(self) -> str:
-        rows = [("parameter", "mean", "MC error", "sd", "MC error", "CV")]
-        columns = self.names, self.mean, self.mean_error, self.sd, self.sd_error, self.cv
-        for name, *values in zip(*columns, strict=True):
-            cells = (f"{x:{form}}" for x, form in zip(values, (".5g", ".2g", ".4g", ".2g", ".3g"), strict=True))
-            rows.append((name, *("-" if cell == "nan" else cell for cell in cells)))
-        return "\n".join(aligned(rows))
-
-    __repr__ = __str__
 
 
 def names_of_parameters(names: Sequence[str] | None, ndim: int) -> tuple[str, ...]:
@@ -71,7 +32,7 @@ def summary(
     names: Sequence[str] | None = None,
     mean_error: np.ndarray | None = None,
     sd_error: np.ndarray | None = None,
-) -> Summary:
+) -> "pandas.DataFrame":
     """Posterior mean, standard deviation, their Monte Carlo errors, and coefficient of variation.
 
     Parameters
@@ -86,28 +47,29 @@ def summary(
 
     Returns
     -------
-    Summary
+    pandas.DataFrame
+        A row per parameter: ``mean`` and ``mean_error``, ``sd`` and ``sd_error``, and the coefficient of variation
+        ``cv``, standard deviation / magnitude of the mean [-].
 
     Examples
     --------
     >>> print(summary(samples, posterior.parameter_names))  # doctest: +SAMPLED
-    parameter              mean  MC error         sd  MC error       CV
-    stiffness            1.1022         -   0.002393         -  0.00217
-    damping             0.86008         -    0.02466         -   0.0287
-    sigma_acceleration  0.46343         -     0.0243         -   0.0524
-    sigma_displacement  0.01823         -  0.0009417         -   0.0517
+                            mean  mean_error        sd  sd_error        cv
+    stiffness           1.102246         NaN  0.002427       NaN  0.002202
+    damping             0.857993         NaN  0.022188       NaN  0.025860
+    sigma_acceleration  0.461220         NaN  0.022175       NaN  0.048078
+    sigma_displacement  0.018123         NaN  0.000849       NaN  0.046850
     """
+    import pandas  # slow to import
+
     samples = np.asarray(samples, dtype=float)
     if samples.ndim != 2 or len(samples) < 2:
         raise ValueError(
             f"samples must be an array (n, ndim) with n >= 2, as get_chain(flat=True) returns; got {samples.shape}"
         )
-    errors = []
-    for name, given in (("mean_error", mean_error), ("sd_error", sd_error)):
-        error = np.full(samples.shape[1], np.nan) if given is None else np.asarray(given, dtype=float)
-        if error.shape != samples.shape[1:] or np.any(error < 0.0):
-            raise ValueError(f"{name} must be {samples.shape[1]} numbers, each non-negative or NaN; got {given}")
-        errors.append(error)
     mean, sd = samples.mean(axis=0), samples.std(axis=0)
-    cv = np.divide(sd, np.abs(mean), out=np.where(sd > 0.0, np.inf, 0.0), where=mean != 0.0)
-    return Summary(names_of_parameters(names, samples.shape[1]), mean, sd, cv, *errors)
+    errors = (np.nan if error is None else error for error in (mean_error, sd_error))
+    columns = dict(zip(("mean", "sd", "mean_error", "sd_error"), (mean, sd, *errors), strict=True))
+    found = pandas.DataFrame(columns, index=names_of_parameters(names, samples.shape[1]))
+    found["cv"] = found["sd"] / found["mean"].abs()
+    return found[["mean", "mean_error", "sd", "sd_error", "cv"]]

@@ -99,7 +99,6 @@ def test_corner_shows_units_prior_truth_and_nominal_values(updated):
             r"3 parameters \(k, c, sigma\), but the samples have 2 columns",
         ),
         (lambda x: x, {"truths": [1.0]}, "truths must have one value for each of 3"),
-        (lambda x: x, {"posterior": Posterior(), "truths": {"mass": 1.0}}, "unknown parameters mass; known are k, c"),
         (lambda x: x[:2], {}, "n >= ndim"),
     ],
 )
