@@ -59,14 +59,14 @@ def reason_in(outcome: Any) -> str:
 
 
 class Requested:
-    """Distinct simulations of a model that were requested, and what is known of them, by key (see `distinct_keys`).
+    """Simulations of a model that were requested, and what is known of them, by key (see `distinct_keys`).
 
     `outcomes` are statistics in bytes, `responses` arrays (n_channels, n_steps) if `full` ones were requested; failures
-    have their reasons in both. `fingerprint` is the model's.
+    have their reasons in both. `which` has the index of the key of every row. `fingerprint` is the model's.
     """
 
-    def __init__(self, keys: list[bytes], full: bool, model: Any) -> None:
-        self.keys, self.full, self._model = keys, full, model
+    def __init__(self, thetas: np.ndarray, full: bool, model: Any) -> None:
+        (self.keys, self.which), self.full, self._model = distinct_keys(thetas), full, model
         self.outcomes: dict[bytes, bytes | str] = {}
         self.responses: dict[bytes, np.ndarray | str] = {}
 
@@ -84,6 +84,10 @@ class Requested:
         """Fill in outcomes."""
         self.outcomes |= outcomes
         self.responses |= {key: reason for key, reason in outcomes.items() if isinstance(reason, str)}
+
+    def statistics(self, width: int) -> np.ndarray:
+        """Statistics (n, width) of all rows; NaN for failures."""
+        return statistics_in(map(self.outcomes.get, self.keys), width)[self.which]
 
 
 class MemoryCache:
@@ -113,14 +117,12 @@ class MemoryCache:
         self._outcomes: OrderedDict[Hashable, Any] = OrderedDict()
         self._size = 0
 
-    def look_up(self, keys: Iterable[Hashable]) -> list[Any]:
-        """Outcomes of keys; None where nothing is stored."""
-        found = []
+    def look_up(self, keys: Iterable[Hashable]) -> dict[Hashable, Any]:
+        """Outcomes that are known, by key."""
         with self._lock:
-            for key in keys:
-                if (outcome := self._outcomes.get(key)) is not None:
-                    self._outcomes.move_to_end(key)
-                found.append(outcome)
+            found = {key: self._outcomes[key] for key in keys if key in self._outcomes}
+            for key in found:
+                self._outcomes.move_to_end(key)
         return found
 
     def store(self, keys: Iterable[Hashable], outcomes: Iterable[Any]) -> None:

@@ -11,12 +11,12 @@ import os
 import secrets
 import threading
 import time
-from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import lru_cache
 from hashlib import blake2b
 from itertools import islice
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from ..simulation.model import Model, SimulationBatch, misfit_of_responses, most
 from .memory import thetas_of
 from .simulation_cache import TOLERANCE, Row, SimulationCache, pack_rows
 
-__all__ = ["ROWS", "Simulated", "StaleCache", "Trust", "VerifiedModel"]
+__all__ = ["ROWS", "StaleCache", "Trust", "VerifiedModel"]
 
 logger = logging.getLogger(__name__)
 
@@ -40,7 +40,6 @@ ROWS_PER_VERIFICATION = 100
 FIRST_COMPARED = 3  # rows in the first batch of a comparison; each further batch has three times as many as were equal
 MAX_ATTEMPTS = 4  # simulations that may fail for other reasons than the model
 LARGEST_ROUNDING = 1e-4  # largest relative response difference that may come from rounding and iterations
-MAX_TRUSTS = 32
 SHARE_OF_TIME = 0.01  # for comparisons of the model
 FINGERPRINT = "its fingerprint"
 OF_A_PROCESS = ("environment ", "library", "package ", "python", "source of ")  # items that differ between processes
@@ -70,22 +69,17 @@ class Trust:
     need no verification. `stale` is the message on a row that differed, `running` are simulations that run now.
     """
 
-    _known: "OrderedDict[str, Trust]" = OrderedDict()  # of this process, the most recently used last
-
-    def __init__(self, label: ModelLabel, key: str) -> None:
-        self.label, self.key = label, key
+    def __init__(self, key: str) -> None:
+        self.key, self.label, self.stale, self._owner = key, None, "", 0
         self.labels: dict[str, tuple[str, dict[str, str], int]] = {}
         self.used: dict[str, int] = {}
-        self.stale = ""
         self.running: set[bytes] = set()
-        self._owner = 0
 
-    @classmethod
-    def of(cls, label: ModelLabel, key: str) -> "Trust":
+    @staticmethod
+    def of(label: ModelLabel, key: str) -> "Trust":
         """The object of this process with a key; a new one the first time."""
-        trust = cls._known[key] = cls._known.pop(key, None) or cls(label, key)
-        while len(cls._known) > MAX_TRUSTS:
-            cls._known.popitem(last=False)
+        trust = _trust(key)
+        trust.label = trust.label or label
         return trust
 
     def __reduce__(self) -> tuple:
@@ -107,12 +101,7 @@ class Trust:
         return first + (max(0, before + n) // ROWS_PER_VERIFICATION - max(0, before) // ROWS_PER_VERIFICATION)
 
 
-class Simulated(NamedTuple):
-    """A simulation that was run again."""
-
-    misfit: np.ndarray  # statistics (n_numbers,); NaN if it failed
-    reason: str  # of the failure
-    norm: np.ndarray  # (n_channels,) of the response [SI]
+_trust = lru_cache(32)(Trust)
 
 
 class VerifiedModel:
@@ -182,7 +171,8 @@ class VerifiedModel:
             yield
         self.label.add(observer.result(self.label.opened) if self.pool is None else observer.noted)
 
-    def _simulate_again(self, thetas: np.ndarray) -> list[Simulated]:
+    def _simulate_again(self, thetas: np.ndarray) -> list[tuple[np.ndarray, str, np.ndarray]]:
+        """Statistics (n_numbers,), reason of a failure and norms (n_channels,) of the response [SI], for each row."""
         start, rows, size = time.perf_counter(), [], most_responses(self.model)
         for first in range(0, len(thetas), size):
             with self._observed():
@@ -190,26 +180,28 @@ class VerifiedModel:
             misfit, reasons = self.statistics_of(*batch)
             with np.errstate(over="ignore", invalid="ignore"):
                 norms = np.linalg.norm(batch.response, axis=2)
-            rows += map(Simulated, misfit, reasons, norms)
+            rows += zip(misfit, reasons, norms, strict=True)
         self.seconds += time.perf_counter() - start
         self.verifications += len(thetas)
         return rows
 
-    def _difference(self, earlier: np.ndarray, reason: str, new: Simulated) -> tuple[str, float]:
+    def _difference(
+        self, earlier: np.ndarray, reason: str, now: np.ndarray, why: str, norm: np.ndarray
+    ) -> tuple[str, float]:
         """How a simulation differs from an earlier one, in words and relative to the response norm; empty if it agrees.
 
         It agrees within the tolerance of the cache, relative to the norm; zero is for equal bits.
         """
-        if reason or new.reason:
-            was, now = (f"failed ({text})" if text else "succeeded" for text in (reason, new.reason))
-            return ("" if reason and new.reason else f"it {was}; simulated again, it {now}"), 0.0
+        if reason or why:
+            was, did = (f"failed ({text})" if text else "succeeded" for text in (reason, why))
+            return ("" if reason and why else f"it {was}; simulated again, it {did}"), 0.0
         tolerance = TOLERANCE if self.cache is None else self.cache.tolerance
-        change = relative_changes(earlier, new.misfit, new.norm, self._of_response, ROUNDING if tolerance else 0.0)
-        worst, n = int(np.argmax(np.nan_to_num(change, nan=np.inf))), len(new.norm)
+        change = relative_changes(earlier, now, norm, self._of_response, ROUNDING if tolerance else 0.0)
+        worst, n = int(np.argmax(np.nan_to_num(change, nan=np.inf))), len(norm)
         if change[worst] <= tolerance:
             return "", 0.0
         what = "sum of squared residuals" if worst < n else f"statistic {worst}"
-        values = f"stored {earlier[worst]:.17g}, simulated again {new.misfit[worst]:.17g}"
+        values = f"stored {earlier[worst]:.17g}, simulated again {now[worst]:.17g}"
         return f"channel {self.measurements.channels[worst % n].name!r}, {what}: {values}", float(change[worst])
 
     # changes of the model -----------------------------------------------------------------------------------------
@@ -282,13 +274,12 @@ class VerifiedModel:
         thetas, earlier = np.array([theta for theta, _ in self._points]), [misfit for _, misfit in self._points]
         for is_original in (True, False):
             new = self._simulate_again(thetas)
-            differ = any(
-                not isinstance(each.reason, TransientReason) and self._difference(before, "", each)[0]
-                for before, each in zip(earlier, new, strict=True)
-            )
-            if not differ:
+            ended = [
+                (was, *now) for was, now in zip(earlier, new, strict=True) if not isinstance(now[1], TransientReason)
+            ]
+            if not any(self._difference(was, "", *now)[0] for was, *now in ended):
                 return is_original
-            earlier = [each.misfit for each in new]
+            earlier = [misfit for misfit, *_ in new]
         return True
 
     # stored rows --------------------------------------------------------------------------------------------------
@@ -349,25 +340,22 @@ class VerifiedModel:
 
     def _adopted(self, fingerprint: str) -> int:
         """The generation that new simulations agree with, else a new one."""
-        identities = self.simulation_key, fingerprint
-        stored = [(each, identity) for identity in identities for each in self.cache.generations_of(identity)]
+        identities = {self.simulation_key: self.n_numbers, fingerprint: len(self.model.channels) * self.model.n_steps}
+        stored = list(dict.fromkeys(each for identity in identities for each in self.cache.generations_of(identity)))
         if stored:
             what = f"are used if {ROWS} of them agree with new simulations"
             self._say("the code, a file, a package or the machine is not that of stored simulations, which %s", what)
         waits = False
-        for generation in dict.fromkeys(each for each, _ in stored):
-            compared, other = 0, None
-            for identity in identities:
-                width = len(self.model.channels) * self.model.n_steps if identity == fingerprint else self.n_numbers
-                rows = self.cache.some_rows(identity, generation, width, ROWS)
-                if other is None and compared < ROWS / 2 and len(rows) == ROWS and not all(row.reason for row in rows):
-                    compared, stopped, other = self._compare(rows, ROWS)
-                    waits |= other is None and bool(stopped)
+        for generation in stored:
+            choices = (self.cache.some_rows(each, generation, width, ROWS) for each, width in identities.items())
+            rows = next((rows for rows in choices if len(rows) == ROWS and not all(row.reason for row in rows)), [])
+            compared, stopped, other = self._compare(rows, ROWS)
             if other is None and compared >= ROWS / 2:
-                self._trust.used |= {identity: -ROWS_PER_VERIFICATION * compared for identity in identities}
+                self._trust.used |= dict.fromkeys(identities, -ROWS_PER_VERIFICATION * compared)
                 self._say("%d stored simulations agree with new ones: all are used", compared)
                 self._use(fingerprint, generation)
                 return generation
+            waits |= other is None and bool(stopped)
         if waits:  # as without a licence: later simulations decide
             return 0
         if stored:
@@ -422,18 +410,18 @@ class VerifiedModel:
             chosen = list(islice(rows, min(max(FIRST_COMPARED, 3 * compared), n - compared)))
             if not chosen:
                 break
-            new = self._simulate_again(np.array([np.frombuffer(row.theta, dtype="<f8") for row in chosen]))
+            again = self._simulate_again(np.array([np.frombuffer(row.theta, dtype="<f8") for row in chosen]))
             if self.pool is None and self.label.observes:
                 self.label.has_changed_itself(self._changes())
-            for row, each in zip(chosen, new, strict=True):
-                if isinstance(each.reason, TransientReason):
-                    stopped.append(each.reason)
+            for row, new in zip(chosen, again, strict=True):
+                if isinstance(new[1], TransientReason):
+                    stopped.append(new[1])
                     self.verifications, self.unverified = self.verifications - 1, self.unverified + 1
                     continue
                 misfit, reason = np.frombuffer(row.value, dtype="<f8"), row.outcome if row.reason else ""
                 if not reason and row.size is not None:  # a response
                     (misfit,), (reason,) = self.statistics_of(misfit.reshape(1, len(self.model.channels), -1), [""])
-                if (difference := self._difference(misfit, reason, each))[0]:
+                if (difference := self._difference(misfit, reason, *new))[0]:
                     return compared, stopped, (row, *difference)
                 compared += 1
         return compared, stopped, None

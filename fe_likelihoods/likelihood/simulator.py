@@ -17,16 +17,7 @@ import numpy as np
 
 from samplers.interrupts import interrupts_end_the_run
 
-from ..cache.memory import (
-    MemoryCache,
-    Requested,
-    ResponseMemory,
-    distinct_keys,
-    outcomes_of,
-    reason_in,
-    statistics_in,
-    thetas_of,
-)
+from ..cache.memory import MemoryCache, Requested, ResponseMemory, outcomes_of, reason_in, thetas_of
 from ..cache.simulation_cache import SimulationCache
 from ..cache.verification import StaleCache, VerifiedModel
 from ..noise.sufficient_statistics import Statistic, check_statistic, name_of_statistic
@@ -123,20 +114,21 @@ class Simulator(VerifiedModel):
         is False (n,), nothing is simulated and rows may be NaN. Raises `ChangedModel` or `StaleCache`;
         simulations that have ended are cached, except after the model has changed.
         """
-        keys, which = distinct_keys(thetas)
-        if not full and None not in (outcomes := self.memory_cache.look_up(keys)):
-            self.cache_hits += len(which)
-            return statistics_in(outcomes, self.n_numbers)[which]
+        request = Requested(thetas, full, self.model)
+        request.outcomes = self.memory_cache.look_up(request.keys)
+        if not full and len(request.outcomes) == len(request.keys):
+            self.cache_hits += len(thetas)
+            return request.statistics(self.n_numbers)
         if possible is not None and not (wanted := possible()).all():
-            statistics = np.full((len(which), self.n_numbers), np.nan)
+            statistics = np.full((len(thetas), self.n_numbers), np.nan)
             if wanted.any():
                 statistics[wanted] = self.run(thetas[wanted])
             return statistics
         trust, new = self._trust, []
         try:
             with trust.lock:  # after what runs for other requests
-                trust.lock.wait_for(lambda: trust.running.isdisjoint(keys))
-                request = self._look_up(keys, which, full)
+                trust.lock.wait_for(lambda: trust.running.isdisjoint(request.keys))
+                self._look_up(request)
                 if new := request.left:
                     self._check_before()  # so that finished simulations are stored
                     self._trust.running.update(new)  # of another label, if the check has made one
@@ -155,8 +147,10 @@ class Simulator(VerifiedModel):
             with self._trust.lock:
                 self._trust.running.difference_update(new)
                 self._trust.lock.notify_all()
-        statistics = statistics_in([request.outcomes[key] for key in keys], self.n_numbers)[which]
-        return (statistics, self._as_batch([request.responses[keys[place]] for place in which])) if full else statistics
+        if not full:
+            return request.statistics(self.n_numbers)
+        responses = [request.responses[request.keys[place]] for place in request.which]
+        return request.statistics(self.n_numbers), self._as_batch(responses)
 
     def _as_batch(self, found: Sequence[np.ndarray | str]) -> SimulationBatch:
         """Responses or reasons of failures as a batch."""
@@ -170,27 +164,27 @@ class Simulator(VerifiedModel):
         cache on disk. Without statistics, only failures are cached.
         """
         rows = {theta.tobytes(): row for row, theta in enumerate(thetas + 0.0) if np.isfinite(theta).all()}
-        for (key, row), known in zip(rows.items(), self.memory_cache.look_up(rows), strict=True):
-            if known is None:
+        known = self.memory_cache.look_up(rows)
+        for key, row in rows.items():
+            if key not in known:
                 self.failures.count_outcomes(thetas[row : row + 1], [reasons[row]])
                 if reasons[row] or statistics is not None:
                     self.memory_cache.store([key], [reasons[row] or statistics[row].tobytes()])
 
     def reason(self, point: np.ndarray) -> str:
         """Reason of a failure that is cached at parameters (n,), the structural ones first; empty for others."""
-        return reason_in(*self.memory_cache.look_up([(point[: self.n_structural] + 0.0).tobytes()]))
+        key = (point[: self.n_structural] + 0.0).tobytes()
+        return reason_in(self.memory_cache.look_up([key]).get(key))
 
     # known simulations --------------------------------------------------------------------------------------------
 
-    def _look_up(self, keys: list[bytes], which: Sequence[int], full: bool) -> Requested:
-        """What is known of distinct keys, which is counted; `which` has the key of every requested row."""
-        request, known = Requested(keys, full, self.model), zip(keys, self.memory_cache.look_up(keys), strict=True)
-        finite = np.isfinite(thetas_of(keys, self.n_structural)).all(axis=1)
-        skipped = [key for key, fine in zip(keys, finite, strict=True) if not fine]
-        outcomes = {key: outcome for key, outcome in known if outcome is not None}
-        request.enter(outcomes | dict.fromkeys(skipped, "the parameters are not finite"))
+    def _look_up(self, request: Requested) -> None:
+        """Fill in what is known, and count it."""
+        finite = np.isfinite(thetas_of(request.keys, self.n_structural)).all(axis=1)
+        skipped = [key for key, fine in zip(request.keys, finite, strict=True) if not fine]
+        request.enter(self.memory_cache.look_up(request.keys) | dict.fromkeys(skipped, "the parameters are not finite"))
         try:
-            if self.cache is not None and not full and (left := request.left):
+            if self.cache is not None and not request.full and (left := request.left):
                 self._enter(request, read := self._stored(left, request.fingerprint, False))
                 self.disk_hits += len(read)
             if self.cache is not None or len(self.response_memory):
@@ -198,9 +192,8 @@ class Simulator(VerifiedModel):
         except StaleCache:  # results in memory may belong to another model
             self._clear()
             raise
-        found = set(keys).difference(skipped, request.left)
-        self.cache_hits += sum([keys[place] in found for place in which])
-        return request
+        found = set(request.keys).difference(skipped, request.left)
+        self.cache_hits += sum([request.keys[place] in found for place in request.which])
 
     def _take_responses(self, request: Requested) -> None:
         """Fill in stored responses, and statistics that are not known."""
@@ -208,7 +201,7 @@ class Simulator(VerifiedModel):
         for start in range(0, len(left), size):
             keys = left[start : start + size]
             in_memory = self.response_memory.look_up([(fingerprint, key) for key in keys])
-            found = {key: each for key, each in zip(keys, in_memory, strict=True) if each is not None}
+            found = {key: response for (_, key), response in in_memory.items()}
             missing = [key for key in keys if key not in found]
             if self.cache is not None and missing:
                 found |= (read := self._stored(missing, fingerprint, True))
@@ -243,12 +236,9 @@ class Simulator(VerifiedModel):
         """Number of simulations, of n, between two writes to the cache on disk, or two reports of progress."""
         if self.streams:
             return n
-        most = min(n, most_responses(self.model))
-        if self.cache is None and (self.when_simulated is None or self.pool is not None):
-            return most
         workers = (os.cpu_count() or 1) if self.pool is None else self.pool.n_workers or n
         together = self.pool is not None or hasattr(self.model, "simulate_batch")  # then all workers are to be busy
-        return min(max(_ROUNDS_PER_CHUNK * workers if together else 1, self._most), most)
+        return min(n, most_responses(self.model), max(_ROUNDS_PER_CHUNK * workers if together else 1, self._most))
 
     @interrupts_end_the_run()
     def _run_in_pool(self, request: Requested, keys: Sequence[bytes], start: float) -> None:
@@ -286,11 +276,10 @@ class Simulator(VerifiedModel):
                 self.when_simulated(len(thetas))
             self._check_after(thetas, statistics, why)
             if self._keeps_responses(request.full):
-                kept = [reason or response.copy() for reason, response in zip(reasons, values, strict=True)]
+                kept = (reason or response.copy() for reason, response in zip(reasons, values, strict=True))
                 self.response_memory.store([(request.fingerprint, key) for key in keys], kept)
-                del kept  # the memory may be too small for them
             if request.full:
-                request.responses |= zip(keys, [reasons[k] or values[k] for k in range(len(keys))], strict=True)
+                request.responses |= {key: reasons[k] or values[k] for k, key in enumerate(keys)}
             self._enter(request, outcomes_of(keys, statistics, why))
             if self.cache is not None:
                 stored = values if request.full or self.stores_responses or self.cache.responses else None

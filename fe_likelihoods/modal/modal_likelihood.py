@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import ndtri, stdtrit
 
-from ..cache.verification import Simulated
 from ..likelihood.likelihood import FELikelihood
 from ..likelihood.simulator import Simulator
 from ..models.linear_structure import LinearStructure
@@ -236,9 +235,8 @@ class _ModesSimulator(Simulator):
         super().__init__(modes, anything, paired, **options)
         self.measurements, self._of_response = paired.measurements, False
 
-    def _difference(self, earlier: np.ndarray, reason: str, new: Simulated) -> tuple[str, float]:
-        norm = np.linalg.norm(self.measurements.values, axis=1)
-        return super()._difference(earlier, reason, new._replace(norm=norm))
+    def _difference(self, earlier: np.ndarray, reason: str, now: np.ndarray, why: str, _: Any) -> tuple[str, float]:
+        return super()._difference(earlier, reason, now, why, np.linalg.norm(self.measurements.values, axis=1))
 
 
 class PredictedModes(NamedTuple):

@@ -19,9 +19,8 @@ import numpy as np
 
 from ..signals.channels import Channel
 from ..signals.records import Record
-from ..simulation.failure_reasons import SimulationFailed, TransientReason, reason_of
+from ..simulation.failure_reasons import SimulationFailed, TransientReason, describe_exit, reason_of
 from ..simulation.files import Group
-from ..simulation.worker import describe_exit, run_program
 from ..units import find_unit
 from .user_model import UserModel, content_digest
 from .validation import positive_float
@@ -254,7 +253,7 @@ class ExecutableModel(UserModel):
             return min(_WATCH_INTERVAL, self.time_limit - seconds + 1e-3)
 
         outputs = place / "stdout.txt", place / "stderr.txt"
-        exit_code = run_program(group, [self.command[0], *arguments], place / "run", *outputs, watch)
+        exit_code = group.run([self.command[0], *arguments], place / "run", *outputs, watch)
         if exit_code:
             with open(outputs[1], "rb") as stderr:
                 reason = ": ".join(filter(None, [describe_exit(exit_code, "the program"), _last_lines(stderr, 3)]))

@@ -17,9 +17,9 @@ from numpy.typing import ArrayLike
 from ..signals.channels import Channel
 from ..signals.records import Record
 from ..signals.sampling import sample_window
+from ..simulation.executors import Sandbox
 from ..simulation.failure_reasons import UnusableModel
 from ..simulation.files import Observed, note
-from ..simulation.worker import Sandbox
 from .user_model import UserModel
 from .validation import check_theta, positive_float
 

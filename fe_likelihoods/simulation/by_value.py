@@ -6,7 +6,7 @@ notebook functions work. The worker imports this library, installed packages and
 
 * A module is sent once, with all of its values; sent functions that import it while they run find it under its name. Of
   the script or notebook (``__main__``), only the values that the sent functions use are sent.
-* A lock becomes a new lock. Other values that cannot be sent, such as an open file, are refused with their name.
+* A lock becomes a new lock. Other values that cannot be sent, such as an open file, are refused with their type.
 * A worker refuses everything if its version of this library has different source code.
 """
 
@@ -14,7 +14,6 @@ import dis
 import functools
 import importlib.machinery
 import importlib.metadata
-import inspect
 import io
 import pickle
 import re
@@ -55,7 +54,6 @@ LIBRARY = __name__.split(".")[0]
 SCRIPTS = ("__main__", "__mp_main__")  # names of a script or notebook, and of a script in a worker that imports it
 _LOCKS = (type(threading.Lock()), type(threading.RLock()))
 _CACHED = type(functools.cache(len))
-_CODE = (types.FunctionType, type, _CACHED)
 _OF_THE_IMPORT = {"__builtins__", "__loader__", "__spec__", "__cached__"}
 _COMPILED = tuple(importlib.machinery.EXTENSION_SUFFIXES)
 _STANDARD = [Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib")]
@@ -85,17 +83,14 @@ class Pickled(NamedTuple):
 
     @classmethod
     def of(cls, function: Any) -> "Pickled":
-        """Pickle a function with everything that it uses at present; ValueError, with a name, if that is impossible."""
+        """Pickle a function with everything that it uses at present; ValueError, with a type, if that is impossible."""
         try:
             return cls(sources_digest() + process_name() + dumps(function))
         except Exception as error:
-            name, value = _culprit(function)
-            kind = getattr(function, "__qualname__", type(function).__qualname__)
-            what = f"the {name} of {kind}, of type {type(value).__name__}," if name else kind
             raise ValueError(
-                f"{what} cannot be sent to another process ({type(error).__name__}: "
-                f"{without_addresses(str(error))}). Objects that it uses must not contain open files and connections: "
-                "make them inside the function"
+                f"{getattr(function, '__qualname__', type(function).__qualname__)} cannot be sent to another process "
+                f"({type(error).__name__}: {without_addresses(str(error))}). Objects that it uses must not contain "
+                "open files and connections: make them inside the function"
             ) from error
 
     def __call__(self, item: Any) -> Any:
@@ -142,25 +137,6 @@ def dumps(thing: Any) -> bytes:
     """Pickle an object, with user code and its values by value."""
     _Pickler(file := io.BytesIO()).dump(thing)
     return file.getvalue()
-
-
-def _culprit(thing: Any, depth: int = 3) -> tuple[str, Any]:
-    """Name and value of the innermost attribute, or value that a function or module has, that cannot be pickled."""
-    try:
-        if isinstance(thing, types.FunctionType):
-            used = inspect.getclosurevars(thing)
-            state = used.nonlocals | (used.globals if thing.__module__ in SCRIPTS else thing.__globals__)
-        else:
-            state = thing.__dict__ if isinstance(thing, types.ModuleType) else thing.__getstate__()
-    except Exception:
-        return "", thing
-    for name, value in (state if isinstance(state, dict) else getattr(thing, "__dict__", {})).items():
-        try:
-            dumps(None if name.startswith("__") or isinstance(value, _CODE) else value)
-        except Exception:
-            inner, culprit = _culprit(value, depth - 1) if depth else ("", value)
-            return (f"{name}.{inner}", culprit) if inner else (name, value)
-    return "", thing
 
 
 class _Pickler(cloudpickle.Pickler):
@@ -322,11 +298,7 @@ def package_version(top: str) -> str:
     try:
         return importlib.metadata.version(top)
     except (importlib.metadata.PackageNotFoundError, ValueError):
-        pass
-    try:
         return " ".join(map(importlib.metadata.version, _packages().get(top, ())))
-    except importlib.metadata.PackageNotFoundError:
-        return ""
 
 
 @functools.cache

@@ -14,33 +14,49 @@ depend on the pool, to the last bit.
 
 When a worker dies, the standard library's pools hang or break, and cannot say which item killed it. Each worker of a
 `LocalPool` has a pipe, and a thread in this process sends it one item at a time, which is run again if the worker dies.
+It is started with `subprocess`, in a group that ends with it (`fe_likelihoods.simulation.files.Group`): pool processes,
+in which it must also work, often may not use `multiprocessing`.
 """
 
+import json
+import math
 import os
+import pickle
+import select
+import signal
+import subprocess
+import sys
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecutor
 from concurrent.futures import wait as wait_for
-from contextlib import AbstractContextManager, closing
+from contextlib import AbstractContextManager, closing, suppress
 from functools import cache, cached_property, partial
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
 from multiprocessing.pool import Pool, ThreadPool
 from numbers import Integral
 from queue import SimpleQueue
 from typing import Any
 
 from samplers.evaluation.pools import submit_all, workers_of
-from samplers.interrupts import Ended, SentFunction
+from samplers.interrupts import Ended, SentFunction, become_worker
 
-from .by_value import Pickled
-from .failure_reasons import TransientReason
-from .worker import Died, Worker
+from .by_value import CannotLoad, Pickled, load, without_addresses
+from .failure_reasons import SimulationFailed, TransientReason, describe_exit, is_transient
+from .files import Group, given_places, working_folder
 
-__all__ = ["Job", "LocalPool", "PoolExecutor", "Submitting", "Threads", "as_executor", "result_of"]
+__all__ = ["Job", "LocalPool", "PoolExecutor", "Sandbox", "Submitting", "Threads", "as_executor", "result_of", "serve"]
 
 MAX_ATTEMPTS = 3
+_CHECK = 0.5  # [s] between checks that a process lives, while waiting for its answer
 _THREADS = [f"{each}_NUM_THREADS" for each in ("OMP", "OPENBLAS", "MKL", "BLIS", "VECLIB_MAXIMUM", "NUMBA")]
+_BOOT = (
+    "import json, sys; sys.path[:], sys.argv, *settings = json.loads(sys.argv[1]); "
+    "from fe_likelihoods.simulation.executors import serve; serve(*settings)"
+)
 
 
 class Submitting:
@@ -172,20 +188,105 @@ def _work(jobs: SimpleQueue, run: Callable[[Job], Any]) -> None:
     jobs.put(None)  # for the other threads
 
 
-def _result(worker: Worker, job: Job) -> Any:
-    """Result of an item, from another process if its process dies."""
-    deaths, job.worker = 0, worker
-    try:
-        while not job.given_up:
-            try:
-                return worker.run(job.function, job.item, given_up=lambda: job.given_up)
-            except Died as error:
-                deaths += 1
-                if deaths == MAX_ATTEMPTS:
-                    return None, error.reason
-        raise CancelledError
-    finally:
-        job.worker = None
+class Died(SimulationFailed):
+    """A worker process that died, or was stopped, before it answered."""
+
+
+class Worker:
+    """Calls functions in one process after the other. Its methods may be called from one thread, apart from `kill`.
+
+    The process is started for a call, and replaced if it has died or after `most_calls`. It is killed by `kill`, when
+    this object is garbage-collected, or when this process ends. `environment` adds variables; with `quiet`,
+    its output is not shown.
+    """
+
+    def __init__(self, environment: Mapping[str, str], quiet: bool = False, most_calls: float = math.inf) -> None:
+        self._settings, self._most_calls = (environment, quiet), most_calls
+        self._process: subprocess.Popen | None = None
+
+    def run(self, job: Job, seconds: float = math.inf) -> Any:
+        """Result of a function for an item, or its exception; CancelledError if the job was given up before.
+
+        Died if the process dies, or does not answer within `seconds` after it was given the item and is killed.
+        """
+        message = b"\0" + pickle.dumps(job.item, protocol=5)
+        if not self._is_ready() and not job.given_up:
+            self._renew()
+        if job.given_up:  # before, there was no process to kill
+            raise CancelledError
+        if self._function != job.function:
+            self._ask(b"\1" + pickle.dumps(job.function, protocol=5), math.inf)
+            self._function = job.function
+        self._calls += 1
+        return self._ask(message, seconds)
+
+    def run_until_it_ends(self, job: Job) -> Any:
+        """Result as from `run`, from another process if one dies; ``(None, reason)`` after the third death."""
+        deaths, job.worker = 0, self
+        try:
+            while True:
+                try:
+                    return self.run(job)
+                except Died as error:
+                    deaths += 1
+                    if deaths == MAX_ATTEMPTS:
+                        return None, error.reason
+        finally:
+            job.worker = None
+
+    def _is_ready(self) -> bool:
+        is_own = self._process is not None and self._owner == os.getpid()  # not of the process that has forked this one
+        return is_own and self._process.poll() is None and self._calls < self._most_calls
+
+    def _renew(self) -> None:
+        environment, quiet = self._settings
+        self.kill()
+        self._connection, theirs = Pipe()
+        output = subprocess.DEVNULL if quiet else None
+        with theirs:
+            self._group = Group()
+            texts = [[str(text) for text in texts] for texts in (sys.path, sys.argv)]
+            self._process = self._group.start(
+                [sys.executable, "-c", _BOOT, json.dumps([*texts, theirs.fileno(), self._group.place])],
+                env={**os.environ, **environment},
+                pass_fds=(theirs.fileno(),),
+                stdout=output,
+                stderr=output,
+                cwd=working_folder() or None,
+            )
+        readable = select.poll()  # kept, since Connection.poll makes one for each call
+        readable.register(self._connection, select.POLLIN)
+        self._poll = readable.poll
+        self._function, self._calls, self._owner = None, 0, os.getpid()
+
+    def _ask(self, message: bytes, seconds: float) -> Any:
+        """Answer to a message, a value or an exception; raises `Died` without one, and the process is killed."""
+        stop = time.monotonic() + seconds
+        try:
+            self._connection.send_bytes(message)
+            # a program that the function has started may hold the connection open
+            while not self._poll(1000.0 * max(0.0, min(_CHECK, stop - time.monotonic()))):
+                if self._process.poll() is not None and not self._poll(0):
+                    raise EOFError
+                if time.monotonic() >= stop:
+                    raise Died(TransientReason(f"stopped at the time limit of {seconds:g} s"))
+            value, error = pickle.loads(self._connection.recv_bytes())
+        except (EOFError, OSError):
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(5.0)  # it may end by itself, with its exit code
+            self.kill()
+            raise Died(TransientReason(describe_exit(self._process.wait(), "the worker process"))) from None
+        except BaseException:
+            self.kill()
+            raise
+        if error is not None:
+            raise error
+        return value
+
+    def kill(self) -> None:
+        """Kill the process and its group."""
+        if self._process is not None and self._owner == os.getpid():
+            self._group.end()
 
 
 class LocalPool(Submitting, AbstractContextManager):
@@ -219,7 +320,7 @@ class LocalPool(Submitting, AbstractContextManager):
 
     def _set_up(self) -> None:
         environment = self._environment
-        self._owner, self._threads = os.getpid(), Threads(lambda: partial(_result, Worker(environment)))
+        self._owner, self._threads = os.getpid(), Threads(lambda: Worker(environment).run_until_it_ends)
 
     def __exit__(self, *exception: object) -> None:
         self.close()
@@ -332,3 +433,77 @@ def _run(function: Callable, item: Any) -> Any:
 def _wait_for_nanny() -> None:
     """Wait once per process: dask does not replace a worker that dies before its start is reported."""
     time.sleep(0.5)
+
+
+class Sandbox(threading.local):
+    """Callable that runs a function of one argument in another process, whose output is not shown.
+
+    The process is replaced after a call that did not end by itself, and after `runs_per_process` calls. Each thread has
+    a process of its own. The function is sent by value, in its state at the call; ValueError if it cannot be sent.
+    `time_limit` [s] is for a call, without the start of the process.
+    """
+
+    def __init__(
+        self,
+        function: Callable[[Any], Any],
+        time_limit: float | None = None,
+        runs_per_process: int | None = None,
+    ) -> None:
+        Pickled.of(function)  # an error is raised here instead of in the first call
+        self._arguments = function, time_limit, runs_per_process
+        self._worker = Worker({}, True, runs_per_process or math.inf)
+
+    def __reduce__(self) -> tuple:
+        return Sandbox, self._arguments
+
+    def __call__(self, item: Any) -> Any:
+        """Result of the function for an item, or its exception; SimulationFailed if the process died or was stopped."""
+        function, limit, _ = self._arguments
+        try:
+            return self._worker.run(Job(Pickled.of(function), item), limit or math.inf)
+        except CannotLoad as error:
+            raise SimulationFailed(TransientReason(str(error))) from error
+
+
+# in the worker ------------------------------------------------------------------------------------------------------
+
+
+def serve(fileno: int, place: str) -> None:
+    """Main loop of a worker process: answer messages until the connection with a file descriptor closes.
+
+    A message is a function to load, or an item for it. `place` is a folder for this process.
+    """
+    given_places[os.getpid()] = place
+    os.set_inheritable(fileno, False)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the parent, which ends this process
+    become_worker()
+    function, me = None, os.getpid()
+    with Connection(fileno) as connection:
+        while True:
+            try:
+                message = memoryview(connection.recv_bytes())
+            except (EOFError, OSError):
+                return
+            try:
+                if message[0]:
+                    function = load(pickle.loads(message[1:]))
+                answer = _packed(None if message[0] else function(pickle.loads(message[1:])))
+            except BaseException as error:
+                answer = _packed(None, error)
+            if os.getpid() != me:  # the function has forked, and its copy has returned as well
+                os._exit(0)
+            connection.send_bytes(answer)
+
+
+def _packed(value: Any, error: BaseException | None = None) -> bytes:
+    """Pickled value and error; if they cannot be pickled, a `SimulationFailed` with the text of the error, or why."""
+    try:
+        data = pickle.dumps((value, error), protocol=5)
+        if error is not None:
+            pickle.loads(data)  # exceptions with custom constructors can often be pickled but not unpickled
+        if error is None or isinstance(error, Exception | KeyboardInterrupt):  # which ends the run
+            return data
+    except Exception as failure:
+        error = error or failure
+    text = without_addresses(f"{type(error).__name__}: {error}")
+    return pickle.dumps((None, SimulationFailed(TransientReason(text) if is_transient(error) else text)), protocol=5)

@@ -16,6 +16,7 @@ __all__ = [
     "SimulationFailed",
     "TransientReason",
     "UnusableModel",
+    "describe_exit",
     "is_transient",
     "reason_of",
     "shortened",
@@ -71,6 +72,11 @@ def is_transient(error: BaseException) -> bool:
     if isinstance(error, subprocess.CalledProcessError):
         return error.returncode < 0  # killed by a signal
     return isinstance(error, _FAULTS)
+
+
+def describe_exit(exit_code: int, who: str) -> str:
+    """Description of an exit code, such as "the worker process died (signal 11)"."""
+    return f"{who} died (signal {-exit_code})" if exit_code < 0 else f"{who} ended with exit code {exit_code}"
 
 
 def reason_of(error: BaseException) -> str:

@@ -43,7 +43,6 @@ __all__ = [
     "digests_by_name",
     "file_digest",
     "given_places",
-    "kill_group",
     "mapped",
     "note",
     "observing",
@@ -56,8 +55,8 @@ _CLOCK_TICK = 2.0  # [s]; a file changed more recently may change again with the
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 _SYSTEM = ("/proc/", "/sys/", "/dev/", "/run/")
 _INSTALLED = ("/usr/", "/lib", "/etc/", "/bin/", "/opt/", "/memfd:", "/SYSV")
-_CACHES = {"__pycache__", ".cache", ".config"}  # written once per machine, by installed packages
-_CACHES_OF_NUMBA = (".nbi", ".nbc")
+# written once per machine, by installed packages and numba
+_CACHES = (*(f"{os.sep}{name}{os.sep}" for name in ("__pycache__", ".cache", ".config")), ".nbi", ".nbc")
 
 _WATCH = 'trap "" TERM; read -r _; kill -TERM 0; rm -rf "$0" || { sleep 1; rm -rf "$0"; }; kill -KILL 0'
 _MOST_ENTRIES = 100  # in subfolders that are shown as folders; other subfolders are links. A copy takes 60 us
@@ -65,10 +64,9 @@ _MOST_BYTES = 2**20  # of a copy
 _MOST_BESIDE = 3000  # entries beside the working folder, which ``..`` shows
 
 _STARTS = {"os.fork", "os.posix_spawn", "os.system", "subprocess.Popen"}
-_REMOVALS = {"os.remove", "os.rmdir"}  # within a folder, whose removal has its own event, or not
-_WRITES = {"os.mkdir": 0, "os.truncate": 0, "shutil.rmtree": 0, "os.remove": 0, "os.rmdir": 0}  # places of paths
-_WRITES |= {"os.link": 1, "os.rename": 1, "os.symlink": 1}
-_EVENTS = _STARTS | _WRITES.keys() | {"open", "tempfile.mkdtemp", "sqlite3.connect", "ctypes.dlopen"}
+_CHANGES = {"os.mkdir": 0, "os.truncate": 0, "shutil.rmtree": 0, "os.remove": 0, "os.rmdir": 0}  # places of paths
+_CHANGES |= {"os.link": 1, "os.rename": 1, "os.symlink": 1}
+_EVENTS = _STARTS | _CHANGES.keys() | {"open", "tempfile.mkdtemp", "sqlite3.connect", "ctypes.dlopen"}
 
 _observers: "list[Observer]" = []
 _own = threading.local()
@@ -102,13 +100,9 @@ class Observer:
 
     def __init__(self, alone: bool = True, thread: int = 0, mirror: "_Mirror | None" = None) -> None:
         self.alone, self.thread, self.mirror, self.shared = alone, thread, mirror, ""
-        self.is_simulation = bool(thread or mirror)
-        self.read: set[str] = set()
-        self.written: set[str] = set()
-        self.noted: Opened = {}
-        self._modules = set(sys.modules)
-        self._made: list[str] = []  # files and folders
-        self._start = time.time_ns()
+        self.read, self.written, self.noted = set[str](), set[str](), Opened()
+        self._made: list[str] = []  # new files and folders, which belong to this simulation
+        self._modules, self._start = set(sys.modules), time.time_ns()
 
     def result(self, known: Opened) -> Opened:
         """The files that are `known`, and those read and not written, with new modules and shared libraries."""
@@ -119,96 +113,34 @@ class Observer:
             return known if self.noted.keys() <= known.keys() else known | self.noted
         return known | {path: each for path, each in mapped(read).items() if path not in self.written} | self.noted
 
-    def on(self, event: str, arguments: tuple, of_library: bool) -> None:
-        """Note an event of the audit hook; `of_library` if the simulation has not caused it."""
-        with contextlib.suppress(Exception):  # never disturb the code that is observed
-            if event == "open":
-                self._see(arguments[0], bool(arguments[2] & _WRITING))
-            elif event in ("ctypes.dlopen", "sqlite3.connect"):
-                self._see(arguments[0])
-            elif event == "subprocess.Popen":
-                program, command, folder, _ = arguments
-                words = [command] if isinstance(command, str | bytes | os.PathLike) else list(command)
-                for word in filter(None, [shutil.which(os.fsdecode(program or words[0])), *words]):
-                    self._see(os.path.join(folder or "", os.fsdecode(word)))
-        if of_library or not self.is_simulation:
-            return
-        if event == "open":
-            self._opens(*arguments)
-        elif event == "tempfile.mkdtemp":
-            self._makes(arguments[0])
-        elif event in _STARTS:
-            if self.mirror is not None:  # where the process may still write
-                self.mirror.states = {}
-            if event != "os.fork":
-                folder = os.fsdecode((event == "subprocess.Popen" and arguments[2]) or ".")
-                self._writes(os.path.join(os.path.realpath(folder), "*"))
-        elif event in _WRITES and (event not in _REMOVALS or arguments[1] in (None, -1)):
-            self._writes(arguments[_WRITES[event]])
-
-    def _see(self, path: Any, writes: bool = False) -> None:
-        """Note a path, or the file that it shows if it is in the own folder of a simulation."""
-        if isinstance(path, str | bytes | os.PathLike):
-            path, simulation = os.path.abspath(os.fsdecode(path)), running_simulation()
-            if simulation is not None and simulation._is_own(path):
-                path = os.path.join(simulation.mirror.base, os.path.relpath(path, simulation.mirror.path))
-                if not os.path.exists(path):
-                    return
-            elif simulation is not None:
-                path = os.path.realpath(path)
-            (self.written if writes else self.read).add(path)
-
-    def _opens(self, path: Any, mode: Any, flags: int) -> None:
-        """A link in the own folder is replaced by a private file before it is opened for writing."""
-        if (path := _full(path)) is None:
-            return
-        if not flags & _WRITING:
-            self._reads(path)
-        elif self._is_own(path):
-            if os.path.islink(path) and not flags & os.O_EXCL:
+    def sees(self, how: str, path: str) -> None:
+        """Note a file that others may write, too, if this simulation changes it, or reads what was just written."""
+        if self.is_own(path):
+            if how in ("writes", "touches") and os.path.islink(path):  # a private file takes its place
                 target = os.path.realpath(path)
                 os.unlink(path)
-                if not flags & os.O_TRUNC and os.path.isfile(target):
+                if os.path.isfile(target):
                     shutil.copyfile(target, path)
-        elif os.path.isdir(path):  # of tempfile, which opens a file in it
             return
-        elif flags & os.O_EXCL:
-            self._makes(path)
-        elif (mode is not None or flags & (os.O_RDWR | os.O_TRUNC)) and not flags & os.O_APPEND:  # else Path.touch
-            self._writes(path)
-
-    def _reads(self, path: str) -> None:
-        """Note a file that was written twice while a simulation ran, but not by Python code of this simulation."""
-        path = os.path.realpath(path)
-        if path.startswith(_SYSTEM) or self._is_private(path):
+        is_made = any(path == each or path.startswith(each + os.sep) for each in self._made)
+        if is_made or self.shared or any(each in path for each in _CACHES):
             return
         with contextlib.suppress(OSError):
             status = os.stat(path)
-            if self._start <= status.st_mtime_ns <= time.time_ns() and stat.S_ISREG(status.st_mode):
-                self.shared = self.shared or (path if path in _fresh else "")
+            is_file = stat.S_ISREG(status.st_mode)
+            if not is_file and (how == "writes" or not stat.S_ISDIR(status.st_mode)):
+                return  # a terminal, a pipe, /dev/null, a folder in which tempfile opens a file
+            is_new = is_file and self._start <= status.st_mtime_ns <= time.time_ns()
+            if how == "reads" and is_new and not path.startswith(_SYSTEM):  # not by Python code of this simulation
+                self.shared = path if path in _fresh else ""
                 _fresh.add(path)
-
-    def _makes(self, path: Any) -> None:
-        """A file or folder that is new belongs to this simulation."""
-        if (path := _full(path)) is not None and not os.path.lexists(path):
+        if how == "makes" and not os.path.lexists(path):
             self._made.append(path)
+        elif how in ("writes", "changes"):
+            self.shared = path
 
-    def _writes(self, path: Any) -> None:
-        """Note a file that does not belong to this simulation alone."""
-        if self.shared or (path := _full(path)) is None or self._is_private(path):
-            return
-        with contextlib.suppress(OSError):
-            mode = os.stat(path).st_mode
-            if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):  # a terminal, a pipe, /dev/null
-                return
-        self.shared = os.path.dirname(path) if path.endswith("/*") else path
-
-    def _is_private(self, path: str) -> bool:
-        """Whether no other simulation writes a file while this one runs."""
-        made = any(path == each or path.startswith(each + os.sep) for each in self._made)
-        return made or self._is_own(path) or _is_cache(path)
-
-    def _is_own(self, path: str) -> bool:
+    def is_own(self, path: str) -> bool:
+        """Whether a file is in the folder of this simulation."""
         return self.mirror is not None and path.startswith(self.mirror.path + os.sep)
 
 
@@ -223,10 +155,10 @@ def observing(alone: bool = True, thread: int = 0, mirror: "_Mirror | None" = No
         _observers.remove(observer)
     if observer.shared and not alone:
         raise UnusableModel(
-            f"The simulations write to {observer.shared}, or read there what is written while they run, and "
-            "simulations in other workers may do the same at that moment, so that results would be mixed up. Use a "
-            "pool of processes (dask: workers with one thread) and a relative file name, which is private to each "
-            "simulation, or a folder from tempfile (docs/parallel.rst); or use one worker, pool=1"
+            f"The simulations write to {observer.shared.removesuffix('/*')}, or read there what is written while they "
+            "run, and simulations in other workers may do the same at that moment, so that results would be mixed up. "
+            "Use a pool of processes (dask: workers with one thread) and a relative file name, which is private to "
+            "each simulation, or a folder from tempfile (docs/parallel.rst); or use one worker, pool=1"
         )
 
 
@@ -238,8 +170,8 @@ def note(opened: Opened) -> None:
 
 def running_simulation() -> Observer | None:
     """The simulation that runs in this thread."""
-    own = (each for each in list(_observers) if each.is_simulation and each.thread in (0, threading.get_ident()))
-    return next(own, None)
+    own = (each for each in list(_observers) if each.thread in (0, threading.get_ident()))
+    return next((each for each in own if each.thread or each.mirror is not None), None)
 
 
 @contextlib.contextmanager
@@ -262,9 +194,49 @@ def _hook(event: str, arguments: tuple) -> None:
         return
     of_library = getattr(_own, "is_quiet", False)
     with of_this_library():
-        for observer in list(_observers):
-            if observer.thread in (0, threading.get_ident()):
-                observer.on(event, arguments, of_library)
+        simulation, uses = running_simulation(), []
+        with contextlib.suppress(Exception):  # never disturb the code that is observed
+            uses = [(how, _full(path)) for how, path in _uses(event, arguments) if not isinstance(path, int)]
+        if simulation is not None and simulation.mirror is not None and event in _STARTS and not of_library:
+            simulation.mirror.states = {}  # where the process may still write
+        for how, path in uses:
+            name = path
+            if simulation is not None:
+                name = os.path.realpath(path)
+                if not of_library:
+                    simulation.sees(how, name if how == "reads" else path)
+                if simulation.is_own(path):  # the file that it shows
+                    name = os.path.join(simulation.mirror.base, os.path.relpath(path, simulation.mirror.path))
+                    if not os.path.exists(name):
+                        continue
+            for observer in list(_observers):
+                if observer.thread in (0, threading.get_ident()):
+                    (observer.read if how in ("reads", "loads") else observer.written).add(name)
+
+
+def _uses(event: str, arguments: tuple) -> list[tuple[str, Any]]:
+    """How an event uses files, and their paths."""
+    if event == "open":
+        path, mode, flags = arguments
+        if not flags & _WRITING:
+            return [("reads", path)]
+        if flags & os.O_EXCL:
+            return [("makes", path)]
+        # what is appended stays apart, and Path.touch writes nothing
+        is_changed = (mode is not None or flags & (os.O_RDWR | os.O_TRUNC)) and not flags & os.O_APPEND
+        return [("writes" if is_changed else "touches", path)]
+    if event == "subprocess.Popen":
+        program, command, folder, _ = arguments
+        words = [command] if isinstance(command, str | bytes | os.PathLike) else list(command)
+        folder, found = os.fsdecode(folder or ""), [shutil.which(os.fsdecode(program or words[0])), *words]
+        names = [os.path.join(folder, os.fsdecode(word)) for word in filter(None, found)]
+        return [("changes", os.path.join(folder, "*")), *(("loads", name) for name in names)]
+    if event in _STARTS:
+        return [] if event == "os.fork" else [("changes", "*")]
+    if event in _CHANGES:
+        is_within = event in ("os.remove", "os.rmdir") and arguments[1] not in (None, -1)  # a folder that is removed
+        return [] if is_within else [("changes", arguments[_CHANGES[event]])]
+    return [("makes" if event == "tempfile.mkdtemp" else "loads", arguments[0])]
 
 
 # paths --------------------------------------------------------------------------------------------------------------
@@ -316,17 +288,10 @@ def _installed() -> tuple[str, ...]:
     return tuple(os.path.realpath(folder) + os.sep for folder in (library, *prefixes))
 
 
-def _full(path: Any) -> str | None:
-    """Absolute path, without links among its folders; None for file descriptors."""
-    if not isinstance(path, str | bytes | os.PathLike):
-        return None
+def _full(path: Any) -> str:
+    """Absolute path, without links among its folders."""
     folder, name = os.path.split(os.path.abspath(os.fsdecode(path)))
     return os.path.join(os.path.realpath(folder), name)
-
-
-def _is_cache(path: str) -> bool:
-    folder, name = os.path.split(path)
-    return not _CACHES.isdisjoint(folder.split(os.sep)) or any(suffix in name for suffix in _CACHES_OF_NUMBA)
 
 
 # working folders ----------------------------------------------------------------------------------------------------
@@ -425,6 +390,34 @@ class Group:
         self.processes.append(process)
         return process
 
+    def run(
+        self, command: Sequence[str], folder: Path, stdout: Path, stderr: Path, watch: Callable[[float], float]
+    ) -> int:
+        """Run a program to its end, kill the group, and return the exit code, as in `subprocess`; the folder stays.
+
+        The command has an absolute path; no shell is used. `watch` is called with the time since the start [s] and
+        returns the time until the next call [s], or raises an exception, which stops the program and is passed on.
+        OSError if the program cannot be started.
+        """
+        try:
+            with of_this_library(), open(stdout, "wb") as out, open(stderr, "wb") as error:
+                program = self.start(command, cwd=folder, stdout=out, stderr=error)
+            start = time.monotonic()
+            waiter = threading.Thread(target=program.wait, daemon=True)  # without the pauses of a wait with a limit
+            waiter.start()
+            while waiter.is_alive():
+                waiter.join(watch(time.monotonic() - start))
+            return program.returncode
+        finally:
+            for process in self.processes[1:]:  # and what a program has started in other groups, while it waits for it
+                for pid in _descendants(process.pid) if process.poll() is None else ():
+                    with contextlib.suppress(ProcessLookupError, PermissionError):
+                        os.kill(pid, signal.SIGKILL)
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.killpg(self.processes[0].pid, signal.SIGKILL)
+            for process in self.processes:
+                process.communicate()
+
 
 _groups: weakref.WeakSet[Group] = weakref.WeakSet()
 if hasattr(os, "register_at_fork"):  # a forked process must not keep the groups alive
@@ -441,13 +434,17 @@ def _end(processes: Sequence[subprocess.Popen], place: str, owner: int) -> None:
             shutil.rmtree(place, ignore_errors=True)
 
 
-def kill_group(processes: Sequence[subprocess.Popen]) -> None:
-    """Kill the processes of a `Group`; its folder stays."""
-    if processes[0].returncode is None:
-        with contextlib.suppress(ProcessLookupError, PermissionError):
-            os.killpg(processes[0].pid, signal.SIGKILL)
-        for process in processes:
-            process.communicate()
+def _descendants(pid: int) -> list[int]:
+    """Process ids of a process's descendants, from /proc; none on other systems than Linux."""
+    parents = {}
+    for name in filter(str.isdigit, os.listdir("/proc") if os.path.isdir("/proc") else ()):
+        with contextlib.suppress(OSError), open(f"/proc/{name}/stat", "rb") as file:
+            parents[int(name)] = int(file.read().rpartition(b")")[2].split()[1])
+    found, new = [], [pid]
+    while new:
+        new = [child for child, parent in parents.items() if parent in new]
+        found += new
+    return found
 
 
 @functools.cache
@@ -490,35 +487,31 @@ class _Mirror:
         """Show what `base` contains now, and nothing that another simulation has left."""
         shutil.rmtree(self.path, ignore_errors=True)
         self.path = tempfile.mkdtemp(prefix="run_", dir=self._place)
-        shown, left, folders = [], _MOST_ENTRIES, [(self.base, self.path)]
-        self.states = {}
-        for base, place in folders:
-            self.states[base] = _state(base)
-            for entry in _scan(base):
-                own = os.path.join(place, entry.name)
-                if self._is_folder(entry) and (below := len(_scan(entry.path, left + 1))) <= left:
-                    left -= below
-                    folders.append((entry.path, own))
-                    os.mkdir(own)
-                elif entry.is_file() and entry.stat().st_size <= _MOST_BYTES:
-                    self.states[entry.path] = _state(entry.path)
-                    shown.append(own)
-                    try:
-                        shutil.copy2(entry.path, own)
-                    except OSError:  # the user may not read it, or it is not there any more
-                        os.symlink(entry.path, own)
-                else:
-                    os.symlink(entry.path, own)
-        for _, place in folders:
-            os.utime(place, ns=(0, 0))  # so that whatever is added or removed changes it
-        self.states |= {own: _state(own) for own in [*shown, *(place for _, place in folders)]}
+        self.states, self._left = {}, _MOST_ENTRIES
+        self._show(self.base, self.path)
 
-    def _is_folder(self, entry: os.DirEntry) -> bool:
-        """Whether an entry is shown as a folder: not if it is hidden, or contains the mirror."""
-        if entry.name.startswith(".") or not entry.is_dir():
-            return False
-        above = os.path.realpath(entry.path) + os.sep
-        return not any(os.path.join(os.path.realpath(each), "").startswith(above) for each in (self.base, self._place))
+    def _show(self, base: str, own: str) -> None:
+        """Show a folder in another one; folders that are hidden, too large, or contain the mirror, are links."""
+        self.states[base] = _state(base)
+        for entry in _scan(base):
+            place, inside = os.path.join(own, entry.name), os.path.realpath(entry.path) + os.sep
+            is_shown = entry.is_dir() and not entry.name.startswith(".")
+            contained = os.path.realpath(self.base) + os.sep, self._place
+            is_shown &= not any(each.startswith(inside) for each in contained)
+            if is_shown and (below := len(_scan(entry.path, self._left + 1))) <= self._left:
+                self._left -= below
+                os.mkdir(place)
+                self._show(entry.path, place)
+                continue
+            with contextlib.suppress(OSError):  # the user may not read it, or it is not there any more
+                if entry.is_file() and entry.stat().st_size <= _MOST_BYTES:
+                    self.states[entry.path] = _state(entry.path)
+                    shutil.copy2(entry.path, place)
+                    self.states[place] = _state(place)
+                    continue
+            os.symlink(entry.path, place)
+        os.utime(own, ns=(0, 0))  # so that whatever is added or removed changes it
+        self.states[own] = _state(own)
 
 
 def _scan(folder: str, most: int | None = None) -> list[os.DirEntry]:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import Channel, ExecutableModel, FELikelihood, FunctionModel, Measurements, SimulationCache
-from fe_likelihoods.cache.verification import StaleCache
+from fe_likelihoods.cache.verification import SHARE_OF_TIME, StaleCache
 from fe_likelihoods.simulation.failure_reasons import ChangedModel
 from tests.covering import covering
 
@@ -284,13 +284,15 @@ def test_adoption_waits_while_simulations_are_stopped(workshop):
 
 
 @pytest.mark.parametrize("helper", COUNTERS.values(), ids=COUNTERS)
-def test_a_model_may_change_its_own_values(workshop, helper, monkeypatch):
-    monkeypatch.setattr("fe_likelihoods.cache.verification.SHARE_OF_TIME", np.inf)  # compared after every batch
+@pytest.mark.parametrize(("share", "most"), [(SHARE_OF_TIME, 20), (np.inf, 2 * 30 + 10)], ids=["usual", "always"])
+def test_a_model_may_change_its_own_values(workshop, helper, share, most, monkeypatch):
+    """Two points are repeated where a comparison finds a change: 0 to 4 in 300, more if all batches are compared."""
+    monkeypatch.setattr("fe_likelihoods.cache.verification.SHARE_OF_TIME", share)
     workshop.write(helper=helper)
     likelihood = workshop.run(points=POINTS[:10])
     for start in range(10, 300, 10):
         likelihood.simulator.statistics(POINTS[start : start + 10])
         workshop.module.f(POINTS[start] / 3.0)
     assert (likelihood.simulations, likelihood.simulator.cache.info().simulations) == (300, 300)
-    assert likelihood.simulator.verifications <= 70  # two points for each comparison that finds a change
+    assert likelihood.simulator.verifications <= most
     assert workshop.run().simulator.verifications == USUAL  # the label is that of the beginning

@@ -5,7 +5,6 @@ import os
 import pickle
 import sys
 import time
-from collections import OrderedDict
 
 import numpy as np
 import pytest
@@ -283,9 +282,9 @@ def test_rows_that_the_same_likelihood_has_stored_are_not_verified(path, thetas)
 # copies ---------------------------------------------------------------------------------------------------------------
 
 
-def test_a_process_verifies_once_for_all_copies_of_a_likelihood(filled, thetas, monkeypatch):
+def test_a_process_verifies_once_for_all_copies_of_a_likelihood(filled, thetas):
     data = pickle.dumps(likelihood_of(Scaled(), filled))
-    monkeypatch.setattr(verification.Trust, "_known", OrderedDict())  # as in a new process
+    verification._trust.cache_clear()  # as in a new process
     copies = [pickle.loads(data) for _ in range(3)]  # as for the tasks of a pool
     for copy in copies:
         copy.misfit(thetas[:20])

@@ -45,7 +45,7 @@ def nothing_is_left():
 
 def workers_now():
     """Worker processes of this process, also in pools that other tests share."""
-    return {child for child in descendants(os.getpid()) if b"fe_likelihoods.simulation.worker" in _command(child)}
+    return {child for child in descendants(os.getpid()) if b"fe_likelihoods.simulation.executors" in _command(child)}
 
 
 def _command(pid):

@@ -83,7 +83,11 @@ def test_a_guided_run_with_its_checks_and_a_cache_runs_once(tmp_path, runs):
     made = sum(runs)
     other = joint(of_function(), cache=cache)
     np.testing.assert_array_equal(other(sampler.get_chain(flat=True)), sampler.get_log_prob(flat=True))
-    assert sum(runs) <= made + 8  # verified rows
+    simulators = [part.simulator for part in other.likelihood.likelihoods.values()]
+    assert [each.simulations for each in simulators] == [0, 0]
+    # two rows of each data set are verified first, and one of every 100 that are used
+    assert sum(runs) - made <= sum(each.verifications for each in simulators)
+    assert [each.verifications for each in simulators] == [2 + each.disk_hits // 100 for each in simulators]
     assert check_result(sampler).status == "use"
 
 

@@ -11,10 +11,9 @@ import pytest
 from fe_likelihoods import FunctionModel
 from fe_likelihoods.simulation import by_value
 from fe_likelihoods.simulation.by_value import Pickled, load
-from fe_likelihoods.simulation.executors import LocalPool, as_executor
+from fe_likelihoods.simulation.executors import LocalPool, Sandbox, as_executor
 from fe_likelihoods.simulation.failure_reasons import ChangedModel
 from fe_likelihoods.simulation.label import ModelLabel
-from fe_likelihoods.simulation.worker import Sandbox
 from tests.faults.treacherous import CHANNELS, DT, N_STEPS, Treacherous, line
 
 LAW = """
@@ -173,11 +172,11 @@ def test_a_module_is_one_namespace_in_the_worker(user, pool):
     assert user.law.K == 3.0
 
 
-def test_locks_are_new_and_values_that_cannot_be_sent_are_refused_with_their_name(user, pool):
+def test_locks_are_new_and_values_that_cannot_be_sent_are_refused_with_their_type(user, pool):
     assert pool.map(user.law.with_a_lock, [1.0]) == [3.0]
     user.law.bad = (number for number in (1, 2))
-    for function, name in ((user.law.direct, "bad"), (user.by_name, "law.bad")):
-        with pytest.raises(ValueError, match=f"the {name} of {function.__name__}, of type generator, cannot be sent"):
+    for function in (user.law.direct, user.by_name):
+        with pytest.raises(ValueError, match=f"{function.__name__} cannot be sent .*cannot pickle 'generator'"):
             pool.map(function, [1.0])
     user.law.bad = user.law.Named()
     with pytest.raises(ValueError, match="cannot be loaded in a worker process: AttributeError.*'bad'"):
