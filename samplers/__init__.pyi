@@ -5,9 +5,8 @@ from .reporting.figures import plot_corner, plot_marginals, plot_run
 from .reporting.model_comparison import compare_models
 from .reporting.summary import summary
 from .reports import SamplingWarning
-from .smc import SMCSampler
+from .smc import SMCSampler, TMCMCSampler
 from .tempering.guide import Guide
-from .tmcmc import TMCMCSampler
 
 __all__ = [
     "Guide",

@@ -34,18 +34,10 @@ class RunResults:
         return len(self._record.failed)
 
     @property
-    def _failed_simulations(self) -> int:
-        """Failed simulations of this run that the function counts itself, also in the search of a guide."""
-        since = (self._target.failure_count or 0) - self._failed_before
-        return max(len(self._record.counted), since)
-
-    @property
     def _failed(self) -> tuple[str, str]:
-        """How many simulations, or else evaluations, failed, and the most frequent reasons; empty without failures."""
-        if simulations := self._failed_simulations:
-            return f"{simulations} of {self.simulations:.0f} simulations", self._target.failure_reasons
-        reasons = most_common_reasons(reason for _, reason in self._record.failed)
-        return f"{self.failure_count} of {self.evaluations} evaluations" if self.failure_count else "", reasons
+        """How many evaluations failed, and the most frequent reasons; empty without failures."""
+        reasons = most_common_reasons(each["reason"] for each in self.failures)
+        return f"{len(self.failures)} of {self.evaluations} evaluations" if reasons else "", reasons
 
     @property
     def failures(self) -> list[dict]:

@@ -14,7 +14,7 @@ import logging
 import time
 import uuid
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, fields
 from typing import Any
 
@@ -51,8 +51,6 @@ from .tempering.mutation import MoveSchedule, check_moves
 from .tempering.population import Population, check_size
 
 logger = logging.getLogger(__name__)
-
-ARGUMENTS = ("log_prior_fn", "log_likelihood_fn", "guide", "max_simulations", "seed")
 
 
 class TemperedSampler(RunResults, EnsembleSampler):
@@ -130,7 +128,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
         check_arguments(pool, backend, seed)
         if unknown := settings.keys() - (names := [each.name for each in fields(Settings)]):
             text = f"{type(self).__name__}() got an unexpected keyword argument {min(unknown)!r}; settings are "
-            raise TypeError(f"{text}{', '.join(names)}, other arguments are those of emcee and {', '.join(ARGUMENTS)}")
+            ours = TemperedSampler.__init__.__kwdefaults__
+            raise TypeError(f"{text}{', '.join(names)}, other arguments are those of emcee and {', '.join(ours)}")
         functions = log_prob_fn, log_likelihood_fn, log_prior_fn
         self._target = target = Target(*functions, ndim, args, kwargs, vectorize, blobs_dtype)
         self.log_prior_fn = target.log_prior_fn
@@ -149,13 +148,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._must_repeat = reopened = self._record.start is not None  # the annealing, from the record
         self._previous_state = None
         same = pool, copy.deepcopy(moves), args, kwargs, backend, vectorize, blobs_dtype, parameter_names
-        try:
-            super().__init__(nwalkers, ndim, target.function, *same)
-        except AssertionError as error:  # emcee's test of the names
-            raise ValueError(
-                f"parameter_names must be a list of {ndim} different names, or a dict of names with their indices, "
-                f"with vectorize=False; got {parameter_names!r}: {error}"
-            ) from error
+        super().__init__(nwalkers, ndim, target.function, *same)
         self._chain = Chain(self.backend)
         self._result, self._verdict = self._chain.result, self._chain.verdict
         self._must_compare = reopened or self.backend.iteration > 0
@@ -176,7 +169,6 @@ class TemperedSampler(RunResults, EnsembleSampler):
             self._evaluator: Evaluator = AsynchronousEvaluator(*common)
         else:
             self._evaluator = Evaluator(*common)
-        self._failed_before = target.failure_count or 0
         known = self._record.latest() if reopened else None
         if known and self._record.start.header["log_prob_fn"] == getattr(target.function, "fingerprint", None):
             target.recall(known)
@@ -307,13 +299,10 @@ class TemperedSampler(RunResults, EnsembleSampler):
                 if isinstance(state, RunStart):
                     start_of_run, stored, skip = state, self._chain.last_state(), True
                     try:
-                        with self._annealing(start_of_run, stored, bar) as (steps, take):
+                        with self._annealing(start_of_run, stored, bar) as (steps, take), suppress(StopIteration):
                             answer = None
                             while True:
-                                try:
-                                    population, report = steps.send(answer)
-                                except StopIteration:
-                                    break
+                                population, report = steps.send(answer)
                                 # the search of a guide asks for a function to be called: it is no part of the stack
                                 answer = report() if callable(report) else take(population, report)
                         state = self._annealed(population, stored)
@@ -328,7 +317,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
                 self._evaluator.typed(EvaluatedBatch(state.coords, state.log_prob, state.blobs, {}))
                 if store:
                     self._chain.trim()
-                ended, advanced, stored, new = self._must_repeat, None, State(state, copy=True), 0
+                ended, stored, new = self._must_repeat, State(state, copy=True), 0
                 # walkers resampled from a guide's draws are the first step: moves would replace them by as good ones
                 untouched = self._guided is not None and np.array_equal(state.coords, self._guided)
                 if untouched and store and iterations and not ended and self.backend.iteration == 0:
@@ -338,9 +327,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
                         self._chain.step_stored()
                     arguments["iterations"], new = iterations - 1, 1
                     yield State(stored, copy=True)
-                steps = (
-                    () if ended else super().sample(state, skip_initial_state_check=skip, **arguments, progress=False)
-                )
+                steps = () if ended else super().sample(state, skip_initial_state_check=skip, **arguments)
                 per_step = 1 if thin else int(thin_by)
                 sweeps = None if iterations is None else (iterations - new) * per_step
                 shown = Progress(bar, self._evaluator, self._target.function, "sweeps at beta = 1", sweeps)
@@ -354,18 +341,18 @@ class TemperedSampler(RunResults, EnsembleSampler):
                                 if store:
                                     self._chain.step_stored()
                             self._record.drop_old_points(KEPT_POINTS)
-                            yield advanced
+                            yield State(stored, copy=True)  # a move that exceeds the limit may change `advanced`
                 except BudgetExhausted:
                     ended = True
                 missing = 0 if iterations is None else iterations - new
                 self._judge(missing, stored.coords)
                 if ended:
-                    yield from self._end_early(advanced, stored, new, missing, store)
+                    yield from self._end_early(stored, new, missing, store)
             except Exception as error:
                 self._undo(random_state)
                 if self.evaluations > evaluations:  # not for an argument that was refused
-                    if reasons := self._target.failure_reasons:
-                        error.add_note(f"Failed simulations: {reasons}.")
+                    if reasons := self._failed[1]:
+                        error.add_note(f"Failures: {reasons}.")
                     error.add_note(self._kept)
                 raise
             except (KeyboardInterrupt, SystemExit):
@@ -397,11 +384,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
         if self._record.start is None:  # the next call makes the same draws
             self._random.set_state(random_state)
 
-    def _end_early(self, advanced: State | None, stored: State, new: int, missing: int, store: bool) -> Iterator[State]:
+    def _end_early(self, stored: State, new: int, missing: int, store: bool) -> Iterator[State]:
         """Finish a call that the limit of simulations has ended after `new` steps; `stored` is the last step."""
-        if advanced is not None:  # the move that exceeded the limit may have changed some of its walkers
-            for name in State.__slots__:
-                setattr(advanced, name, getattr(stored, name))
         self.random_state = stored.random_state
         if store and missing > 0 and self.backend.iteration == 0:
             self._chain.store_step(stored, False, provisional=True)
@@ -537,7 +521,6 @@ class TemperedSampler(RunResults, EnsembleSampler):
         run = {"run": uuid.uuid4().hex, "seed": self._seed, "log_prior": float(np.sum(log_prior))}
         start = RunStart(self._header() | run, coords, self.random_state)
         self._record.begin(start)
-        self._failed_before = self._target.failure_count or 0
         self._chain.begin(run["run"])
         if state.log_prob is not None:
             known = EvaluatedBatch(coords, np.asarray(state.log_prob, dtype=float), state.blobs, {})

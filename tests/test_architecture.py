@@ -33,7 +33,7 @@ ORDER = {
         ("text_tables", "units"),
     ),
     "samplers": (
-        ("rare_events", "smc", "tmcmc"),
+        ("rare_events", "smc"),
         ("tempered",),
         ("results",),
         ("reporting",),

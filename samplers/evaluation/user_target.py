@@ -12,7 +12,7 @@ from ..interrupts import Ended, SentFunction, interrupts_end_the_run
 from ..record import EvaluatedBatch
 from .pools import map_in
 from .starts import not_of_the_prior
-from .values import Caught, log_densities, most_common_reasons, outcomes
+from .values import Caught, log_densities, outcomes
 
 logger = logging.getLogger(__name__)
 
@@ -90,22 +90,6 @@ class Target:
         fast = set(self.fast_parameters)
         return [j for j in range(self.ndim) if j not in fast] or list(range(self.ndim))
 
-    @property
-    def failure_count(self) -> int | None:
-        """Failed simulations by the count of the function, so that -inf may be one of them; None without a count."""
-        report = self._report()
-        return int(report["failure_count"]) if "failure_count" in report else None
-
-    @property
-    def failure_reasons(self) -> str:
-        """The most frequent reasons of failed simulations that the function reports; empty if it reports none."""
-        return most_common_reasons(self._report().get("failure_reasons") or {})
-
-    def _report(self) -> Mapping[str, Any]:
-        report = getattr(self.function, "report", None)
-        found = report() if callable(report) else None
-        return found if isinstance(found, Mapping) else {}
-
     def may_be_positive(self, coords: np.ndarray) -> np.ndarray:
         """Whether points (n, ndim) may have a positive density, (n,) bool, by the method `possible` of the function,
         which knows this without a simulation; True if unknown.
@@ -113,6 +97,11 @@ class Target:
         possible = getattr(self.function, "possible", None)
         unknown = np.ones(len(coords), dtype=bool)
         return unknown if possible is None or len(coords) == 0 else unknown & np.asarray(possible(coords.copy()))
+
+    @property
+    def knows_failures(self) -> bool:
+        """Whether the function gives reasons of failed simulations, so that -inf may be one of them."""
+        return hasattr(self._owner, "failures_at")
 
     def recall(self, batch: EvaluatedBatch) -> None:
         """Tell a function that counts failures itself what an earlier process has evaluated, by `recall_failures`."""
@@ -159,7 +148,7 @@ class Target:
         if self.is_likelihood:
             log_prob = log_prob + self.log_prior(coords)
         impossible = np.flatnonzero(log_prob == -np.inf)
-        if len(impossible) > 0 and hasattr(self._owner, "failures_at"):
+        if len(impossible) > 0 and self.knows_failures:
             said = self._owner.failures_at(self._as_columns(coords[impossible]))
             reasons |= {int(row): text for row, text in zip(impossible, said, strict=True) if text}
         return EvaluatedBatch(coords, log_prob, blobs, reasons)

@@ -95,7 +95,7 @@ def failures_near(samples: np.ndarray, failed: np.ndarray, succeeded: np.ndarray
 
 def judged_failures(evaluated: Any, final_coords: np.ndarray, target: Any) -> NearFailures:
     """Failures in the region of a run's final points (n, ndim), among the latest 20 000 of the `evaluated` points, by
-    the parameters that a simulation depends on. If the `target` counts failures by itself, all -inf are failures,
+    the parameters that a simulation depends on. If the `target` knows failures by itself, all -inf are failures,
     except outside its support.
     """
     coords, log_prob = evaluated.coords[-KEPT_POINTS:], evaluated.log_prob[-KEPT_POINTS:]
@@ -106,7 +106,7 @@ def judged_failures(evaluated: Any, final_coords: np.ndarray, target: Any) -> Ne
     ruled_out = rows[~target.may_be_positive(coords[rows])]
     coords, failed, impossible = (np.delete(each, ruled_out, axis=0) for each in (coords, failed, impossible))
     slow, either = target.slow_parameters, failed | impossible
-    coords, counted = coords[:, slow], failed if target.failure_count is None else either
+    coords, counted = coords[:, slow], either if target.knows_failures else failed
     return failures_near(final_coords[:, slow], coords[counted], coords[~either])
 
 

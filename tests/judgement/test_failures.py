@@ -29,10 +29,10 @@ class Cut(Gaussian):
 
 
 class Counting(Cut):
-    """As a posterior of finite-element models, it says how many simulations failed."""
+    """As a posterior of finite-element models, it says which simulations failed."""
 
-    def report(self):
-        return {"failure_count": self.failed}
+    def failures_at(self, x):
+        return ["too far" if each[0] > self.limit else "" for each in np.asarray(x)]
 
 
 def run(posterior, Sampler=SMCSampler, nwalkers=N, steps=1, **options):
@@ -91,7 +91,7 @@ class RulesOut(Cut):
 
 
 class CountingRulesOut(RulesOut, Counting):
-    """The same, with a number of failures."""
+    """The same, with reasons of failures."""
 
 
 @pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
