@@ -91,8 +91,8 @@ class Archive:
         self._file.seek(0, 2)
         np.asarray(histories, np.float32).tofile(self._file)
         for rows in self._blocks(first, end):
-            own = self._read(rows)
-            parts = [_bilinear_form(self._statistic, own, self._read(each)) for each in self._blocks(0, rows.stop)]
+            own = self.read(rows)
+            parts = [_bilinear_form(self._statistic, own, self.read(each)) for each in self._blocks(0, rows.stop)]
             products = np.concatenate(parts, axis=1)
             self._forms += [row[: number + 1].copy() for number, row in zip(rows, products, strict=True)]
         return np.arange(first, end)
@@ -102,14 +102,11 @@ class Archive:
         size = max(1, _VALUES // (self._shape[0] * self._shape[1]))
         return (range(begin, min(begin + size, end)) for begin in range(first, end, size))
 
-    def _read(self, rows: range) -> np.ndarray:
+    def read(self, rows: range) -> np.ndarray:
+        """Histories (n, n_channels, n_steps) by their numbers: of runs, measured minus simulated responses [SI]."""
         size = self._shape[0] * self._shape[1]
         self._file.seek(4 * size * rows.start)
         return np.fromfile(self._file, np.float32, size * len(rows)).reshape(-1, *self._shape).astype(float)
-
-    def residuals(self, number: int) -> np.ndarray:
-        """Residuals (n_channels, n_steps) of a run, by its number: measured minus simulated response [SI]."""
-        return self._read(range(number, number + 1))[0]
 
     def weights(self, rows: Sequence[Any]) -> np.ndarray:
         """Combinations (k, n) that are given as numbers of histories, or as weights of the first of them."""

@@ -15,7 +15,7 @@ _FIRST_DAMPING = 1e-2
 _LARGEST_STEP = 2.0  # prior standard deviations
 FIRST_DIFFERENCE = 3e-3  # prior standard deviations
 _DIFFERENCE_SHARE, _DIFFERENCE_LIMITS = 0.1, (3e-4, 2e-2)  # of a posterior standard deviation; prior ones
-_CHECKED_CHANGE = 1e-3  # of the response by a step, relative, where the model's derivatives are first used
+_CHECKED_CHANGE = 1e-3  # of the residuals by a step, relative, where the model's derivatives are first used
 _CHECKED_ERROR = 0.05
 # Parameters up to which every start makes differences. Without them, secants of the first ascent lead all starts into
 # its mode: in 8 parameters, a mode was lost in 11 of 12 searches, and with them in 2.
@@ -195,33 +195,33 @@ class Climb:
         changes = _differences(ends, here.run, max(here.run, *ends) + 1)
         self.jacobians.known.append((here.coords, np.linalg.solve(used, changes)))
 
-    def _check(self, numbers: np.ndarray) -> Requests:
-        """ValueError if derivatives, numbers (d,) in the archive, deny the residuals at a step along all coordinates.
-
-        Without a change along it, or a simulation there, the next derivatives are compared.
+    def _check(self, slopes: np.ndarray) -> Requests:
+        """ValueError if derivatives (d, n), as weights, deny the residuals at a step along all coordinates, which is
+        small beside the residuals. Without a change along it, or a simulation there, the next ones are compared.
         """
         target, here = self.target, self._here
-        scales = np.nanstd(target.data.measured, axis=1, keepdims=True)
-        scales[scales == 0.0] = 1.0
-        slopes = np.array([target.archive.residuals(number) / scales for number in numbers])
-        random = np.random.default_rng(0)  # a row in the place of another one shows, and so does a sign
-        steps = random.uniform(0.5, 1.0, len(slopes)) * random.choice([-1.0, 1.0], len(slopes))
-        sizes = np.sqrt(np.square(slopes).mean(axis=(1, 2)))
-        steps *= np.minimum(_CHECKED_CHANGE / np.maximum(sizes, 1e-300), _DIFFERENCE_LIMITS[1])
+        metric = target.slopes(here.statistics, here.noise.coords)
+
+        def norms(combinations: np.ndarray) -> np.ndarray:
+            return np.sqrt(np.maximum(-np.einsum("iin,n->i", target.archive.forms(combinations), metric), 0.0))
+
+        of_residuals, *sizes = norms(target.archive.weights([here.run, *slopes]))
+        # of both signs and different lengths: a row in the place of another one shows
+        steps = (-1.0) ** np.arange(len(slopes)) * np.linspace(0.5, 1.0, len(slopes))
+        steps *= np.minimum(_CHECKED_CHANGE * of_residuals / np.maximum(sizes, 1e-300), _DIFFERENCE_LIMITS[1])
         runs = yield (here.coords + steps)[None]
-        reached, predicted = here.run if runs.failed[0] else runs.numbers[0], np.tensordot(steps, slopes, 1)
-        change = (target.archive.residuals(reached) - target.archive.residuals(here.run)) / scales
-        size = 0.0 if runs.failed[0] else max(np.linalg.norm(change), np.linalg.norm(predicted))
-        if size == 0.0:
+        change, predicted = target.archive.weights([runs.numbers[0], steps @ slopes])
+        change[here.run] -= 1.0
+        *sizes, error = norms(np.array([change, predicted, change - predicted]))
+        if runs.failed[0] or max(sizes) == 0.0:
             target.unchecked.append(True)
             return
-        error = float(np.linalg.norm(change - predicted) / size)
-        if error < _CHECKED_ERROR:
+        if error < _CHECKED_ERROR * max(sizes):
             return
         raise ValueError(
             f"the derivatives of {target.data.kinds}.jacobian differ from a difference of two simulations by "
-            f"{100.0 * error:.0f} % of the norm; expected at most {100.0 * _CHECKED_ERROR:.0f} %: return the "
-            "derivatives of the response, in the units of the response [SI], by "
+            f"{100.0 * error / max(sizes):.0f} % of the norm; expected at most {100.0 * _CHECKED_ERROR:.0f} %: return "
+            "the derivatives of the response, in the units of the response [SI], by "
             f"{', '.join(target.data.parameter_names)}, or leave jacobian out"
         )
 
@@ -246,11 +246,11 @@ class Climb:
         damping, failures, gain = _FIRST_DAMPING, 0, np.inf
         for iteration in range(_MAX_ITERATIONS):
             if self.target.data.differentiable and not self._known_here():
-                numbers = yield self._here.coords
+                slopes = self.target.archive.weights((yield self._here.coords))
                 if self.target.unchecked:  # the first derivatives are compared with a difference
                     self.target.unchecked.clear()
-                    yield from self._check(numbers)
-                self.jacobians.known.append((self._here.coords, self.target.archive.weights(numbers)))
+                    yield from self._check(slopes)
+                self.jacobians.known.append((self._here.coords, slopes))
             at = self._quadratic()
             if merging and (joined := self._explained()) is not None:
                 return joined
