@@ -20,6 +20,8 @@ from typing import Any
 
 import numpy as np
 
+from samplers.interrupts import process_name
+
 from ..noise.sufficient_statistics import Statistic, needs_response, relative_changes, statistic_width
 from ..signals.channels import Comparison
 from ..simulation.failure_reasons import ChangedModel, TransientReason
@@ -39,7 +41,6 @@ FIRST_ROWS = 2  # rows verified before the first row is used, if the label is kn
 ROWS_PER_VERIFICATION = 100
 FIRST_COMPARED = 3  # rows in the first batch of a comparison; each further batch has three times as many as were equal
 MAX_ATTEMPTS = 4  # simulations that may fail for other reasons than the model
-LARGEST_ROUNDING = 1e-4  # largest relative response difference that may come from rounding and iterations
 SHARE_OF_TIME = 0.01  # for comparisons of the model
 FINGERPRINT = "its fingerprint"
 OF_A_PROCESS = ("environment ", "library", "package ", "python", "source of ")  # items that differ between processes
@@ -47,7 +48,8 @@ CHANGED = (
     "Something has changed that neither its declared identity nor its label contains, or the model does not repeat its "
     "results or failures (make them depend on the parameters alone, for example with a fixed seed). Delete its rows "
     "with likelihood.simulator.cache.forget(*likelihood.simulator.cache_keys), or give the model a new version= (or "
-    "depends_on=)"
+    "depends_on=). A small difference from rounding, as on another machine, is accepted with SimulationCache(path, "
+    "tolerance=...)"
 )
 
 
@@ -132,18 +134,14 @@ class VerifiedModel:
         label = ModelLabel(self.model, self.statistic)
         self._trust = Trust.of(label, secrets.token_hex(16))
         self._known: dict[str, str | None] = label.items | {FINGERPRINT: self.model.fingerprint}
-        self.has_results = self._was_sent = False  # from another process
+        self.has_results, self._labelled_by = False, process_name()
         self._points: list[tuple[np.ndarray, np.ndarray]] = []  # first and latest success: parameters, statistics
         self._unchecked: list[np.ndarray] = []  # parameters (n, n_structural) simulated since the last comparison
         self._not_before = self._counted_until = 0.0  # times of the next comparison, and of the last end of a run [s]
 
     def __getstate__(self) -> dict:
         begun = {"pool": None, "when_simulated": None, "has_results": False, "_points": [], "_unchecked": []}
-        return vars(self) | begun | {"_not_before": 0.0, "_counted_until": 0.0, "_was_sent": os.getpid()}
-
-    def __setstate__(self, state: dict) -> None:
-        vars(self).update(state)
-        self._was_sent = state["_was_sent"] != os.getpid()
+        return vars(self) | begun | {"_not_before": 0.0, "_counted_until": 0.0}
 
     @property
     def label(self) -> ModelLabel:
@@ -185,24 +183,22 @@ class VerifiedModel:
         self.verifications += len(thetas)
         return rows
 
-    def _difference(
-        self, earlier: np.ndarray, reason: str, now: np.ndarray, why: str, norm: np.ndarray
-    ) -> tuple[str, float]:
-        """How a simulation differs from an earlier one, in words and relative to the response norm; empty if it agrees.
+    def _difference(self, earlier: np.ndarray, reason: str, now: np.ndarray, why: str, norm: np.ndarray) -> str:
+        """How a simulation differs from an earlier one; empty if it agrees.
 
         It agrees within the tolerance of the cache, relative to the norm; zero is for equal bits.
         """
         if reason or why:
             was, did = (f"failed ({text})" if text else "succeeded" for text in (reason, why))
-            return ("" if reason and why else f"it {was}; simulated again, it {did}"), 0.0
+            return "" if reason and why else f"it {was}; simulated again, it {did}"
         tolerance = TOLERANCE if self.cache is None else self.cache.tolerance
         change = relative_changes(earlier, now, norm, self._of_response, ROUNDING if tolerance else 0.0)
         worst, n = int(np.argmax(np.nan_to_num(change, nan=np.inf))), len(norm)
         if change[worst] <= tolerance:
-            return "", 0.0
+            return ""
         what = "sum of squared residuals" if worst < n else f"statistic {worst}"
-        values = f"stored {earlier[worst]:.17g}, simulated again {now[worst]:.17g}"
-        return f"channel {self.measurements.channels[worst % n].name!r}, {what}: {values}", float(change[worst])
+        values = f"stored {earlier[worst]:.17g}, simulated again {now[worst]:.17g} (relative: {change[worst]:.1e})"
+        return f"channel {self.measurements.channels[worst % n].name!r}, {what}: {values}"
 
     # changes of the model -----------------------------------------------------------------------------------------
 
@@ -215,7 +211,7 @@ class VerifiedModel:
             return
         changed = self._changes() - self.label.changing
         found = sorted(name for name in changed if not name.startswith(OF_A_PROCESS))
-        if self._was_sent and found:
+        if found and self._labelled_by != process_name():
             raise ChangedModel(
                 f"the {type(self.model).__name__} in this process is not the one that was sent ({', '.join(found[:3])} "
                 "differ): modules have other contents or values here. Give the pool to the likelihood, "
@@ -277,7 +273,7 @@ class VerifiedModel:
             ended = [
                 (was, *now) for was, now in zip(earlier, new, strict=True) if not isinstance(now[1], TransientReason)
             ]
-            if not any(self._difference(was, "", *now)[0] for was, *now in ended):
+            if not any(self._difference(was, "", *now) for was, *now in ended):
                 return is_original
             earlier = [misfit for misfit, *_ in new]
         return True
@@ -400,7 +396,7 @@ class VerifiedModel:
             text = "%d of %d stored simulations could not be verified, because the new simulation was stopped (%s)"
             self._say(text, len(stopped), len(stopped) + compared, stopped[0])
 
-    def _compare(self, rows: Iterable[Row], n: int) -> tuple[int, list[str], tuple[Row, str, float] | None]:
+    def _compare(self, rows: Iterable[Row], n: int) -> tuple[int, list[str], tuple[Row, str] | None]:
         """Simulate rows again, in growing batches, until n are compared, one differs, or too many stop.
 
         Returns how many agree, the reasons of new simulations that were stopped, and how which row differs.
@@ -421,22 +417,17 @@ class VerifiedModel:
                 misfit, reason = np.frombuffer(row.value, dtype="<f8"), row.outcome if row.reason else ""
                 if not reason and row.size is not None:  # a response
                     (misfit,), (reason,) = self.statistics_of(misfit.reshape(1, len(self.model.channels), -1), [""])
-                if (difference := self._difference(misfit, reason, *new))[0]:
-                    return compared, stopped, (row, *difference)
+                if difference := self._difference(misfit, reason, *new):
+                    return compared, stopped, (row, difference)
                 compared += 1
         return compared, stopped, None
 
-    def _refuse(self, row: Row, difference: str, change: float, used: int) -> None:
+    def _refuse(self, row: Row, difference: str, used: int) -> None:
         """Raise `StaleCache`, now and for all rows until they are deleted."""
         trust, theta = self._trust, np.frombuffer(row.theta, dtype="<f8")
         trust.used, trust.session = {}, secrets.randbits(62)
         point = ", ".join(f"{n} = {value:.17g}" for n, value in zip(self.model.parameter_names, theta, strict=True))
-        text = f"{self.cache.path}: a stored simulation is not that of this {type(self.model).__name__}. At {point}: "
-        text += f"{difference}. {CHANGED}" + (f", and discard this run, which has used {used} rows" if used > 0 else "")
-        if 0.0 < change < LARGEST_ROUNDING:
-            text += (
-                ". If such a difference comes from rounding, for example on another machine, accept differences of "
-                f"this size, with SimulationCache(path, tolerance={2.0 * change:.1e})"
-            )
-        trust.stale = text
-        raise StaleCache(text)
+        trust.stale = f"{self.cache.path}: a stored simulation is not that of this {type(self.model).__name__}. "
+        trust.stale += f"At {point}: {difference}. {CHANGED}"
+        trust.stale += f". Discard this run, which has used {used} rows" if used > 0 else ""
+        raise StaleCache(trust.stale)

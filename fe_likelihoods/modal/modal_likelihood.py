@@ -235,7 +235,7 @@ class _ModesSimulator(Simulator):
         super().__init__(modes, anything, paired, **options)
         self.measurements, self._of_response = paired.measurements, False
 
-    def _difference(self, earlier: np.ndarray, reason: str, now: np.ndarray, why: str, _: Any) -> tuple[str, float]:
+    def _difference(self, earlier: np.ndarray, reason: str, now: np.ndarray, why: str, _: Any) -> str:
         return super()._difference(earlier, reason, now, why, np.linalg.norm(self.measurements.values, axis=1))
 
 

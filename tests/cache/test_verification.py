@@ -208,11 +208,12 @@ def test_stored_responses_are_verified(path, thetas):
 # tolerance ------------------------------------------------------------------------------------------------------------
 
 
-def test_small_differences_are_accepted_up_to_the_tolerance_of_the_message(filled, thetas):
+def test_small_differences_are_accepted_up_to_the_tolerance(filled, thetas):
     likelihood_of(Scaled(1.0 + 1e-11), filled).misfit(thetas)
     with pytest.raises(StaleCache) as caught:
         likelihood_of(Scaled(1.0 + 1e-7), filled).misfit(thetas)
-    stated = float(str(caught.value).rpartition("tolerance=")[2].rstrip(")"))
+    assert "is accepted with SimulationCache(path, tolerance=" in str(caught.value)
+    stated = 2.0 * float(str(caught.value).partition("(relative: ")[2].partition(")")[0])
     assert 1e-9 < stated < 1e-6
     likelihood_of(Scaled(1.0 + 1e-7), SimulationCache(filled, tolerance=stated)).misfit(thetas)
 
@@ -231,7 +232,7 @@ def test_one_of_every_hundred_rows_is_verified(path, rng):
     in_one_call.misfit(thetas)
     assert in_one_call.simulator.verifications == 2 + 3
     likelihood.model.factor = 2.0
-    with pytest.raises(StaleCache, match="discard this run, which has used 3[0-9]0 rows"):
+    with pytest.raises(StaleCache, match="Discard this run, which has used 3[0-9]0 rows"):
         for start in range(0, 100, 10):
             likelihood.misfit(thetas[start : start + 10])
 
