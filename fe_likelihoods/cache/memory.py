@@ -119,10 +119,12 @@ class MemoryCache:
 
     def look_up(self, keys: Iterable[Hashable]) -> dict[Hashable, Any]:
         """Outcomes that are known, by key."""
+        found = {}
         with self._lock:
-            found = {key: self._outcomes[key] for key in keys if key in self._outcomes}
-            for key in found:
-                self._outcomes.move_to_end(key)
+            for key in keys:
+                if key in self._outcomes:
+                    found[key] = self._outcomes[key]
+                    self._outcomes.move_to_end(key)
         return found
 
     def store(self, keys: Iterable[Hashable], outcomes: Iterable[Any]) -> None:

@@ -128,8 +128,7 @@ class Simulator(VerifiedModel):
         try:
             with trust.lock:  # after what runs for other requests
                 trust.lock.wait_for(lambda: trust.running.isdisjoint(request.keys))
-                self._look_up(request)
-                if new := request.left:
+                if new := self._look_up(request):
                     self._check_before()  # so that finished simulations are stored
                     self._trust.running.update(new)  # of another label, if the check has made one
             while left := request.left:
@@ -178,8 +177,8 @@ class Simulator(VerifiedModel):
 
     # known simulations --------------------------------------------------------------------------------------------
 
-    def _look_up(self, request: Requested) -> None:
-        """Fill in what is known, and count it."""
+    def _look_up(self, request: Requested) -> list[bytes]:
+        """Fill in what is known, and count it; returns the keys that are to be simulated."""
         finite = np.isfinite(thetas_of(request.keys, self.n_structural)).all(axis=1)
         skipped = [key for key, fine in zip(request.keys, finite, strict=True) if not fine]
         request.enter(self.memory_cache.look_up(request.keys) | dict.fromkeys(skipped, "the parameters are not finite"))
@@ -192,8 +191,9 @@ class Simulator(VerifiedModel):
         except StaleCache:  # results in memory may belong to another model
             self._clear()
             raise
-        found = set(request.keys).difference(skipped, request.left)
+        found = set(request.keys).difference(skipped, left := request.left)
         self.cache_hits += sum([request.keys[place] in found for place in request.which])
+        return left
 
     def _take_responses(self, request: Requested) -> None:
         """Fill in stored responses, and statistics that are not known."""
