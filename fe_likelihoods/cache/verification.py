@@ -22,14 +22,13 @@ import numpy as np
 
 from samplers.interrupts import process_name
 
-from ..noise.sufficient_statistics import Statistic, needs_response, relative_changes, statistic_width
-from ..signals.channels import Comparison
+from ..noise.sufficient_statistics import relative_changes
 from ..simulation.failure_reasons import ChangedModel, TransientReason
 from ..simulation.files import digests_by_name, observing, read_again
 from ..simulation.label import ModelLabel
-from ..simulation.model import Model, SimulationBatch, misfit_of_responses, most_responses, simulate_batch
+from ..simulation.model import SimulationBatch, misfit_of_responses, most_responses, simulate_batch
 from .memory import thetas_of
-from .simulation_cache import TOLERANCE, Row, SimulationCache, pack_rows
+from .simulation_cache import TOLERANCE, Row, pack_rows
 
 __all__ = ["ROWS", "StaleCache", "Trust", "VerifiedModel"]
 
@@ -112,36 +111,24 @@ class VerifiedModel:
     `label` identifies the model when it was first simulated. Derived likelihoods and copies share its `Trust`.
     `verifications` counts simulations that were made again, `unverified` rows whose new simulation was stopped (not by
     the model), `seconds` is the wall time of simulations [s]; `has_results` says whether results are known in this
-    process. A subclass has the measurements, and memories; methods take the model's `fingerprint`, one for a request.
+    process. All else has the `Simulator`; methods take the model's `fingerprint`, one for a request.
     """
 
-    def __init__(
-        self,
-        model: Model,
-        measured: np.ndarray | Comparison,
-        statistic: Statistic | None,
-        pool: Any,
-        cache: SimulationCache | str | os.PathLike | None,
-    ) -> None:
-        self.model, self.measured, self.statistic, self.pool = model, measured, statistic, pool
-        self.n_numbers, self._of_response = statistic_width(measured, statistic), needs_response(statistic)
-        self.cache = cache if cache is None or isinstance(cache, SimulationCache) else SimulationCache(cache)
-        self.verifications = self.unverified = 0
-        self.seconds = 0.0
-        self._label_model()
+    verifications = unverified = 0
+    seconds = 0.0
+    # in a process before its first simulation: points are the first and latest success with its statistics, and those
+    # since the last comparison; times [s] are those of the next comparison, and of the last end of a run
+    _begun = {"has_results": False, "_points": (), "_unchecked": (), "_not_before": 0.0, "_counted_until": 0.0}
 
     def _label_model(self) -> None:
         label = ModelLabel(self.model, self.statistic)
         self._trust = Trust.of(label, secrets.token_hex(16))
         self._known: dict[str, str | None] = label.items | {FINGERPRINT: self.model.fingerprint}
-        self.has_results, self._labelled_by = False, process_name()
-        self._points: list[tuple[np.ndarray, np.ndarray]] = []  # first and latest success: parameters, statistics
-        self._unchecked: list[np.ndarray] = []  # parameters (n, n_structural) simulated since the last comparison
-        self._not_before = self._counted_until = 0.0  # times of the next comparison, and of the last end of a run [s]
+        self._labelled_by = process_name()
+        vars(self).update(self._begun)
 
     def __getstate__(self) -> dict:
-        begun = {"pool": None, "when_simulated": None, "has_results": False, "_points": [], "_unchecked": []}
-        return vars(self) | begun | {"_not_before": 0.0, "_counted_until": 0.0}
+        return vars(self) | self._begun | {"pool": None, "when_simulated": None}
 
     @property
     def label(self) -> ModelLabel:
@@ -184,10 +171,7 @@ class VerifiedModel:
         return rows
 
     def _difference(self, earlier: np.ndarray, reason: str, now: np.ndarray, why: str, norm: np.ndarray) -> str:
-        """How a simulation differs from an earlier one; empty if it agrees.
-
-        It agrees within the tolerance of the cache, relative to the norm; zero is for equal bits.
-        """
+        """How a simulation differs from an earlier one by more than the tolerance of the cache; zero: in any bit."""
         if reason or why:
             was, did = (f"failed ({text})" if text else "succeeded" for text in (reason, why))
             return "" if reason and why else f"it {was}; simulated again, it {did}"
@@ -225,10 +209,10 @@ class VerifiedModel:
 
         Raises `ChangedModel`; what was simulated since the last comparison, on either side of the change, is dropped.
         """
-        self._unchecked.append(thetas)
+        self._unchecked += (thetas,)
         is_first, succeeded = not self._points, [row for row, reason in enumerate(reasons) if not reason]
         points = [(thetas[row].copy(), misfit[row].copy()) for row in succeeded[:1] + succeeded[-1:]]
-        self._points = (self._points or points)[:1] + points[-1:]
+        self._points = [*(self._points or points)[:1], *points[-1:]]
         if not self._points or (start := time.monotonic()) < self._not_before:
             return
         if changed := self._changes():
@@ -248,7 +232,7 @@ class VerifiedModel:
             self.label.has_changed_itself(changed)
             now = self.label.present(self.model)
             self._known |= {name: now.get(name) for name in changed}
-        self._unchecked.clear()
+        self._unchecked = ()
         now = time.monotonic()
         self._not_before = now + (now - start) / SHARE_OF_TIME
 
@@ -263,10 +247,7 @@ class VerifiedModel:
         return {name for name in known.keys() | now.keys() if known.get(name) != now.get(name)}
 
     def _repeats(self) -> bool:
-        """Whether the first and latest simulation give the earlier results again, or the model is not repeatable.
-
-        So what has changed is user code's own, such as a counter.
-        """
+        """Whether the first and latest simulation give the earlier results again (user code has counted), or never."""
         thetas, earlier = np.array([theta for theta, _ in self._points]), [misfit for _, misfit in self._points]
         for is_original in (True, False):
             new = self._simulate_again(thetas)
@@ -285,9 +266,7 @@ class VerifiedModel:
     ) -> None:
         """Store simulations under the model's label: statistics, responses if given, and failures of the model."""
         trust = self._trust
-        if {TransientReason}.issuperset(map(type, reasons)):
-            return
-        if not (generation := self._generation(fingerprint)):
+        if {TransientReason}.issuperset(map(type, reasons)) or not (generation := self._generation(fingerprint)):
             return
         self._use(fingerprint, generation)
         rows = pack_rows(self.simulation_key, thetas, misfit, reasons, generation, trust.session)

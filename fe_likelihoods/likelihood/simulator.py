@@ -20,7 +20,13 @@ from samplers.interrupts import interrupts_end_the_run
 from ..cache.memory import MemoryCache, Requested, ResponseMemory, outcomes_of, reason_in, thetas_of
 from ..cache.simulation_cache import SimulationCache
 from ..cache.verification import StaleCache, VerifiedModel
-from ..noise.sufficient_statistics import Statistic, check_statistic, name_of_statistic
+from ..noise.sufficient_statistics import (
+    Statistic,
+    check_statistic,
+    name_of_statistic,
+    needs_response,
+    statistic_width,
+)
 from ..priors.points import as_rows
 from ..signals.channels import Comparison, Measurements, compare_with
 from ..simulation.executors import as_executor
@@ -68,10 +74,13 @@ class Simulator(VerifiedModel):
     ) -> None:
         self.failures = FailureLog(model.parameter_names)
         self.memory_cache, self.response_memory = MemoryCache(memory_rows), ResponseMemory(memory_bytes)
-        self.measurements = measurements
         measured = compare_with(measurements, model.dt, model.n_steps)
         check_statistic(statistic, measured)
-        super().__init__(model, measured, statistic, as_executor(pool, model), cache)
+        self.measurements, self.measured = measurements, measured
+        self.model, self.statistic, self.pool = model, statistic, as_executor(pool, model)
+        self.n_numbers, self._of_response = statistic_width(measured, statistic), needs_response(statistic)
+        self.cache = cache if cache is None or isinstance(cache, SimulationCache) else SimulationCache(cache)
+        self._label_model()
         text = f"{model.fingerprint} {measurements.fingerprint}{name_of_statistic(statistic)}"
         text += measured.description if isinstance(measured, Comparison) else ""
         self.simulation_key = hashlib.blake2b(text.encode(), digest_size=16).hexdigest()

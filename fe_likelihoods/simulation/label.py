@@ -40,10 +40,10 @@ _sources: dict[str, tuple] = {}  # by name of a module: the module and its spec,
 
 
 class ModelLabel:
-    """Label of a model in its present state: digests `items` of its code and values, and what simulations `opened`.
+    """Label of a model in its present state: `items`, digests of its code and values, with their digest `code`.
 
     The code is what ``code_parts()`` returns, and the model and the residual statistic if the user has defined them.
-    Simulations that may run user code are observed (`observes`).
+    Simulations that may run user code are observed (`observes`): `opened` are the files that they have opened.
     """
 
     def __init__(self, model: Any, statistic: Any = None) -> None:
@@ -51,14 +51,10 @@ class ModelLabel:
         self._statistic = statistic if by_user else None
         self.items = self._present(model)
         self.items |= {name: _first[name] for name in self.changing}
+        self.code = _joined(self.items)
         is_users = hasattr(model, "code_parts") or is_of_user(type(model).__module__)
         self.observes = is_users or self._statistic is not None
         self.opened = mapped() if self.observes else {}
-
-    @property
-    def code(self) -> str:
-        """Digest of `items`."""
-        return _joined(self.items)
 
     @property
     def identity(self) -> str:
