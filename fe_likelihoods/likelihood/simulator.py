@@ -1,9 +1,8 @@
 """Simulations of a model and their statistics against measurements: each is run once, counted, cached and verified.
 
-A request first takes what is known: statistics in memory and on disk, then responses in memory and on disk, from which
-the statistics are computed with the same bits as from a new simulation. The other simulations are run in chunks, in
-this process (compiled models on threads) or by a pool, and cached as they arrive. With a pool to which single items can
-be submitted there is one chunk, so that nothing waits for a batch. Several threads may send requests.
+A request first takes what is known (`fe_likelihoods.cache.memo`). The other simulations are run in chunks, in this
+process (compiled models on threads) or by a pool, and cached as they arrive. With a pool to which single items can be
+submitted there is one chunk, so that nothing waits for a batch. Several threads may send requests.
 """
 
 import hashlib
@@ -17,9 +16,9 @@ import numpy as np
 
 from samplers.interrupts import interrupts_end_the_run
 
-from ..cache.memory import MemoryCache, Requested, ResponseMemory, outcomes_of, reason_in, thetas_of
+from ..cache.memo import Memo
+from ..cache.memory import MemoryCache, Requested, ResponseMemory, outcomes_of, thetas_of
 from ..cache.simulation_cache import SimulationCache
-from ..cache.verification import StaleCache, VerifiedModel
 from ..noise.sufficient_statistics import (
     Statistic,
     check_statistic,
@@ -33,7 +32,6 @@ from ..simulation.executors import as_executor
 from ..simulation.files import Observed
 from ..simulation.model import (
     Model,
-    SimulationBatch,
     gathered,
     has_jacobian,
     most_responses,
@@ -49,7 +47,7 @@ _SECONDS_PER_CHUNK = 5.0  # simulation time between two writes to the cache on d
 _ROUNDS_PER_CHUNK = 8  # simulations per worker and chunk: at the end of a chunk, workers idle half a round on average
 
 
-class Simulator(VerifiedModel):
+class Simulator(Memo):
     """A model's simulations, compared with measurements in the order of the model's channels; each is run once.
 
     Options are those of `FELikelihood`; the statistic is the sums of squares by default. `measured` are values
@@ -159,80 +157,6 @@ class Simulator(VerifiedModel):
             return request.statistics(self.n_numbers)
         responses = [request.responses[request.keys[place]] for place in request.which]
         return request.statistics(self.n_numbers), self._as_batch(responses)
-
-    def _as_batch(self, found: Sequence[np.ndarray | str]) -> SimulationBatch:
-        """Responses or reasons of failures as a batch."""
-        outcomes = [(None, each) if isinstance(each, str) else (each, "") for each in found]
-        return SimulationBatch(*gathered(outcomes, (len(self.model.channels), self.model.n_steps)))
-
-    def recall(self, thetas: np.ndarray, statistics: np.ndarray | None, reasons: Sequence[str]) -> None:
-        """Cache statistics (n, n_numbers) of an earlier run in memory, at structural parameters (n, n_structural).
-
-        Failures (with a reason) are recorded. Rows that are cached already are not changed. Nothing is written to the
-        cache on disk. Without statistics, only failures are cached.
-        """
-        rows = {theta.tobytes(): row for row, theta in enumerate(thetas + 0.0) if np.isfinite(theta).all()}
-        known = self.memory_cache.look_up(rows)
-        for key, row in rows.items():
-            if key not in known:
-                self.failures.count_outcomes(thetas[row : row + 1], [reasons[row]])
-                if reasons[row] or statistics is not None:
-                    self.memory_cache.store([key], [reasons[row] or statistics[row].tobytes()])
-
-    def reason(self, point: np.ndarray) -> str:
-        """Reason of a failure that is cached at parameters (n,), the structural ones first; empty for others."""
-        key = (point[: self.n_structural] + 0.0).tobytes()
-        return reason_in(self.memory_cache.look_up([key]).get(key))
-
-    # known simulations --------------------------------------------------------------------------------------------
-
-    def _look_up(self, request: Requested) -> list[bytes]:
-        """Fill in what is known, and count it; returns the keys that are to be simulated."""
-        finite = np.isfinite(thetas_of(request.keys, self.n_structural)).all(axis=1)
-        skipped = [key for key, fine in zip(request.keys, finite, strict=True) if not fine]
-        request.enter(self.memory_cache.look_up(request.keys) | dict.fromkeys(skipped, "the parameters are not finite"))
-        try:
-            if self.cache is not None and not request.full and (left := request.left):
-                self._enter(request, read := self._stored(left, request.fingerprint, False))
-                self.disk_hits += len(read)
-            if self.cache is not None or len(self.response_memory):
-                self._take_responses(request)
-        except StaleCache:  # results in memory may belong to another model
-            self._clear()
-            raise
-        found = set(request.keys).difference(skipped, left := request.left)
-        self.cache_hits += sum([request.keys[place] in found for place in request.which])
-        return left
-
-    def _take_responses(self, request: Requested) -> None:
-        """Fill in stored responses, and statistics that are not known."""
-        left, size, fingerprint = request.left, most_responses(self.model), request.fingerprint
-        for start in range(0, len(left), size):
-            keys = left[start : start + size]
-            in_memory = self.response_memory.look_up([(fingerprint, key) for key in keys])
-            found = {key: response for (_, key), response in in_memory.items()}
-            missing = [key for key in keys if key not in found]
-            if self.cache is not None and missing:
-                found |= (read := self._stored(missing, fingerprint, True))
-                self.disk_hits += len(read)
-                if request.full:
-                    self.response_memory.store([(fingerprint, key) for key in read], read.values())
-            if request.full:
-                request.responses |= found
-            if new := [key for key in found if key not in request.outcomes]:
-                statistics, reasons = self.statistics_of(*self._as_batch([found[key] for key in new]))
-                self._enter(request, outcomes_of(new, statistics, reasons))
-                if self.cache is not None:
-                    self._store(thetas_of(new, self.n_structural), statistics, reasons, None, fingerprint)
-
-    def _enter(self, request: Requested, outcomes: dict[bytes, bytes | str]) -> None:
-        """Fill in statistics and reasons of failures, count these, and cache both in memory."""
-        if outcomes:
-            thetas = thetas_of(list(outcomes), self.n_structural)
-            self.failures.count_outcomes(thetas, list(map(reason_in, outcomes.values())))
-            request.enter(outcomes)
-            self.memory_cache.store(outcomes, outcomes.values())
-            self.has_results = True
 
     # simulations --------------------------------------------------------------------------------------------------
 
