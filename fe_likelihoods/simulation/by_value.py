@@ -76,47 +76,57 @@ class CannotLoad(ValueError):
     """A function that cannot be unpickled in a worker process."""
 
 
-class Pickled(NamedTuple):
-    """A function as it is sent to workers; another one after a change of its values."""
+class Pickled:
+    """A function for other processes, by value in its state when it is first pickled; in this one it is itself."""
 
-    payload: bytes  # digest of the library, name of the sending process, and the pickled function
+    def __init__(self, function: Any, payload: bytes = b"") -> None:
+        self._function, self._payload = function, payload
 
     @classmethod
     def of(cls, function: Any) -> "Pickled":
         """Pickle a function with everything that it uses at present; ValueError, with a type, if that is impossible."""
+        return cls(function, cls(function).payload)
+
+    @property
+    def payload(self) -> bytes:
+        """Digest of the library, name of the sending process, and the pickled function."""
         try:
-            return cls(sources_digest() + process_name() + dumps(function))
+            self._payload = self._payload or sources_digest() + process_name() + dumps(self._function)
         except Exception as error:
+            name = getattr(self._function, "__qualname__", type(self._function).__qualname__)
             raise ValueError(
-                f"{getattr(function, '__qualname__', type(function).__qualname__)} cannot be sent to another process "
-                f"({type(error).__name__}: {without_addresses(str(error))}). Objects that it uses must not contain "
-                "open files and connections: make them inside the function"
+                f"{name} cannot be sent to another process ({type(error).__name__}: {without_addresses(str(error))}). "
+                "Objects that it uses must not contain open files and connections: make them inside the function"
             ) from error
+        return self._payload
+
+    def __reduce__(self) -> tuple:
+        return Pickled, (None, self.payload)
 
     def __call__(self, item: Any) -> Any:
-        """The result for an item in another process, which loads the function once."""
-        return load(self)(item)
+        """The result for an item; another process loads the function once."""
+        return (self._function or load(self.payload))(item)
 
 
 @functools.lru_cache(8)
-def load(pickled: Pickled) -> Callable[[Any], Any]:
-    """The function, in a worker, with user modules of its own.
+def load(payload: bytes) -> Callable[[Any], Any]:
+    """The function of a `Pickled`, in a worker, with user modules of its own.
 
     CannotLoad if it cannot be unpickled; ChangedModel if this process has another version of this library, or a file
     that the model depends on differs.
     """
     global _arriving
-    if pickled.payload[:16] != sources_digest():
+    if payload[:16] != sources_digest():
         raise ChangedModel(
             "the worker process has another version of fe_likelihoods than the process that sends simulations: "
             "install the same version everywhere, and start a new pool"
         )
     with _lock:
-        if pickled.payload[16:32] != process_name():
+        if payload[16:32] != process_name():
             become_worker()
         _arriving = modules = {}
         try:
-            function = pickle.loads(memoryview(pickled.payload)[32:])
+            function = pickle.loads(memoryview(payload)[32:])
         except ChangedModel:
             raise
         except Exception as error:

@@ -33,7 +33,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecutor
 from concurrent.futures import wait as wait_for
 from contextlib import AbstractContextManager, closing, suppress
-from functools import cache, cached_property, partial
+from functools import cache, partial
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from multiprocessing.pool import Pool, ThreadPool
@@ -114,25 +114,24 @@ def _results(left: dict[Any, int], ended: Sequence[Any]) -> tuple[dict[int, Any]
     return found, error
 
 
-def result_of(future: Any) -> Any:
+def result_of(future: Any, is_last: bool = False) -> Any:
     """The result of an item; raises KeyboardInterrupt or SystemExit if the function has raised it in a pool.
 
     Dask gives up all items that ran beside one that killed their worker: an item is run once more, apart from the
     others. If it is lost again, it is the cause.
     """
-    for is_last in (False, True):
-        try:
-            result = future.result()
-        except Exception as error:
-            if type(error).__name__ != "KilledWorker":
-                raise
-            if not is_last:
-                future.retry()
-        else:
-            if isinstance(result, Ended):
-                raise result.error
-            return result
-    return None, TransientReason("the worker process died in every attempt of dask")
+    try:
+        result = future.result()
+    except Exception as error:
+        if type(error).__name__ != "KilledWorker":
+            raise
+        if is_last:
+            return None, TransientReason("the worker process died in every attempt of dask")
+        future.retry()
+        return result_of(future, True)
+    if isinstance(result, Ended):
+        raise result.error
+    return result
 
 
 class Job(Future):
@@ -214,9 +213,9 @@ class Worker:
             self._renew()
         if job.given_up:  # before, there was no process to kill
             raise CancelledError
-        if self._function != job.function:
-            self._ask(b"\1" + pickle.dumps(job.function, protocol=5), math.inf)
-            self._function = job.function
+        if self._function != job.function.payload:
+            self._ask(b"\1" + job.function.payload, math.inf)
+            self._function = job.function.payload
         self._calls += 1
         return self._ask(message, seconds)
 
@@ -390,9 +389,7 @@ class PoolExecutor(Submitting):
 
     def submit_all(self, function: Callable[[Any], Any], items: Sequence[Any]) -> list[Future]:
         """Futures as from `submit`, for several items; they have ended if the pool only has ``map``."""
-        by_value = _ByValue(function)
-        if self.other_processes:
-            by_value.pickled  # noqa: B018  # now
+        by_value = Pickled.of(function) if self.other_processes else Pickled(function)
         if self.submits and len(items):
             return submit_all(self.pool, partial(_run, by_value) if self._is_dask else by_value, items)
         futures = [Future() for _ in items]
@@ -404,23 +401,6 @@ class PoolExecutor(Submitting):
         """Cancel items that the pool has not started."""
         for future in futures:
             future.cancel()
-
-
-class _ByValue:
-    """A function that is sent to other processes by value, in its state when it is first pickled."""
-
-    def __init__(self, function: Callable) -> None:
-        self._function = function
-
-    @cached_property
-    def pickled(self) -> Pickled:
-        return Pickled.of(self._function)
-
-    def __call__(self, item: Any) -> Any:
-        return self._function(item)
-
-    def __reduce__(self) -> tuple:
-        return Pickled, tuple(self.pickled)
 
 
 def _run(function: Callable, item: Any) -> Any:
@@ -486,7 +466,7 @@ def serve(fileno: int, place: str) -> None:
                 return
             try:
                 if message[0]:
-                    function = load(pickle.loads(message[1:]))
+                    function = load(bytes(message[1:]))
                 answer = _packed(None if message[0] else function(pickle.loads(message[1:])))
             except BaseException as error:
                 answer = _packed(None, error)

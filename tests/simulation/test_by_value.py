@@ -205,7 +205,7 @@ def test_another_version_of_the_library_is_refused(monkeypatch):
     pickled = Pickled.of(line)
     monkeypatch.setattr(by_value, "sources_digest", lambda: bytes(16))
     with pytest.raises(ChangedModel, match="another version of fe_likelihoods"):
-        load(pickled)
+        load(pickled.payload)
 
 
 def test_a_file_that_differs_in_the_worker_is_refused(tmp_path, pool):
@@ -218,12 +218,12 @@ def test_a_file_that_differs_in_the_worker_is_refused(tmp_path, pool):
 
 
 def _load(pickled):
-    return load(pickled) is not None
+    return load(pickled.payload) is not None
 
 
 def test_modules_of_this_process_stay_when_a_function_is_loaded_in_it(user):
     law = user.law
-    assert load(Pickled.of(user.by_module))(1.0) == 3.0
+    assert load(Pickled.of(user.by_module).payload)(1.0) == 3.0
     assert sys.modules["law"] is law and law.K == 3.0
 
 
