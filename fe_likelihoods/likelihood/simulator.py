@@ -169,9 +169,12 @@ class Simulator(Memo):
         """Number of simulations, of n, between two writes to the cache on disk, or two reports of progress."""
         if self.streams:
             return n
+        most = min(n, most_responses(self.model))
+        if self.cache is None and (self.when_simulated is None or self.pool is not None):
+            return most
         workers = (os.cpu_count() or 1) if self.pool is None else self.pool.n_workers or n
         together = self.pool is not None or hasattr(self.model, "simulate_batch")  # then all workers are to be busy
-        return min(n, most_responses(self.model), max(_ROUNDS_PER_CHUNK * workers if together else 1, self._most))
+        return min(max(_ROUNDS_PER_CHUNK * workers if together else 1, self._most), most)
 
     @interrupts_end_the_run()
     def _run_in_pool(self, request: Requested, keys: Sequence[bytes], start: float) -> None:
