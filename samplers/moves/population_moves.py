@@ -36,10 +36,10 @@ KERNEL_PROBABILITIES = (0.5, 0.25, 0.25)
 # preferred, since it decorrelates the ensemble fastest: equal probabilities take a tenth more evaluations.
 TARGET_ACCEPTANCE, HIGH_ACCEPTANCE = 0.25, 0.5
 KERNEL_PROBABILITIES_IF_ACCEPTED = (0.8, 0.1, 0.1)
-# Parts of the fitted points, from this number of dimensions on; the points of a part are moved by a fit to the others.
-# The log-evidence of six runs was off by 1.9 stated errors in 20 dimensions, with 10 parts by 0.4; in 10 dimensions by
-# 0.4 without parts, which take a sixth more evaluations there.
-PARTS, FEWEST_DIMENSIONS = 10, 15
+# Parts of the fitted points, where they are fewer than this per number of a mean and a covariance; the points of a part
+# are moved by a fit to the others. Without, means of two modes in 11 dimensions are off by 1.3 stated errors (0.93,
+# 160 runs of 150 walkers), and the log-evidence in 20 dimensions by 1.9 (0.4; six runs); in 10 dimensions by 0.4.
+PARTS, FEW_POINTS = 10, 5.0
 # Share of the difference steps with scale 1, which lead from mode to mode (ter Braak 2006). Without differences, the
 # means of 24 runs with two modes in 11 dimensions are off by 1.6 stated errors.
 UNIT_SCALE_SHARE = 0.1
@@ -164,9 +164,8 @@ class MixtureMove(_FittedMove):
         self, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None, mixture: Mixture | None = None
     ) -> None:
         """Fit the mixture to points (n, ndim) with normalised weights (n,), or take a given `mixture`; the bounds of
-        the support are found at the first call. From 15 dimensions on, each tenth of the points is moved by a fit to
-        the others, if `follow` says which walker descends from which: a point that has widened a mixture is replaced
-        too easily.
+        the support are found at the first call. Each tenth of few points is moved by a fit to the others, if `follow`
+        says which walker descends from which: a point that has widened a mixture is replaced too easily.
         """
         self.is_fitted = True
         if inside is not None and self._bounds is None:
@@ -177,7 +176,8 @@ class MixtureMove(_FittedMove):
         self._cumulated = np.cumsum(weights)
         self._current, self._independence_accepted = None, False
         self._part, self._mixtures = None, []
-        if mixture is None and coords.shape[1] >= FEWEST_DIMENSIONS:
+        n, ndim = coords.shape
+        if mixture is None and n < FEW_POINTS * ndim * (ndim + 3.0) / 2.0:
             self._mixtures = leave_out(self._mixture, coords, weights, np.arange(len(coords)) % PARTS)
 
     def follow(self, ancestors: np.ndarray) -> None:
