@@ -179,15 +179,16 @@ def fit_mixture(
     """Fit a mixture to points (n, ndim) with weights (n,) of sum 1. The Bayesian information criterion chooses
     components, degrees of freedom, shears, and a transformation that removes `bounds` near the population.
     """
-    mixture, criterion = _fit_with_shears(coords, weights, max_components)
+    kept, effective, tried = weights > 0.0, 1.0 / (weights @ weights), []
     near = None if bounds is None else near_bounds(bounds, coords, weights)
-    if near is None or not np.any(np.isfinite([near.low, near.high])):
-        return mixture
-    unbounded, other = _fit_with_shears(to_unbounded(near, coords), weights, max_components)
-    # the criterion of a density in the parameters contains the Jacobian determinant of the transformation
-    kept = weights > 0.0
-    other -= 2.0 / (weights @ weights) * float(weights[kept] @ log_abs_det_jacobian(near, coords[kept]))
-    return unbounded._replace(bounds=near) if other < criterion else mixture
+    for edges in [None] if near is None or not np.any(np.isfinite([near.low, near.high])) else [None, near]:
+        points = coords if edges is None else to_unbounded(edges, coords)
+        # the criterion of a density in the parameters contains the Jacobian determinant of the transformation
+        volume = 0.0 if edges is None else weights[kept] @ log_abs_det_jacobian(edges, coords[kept])
+        for shears in dict.fromkeys([(), find_shears(points, weights)]):
+            mixture, criterion = _fit_components(shears, points, weights, max_components)
+            tried.append((criterion - 2.0 * effective * volume, mixture._replace(bounds=edges)))
+    return min(tried, key=lambda each: each[0])[1]
 
 
 def fit_normals(coords: np.ndarray, effective: float, start: Mixture | None = None) -> Mixture:
@@ -222,18 +223,6 @@ def leave_out(mixture: Mixture, coords: np.ndarray, weights: np.ndarray, parts: 
         fitted = _components(white[rows], own, 1.0 / (own @ own), responsibilities[rows], stretch[rows], mixture.dof)
         found.append(_unwhitened(fitted, mean, root)._replace(shears=mixture.shears, bounds=mixture.bounds))
     return found
-
-
-def _fit_with_shears(coords: np.ndarray, weights: np.ndarray, max_components: int) -> tuple[Mixture, float]:
-    """Fit a mixture, with shears if they improve the criterion; return it with its criterion."""
-    shears = find_shears(coords, weights)
-    if not shears:
-        return _fit_components((), coords, weights, max_components)
-    sheared, criterion = _fit_components(shears, coords, weights, max_components)
-    # a fit without shears that needs many more components has a worse criterion, so it is not tried
-    most = min(max_components, len(sheared.weights) + 2)
-    plain, other = _fit_components((), coords, weights, most)
-    return (sheared, criterion) if criterion < other else (plain, other)
 
 
 def _fit_components(
