@@ -33,7 +33,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecutor
 from concurrent.futures import wait as wait_for
 from contextlib import AbstractContextManager, closing, suppress
-from functools import cache, partial
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from multiprocessing.pool import Pool, ThreadPool
@@ -315,11 +314,7 @@ class LocalPool(Submitting, AbstractContextManager):
             )
         self.n_workers = int(workers)  # items that run at once
         self._environment = {name: "1" for name in _THREADS if name not in os.environ}
-        self._set_up()
-
-    def _set_up(self) -> None:
-        environment = self._environment
-        self._owner, self._threads = os.getpid(), Threads(lambda: Worker(environment).run_until_it_ends)
+        self._threads: dict[int, Threads] = {}  # by the process, since a fork copies it
 
     def __exit__(self, *exception: object) -> None:
         self.close()
@@ -329,15 +324,17 @@ class LocalPool(Submitting, AbstractContextManager):
 
     def close(self) -> None:
         """Give up all items and end the processes; a later item starts new processes."""
-        self.give_up(self._threads_here().pending)
-        self._threads.close()
-        self._set_up()
+        if threads := self._threads.pop(os.getpid(), None):
+            self.give_up(threads.pending)
+            threads.close()
 
     def submit_all(self, function: Callable[[Any], Any], items: Sequence[Any]) -> list[Future]:
         """Futures as from `submit`, for several items; ValueError if the function cannot be sent to the processes."""
         pickled = Pickled.of(function)  # each time: the values that it uses may have changed
         jobs = [Job(pickled, item) for item in items]
-        self._threads_here().submit_all(jobs, self.n_workers)
+        environment = self._environment  # not this object, which ends its threads when it is garbage-collected
+        threads = self._threads.setdefault(os.getpid(), Threads(lambda: Worker(environment).run_until_it_ends))
+        threads.submit_all(jobs, self.n_workers)
         return jobs
 
     def give_up(self, futures: Sequence[Future]) -> None:
@@ -348,12 +345,6 @@ class LocalPool(Submitting, AbstractContextManager):
             if (worker := job.worker) is not None:
                 worker.kill()
         wait_for(started)
-
-    def _threads_here(self) -> Threads:
-        """The threads of this process, not those of the process that has forked it."""
-        if self._owner != os.getpid():
-            self._set_up()
-        return self._threads
 
 
 def as_executor(pool: Any, model: Any = None) -> "LocalPool | PoolExecutor | None":
@@ -377,10 +368,9 @@ class PoolExecutor(Submitting):
     """
 
     def __init__(self, pool: Any) -> None:
-        self.pool, self._is_dask = pool, hasattr(pool, "gather")
+        self.pool, self.submits = pool, hasattr(pool, "submit")
         is_known = isinstance(pool, Executor | Pool) and not isinstance(pool, ThreadPoolExecutor | ThreadPool)
-        self.other_processes = is_known or self._is_dask  # as far as that is known
-        self.submits = hasattr(pool, "submit")
+        self.other_processes = is_known or hasattr(pool, "gather")  # as far as that is known
 
     @property
     def n_workers(self) -> int | None:
@@ -391,7 +381,7 @@ class PoolExecutor(Submitting):
         """Futures as from `submit`, for several items; they have ended if the pool only has ``map``."""
         by_value = Pickled.of(function) if self.other_processes else Pickled(function)
         if self.submits and len(items):
-            return submit_all(self.pool, partial(_run, by_value) if self._is_dask else by_value, items)
+            return submit_all(self.pool, by_value, items)
         futures = [Future() for _ in items]
         for future, result in zip(futures, self.pool.map(SentFunction(by_value), list(items)), strict=True):
             future.set_result(result)
@@ -401,18 +391,6 @@ class PoolExecutor(Submitting):
         """Cancel items that the pool has not started."""
         for future in futures:
             future.cancel()
-
-
-def _run(function: Callable, item: Any) -> Any:
-    """Result of an item, in a worker of dask."""
-    _wait_for_nanny()
-    return function(item)
-
-
-@cache
-def _wait_for_nanny() -> None:
-    """Wait once per process: dask does not replace a worker that dies before its start is reported."""
-    time.sleep(0.5)
 
 
 class Sandbox(threading.local):
