@@ -84,39 +84,6 @@ class Ascent(NamedTuple):
         return self.gain_left < _ROUGH
 
 
-class Jacobians:
-    """Derivatives of the residuals on one part of the record, from differences at few points and all runs.
-
-    At a point z, with the derivatives J_0 of the nearest point z_0 at which they are known, and runs at z + s_i whose
-    residuals differ by y_i from those at z, they are J_0 + D with the least sum_i |y_i - (J_0 + D) s_i|^2 / |s_i|^4 +
-    |D|^2 / |z - z_0|^2: secants (Broyden 1965, Mathematics of Computation 19, 577-593) with errors from curvature.
-    """
-
-    def __init__(self) -> None:
-        self.known: list[tuple[np.ndarray, np.ndarray]] = []  # coordinates (d,), and derivatives (d, n) there
-        self._runs: list[tuple[np.ndarray, int]] = []
-
-    def note(self, points: np.ndarray, runs: Runs) -> None:
-        """Enter runs at points (n, d)."""
-        self._runs += [(points[k], int(runs.numbers[k])) for k in np.flatnonzero(~runs.failed)]
-
-    def at(self, coords: np.ndarray, run: int) -> np.ndarray:
-        """Derivatives (d, n) at coordinates (d,), where a run was made."""
-        origin, slopes = min(reversed(self.known), key=lambda each: float(np.square(each[0] - coords).sum()))
-        far, d = float(np.square(origin - coords).sum()), len(coords)
-        steps = np.array([point for point, _ in self._runs]) - coords
-        squared = np.square(steps).sum(axis=1)
-        rows = np.flatnonzero(squared > _TOO_CLOSE)
-        rows = rows[np.argsort(squared[rows])[: _NEAREST_RUNS[0] * d + _NEAREST_RUNS[1]]]
-        if far < _TOO_CLOSE or not len(rows):
-            return slopes
-        steps, weighted = steps[rows], steps[rows] / np.square(squared[rows])[:, None]
-        solved = np.linalg.solve(weighted.T @ steps + np.eye(d) / far, weighted.T)
-        runs = np.array([self._runs[row][1] for row in rows])
-        slopes = np.pad(slopes, ((0, 0), (0, max(0, max(run, *runs) + 1 - slopes.shape[1]))))
-        return slopes + solved @ (_differences(runs, run, slopes.shape[1]) - steps @ slopes)
-
-
 @dataclass
 class Climb:
     """Levenberg-Marquardt from one start on a part of the record, where the prior is centred at `centre`.
@@ -127,7 +94,7 @@ class Climb:
     """
 
     target: ResponseTarget
-    jacobians: Jacobians
+    derivatives: list[tuple[np.ndarray, np.ndarray]]  # coordinates (d,), and derivatives (d, n) there
     number: int
     centre: np.ndarray
     known: dict[int, Ascent]
@@ -144,7 +111,7 @@ class Climb:
         self._here = found[0]
         joined = self._explained()
         if joined is None and not (self.target.data.differentiable and (steps is None or not self.whole)):
-            if steps is not None or not self.jacobians.known or len(start) <= OWN:
+            if steps is not None or not self.derivatives or len(start) <= OWN:
                 yield from self._difference(FIRST_DIFFERENCE * np.eye(len(start)) if steps is None else steps)
         if joined is None:
             first = max(tolerance, _DESIGN_FROM * len(start)) if self.whole else tolerance
@@ -170,8 +137,7 @@ class Climb:
         return joined
 
     def _heights(self, points: np.ndarray, runs: Runs, noise: np.ndarray | None) -> list[Ascent]:
-        """The points that did not fail, with their log-densities; they are noted for secants."""
-        self.jacobians.note(points, runs)
+        """The points that did not fail, with their log-densities."""
         found = []
         for k in np.flatnonzero(~runs.failed):
             fit = self.target.fit_noise(runs.statistics[k], noise)
@@ -184,7 +150,6 @@ class Climb:
         here = self._here
         if runs is None:
             runs = yield here.coords + steps
-            self.jacobians.note(here.coords + steps, runs)
         ends, used = np.where(runs.failed, here.run, runs.numbers), steps.copy()
         for k in np.flatnonzero(runs.failed):
             for factor in _RETRIES:
@@ -193,7 +158,7 @@ class Climb:
                     ends[k], used[k] = again.numbers[0], factor * steps[k]
                     break
         changes = _differences(ends, here.run, max(here.run, *ends) + 1)
-        self.jacobians.known.append((here.coords, np.linalg.solve(used, changes)))
+        self.derivatives.append((here.coords, np.linalg.solve(used, changes)))
 
     def _check(self, slopes: np.ndarray) -> Requests:
         """ValueError if derivatives (d, n), as weights, deny the residuals at a step along all coordinates, which is
@@ -225,10 +190,33 @@ class Climb:
             f"{', '.join(target.data.parameter_names)}, or leave jacobian out"
         )
 
+    def _slopes(self) -> np.ndarray:
+        """Derivatives (d, n) of the residuals here, from differences at few points and all runs that are nearer than
+        `apart` in each coordinate: those of other ascents farther away lead into their modes.
+
+        At a point z, with the derivatives J_0 of the nearest point z_0 at which they are known, and runs at z + s_i
+        whose residuals differ by y_i from those at z, they are J_0 + D with the least sum_i |y_i - (J_0 + D) s_i|^2 /
+        |s_i|^4 + |D|^2 / |z - z_0|^2: secants (Broyden 1965, Mathematics of Computation 19, 577-593) with errors from
+        curvature.
+        """
+        here, archive = self._here, self.target.archive
+        origin, slopes = min(reversed(self.derivatives), key=lambda each: float(np.square(each[0] - here.coords).sum()))
+        far, d = float(np.square(origin - here.coords).sum()), len(origin)
+        steps = archive.coords - here.coords
+        squared = np.square(steps).sum(axis=1)
+        rows = np.flatnonzero((squared > _TOO_CLOSE) & (np.abs(steps).max(axis=1) < self.apart))
+        rows = rows[np.argsort(squared[rows])[: _NEAREST_RUNS[0] * d + _NEAREST_RUNS[1]]]
+        if far < _TOO_CLOSE or not len(rows):
+            return slopes
+        steps, weighted = steps[rows], steps[rows] / np.square(squared[rows])[:, None]
+        solved = np.linalg.solve(weighted.T @ steps + np.eye(d) / far, weighted.T)
+        slopes = archive.weights(slopes)
+        return slopes + solved @ (_differences(archive.numbers[rows], here.run, len(archive)) - steps @ slopes)
+
     def _quadratic(self) -> Ascent:
         """The log-density around the present point."""
         archive = self.target.archive
-        slopes = self.jacobians.at(self._here.coords, self._here.run)
+        slopes = self._slopes()
         weights = self.target.slopes(self._here.statistics, self._here.noise.coords)
         forms = archive.forms(archive.weights([*slopes, self._here.run])) @ weights
         gradient = 2.0 * forms[:-1, -1] - (self._here.coords - self.centre)
@@ -250,7 +238,7 @@ class Climb:
                 if self.target.unchecked:  # the first derivatives are compared with a difference
                     self.target.unchecked.clear()
                     yield from self._check(slopes)
-                self.jacobians.known.append((self._here.coords, slopes))
+                self.derivatives.append((self._here.coords, slopes))
             at = self._quadratic()
             if merging and (joined := self._explained()) is not None:
                 return joined
@@ -282,7 +270,7 @@ class Climb:
         return None
 
     def _known_here(self) -> bool:
-        return any(np.array_equal(self._here.coords, point) for point, _ in self.jacobians.known)
+        return any(np.array_equal(self._here.coords, point) for point, _ in self.derivatives)
 
     def _own_differences(self, at: Ascent, factor: float) -> Requests:
         """Derivatives by differences with steps of a share of the standard deviations, times a factor."""

@@ -16,7 +16,7 @@ from samplers.judgement.guides import DOUBTED_SHARE
 from samplers.tempering.guide import GuideSession
 
 from ..text_tables import text_table
-from .levenberg_marquardt import FIRST_DIFFERENCE, TOLERANCE, Ascent, Climb, Jacobians, axes_of
+from .levenberg_marquardt import FIRST_DIFFERENCE, TOLERANCE, Ascent, Climb, axes_of
 from .target import ResponseTarget, Runs, Steps, at_once, nothing_stored
 
 _NEGLIGIBLE = 15.0  # a mode whose log-evidence is lower than the largest by more than this is dropped
@@ -149,7 +149,7 @@ class _Part(NamedTuple):
     target: ResponseTarget
     share: float
     ends: dict[int, Ascent]
-    jacobians: Jacobians
+    derivatives: list  # see `Climb`, shared by all ascents
 
 
 class Search:
@@ -161,7 +161,7 @@ class Search:
         self._target, self._starts, self._session, self.spent = target, starts, session, 0.0
         self._tolerance = tolerance
         parts = [*target.shortened(_SHARES), target]
-        self._parts = [_Part(part, part.n_steps / target.n_steps, {}, Jacobians()) for part in parts]
+        self._parts = [_Part(part, part.n_steps / target.n_steps, {}, []) for part in parts]
         self.standing_for: list[int] = []  # start that has taken the place of each that has begun; -1 for none
 
     def run(self, starts: int) -> Steps:
@@ -230,9 +230,8 @@ class Search:
                 ascents = {}
                 for k in wave:
                     start, steps = fronts[k]
-                    jacobians = part.jacobians if shared else Jacobians()
                     centre = np.zeros(self._target.n_structural) if whole else start
-                    climb = Climb(part.target, jacobians, k, centre, part.ends, apart, whole)
+                    climb = Climb(part.target, part.derivatives if shared else [], k, centre, part.ends, apart, whole)
                     least = self._tolerance if whole else min(TOLERANCE / part.share, _LOOSEST)
                     ascents[k] = climb.run(start, steps, least)
                 yield from self._side_by_side(part, ascents)
