@@ -100,7 +100,6 @@ class GuideTick(NamedTuple):
     phase: str  # "search", "round 3", or "after round 3" while the guide learns
     simulations: float  # so far; of the search alone in this phase
     target: int  # wanted effective sample size of all rounds; the population has the present one
-    expected: float  # simulations of the search, about; 0 where the guide does not know
 
 
 class GuidedRound(NamedTuple):

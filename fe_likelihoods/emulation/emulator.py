@@ -7,6 +7,9 @@ variances of the process are not used).
 Reference: Higdon, Gattiker, Williams & Rightley (2008), J. Am. Stat. Assoc. 103(482), doi:10.1198/016214507000000888.
 """
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 
 from .gaussian_process import fit_process, predict
@@ -42,19 +45,21 @@ class ResponseEmulator:
         histories = np.zeros((1 + k, len(archive)))  # the mean residual and the components, as weights of runs
         histories[:, archive.numbers[rows]] = np.concatenate([np.full((1, n), 1.0 / n), vectors[:, :k].T @ centred])
         histories[1:] /= lengths[:, None]
-        spread = np.diag(np.sqrt(np.diag(covariance)))
-        # on a bound of the prior, parameters hardly depend on their coordinates, where any scale will do
-        apart = target.scaled(np.ones((1, d))) - target.scaled(-np.ones((1, d)))
-        steps = np.diag(target.scaled(centre + spread) - target.scaled(centre - spread)) / (2.0 * np.diag(spread))
-        stretch = np.maximum(steps, 1e-6 * apart[0])
-        self._centre = target.scaled(centre[None])[0]
-        self._whitening = np.linalg.inv(np.linalg.cholesky(covariance * np.outer(stretch, stretch))).T
         importance = np.minimum(1.0, values[:k] / values[0] * 1e3)
-        self._process = fit_process(self._inputs(archive.coords[rows]), coefficients, importance)
+        least, spread = np.inf, np.diag(np.sqrt(np.diag(covariance)))
+        for logarithmic in target.logarithms:  # the scale that predicts left-out runs better
+            scaled = partial(target.scaled, logarithmic=logarithmic)
+            # on a bound of the prior, parameters hardly depend on their coordinates, where any scale will do
+            apart = scaled(np.ones((1, d))) - scaled(-np.ones((1, d)))
+            steps = np.diag(scaled(centre + spread) - scaled(centre - spread)) / (2.0 * np.diag(spread))
+            stretch = np.maximum(steps, 1e-6 * apart[0])
+            whitening = np.linalg.inv(np.linalg.cholesky(covariance * np.outer(stretch, stretch))).T
+            inputs = partial(_whitened, scaled, scaled(centre[None])[0], whitening)
+            process = fit_process(inputs(archive.coords[rows]), coefficients, importance)
+            error = float(np.square(process.left_out).sum())
+            if error < least:
+                least, self._inputs, self._process = error, inputs, process
         self._forms = archive.forms(histories)
-
-    def _inputs(self, coords: np.ndarray) -> np.ndarray:
-        return (self.target.scaled(coords)[:, : len(self._centre)] - self._centre) @ self._whitening
 
     def squared_distance(self, coords: np.ndarray) -> np.ndarray:
         """Squared distance (n,) of coordinates (n, >= n_structural) from the centre, in whitened parameters."""
@@ -70,3 +75,8 @@ class ResponseEmulator:
         ]
         statistics = np.maximum(np.stack(columns, axis=1), np.finfo(float).tiny)
         return self.target.log_likelihood(statistics, coords[:, self.target.n_structural :])
+
+
+def _whitened(scaled: Callable, centre: np.ndarray, whitening: np.ndarray, coords: np.ndarray) -> np.ndarray:
+    """Inputs (n, d) at coordinates (n, >= d)."""
+    return (scaled(coords)[:, : len(centre)] - centre) @ whitening

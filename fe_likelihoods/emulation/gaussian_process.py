@@ -15,7 +15,7 @@ is decomposed once per length scale; a nugget and output then costs a sum.
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, qr
+from scipy.linalg import cho_factor, cho_solve, qr, solve_triangular
 
 _NUGGETS = 10.0 ** np.array([-9.0, -7.0, -5.0, -3.0, -1.0, 1.0])
 _LOG_SCALES = -2.0, 4.0  # bounds of the logarithms of the length scales, in units of the inputs, and of the shape
@@ -29,6 +29,7 @@ class GaussianProcess(NamedTuple):
     log_scales: np.ndarray  # logarithms of the length scales and of the shape (d + 1,)
     linear: np.ndarray  # coefficients of the linear part (1 + d, k)
     weights: np.ndarray  # of the covariances with the training inputs (m, k)
+    left_out: np.ndarray  # errors (m, k) of the training outputs as predicted from the other training points
 
 
 def _basis(inputs: np.ndarray) -> np.ndarray:
@@ -98,7 +99,7 @@ def fit_process(
         log_scales = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
     nuggets = _NUGGETS[_restricted(log_scales, *fixed)[0].argmin(axis=0)]
     covariance = _covariance(inputs, inputs, log_scales)
-    linear, weights = np.empty((d + 1, outputs.shape[1])), np.empty_like(outputs)
+    linear, weights, left_out = np.empty((d + 1, outputs.shape[1])), np.empty_like(outputs), np.empty_like(outputs)
     for nugget in np.unique(nuggets):
         members = np.flatnonzero(nuggets == nugget)
         factor = cho_factor(covariance + nugget * np.eye(m), lower=True)
@@ -106,7 +107,11 @@ def fit_process(
         gram = cho_factor(basis.T @ solved)
         linear[:, members] = cho_solve(gram, solved.T @ outputs[:, members])
         weights[:, members] = cho_solve(factor, outputs[:, members] - basis @ linear[:, members])
-    return GaussianProcess(inputs, log_scales, linear, weights)
+        # with P the inverse of the covariance after the linear part is projected out, the errors are (P y)_i / P_ii
+        inverse = np.square(solve_triangular(factor[0], np.eye(m), lower=True)).sum(axis=0)
+        inverse -= (solved * cho_solve(gram, solved.T).T).sum(axis=1)
+        left_out[:, members] = weights[:, members] / np.maximum(inverse, _TINY)[:, None]
+    return GaussianProcess(inputs, log_scales, linear, weights, left_out)
 
 
 def predict(process: GaussianProcess, inputs: np.ndarray) -> np.ndarray:

@@ -30,7 +30,6 @@ from samplers.tempering.guide import Guide
 
 from .density import EmulatedPosterior, Region, student_mixture, tempered
 from .emulator import ResponseEmulator
-from .levenberg_marquardt import OWN
 from .modes import ModeSearch, Search, check_starts, draw_starts
 from .target import ResponseTarget, Steps, at_once
 
@@ -95,14 +94,6 @@ class ResponseGuide(Guide):
     def simulations(self) -> float:
         """Simulations run by the guide: parts of a record are fractions, a call of a ``jacobian`` counts as one."""
         return 0.0 if self._searching is None else self._searching.spent
-
-    @property
-    def expected_simulations(self) -> float:
-        """Simulations that the search takes, about: of 38 searches, 26 took between half of these and twice as many."""
-        starts, d = self._starts, self._target.n_structural
-        if self._searching is not None:
-            starts = max(starts, len(self._searching.standing_for))
-        return 3.0 * (starts + d) if d > OWN else starts * (3.0 + 1.5 * d)
 
     def check(self, log_prob_fn: Callable) -> None:
         """Raise ValueError if a sampler evaluates another object: every draw would be simulated twice."""
@@ -289,9 +280,5 @@ class ResponseGuide(Guide):
     def _wide_mixture(self) -> Mixture:
         weights = normalised_weights(np.array([region.log_evidence for region in self._regions]))
         weights = (1.0 - _SMALLEST_WEIGHT) * weights + _SMALLEST_WEIGHT / len(weights)
-        # the modes themselves as well: where an emulator is wrong, so are the moments that it gives
-        around = [(each.coords, each.covariance) for each in self.search.modes]
-        around = [(each.centre, each.covariance) for each in self._regions] + around
-        centres, covariances = zip(*around, strict=True)
-        weights = np.concatenate([0.75 * weights, 0.25 * weights])
-        return student_mixture(weights, centres, [_WIDENED * each for each in covariances], _FREEDOM)
+        centres, covariances = zip(*((each.centre, _WIDENED * each.covariance) for each in self._regions), strict=True)
+        return student_mixture(weights, centres, covariances, _FREEDOM)

@@ -80,6 +80,8 @@ class ResponseTarget:
         least, low, high = self.structural_parameters(at)
         factors = (least >= 0.0) & (low > 0.0) & (high < _LARGEST_FACTOR * low)
         self._logarithmic = self._structural.logarithmic | factors
+        # of inputs of emulators: as `scaled`, or only those with lognormal priors
+        self.logarithms = np.unique([self._logarithmic, self._structural.logarithmic], axis=0)
 
     def shortened(self, shares: Sequence[float]) -> list["ResponseTarget"]:
         """The same posterior for the first parts of the record, up to shares of the Arias intensity; none if the model
@@ -134,14 +136,15 @@ class ResponseTarget:
         inside = np.isfinite(coords).all(axis=1) & np.isfinite(log_prior)
         return coords, np.where(inside, log_prior - self.log_prior(np.where(inside[:, None], coords, 0.0)), -np.inf)
 
-    def scaled(self, coords: np.ndarray) -> np.ndarray:
-        """Structural parameters, the logarithms of those that the prior keeps away from zero, and noise coordinates, at
-        coordinates (n, >= d). Products, as E I, are linear in logarithms, and responses smooth functions of these,
-        unlike of coordinates near a bound.
+    def scaled(self, coords: np.ndarray, logarithmic: np.ndarray | None = None) -> np.ndarray:
+        """Structural parameters, the logarithms of those that are `logarithmic` (d,), by default those that the prior
+        keeps away from zero, and noise coordinates, at coordinates (n, >= d). Products, as E I, are linear in
+        logarithms, and responses smooth functions of these, unlike of coordinates near a bound.
         """
+        chosen = self._logarithmic if logarithmic is None else logarithmic
         parameters = self.structural_parameters(coords[:, : self.n_structural])
-        logarithms = np.log(np.where(self._logarithmic, np.maximum(parameters, _SMALLEST), 1.0))
-        return np.column_stack([np.where(self._logarithmic, logarithms, parameters), coords[:, self.n_structural :]])
+        logarithms = np.log(np.where(chosen, np.maximum(parameters, _SMALLEST), 1.0))
+        return np.column_stack([np.where(chosen, logarithms, parameters), coords[:, self.n_structural :]])
 
     def unscaled(self, scaled: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Coordinates (n, ndim) of what `scaled` returns, and the logarithm (n,) of their volume over its volume.

@@ -172,14 +172,13 @@ def sensitivity(
     designs = [qmc.Sobol(2 * d, seed=seed + k).random(DESIGN) for k in range(DESIGNS)]
     found = np.array([_indices(known, design, process) for design in designs])
     numbers = np.arange(len(inputs)) % FOLDS
-    without, missed = [], np.empty_like(outputs)
+    without = []
     for fold in range(FOLDS):
         kept = numbers != fold
         part = fit_process(inputs[kept], outputs[kept], np.ones(len(sd)), process.log_scales)
         without.append(_indices(known, designs[0], part))
-        missed[~kept] = outputs[~kept] - predict(part, inputs[~kept])
     errors = np.hypot(np.sqrt(FOLDS - 1) * np.std(without, axis=0), np.std(found, axis=0, ddof=1) / np.sqrt(DESIGNS))
-    unexplained = np.square(missed).mean(axis=0)
+    unexplained = np.square(process.left_out).mean(axis=0)
     errors = np.hypot(errors, unexplained[:, None])  # this part of the variance may belong to any parameter
     first, total = found.mean(axis=0)
     return Sensitivity(

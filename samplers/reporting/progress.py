@@ -57,15 +57,6 @@ def _open_bar(display: bool | str, total: int | None, **kwargs: Any) -> Any:
     return tqdm(total=total, **options | kwargs)
 
 
-def _count(search: GuideTick) -> str:
-    """Which simulation of a search runs, of about how many, rounded to two digits."""
-    if not search.simulations + search.expected:
-        return search.phase
-    number, most = max(1, round(search.simulations)), float(f"{search.expected:.2g}")
-    about = (f" of about {most:.0f}" if number <= most else f", {most:.0f} were expected") if most else ""
-    return f"{search.phase}: simulation {number}{about}"
-
-
 class Progress:
     """Shows a run in a bar: a context manager that observes an `Evaluator`, with `bar` as emcee's arguments
     ``progress`` and ``progress_kwargs``. Without a `total`, evaluations are counted, which ``function.when_simulated``
@@ -140,7 +131,9 @@ class Progress:
         figures = self._figures | {name: f"{number:.0f}" for name, number in counts.items() if number}
         if self._total is None:
             counted = f"{self._text or self._label}: {evaluator.done - self._begun:.0f} evaluations"
-            text = _count(self._search) if self._search else self._text if "simulations" in figures else counted
+            text = self._text if "simulations" in figures else counted
+            if self._search is not None:
+                text = f"{self._search.phase}: {self._search.simulations:.0f} simulations"
             self._bar.set_description_str(text, refresh=False)
         self._bar.set_postfix(figures, refresh=False)
         self._bar.update(steps)

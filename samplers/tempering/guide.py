@@ -59,8 +59,6 @@ class Guide(ABC):
         How parts of the posterior were searched for, as a clause of the verdict.
     simulations : float
         Simulations made by `prepare` and `refine`; parts of a simulation count as fractions.
-    expected_simulations : float
-        Simulations that `prepare` takes in all, about, for the progress bar; 0 where that is not known.
     known_density : KnownDensity, optional
         A density close to the posterior with known expectations, such as an emulated posterior, as it is now
         (`samplers.estimates.importance.KnownDensity`). It makes expectations under the posterior more accurate
@@ -92,7 +90,6 @@ class Guide(ABC):
     findings: Sequence[Finding] = (find_missing_part("it is not known whether the posterior has other modes"),)
     basis = ""
     simulations = 0.0
-    expected_simulations = 0.0
     known_density: KnownDensity | None = None
     observe: Callable | None = None
 

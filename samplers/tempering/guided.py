@@ -121,7 +121,7 @@ def draw_rounds(
 
     def tick(phase: str) -> tuple[Population, GuideTick]:
         made = guide.simulations if phase == "search" else budget.simulations
-        return population, GuideTick(phase, made, size, guide.expected_simulations)
+        return population, GuideTick(phase, made, size)
 
     def asked(steps: Generator | None, phase: str) -> Generator[tuple[Population, Any], Any, None]:
         answer, steps = None, (iter(()) if steps is None else steps)

@@ -20,7 +20,7 @@ from fe_likelihoods import (
 )
 from fe_likelihoods.emulation.guide import ResponseGuide
 from samplers import SamplingWarning, SMCSampler, TMCMCSampler
-from samplers.judgement.guides import check_excluded_runs
+from samplers.judgement.guides import check_excluded_runs, check_tops
 from tests.statistics.hard_posteriors import CASES
 
 from .problems import guided, vibration
@@ -212,8 +212,13 @@ def test_a_rough_response_is_doubted_too(rng):
     assert "the response is rough" in found.text
 
 
-def test_a_search_that_ends_below_the_modes_is_refused():
-    """Equal aliases of a frequency: ascents end where the amplitude is small, and draws find some of five modes."""
+@pytest.mark.parametrize(("excess", "severities"), [(-np.inf, []), (6.4, []), (28.0, ["wrong"])])
+def test_draws_above_every_mode_are_told(excess, severities):
+    assert [found.severity for found in check_tops(excess)] == severities
+
+
+def test_a_search_that_finds_some_of_five_modes_is_refused():
+    """Equal aliases of a frequency: ascents end where the amplitude is small, or the limit ends the search."""
     times = 0.25 * np.arange(40)
 
     def vibration(theta):
@@ -228,6 +233,6 @@ def test_a_search_that_ends_below_the_modes_is_refused():
     posterior = Posterior(FELikelihood(model, measured), prior).marginal()
     for seed in (1, 3):
         sampler = SMCSampler(50, 2, posterior, vectorize=True, seed=seed, guide=posterior.guide(), max_simulations=200)
-        with pytest.warns(SamplingWarning, match="above the top of every mode"):
+        with pytest.warns(SamplingWarning):
             sampler.run_mcmc(None, 0)
         assert sampler.verdict.status == "not usable"
