@@ -8,6 +8,7 @@ from pathlib import Path
 
 from docutils import nodes
 from sphinx import addnodes
+from sphinx.pycode import ModuleAnalyzer
 
 DOCS = Path(__file__).resolve().parent
 ENTRY = re.compile(r"^   ~?((?:fe_likelihoods|samplers)[\w.]+)$", re.MULTILINE)
@@ -83,6 +84,18 @@ def keep_initials(app, what, name, obj, options, lines) -> None:
     lines[:] = [re.sub(r"^(\.\. \[\S+\] )?([A-Z]\. )", r"\1\\\2", line) for line in lines]
 
 
+@cache
+def commented_fields() -> list:
+    """Fields of NamedTuples that have a comment of their own."""
+    modules = [importlib.import_module(f"samplers.{name}") for name in ("reports", "rare_events")]
+    return [
+        vars(vars(module)[owner])[name]
+        for module in modules
+        for owner, name in ModuleAnalyzer.for_module(module.__name__).find_attr_docs()
+    ]
+
+
 def skip_fields(app, what, name, obj, skip, options):
-    """Leave out fields of NamedTuples, which the docstring of their class describes, and aliases of types."""
-    return True if type(obj).__name__ == "_tuplegetter" or isinstance(obj, types.GenericAlias) else None
+    """Leave out aliases of types, and fields of NamedTuples that the docstring of their class describes."""
+    is_field = type(obj).__name__ == "_tuplegetter" and all(obj is not each for each in commented_fields())
+    return True if is_field or isinstance(obj, types.GenericAlias) else None

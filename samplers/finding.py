@@ -1,6 +1,5 @@
 """A finding: what a check of data, model, run or prediction has found, for both packages."""
 
-from collections.abc import Iterable
 from typing import NamedTuple
 
 NOTE = "note"  # good to know
@@ -9,30 +8,15 @@ WRONG = "wrong"  # speaks against the result
 
 
 class Finding(NamedTuple):
-    """What a check has found; ``str`` gives it in sentences.
+    """What a check has found; ``str`` gives it in sentences."""
 
-    Attributes
-    ----------
-    kind : str
-        Title, equal for all findings of the same kind.
-    severity : {"note", "care", "wrong"}
-        Whether it is good to know, limits the result, or speaks against it.
-    text : str
-        What was found, with its numbers.
-    action : str
-        What to do about it; may be empty.
-    numbers : dict of str to float
-        The numbers that it was judged by.
-    about : {"input", "data", "fit", "samples"}
-        What was checked: data, motions and model by themselves, data beside responses, the fit, or samples and
-        parameters. A check relies on what stands before it, so a fault there may be its cause.
-    """
-
-    kind: str
-    severity: str
-    text: str
-    action: str = ""
-    numbers: dict[str, float] = {}
+    kind: str  #: title, equal for all findings of the same kind
+    severity: str  #: "note": good to know, "care": limits the result, "wrong": speaks against it
+    text: str  #: what was found, with its numbers
+    action: str = ""  #: what to do about it
+    numbers: dict[str, float] = {}  #: the numbers that it was judged by
+    #: what was checked: "input" (data, motions, model by themselves), "data" (beside responses), "fit", or "samples";
+    #: a check relies on what stands before it, so a fault there may be its cause
     about: str = "samples"
 
     @property
@@ -45,8 +29,3 @@ class Finding(NamedTuple):
 
     def __str__(self) -> str:
         return f"{self.kind}: {self.message}"
-
-
-def by_severity(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Findings with the most severe first, otherwise in their order."""
-    return tuple(sorted(findings, key=lambda each: (WRONG, CARE, NOTE).index(each.severity)))

@@ -2,13 +2,8 @@
 
 `RAMANCHA_2022_CONSTANT` and `RAMANCHA_2022_LITERAL` are for `SMCSampler`. Ramancha, Astroza, Conte, Restrepo & Todd
 (2022) update a bridge column with 1000 particles, multinomial resampling and 10 Metropolis steps per stage, and choose
-beta so that "ESS_j = 0.95 ESS_{j-1}" (their Table 1). This can be read in two ways:
-
-constant
-    After resampling all weights are equal, so ESS_{j-1} is the number of particles, and every stage keeps 95 % of it.
-literal
-    The target itself decreases by 5 % per stage, 950, 902, 857, ..., with a floor of 50.
-
+beta so that "ESS_j = 0.95 ESS_{j-1}" (their Table 1): of the number of particles, since all weights are equal after
+resampling (constant), or of a target that decreases by 5 % per stage, 950, 902, 857, ..., to a floor of 50 (literal).
 The scale of their random walk is not given; 2.38 / sqrt(ndim) is used.
 
 `CHING_CHEN_2007` is for `TMCMCSampler`: coefficient of variation 1 of the weights (an effective sample size of half the
@@ -40,8 +35,8 @@ _COMMON = {
     "max_moves": 10,
     "fast_sweeps": 0,
 }
-RAMANCHA_2022_CONSTANT: Mapping[str, Any] = MappingProxyType({**_COMMON, "ess_rule": "constant"})
-RAMANCHA_2022_LITERAL: Mapping[str, Any] = MappingProxyType({**_COMMON, "ess_rule": "declining", "ess_floor": 50.0})
+RAMANCHA_2022_CONSTANT: Mapping[str, Any] = MappingProxyType(_COMMON)
+RAMANCHA_2022_LITERAL: Mapping[str, Any] = MappingProxyType({**_COMMON, "ess_floor": 50.0})
 CHING_CHEN_2007: Mapping[str, Any] = MappingProxyType(
     {
         "moves": RandomWalkMove(scale=0.2),

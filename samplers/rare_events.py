@@ -1,14 +1,10 @@
-r"""Subset simulation: the probability of a rare event, as a product of larger conditional probabilities.
+"""Subset simulation: the probability of a rare event, as a product of larger conditional probabilities.
 
-The event is that a quantity g of the parameters exceeds a threshold. With thresholds :math:`b_1 < \dots < b_m = b`,
-
-.. math:: P(g > b) = P(g > b_1) \prod_{l=2}^m P(g > b_l \mid g > b_{l-1}),
-
-and each factor is near a tenth (Au & Beck 2001). It is Sequential Monte Carlo with the indicator of :math:`g > b_l` as
-the likelihood of stage l, and the error of the product is that of an evidence (`samplers.estimates.weights`). Points
-move by the conditional sampling of Papaioannou et al. (2015), whose acceptance does not fall with the number of
-parameters, in chains of ten steps. Moves fitted to the points of a level made a probability of 1e-5 five times too
-small.
+The event is that a quantity exceeds a threshold, which is reached by lower thresholds that each keep about a tenth of
+the points (Au & Beck 2001). It is Sequential Monte Carlo with the indicator of each threshold as its likelihood, and
+the error of the product is an error of an evidence (`samplers.estimates.weights`). Points move by the conditional
+sampling of Papaioannou et al. (2015), whose acceptance does not fall with the number of parameters, in chains of ten
+steps. Moves fitted to the points of a level made a probability of 1e-5 five times too small.
 
 References
 ----------
@@ -37,36 +33,18 @@ MOST_EQUAL = 0.75  # share of points of one value above which levels make no pro
 
 
 class RareEvent(NamedTuple):
-    """Probability of a rare event; ``str`` is a sentence.
+    """Probability of a rare event; ``str`` is a sentence."""
 
-    Attributes
-    ----------
-    probability : float
-        Estimate of the probability that the quantity exceeds the threshold.
-    coefficient_of_variation : float
-        Standard error of the probability, relative to the probability.
-    lower, upper : float
-        95 % interval, lognormal with this coefficient.
-    threshold : float
-        The threshold.
-    levels, shares : (n_levels,) float
-        Thresholds of the stages, and their conditional probabilities, whose product is `probability`.
-    simulations, failed : int
-        Number of points at which the quantity was computed, and how many of them failed.
-    coords : (k, ndim) float
-        Points of the last stage at which the quantity exceeds the threshold: dependent draws given the event.
-    """
-
-    probability: float
-    coefficient_of_variation: float
-    lower: float
-    upper: float
-    threshold: float
-    levels: np.ndarray
-    shares: np.ndarray
-    simulations: int
-    failed: int
-    coords: np.ndarray
+    probability: float  #: estimate of the probability that the quantity exceeds the threshold
+    coefficient_of_variation: float  #: standard error of the probability, relative to the probability
+    lower: float  #: end of the 95 % interval, lognormal with this coefficient
+    upper: float  #: other end
+    threshold: float  #: in the unit of the quantity
+    levels: np.ndarray  #: thresholds (n_levels,) of the stages
+    shares: np.ndarray  #: their conditional probabilities (n_levels,), whose product is `probability`
+    simulations: int  #: number of points at which the quantity was computed
+    failed: int  #: how many of them failed
+    coords: np.ndarray  #: points (k, ndim) of the last stage beyond the threshold: dependent draws given the event
 
     def __str__(self) -> str:
         failed = f", {self.failed} of which failed" if self.failed else ""

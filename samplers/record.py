@@ -27,7 +27,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .interrupts import deferred_interrupts
-from .locks import lock_now
+
+try:
+    import fcntl
+except ImportError:  # Windows has no such locks: two programs on one file are not detected there
+    fcntl = None
 
 logger = logging.getLogger(__name__)
 
@@ -37,6 +41,12 @@ Remember = Callable[..., list[np.ndarray] | None]  # see `Record.remembering`
 ROUNDING = 1e-6
 OF_GUIDES = "simulations of guides"  # key in the record
 _open_records: "weakref.WeakValueDictionary[Path, Record]" = weakref.WeakValueDictionary()
+
+
+def lock_now(file: Any) -> None:
+    """Lock an open file or its descriptor; BlockingIOError if another process has, OSError if it cannot be locked."""
+    if fcntl is not None:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 class Incomplete(Exception):

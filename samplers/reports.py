@@ -42,28 +42,6 @@ def warn(message: str) -> None:
 class Stage(NamedTuple):
     """A finished tempering stage.
 
-    Attributes
-    ----------
-    beta : float
-        Tempering exponent of the stage, 0 < beta <= 1.
-    effective_sample_size : float
-        Effective sample size of the incremental weights that led to this stage.
-    acceptance : float
-        Share of accepted proposals in this stage.
-    moves : int
-        Sweeps of the whole ensemble made at this beta, without sweeps over fast parameters; 0 for recycling.
-    distinct_ancestors : int
-        Number of distinct points that survived the resampling.
-    log_evidence_increment : float
-        Logarithm of the mean incremental weight.
-    log_evidence_error : float
-        Standard error of the summed increments so far.
-    evaluations : int
-        Points for which ``log_prob_fn`` was called in this stage (the first stage includes the draws of the prior).
-        Sweeps over fast parameters count, so this can exceed the number of simulations. Entered by the sampler.
-    seconds : float
-        Wall time of the stage [s]. Entered by the sampler.
-
     Examples
     --------
     >>> last = sampler.ladder[-1]
@@ -71,15 +49,17 @@ class Stage(NamedTuple):
     1.0
     """
 
-    beta: float
-    effective_sample_size: float
-    acceptance: float
-    moves: int
-    distinct_ancestors: int
-    log_evidence_increment: float
-    log_evidence_error: float
+    beta: float  #: tempering exponent of the stage, 0 < beta <= 1
+    effective_sample_size: float  #: of the incremental weights that led to this stage
+    acceptance: float  #: share of accepted proposals in this stage
+    moves: int  #: sweeps of the whole ensemble at this beta, without sweeps over fast parameters; 0 for recycling
+    distinct_ancestors: int  #: number of distinct points that survived the resampling
+    log_evidence_increment: float  #: logarithm of the mean incremental weight
+    log_evidence_error: float  #: standard error of the summed increments so far
+    #: points for which ``log_prob_fn`` was called, in the first stage with the draws of the prior; sweeps over fast
+    #: parameters count, so this can exceed the number of simulations
     evaluations: int = 0
-    seconds: float = 0.0
+    seconds: float = 0.0  #: wall time of the stage [s]
 
 
 class Sweep(NamedTuple):
@@ -103,28 +83,14 @@ class GuideTick(NamedTuple):
 
 
 class GuidedRound(NamedTuple):
-    """A round of draws from a guide.
+    """A round of draws from a guide."""
 
-    Attributes
-    ----------
-    draws : int
-        Number of draws.
-    effective_share : float
-        Effective sample size of the draws divided by their number.
-    pareto_shape : float
-        Pareto shape of the largest weights; inf for too few weights.
-    log_evidence, log_evidence_error : float
-        Log-evidence of all rounds so far, and its standard error.
-    effective_sample_size : float
-        Effective sample size of all rounds so far.
-    """
-
-    draws: int
-    effective_share: float
-    pareto_shape: float
-    log_evidence: float
-    log_evidence_error: float
-    effective_sample_size: float
+    draws: int  #: number of draws
+    effective_share: float  #: effective sample size of the draws divided by their number
+    pareto_shape: float  #: of the largest weights; inf for too few weights
+    log_evidence: float  #: of all rounds so far
+    log_evidence_error: float  #: standard error of `log_evidence`
+    effective_sample_size: float  #: of all rounds so far
 
 
 class Weighted(NamedTuple):

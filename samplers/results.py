@@ -12,7 +12,6 @@ from .judgement.failures import NearFailures
 from .judgement.verdict import Verdict
 from .record import as_limit
 from .reports import GuidedRound, Stage
-from .tempering.guide import Guide
 
 
 class RunResults:
@@ -22,10 +21,7 @@ class RunResults:
 
     @property
     def evaluations(self) -> int:
-        """Points for which `log_prob_fn` was called, by this object and by an interrupted run that it continues.
-
-        Sweeps over fast parameters are included.
-        """
+        """Points for which `log_prob_fn` was called, by this object and by an interrupted run that it continues."""
         return self._record.count
 
     @property
@@ -41,10 +37,7 @@ class RunResults:
 
     @property
     def failures(self) -> list[dict]:
-        """``{"parameters": array (ndim,), "reason": str}`` of the failed points.
-
-        Failed simulations of a posterior are among them, but not those of a guide's search (``posterior.report()``).
-        """
+        """``{"parameters": array (ndim,), "reason": str}`` of the failed points, without a guide's search."""
         failed = self._record.failed + self._record.counted
         return [{"parameters": parameters, "reason": reason} for parameters, reason in failed]
 
@@ -55,18 +48,12 @@ class RunResults:
 
     @property
     def log_evidence(self) -> float:
-        """Log-evidence: `log_evidence_ladder` or `log_evidence_check`, whichever has the smaller error.
-
-        A check that can be trusted and is significantly higher is taken in any case.
-        """
+        """Log-evidence: `log_evidence_ladder` or `log_evidence_check`, by the smaller error."""
         return self._result.evidence[0]
 
     @property
     def log_evidence_error(self) -> float:
-        """Standard error of `log_evidence`, from this run alone.
-
-        At least half the difference of the two estimates if they differ by more than three times their joint error.
-        """
+        """Standard error of `log_evidence`, from this run alone; at least half of what the two estimates differ by."""
         return self._result.evidence[1]
 
     @property
@@ -82,10 +69,8 @@ class RunResults:
 
     @property
     def founders(self) -> np.ndarray:
-        """Founder (nwalkers,) of each walker: walkers with the same number are copies that have been moved since.
-
-        See `samplers.estimates.genealogy`. The file of a run stores founders with the chain; if they are not known,
-        each walker has a different founder.
+        """Founder (nwalkers,) of each walker: walkers with the same number are copies that have been moved since
+        (`samplers.estimates.genealogy`); all different if they are not known.
         """
         founders = self._result.founders
         return np.arange(self.nwalkers) if founders is None else founders
@@ -154,11 +139,6 @@ class RunResults:
         return np.hypot(errors, error_between_modes(chain, values, self._parents, error))
 
     @property
-    def guide(self) -> Guide | None:
-        """A copy of the given guide that learns from this run; None before the run or without a guide."""
-        return self._guide
-
-    @property
     def rounds(self) -> tuple[GuidedRound, ...]:
         """Rounds of the guide in the last annealing of this object; empty without a guide."""
         return self._result.rounds
@@ -167,17 +147,13 @@ class RunResults:
     def signed_sample(self) -> SignedSample | None:
         """Expectations under the posterior; None if the guide knows no density, or the draws alone are more accurate.
 
-        ``sampler.signed_sample.expectation(function)`` gives an expectation and its standard error
-        (`samplers.estimates.control_variates`). Like `guide`, it belongs to the last annealing of this object.
+        ``sampler.signed_sample.expectation(function)`` gives an expectation and its standard error.
         """
         return self._result.signed
 
     @property
     def max_simulations(self) -> float | None:
-        """Largest number of simulations; None for no limit.
-
-        A limit below the number of simulations already made has no effect on these simulations.
-        """
+        """Largest number of simulations, for the next call; None for no limit."""
         return self._record.limit
 
     @max_simulations.setter
@@ -186,23 +162,16 @@ class RunResults:
 
     @property
     def simulations(self) -> float:
-        """Simulations of this run: distinct evaluated points in the slow parameters, plus simulations by the guide.
+        """Simulations of this run, also before an interrupt: distinct evaluated points, plus simulations by the guide.
 
-        Points that differ only in ``log_prob_fn.fast_parameters`` count once. An interrupted run that is continued is
-        included. A cache of `log_prob_fn` can make some simulations unnecessary.
+        Points that differ only in ``log_prob_fn.fast_parameters`` count once.
         """
         return self._record.simulations
 
     @property
     def simulations_of_guides(self) -> float:
-        """The part of `simulations` that guides have made for their search; simulations of first parts of a record
-        count as fractions."""
+        """The part of `simulations` that guides have made for their search; first parts of a record are fractions."""
         return self._record.of_guides
-
-    @property
-    def seed(self) -> int | list[int] | None:
-        """The seed that this object was given; None if it was given none."""
-        return self._seed[0] if self._seed is not None and len(self._seed) == 1 else self._seed
 
     @property
     def verdict(self) -> Verdict:

@@ -28,13 +28,10 @@ class Settings:
     Attributes
     ----------
     ess_ratio : float
-        Wanted effective sample size of each stage, relative to the number of walkers (`ess_rule` "constant") or to the
-        previous stage's target ("declining"); between 0 and 1. Papers on TMCMC give a coefficient of variation c of the
-        weights instead: 1 / (1 + c²).
-    ess_rule : {"constant", "declining"}
-        What `ess_ratio` refers to.
-    ess_floor : float
-        Lower limit of the declining target.
+        Wanted effective sample size of each stage, relative to the number of walkers; between 0 and 1. Papers on TMCMC
+        give a coefficient of variation c of the weights instead: 1 / (1 + c²).
+    ess_floor : float, optional
+        If given, `ess_ratio` refers to the wanted size of the previous stage, which thus declines, down to this value.
     resampling : {"systematic", "multinomial"}
         Scheme of `samplers.resampling`.
     min_moves, max_moves : int
@@ -70,8 +67,7 @@ class Settings:
     """
 
     ess_ratio: float = 0.5
-    ess_rule: str = "constant"
-    ess_floor: float = 0.0
+    ess_floor: float | None = None
     resampling: str = "systematic"
     min_moves: int = 2
     max_moves: int = 7
@@ -93,8 +89,7 @@ class Settings:
             ("asynchronous", isinstance(self.asynchronous, bool), "True or False"),
             ("recycle", isinstance(self.recycle, bool | None), "True, False or None"),
             ("ess_ratio", 0.0 < self.ess_ratio < 1.0, "between 0 and 1 (both excluded)"),
-            ("ess_rule", self.ess_rule in ("constant", "declining"), '"constant" or "declining"'),
-            ("ess_floor", self.ess_floor >= 0.0, "non-negative"),
+            ("ess_floor", self.ess_floor is None or self.ess_floor >= 0.0, "non-negative, or None"),
             ("resampling", self.resampling in RESAMPLING, f"in {[*RESAMPLING]}"),
             ("min_moves", 1 <= self.min_moves <= self.max_moves, f"between 1 and max_moves = {self.max_moves}"),
             ("max_correlation", 0.0 < self.max_correlation <= 1.0, "above 0 and at most 1"),
@@ -105,8 +100,6 @@ class Settings:
         ):
             if not possible:
                 raise ValueError(f"{name} must be {wanted}; got {vars(self)[name]!r}")
-        if self.ess_floor > 0.0 and self.ess_rule == "constant":
-            raise ValueError('ess_floor is the lower limit of a declining target: pass ess_rule="declining" too')
         if self.burn_in > 0 and self.chains == "equal":
             raise ValueError('burn_in belongs to chains="leaders": pass this too')
 
@@ -117,7 +110,9 @@ class Settings:
 
     def target(self, last_target: float, n_walkers: int) -> float:
         """Wanted effective sample size of a stage, from the previous target (n_walkers before the first stage)."""
-        return max(self.ess_ratio * (n_walkers if self.ess_rule == "constant" else last_target), self.ess_floor)
+        if self.ess_floor is None:
+            return self.ess_ratio * n_walkers
+        return max(self.ess_ratio * last_target, self.ess_floor)
 
 
 def check_arguments(pool: Any, backend: Any, seed: Any) -> None:

@@ -17,7 +17,7 @@ from .tempered import TemperedSampler
 from .tempering.mutation import needs_many_walkers
 
 FEWEST_TO_RECYCLE = 150
-OF_MOVES = {"ess_ratio", "ess_rule", "ess_floor", "resampling", "min_moves", "max_moves", "max_correlation"}
+OF_MOVES = {"ess_ratio", "ess_floor", "resampling", "min_moves", "max_moves", "max_correlation"}
 # Steps of a chain from a leader before its points count: without them the shares of the points are biased.
 BURN_IN = 4
 

@@ -93,6 +93,10 @@ class TemperedSampler(RunResults, EnsembleSampler):
     ----------
     settings : Settings
         The settings in use.
+    seed : int, array of int or None
+        The seed that this object was given.
+    guide : Guide or None
+        A copy of the given guide that learns from this run; None before the run or without a guide.
 
     Raises
     ------
@@ -138,7 +142,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         # with 40 normal parameters, 7 sweeps leave means off by 0.57 standard deviations, 60 by 0.04
         most_moves = Settings.max_moves + 3 * max(ndim - 20, 0)
         self.settings = given = Settings(**{"max_moves": most_moves} | settings)
-        self._given_guide, self._guide = guide, None
+        self._given_guide, self.guide, self.seed = guide, None, seed
         self._guided: np.ndarray | None = None  # the walkers (nwalkers, ndim) as the draws of the guide have left them
         if guide is not None:
             check_guide(guide, target.function, vectorize)
@@ -160,7 +164,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         # each annealing begins with copies of these
         self._first_moves = copy.deepcopy(followed), self._weights
         self._moves = followed
-        if given.ess_floor >= nwalkers:
+        if (given.ess_floor or 0.0) >= nwalkers:
             raise ValueError(f"ess_floor={given.ess_floor} must be below nwalkers={nwalkers}")
         target.parameter_names = self.parameter_names if self.params_are_named else None
         common = target, self._record, nwalkers, given.max_failure_share
@@ -207,19 +211,16 @@ class TemperedSampler(RunResults, EnsembleSampler):
     def run_mcmc(self, initial_state, nsteps, **kwargs):
         """Anneal to beta = 1 if that has not been done, then make `nsteps` steps at beta = 1.
 
-        With an emcee `HDFBackend`, a new sampler with the file of a run continues the run, as in emcee: the annealing
-        is repeated from the record, without an evaluation, and ``run_mcmc(None, nsteps)`` adds steps after the last
-        stored step. The results equal a run that was never interrupted, to the last bit. So a script that is restarted
-        after a kill calls ``run_mcmc(None, max(0, nsteps - sampler.iteration))``.
+        With an emcee `HDFBackend`, a new sampler with the file of a run continues the run, as in emcee, and its results
+        equal a run that was never interrupted, to the last bit: the annealing is repeated from the record, without an
+        evaluation. A script that is restarted calls ``run_mcmc(None, max(0, nsteps - sampler.iteration))``.
 
         Parameters
         ----------
         initial_state : (nwalkers, ndim) float, State or None
-            Draws of the prior. None: continue from the last state if there is one, else draw
-            ``log_prob_fn.sample_prior(nwalkers, random)``. After annealing, a State of this sampler (or the coordinates
-            of its last State) is continued, and so is a run that began with the same draws. Other draws need a new
-            sampler. Points that cannot be draws of the prior, such as a ball near the posterior, are refused with a
-            ValueError (`samplers.evaluation.starts`).
+            Draws of the prior, or a State of this sampler to go on from. None: the last state if there is one, else
+            draws of ``log_prob_fn.sample_prior(nwalkers, random)``. Points that cannot be draws of the prior, such as a
+            ball near the posterior, are refused with a ValueError (`samplers.evaluation.starts`).
         nsteps : int
             Number of steps stored in the chain; 0 for the annealing only.
         **kwargs
@@ -233,12 +234,9 @@ class TemperedSampler(RunResults, EnsembleSampler):
         Raises
         ------
         KeyboardInterrupt
-            At Ctrl-C, even if a library has set a handler that raises something else, as dask_jobqueue does. The
-            handler is called; one that returns has dealt with Ctrl-C.
+            At Ctrl-C, even if a library has set a handler that raises something else, as dask_jobqueue does.
         SystemExit
             If the function calls ``sys.exit`` in this process. In a worker process this is a failed evaluation.
-
-        Nothing is stored for the points that were interrupted.
 
         Examples
         --------
@@ -542,8 +540,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._moves, self._weights = schedule
         self._evaluator.remember = remember = self._record.remembering()
         if self._given_guide is not None:
-            self._guide = self._given_guide.fresh()
-            guided = self._guide, lend(self._guide, self._random, remember, self._record)
+            self.guide = self._given_guide.fresh()
+            guided = self.guide, lend(self.guide, self._random, remember, self._record)
         self._record.is_complete = stored is not None
         population = Population(0.0, start.coords, None, float(self.nwalkers))
         since = time.perf_counter(), self._evaluator.evaluations
@@ -575,18 +573,18 @@ class TemperedSampler(RunResults, EnsembleSampler):
         coords, log_prob = first.coords[: self.nwalkers], first.log_prob[: self.nwalkers]  # of the prior, or of a guide
         log_prior = self._target.log_prior(coords)
         said = check_end(result, population.coords) + check_likelihood(log_prob, log_prior)
-        said += check_prior(coords, log_prior) if self._guide is None else list(self._guide.findings)
+        said += check_prior(coords, log_prior) if self.guide is None else list(self.guide.findings)
         for finding in said:
             warn(finding.message)
         self._result = result._replace(
             findings=(*result.findings, *said),
-            basis="" if self._guide is None else self._guide.basis,
+            basis="" if self.guide is None else self.guide.basis,
             independent_points=independent_points(result, population.coords),
         )
         ended = bool(result.ended)
         self._guided = population.coords.copy() if weighted is not None and weighted.guided and not ended else None
         if self._guided is not None:
-            moves = with_fast_sweeps([guide_move(self._guide)], self._fast, self.ndim, self.settings.fast_sweeps)
+            moves = with_fast_sweeps([guide_move(self.guide)], self._fast, self.ndim, self.settings.fast_sweeps)
             schedule = MoveSchedule(moves, np.ones(1))
             schedule.calibrate(population.coords, np.full(self.nwalkers, 1.0 / self.nwalkers))
             self._moves, self._weights = schedule

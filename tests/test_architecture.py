@@ -43,7 +43,7 @@ ORDER = {
         ("presets", "reports"),
         ("estimates", "moves"),
         ("proposals", "record", "settings"),
-        ("emcee_names", "finding", "interrupts", "locks", "resampling"),
+        ("emcee_names", "finding", "interrupts", "resampling"),
     ),
 }
 

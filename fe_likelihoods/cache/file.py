@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from samplers.locks import locked_folder
+from samplers.record import lock_now
 
 __all__ = ["APPLICATION_ID", "SCHEMA_VERSION", "CacheFile", "transaction"]
 
@@ -26,6 +26,7 @@ logger = logging.getLogger(__name__)
 
 APPLICATION_ID = 0x46454C43  # "FELC"
 SCHEMA_VERSION = 6
+SECONDS_BETWEEN_TRIALS = 0.002  # to lock a folder
 LAYOUT = (
     # the id orders rows by age; the size of a response [bytes] is 0 for failures of a model and empty for statistics
     "CREATE TABLE rows (id INTEGER PRIMARY KEY, key BLOB NOT NULL UNIQUE, source INTEGER NOT NULL, "
@@ -220,13 +221,26 @@ class CacheFile:
             return None
         return status.st_dev, status.st_ino
 
-    def _exclusive(self) -> contextlib.AbstractContextManager:
-        """Lock the folder, so that no other process opens the file or moves it aside meanwhile.
+    @contextlib.contextmanager
+    def _exclusive(self) -> Iterator[None]:
+        """Lock the folder, so that no other process opens the file or moves it aside meanwhile; go on after a time, and
+        where there are no locks.
 
         SQLite finds the log by its name: a process that opens a damaged file while it is renamed would write to the
         new file's log. The file itself cannot be locked instead, because closing it releases SQLite's locks.
         """
-        return locked_folder(self.path.parent, self.timeout)
+        with contextlib.ExitStack() as stack:
+            with contextlib.suppress(OSError):  # a folder with search permission only, a file system without locks
+                descriptor = os.open(self.path.parent, os.O_RDONLY)
+                stack.callback(os.close, descriptor)
+                stop = time.monotonic() + self.timeout
+                while time.monotonic() <= stop:
+                    try:
+                        lock_now(descriptor)
+                        break
+                    except BlockingIOError:
+                        time.sleep(SECONDS_BETWEEN_TRIALS)
+            yield
 
     def _open(self) -> sqlite3.Connection:
         uri = f"{self.path.as_uri()}?mode=rwc"

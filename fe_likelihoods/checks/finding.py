@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from samplers.finding import CARE, NOTE, WRONG, Finding, by_severity
+from samplers.finding import CARE, NOTE, WRONG, Finding
 
 SMALL_PROBABILITY = 0.01  # that chance explains what was found; of 100 independent tests of right results, one fails
 TAIL = 0.05  # share of samples, draws or simulations that is as much as a tail of a 90 % interval
@@ -19,7 +19,11 @@ def in_order(findings: Iterable[Finding]) -> tuple[Finding, ...]:
 
     A check relies on what stands before it in `ORDER`: a fit on right data, samples on a fit.
     """
-    return tuple(sorted(by_severity(findings), key=lambda each: (each.severity == NOTE, ORDER.index(each.about))))
+    return tuple(sorted(findings, key=lambda each: (each.severity == NOTE, ORDER.index(each.about), _rank(each))))
+
+
+def _rank(finding: Finding) -> int:
+    return [*STATUS].index(finding.severity)  # the most severe first
 
 
 class Judgement(NamedTuple):
@@ -49,8 +53,9 @@ class Judgement(NamedTuple):
 
 def judge(findings: Iterable[Finding], tests: Iterable[tuple[str, str]] = ()) -> Judgement:
     """The judgement that follows from findings: the most severe one decides."""
-    found = by_severity(findings)
-    return Judgement(STATUS[found[0].severity] if found else "use", in_order(found), tuple(tests))
+    found = in_order(findings)
+    status = STATUS[min(found, key=_rank).severity] if found else "use"
+    return Judgement(status, found, tuple(tests))
 
 
 class FindingWarning(UserWarning):

@@ -34,17 +34,13 @@ def check_asynchronous(target: Target, pool: Any, draws: bool) -> None:
             "recycle=True, or leave it out"
         )
     can_submit = callable(getattr(pool, "submit", None)) and not target.vectorize
-    if not (can_submit if pool is not None else _has_executor(target)):
+    if not (can_submit if pool is not None else callable(getattr(target.function, "executor", None))):
         raise ValueError(
             "asynchronous=True needs points that can be submitted one by one: pass a posterior that has the method "
             "executor (Posterior of fe_likelihoods, with its own pool), or a function of one point and a pool with the "
             "method submit (an executor of concurrent.futures, mpi4py or loky, a dask client); got "
             f"{type(target.function).__name__}, pool={type(pool).__name__}, vectorize={target.vectorize}"
         )
-
-
-def _has_executor(target: Target) -> bool:
-    return callable(getattr(target.function, "executor", None))
 
 
 class AsynchronousEvaluator(Evaluator):
@@ -72,10 +68,6 @@ class AsynchronousEvaluator(Evaluator):
 
     def _opened(self) -> Any:
         if self._executor is None:
-            if self.pool is None and not _has_executor(self.target):
-                raise ValueError(
-                    "this sampler was begun with a pool, which is not stored with it: set its attribute pool"
-                )
             self._executor = self.target.function.executor() if self.pool is None else self.pool
         return self._executor
 

@@ -7,6 +7,7 @@ time, finished points are entered every 0.05 s, so that a killed process loses o
 
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -104,27 +105,18 @@ class Evaluator:
                         if time.perf_counter() - noted > SECONDS_BETWEEN_NOTES:
                             self._enter_successes(new, results)
                             noted = time.perf_counter()
-            except BaseException:  # Ctrl-C, or a pool that cannot go on
-                self._enter_successes(new, results)
+                self.count(0, self.running)
+                batch, before = self.as_batch(new, results), self.record.knows(new)
+                rest = batch.rows(np.flatnonzero(~before))  # failures among them, since many of them end the run
+                failed, total = np.count_nonzero(rest.failed), self.record.count + len(rest.coords)
+                self.check_failures(rest, len(self.record.failed) + failed, total, not (known.any() or before.any()))
+                self.record.evaluated(rest)
+            except BaseException:  # Ctrl-C, a pool that cannot go on, or too many failures
+                with suppress(ValueError):  # of values that are none
+                    self._enter_successes(new, results)
                 raise
-            self.count(0, self.running)
-            self._settle(new, results, whole=not known.any())
         self.evaluations += len(asked)
         return then(coords, self._records(coords, log_prior, asked))
-
-    def _settle(self, coords: np.ndarray, results: Any, whole: bool) -> None:
-        """Enter what the record does not know of a `whole` batch, or of a part of it; failures are entered when all
-        values have arrived, since many of them end the run by a RuntimeError.
-        """
-        batch, before = self.as_batch(coords, results), self.record.knows(coords)
-        rest = batch.rows(np.flatnonzero(~before))
-        counts = len(self.record.failed) + np.count_nonzero(rest.failed), self.record.count + len(rest.coords)
-        try:
-            self.check_failures(rest, *counts, whole and not before.any())
-        except RuntimeError:
-            self._enter_successes(coords, results)
-            raise
-        self.record.evaluated(rest)
 
     def _allowed(self, coords: np.ndarray) -> int:
         """Number of the first points among (n, ndim) that the limit of simulations allows."""
@@ -185,14 +177,11 @@ class Evaluator:
             if blobs is not None and self.record.path is not None:
                 check_storable(blobs.dtype)
             self._blobs = found
-        if bool(found) != bool(self._blobs):
-            this, before = ("blobs", "none") if found else ("no blobs", "some")
-            raise ValueError(f"{name} must return blobs with every point or with none; got {this} after {before}")
         if found != self._blobs:
-            (_, one, shape), (_, first, shape_of_first) = found[0], self._blobs[0]
+            now, before = (f"{each[0][1]} of shape {each[0][2]}" if each else "none" for each in (found, self._blobs))
             raise ValueError(
-                f"{name} must return blobs of one type and shape; got {one} of shape {shape} after {first} of shape "
-                f"{shape_of_first}: return numbers, as many for each point (numpy.nan for None), or pass blobs_dtype="
+                f"{name} must return blobs of one type and shape, with every point or with none; got {now} after "
+                f"{before}: return numbers, as many for each point (numpy.nan for None), or pass blobs_dtype="
             )
         return batch
 

@@ -15,11 +15,6 @@ from .summary import is_tempered, log_posterior_of, names_of_parameters
 if TYPE_CHECKING:
     import xarray
 
-_PRIOR_DRAWS = 1000
-_ORDER = (
-    "Draws are ordered by founder, walker and step, so that dependent draws are neighbours; sample_stats has the step, "
-    "the walker and the founder of each draw."
-)
 _CHAINS = (
     "Each chain is an independent run, so r_hat compares runs, and there is no r_hat of one run: pass a list of runs "
     "with different seeds."
@@ -67,9 +62,8 @@ def to_arviz(
         raise ValueError(f"expected samplers of {len(names)} parameters; got {[type(run).__name__ for run in runs]}")
     chains, stats = _ordered(runs, discard)
     described = {each.name: each for each in getattr(known, "parameters", ())}
-    notes = {"chains": _CHAINS, "order": _ORDER}
     groups = {
-        "posterior": _parameter_group(chains, names, described, notes),
+        "posterior": _parameter_group(chains, names, described, {"chains": _CHAINS}),
         "sample_stats": xarray.Dataset(
             {
                 name: (("chain", "draw", *(f"{name}_dim_{i}" for i in range(values.ndim - 2))), values)
@@ -79,20 +73,18 @@ def to_arviz(
             _statistics_of_runs(runs),
         ),
     }
-    if (prior := _prior_group(runs, known, names, described)) is not None:
-        groups["prior"] = prior
+    first = [getattr(run, "prior_draws", None) for run in runs]
+    if all(draws is not None for draws in first):
+        source = "draws of the prior from which the annealing began; the chains are the runs"
+        groups["prior"] = _parameter_group(np.stack(first), names, described, {"source": source})
     if prediction is not None:
         groups["predictions"] = prediction.to_xarray()
-    groups = {group: _without_slashes(dataset) for group, dataset in groups.items()}
+    for group, data in groups.items():  # a slash would be a folder in netCDF
+        names = {*data.variables, *data.dims}
+        groups[group] = data.rename({name: name.replace("/", "_") for name in names if "/" in name})
     if arviz.__version__.startswith("0."):
         return arviz.InferenceData(**groups)
     return xarray.DataTree.from_dict(groups)
-
-
-def _without_slashes(dataset: "xarray.Dataset") -> "xarray.Dataset":
-    """Data with ``_`` for ``/`` in names, which would be a folder in netCDF."""
-    names = {*dataset.variables, *dataset.dims}
-    return dataset.rename({name: name.replace("/", "_") for name in names if "/" in name})
 
 
 def _ordered(runs: Sequence[Any], discard: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -154,19 +146,6 @@ def _parameter_group(
         variables[name] = (("chain", "draw"), samples[:, :, column], about)
     coordinates = {"chain": np.arange(len(samples)), "draw": np.arange(samples.shape[1])}
     return xarray.Dataset(variables, coordinates, dict(attributes))
-
-
-def _prior_group(
-    runs: Sequence[Any], known: Any, names: Sequence[str], described: Mapping[str, Any]
-) -> "xarray.Dataset | None":
-    first = [getattr(run, "prior_draws", None) for run in runs]
-    if all(draws is not None for draws in first):
-        source = "draws of the prior from which the annealing began; the chains are the runs"
-        return _parameter_group(np.stack(first), names, described, {"source": source})
-    if not hasattr(known, "sample_prior"):
-        return None
-    samples = np.asarray(known.sample_prior(_PRIOR_DRAWS, np.random.default_rng(0)))
-    return _parameter_group(samples[None], names, described, {"source": f"{_PRIOR_DRAWS} draws of sample_prior"})
 
 
 def _statistics_of_runs(runs: Sequence[Any]) -> dict[str, Any]:

@@ -78,7 +78,4 @@ def _evidence(name: str, model: Any) -> tuple[float, float]:
         value, error = map(float, pair)
         if math.isfinite(value) and 0.0 <= error < math.inf:
             return value, error
-    raise ValueError(
-        f"model {name!r}: expected a sampler with log_evidence and log_evidence_error, or a pair of numbers, which are "
-        f"finite, and the error not negative; got {pair!r}"
-    )
+    raise ValueError(f"model {name!r}: expected a sampler that has run, or two finite numbers; got {pair!r}")

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..estimates.importance import EvidenceCheck, evidence_from_weights
 from ..estimates.pareto import pareto_shape
-from ..estimates.weights import WHERE_TO_LOOK, coarse_weights, effective_sample_size, normalised_weights
+from ..estimates.weights import WHERE_TO_LOOK, coarse_weights, normalised_weights
 from ..finding import Finding
 from ..judgement.checks import check_shares
 from ..proposals.basins import find_basins, with_components
@@ -62,7 +62,7 @@ def anneal(
         if settings.recycle:
             recycled = yield from _by_recycling(recycle(start, size, density, random), population, size, kernel)
         if recycled is None or recycled.reason:
-            for coords, records in (start.arrived_part(), *([] if recycled is None else [recycled[1:3]])):
+            for coords, records in (start.arrived_part(), *([] if recycled is None else [recycled.points[1:3]])):
                 kernel.visited.add(coords, records)
             coords, records = start.arrived_part()
             population = population._replace(coords=coords, records=records)
@@ -74,7 +74,7 @@ def anneal(
                 return
             yield from ((population, each) for each in (check, *found))
     except StoppedEarly as stop:
-        yield from _finish_early(stop, size, random, 0.0 if guided is None else density.record.of_guides)
+        yield from _end_with(stop, size, random, 0.0 if guided is None else density.record.of_guides)
 
 
 def check_population(
@@ -107,15 +107,14 @@ def _by_recycling(
         yield population, Restart(found.reason)
         return found
     # the last proposal, since it was not fitted to the draws of the check, which are most of the moved points
-    proposal, schedule = found.proposal, kernel.schedule
-    schedule.calibrate(found.coords, coarse_weights(found.log_weights), kernel.density.inside, proposal)
-    population, distinct = _resampled(found.coords, found.records, found.log_weights, size, kernel.random)
-    effective = population.effective_sample_size
+    points, schedule, effective = found.points, kernel.schedule, found.points.effective_sample_size
+    schedule.calibrate(points.coords, coarse_weights(points.log_weights), kernel.density.inside, found.proposal)
+    population, distinct = _resampled(points, size, kernel.random)
     yield population, found.check
     if found.independent:  # sweeps would cost evaluations and improve nothing
         for move in schedule.mixtures:
             move.expect_independence()
-        moved = Mutated(population, effective / len(found.coords), 0)
+        moved = Mutated(population, effective / len(points.coords), 0)
     else:
         moved = yield from move_together(population, kernel)
     increment, error = found.log_evidence - found.log_evidence_below_one, found.log_evidence_error
@@ -125,45 +124,42 @@ def _by_recycling(
     return found
 
 
-def _resampled(
-    coords: np.ndarray, records: np.ndarray, log_weights: np.ndarray, size: int, random: np.random.RandomState
-) -> tuple[Population, int]:
+def _resampled(points: Population, size: int, random: np.random.RandomState) -> tuple[Population, int]:
     """Weighted points resampled to `size` points at beta = 1, and the number of distinct points among them."""
-    ancestors = systematic(normalised_weights(log_weights), random, size)
-    effective = effective_sample_size(log_weights)
-    return Population(1.0, coords[ancestors], records[ancestors], effective, (ancestors,)), len(np.unique(ancestors))
+    ancestors = systematic(normalised_weights(points.log_weights), random, size)
+    walkers = points.coords[ancestors], points.records[ancestors], points.effective_sample_size, (ancestors,)
+    return Population(1.0, *walkers), len(np.unique(ancestors))
 
 
 def _from_guide(
     population: Population, density: Density, schedule: MoveSchedule, guide: Guide, session: GuideSession
 ) -> Steps:
-    """Rounds of a guide's draws. Raises StoppedEarly with all draws if they are not usable, or at the limit."""
-    size = len(population.coords)
+    """Rounds of a guide's draws; raises StoppedEarly with all draws, also at the limit or if they are not usable."""
     found = yield from draw_rounds(population, density, guide, session)
     if found.signed is not None:
         yield population, found.signed
     yield from ((population, each) for each in found.findings)
     pooled = found.pooled
+    if pooled is None:
+        nothing = Population(1.0, np.empty((0, 0)), np.empty(0), 0.0, (), np.empty(0))
+        raise StoppedEarly(nothing, -np.inf, np.inf, guided=True)
     if found.reason and pooled.log_evidence == -np.inf:
         raise ValueError(
             f"none of {len(pooled.coords)} draws of the guide has a finite log-probability: {WHERE_TO_LOOK}, use a "
             "better guide, or run without a guide"
         )
-    if found.stopped or found.reason:
-        why = f"The rounds of the guide ended, because {found.reason}," if found.reason else LIMIT
-        points = (pooled.coords, pooled.records, pooled.effective_sample_size, (), pooled.log_weights) if pooled else ()
-        points = Population(1.0, *(points or (np.empty((0, 0)), np.empty(0), 0.0, (), np.empty(0))))
-        raise StoppedEarly(points, *(found.evidence if pooled else (-np.inf, np.inf)), guided=True, why=why)
-    resampled, distinct = _resampled(pooled.coords, pooled.records, pooled.log_weights, size, session.random)
-    schedule.calibrate(pooled.coords, coarse_weights(pooled.log_weights), density.inside)
-    ess, share = pooled.effective_sample_size, found.rounds[-1].effective_share
-    yield resampled, Weighted(len(pooled.coords), ess, pooled.pareto_shape, guided=True)
-    yield resampled, Stage(1.0, ess, share, 0, distinct, *found.evidence)
+    why = LIMIT if found.stopped else ""
+    if found.reason:
+        why = f"The rounds of the guide ended, because {found.reason},"
+    if not why:
+        schedule.calibrate(pooled.coords, coarse_weights(pooled.log_weights), density.inside)
+    points = Population(1.0, *pooled[:2], pooled.effective_sample_size, (), pooled.log_weights)
+    raise StoppedEarly(points, *found.evidence, guided=True, why=why)
 
 
-def _finish_early(stop: StoppedEarly, size: int, random: np.random.RandomState, searched: float) -> Steps:
-    """Resample the known points to `size` points at beta = 1; `searched`: simulations made by guides."""
-    population, log_weights = stop.population, stop.population.log_weights
+def _end_with(end: StoppedEarly, size: int, random: np.random.RandomState, searched: float) -> Steps:
+    """Resample weighted points to `size` points at beta = 1; `searched`: simulations made by guides."""
+    points, log_weights, effective = end.population, end.population.log_weights, end.population.effective_sample_size
     if len(log_weights) == 0 or np.max(log_weights) == -np.inf:
         search = f", besides {searched:.0f} simulations of the search by the guide" if searched > 0.0 else ""
         advice = f", or {WHERE_TO_LOOK}" if len(log_weights) > 0 else ""
@@ -172,9 +168,7 @@ def _finish_early(stop: StoppedEarly, size: int, random: np.random.RandomState, 
             f"of which has a finite log-probability{search}: there is nothing to report. Call run_mcmc again with a "
             f"larger limit (the simulations made so far are kept){advice}"
         )
-    effective, known, beta = population.effective_sample_size, len(log_weights), population.beta
-    population, distinct = _resampled(population.coords, population.records, log_weights, size, random)
-    population = population._replace(effective_sample_size=effective)
-    yield population, Weighted(known, effective, pareto_shape(log_weights), beta, stop.why, stop.guided)
-    increment = stop.log_evidence - stop.of_stages
-    yield population, Stage(1.0, effective, effective / known, 0, distinct, increment, stop.error)
+    population, distinct = _resampled(points, size, random)
+    known, increment = len(log_weights), end.log_evidence - end.of_stages
+    yield population, Weighted(known, effective, pareto_shape(log_weights), points.beta, end.why, end.guided)
+    yield population, Stage(1.0, effective, effective / known, 0, distinct, increment, end.error)

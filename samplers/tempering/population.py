@@ -69,8 +69,8 @@ def check_size(nwalkers: int, ndim: int) -> None:
 
 
 class StoppedEarly(Exception):
-    """The limit of simulations has ended an annealing; the known points have log-weights at beta = 1. `of_stages` of
-    the log-evidence was reported before, `guided` points are draws of a guide; `why` the run ended.
+    """An annealing has ended with points that have log-weights at beta = 1, at the limit of simulations or else `why`
+    (empty: as wanted). `of_stages` of the log-evidence was reported before, `guided` points are draws of a guide.
     """
 
     def __init__(

@@ -59,15 +59,12 @@ LARGEST_SHARE_KEPT = 0.9
 
 
 class Recycled(NamedTuple):
-    """Result of recycling: draws made at beta = 1 with those of the check, and log-weights (n,) over the density of
-    their round. `reason` says why it is not reliable, `independent` whether walkers resampled from it are independent
-    draws.
+    """Result of recycling: draws made at beta = 1 with those of the check, with log-weights over the density of their
+    round. `reason` says why it is not reliable, `independent` whether walkers resampled from it are independent draws.
     """
 
     reason: str
-    coords: np.ndarray
-    records: np.ndarray
-    log_weights: np.ndarray
+    points: Population
     log_evidence: float
     log_evidence_error: float
     check: EvidenceCheck | None
@@ -98,7 +95,7 @@ def recycle(
         alive = effective_sample_size(points.log_weights(0.0))
     if alive < target:
         reason = f"only {alive:.0f} of {first} starting points have a likelihood above zero"
-        return Recycled(reason, *pending.arrived_part(), np.zeros(first), float("-inf"), float("inf"), None)
+        return Recycled(reason, Population(0.0, *pending.arrived_part(), alive), float("-inf"), float("inf"), None)
     while True:
         # choose beta
         points.update()
@@ -181,7 +178,7 @@ def recycle(
         # draws that contradict a fit also improve it: check again, as long as that is cheap
         independent = checking and not reason
         if independent:  # are `n` points resampled from the draws as good as independent draws of the posterior?
-            weights = normalised_weights(_result(drawn, 1.0)[2])
+            weights = normalised_weights(_result(drawn, 1.0).log_weights)
             independent = bool(np.minimum(n * weights, 1.0).sum() >= ENOUGH_DISTINCT * n)
         ends = independent or checks == MOST_CHECKS if checking else bool(reason)
         if ends:
@@ -190,7 +187,7 @@ def recycle(
                 points.update()
                 log_evidence, error = _evidence(points.log_weights(beta), inherited)
             result = _result(drawn if beta == 1.0 else [draws], beta)
-            return Recycled(reason, *result, log_evidence, error, check, mixture, sum(increments), independent)
+            return Recycled(reason, result, log_evidence, error, check, mixture, sum(increments), independent)
         points.add(mixture, made, pending)
 
 
@@ -261,8 +258,8 @@ class _Drawn(NamedTuple):
         return tempered_log_prob(records, beta) - log_density(self.mixture, coords)
 
 
-def _result(drawn: Sequence[_Drawn], beta: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points, records and log-weights of complete rounds, as in `Recycled`."""
+def _result(drawn: Sequence[_Drawn], beta: float) -> Population:
+    """Points of complete rounds with their log-weights, as in `Recycled`."""
     parts = [draws.pending.arrived_part() for draws in drawn]
     log_weights = [draws.log_weights(beta) for draws in drawn]
     sizes = np.array([draws.made for draws in drawn])
@@ -270,7 +267,9 @@ def _result(drawn: Sequence[_Drawn], beta: float) -> tuple[np.ndarray, np.ndarra
     # each round counts by the effective share of the one before it, which its own weights do not determine
     shares = np.maximum(sizes * [effective[0], *effective[:-1]], 1.0)
     scaled = [w + x for w, x in zip(log_weights, np.log(shares / shares.sum() / sizes), strict=True)]
-    return np.concatenate([c for c, _ in parts]), np.concatenate([r for _, r in parts]), np.concatenate(scaled)
+    coords, records = (np.concatenate(each) for each in zip(*parts, strict=True))
+    weights = np.concatenate(scaled)
+    return Population(beta, coords, records, effective_sample_size(weights), (), weights)
 
 
 def _evidence(log_weights: np.ndarray, inherited: float) -> tuple[float, float]:

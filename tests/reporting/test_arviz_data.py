@@ -81,7 +81,6 @@ def test_chain_of_emcee_in_the_order_of_its_walkers():
     assert data["posterior"]["x1"].shape == (1, 32 * 20)
     assert np.array_equal(data["posterior"]["x1"][0, :20], sampler.get_chain()[10:, 0, 1])
     assert np.array_equal(data["sample_stats"]["step"][0, :20], np.arange(10, 30))
-    assert "sample_prior" in data["prior"].attrs["source"]
 
 
 def gaussian_with_blobs(x):

@@ -23,8 +23,7 @@ PATHS = {
 # per setting: another value, and what else is given so that it can act at all
 CHANGES = {
     "ess_ratio": (0.8, {}),
-    "ess_rule": ("declining", {}),
-    "ess_floor": (30.0, {"ess_rule": "declining"}),
+    "ess_floor": (30.0, {}),
     "resampling": ("multinomial", {}),
     "min_moves": (7, {}),
     "max_moves": (3, {"max_correlation": 1e-6}),
@@ -38,7 +37,7 @@ CHANGES = {
 }
 ACTS = {
     "recycling": {"fast_sweeps", "recycle", "asynchronous"},
-    "moves": {"ess_ratio", "ess_rule", "ess_floor", "resampling", "min_moves", "max_moves", "max_correlation"}
+    "moves": {"ess_ratio", "ess_floor", "resampling", "min_moves", "max_moves", "max_correlation"}
     | {"fast_sweeps", "recycle"},
     "equal chains": {"ess_ratio", "resampling", "min_moves", "max_moves", "max_correlation", "chains"}
     | {"burn_in", "fast_sweeps"},
@@ -107,8 +106,7 @@ def test_the_share_of_failures_stops_the_run(path):
     ("Sampler", "settings", "match"),
     [
         (SMCSampler, {"asynchronous": True}, "asynchronous=True cannot act here"),
-        (SMCSampler, {"ess_floor": 10.0}, 'ess_rule="declining"'),
-        (SMCSampler, {"ess_floor": 60.0, "ess_rule": "declining"}, "must be below nwalkers=60"),
+        (SMCSampler, {"ess_floor": 60.0}, "must be below nwalkers=60"),
         (SMCSampler, {"pool": 4}, "pool must be an object with a method map"),
         (SMCSampler, {"backend": "run.h5"}, "backend must be a backend of emcee"),
         (TMCMCSampler, {"seed": 1.5}, "seed must be a whole number"),
@@ -128,7 +126,6 @@ def test_a_setting_that_cannot_act_is_refused(Sampler, settings, match):
     [
         *({"ess_ratio": value} for value in (0.0, 1.0, np.nan)),
         *({name: value} for name in ("fast_sweeps",) for value in (-1, 1.5, True)),
-        {"ess_rule": "sometimes"},
         {"ess_floor": -1.0},
         {"resampling": "wheel"},
         {"min_moves": 0},
