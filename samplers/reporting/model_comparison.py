@@ -78,4 +78,6 @@ def _evidence(name: str, model: Any) -> tuple[float, float]:
         value, error = map(float, pair)
         if math.isfinite(value) and 0.0 <= error < math.inf:
             return value, error
-    raise ValueError(f"model {name!r}: expected a sampler that has run, or two finite numbers; got {pair!r}")
+    raise ValueError(
+        f"model {name!r}: expected a sampler that has run, or two finite numbers, the second not negative; got {pair!r}"
+    )
