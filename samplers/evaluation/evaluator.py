@@ -112,7 +112,7 @@ class Evaluator:
                 self.check_failures(rest, len(self.record.failed) + failed, total, not (known.any() or before.any()))
                 self.record.evaluated(rest)
             except BaseException:  # Ctrl-C, a pool that cannot go on, or too many failures
-                with suppress(ValueError):  # of values that are none
+                with suppress(TypeError, ValueError):  # of values that are none
                     self._enter_successes(new, results)
                 raise
         self.evaluations += len(asked)
