@@ -482,7 +482,10 @@ class TemperedSampler(RunResults, EnsembleSampler):
             return []
         best = int(np.argmax(np.where(np.isfinite(known.log_prob), known.log_prob, -np.inf)))
         coords, log_prob = known.coords[best], known.log_prob[best]
-        found = self._evaluator.compute(coords[None]).log_prob[0] if np.isfinite(log_prob) else log_prob
+        if not np.isfinite(log_prob):
+            return []
+        answers = list(self._target.answers(coords[None], self.pool))
+        found = self._target.evaluated(coords[None], answers[0] if self._target.vectorize else answers).log_prob[0]
         if np.isclose(log_prob, found, equal_nan=True, **close):
             return []
         return [f"log_prob_fn was {log_prob:.10g} at {coords}, is {found:.10g}"]

@@ -195,11 +195,6 @@ class Evaluator:
             records["blobs"][rows] = batch.blobs
         return records
 
-    def compute(self, coords: np.ndarray) -> EvaluatedBatch:
-        """Call the function for points (n, ndim), without counting or storing."""
-        answers = list(self.target.answers(coords, self.pool))
-        return self.target.evaluated(coords, answers[0] if self.target.vectorize else answers)
-
 
 def unpack(records: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
     """log_prob and blobs (or None) of records, as emcee takes them."""

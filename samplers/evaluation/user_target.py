@@ -155,13 +155,10 @@ class Target:
 
     def sample_prior(self, n: int, random: np.random.RandomState) -> np.ndarray:
         """Draws (n, ndim) of the prior; ValueError without the method of the function."""
-        draw = getattr(self.function, "sample_prior", None)
-        if draw is None:
-            raise ValueError(
-                f"initial_state is None and {self.name} has no method sample_prior(n, random): pass {n} draws of the "
-                "prior"
-            )
-        return np.array(draw(n, random), dtype=float)
+        if not hasattr(self.function, "sample_prior"):
+            text = f"initial_state is None and {self.name} has no method sample_prior(n, random)"
+            raise ValueError(f"{text}: pass {n} draws of the prior")
+        return np.array(self.function.sample_prior(n, random), dtype=float)
 
     def more_draws(self, n: int, random: np.random.RandomState) -> np.ndarray:
         """Draws (m, ndim) of the prior: m is `n`, or 0 if the function or its object has no method for this prior."""

@@ -156,8 +156,6 @@ def _statistics_of_runs(runs: Sequence[Any]) -> dict[str, Any]:
     numbers = ("log_evidence", "log_evidence_error", "evaluations", "simulations", "failure_count")
     attributes |= {name: np.array([float(getattr(run, name)) for run in runs]) for name in numbers}
     attributes["ladder"] = json.dumps([[stage._asdict() for stage in run.ladder] for run in runs])
-    if len(runs) == 1:
-        attributes["beta"] = np.array([stage.beta for stage in runs[0].ladder])
     attributes["settings"] = "\n".join(repr(run.settings) for run in runs)
     attributes["verdict"] = "\n".join(str(run.verdict) for run in runs)
     failures = (Counter(failure["reason"] for failure in run.failures) for run in runs)

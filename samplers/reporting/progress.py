@@ -34,10 +34,6 @@ class _Lines:
             sys.stderr.write(f"{line}\n" if self._last else "")
             self._last = line
 
-    def flush(self) -> None:
-        """Flush stderr."""
-        sys.stderr.flush()
-
 
 def _open_bar(display: bool | str, total: int | None, **kwargs: Any) -> Any:
     """A bar of tqdm, disabled if `display` is False; emcee's bar of this name for a str.

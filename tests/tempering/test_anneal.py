@@ -42,7 +42,7 @@ def test_the_weights_of_recycling_estimate_the_evidence():
         density = CountedDensity(posterior)
         flight = density.submit(posterior.sample_prior(250, random))
         found = finished(recycle(flight, 250, density, random))
-        deviations.append(np.logaddexp.reduce(found.log_weights) - posterior.log_evidence)
+        deviations.append(np.logaddexp.reduce(found.points.log_weights) - posterior.log_evidence)
     error = np.std(deviations, ddof=1) / np.sqrt(len(deviations))
     assert error < 0.02 and abs(np.mean(deviations)) < 4.0 * error
 
