@@ -18,7 +18,7 @@ import shutil
 import struct
 import weakref
 import zlib
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from numbers import Real
 from pathlib import Path
@@ -119,7 +119,7 @@ class Record:
         # log-probability, blobs (1, ...) or None, reason of failure, empty without one, and batch of each point
         self._known: dict[bytes, tuple[float, np.ndarray | None, str, int]] = {}
         self.simulated: set[bytes] = set()  # keys of the points
-        self._arrays: dict[str, list[list[np.ndarray]]] = {}
+        self._arrays: defaultdict[str, list[list[np.ndarray]]] = defaultdict(list)  # by key, in the order of storing
 
     def __getstate__(self):
         return {**self.__dict__, "_file": None, "_seen": self._seen if self._file is None else self._whole}
@@ -189,7 +189,7 @@ class Record:
         """Simulations that the guide has made by itself, or those in the record, if the annealing is not made again."""
         if self.guide is not None:
             return self.guide.simulations
-        return float(sum(allowed.item() for (allowed,) in self.remembered(OF_GUIDES)))
+        return float(sum(allowed.item() for (allowed,) in self._arrays[OF_GUIDES]))
 
     @property
     def simulations(self) -> float:
@@ -241,7 +241,7 @@ class Record:
         used: Counter[str] = Counter()
 
         def remember(key: str, compute: Callable[[], Sequence[np.ndarray]] | None = None) -> list[np.ndarray] | None:
-            known = self.remembered(key)
+            known = self._arrays[key]
             if used[key] == len(known):
                 if self.is_complete:
                     raise Incomplete
@@ -255,10 +255,6 @@ class Record:
             return known[used[key] - 1]
 
         return remember
-
-    def remembered(self, key: str) -> list[list[np.ndarray]]:
-        """All arrays under a key, in the order in which they were stored."""
-        return self._arrays.setdefault(key, [])
 
     def forget_arrays(self) -> None:
         """Forget the arrays in memory: the annealing has ended, and is not made again in this process."""
@@ -385,7 +381,7 @@ class Record:
             header, name, *rest = text
             self.start = RunStart(header, arrays[0], (name, arrays[1], *rest))
         else:
-            self.remembered(text).append(arrays)
+            self._arrays[text].append(arrays)
 
 
 def kept_aside(path: Path) -> Path:

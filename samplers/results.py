@@ -101,7 +101,7 @@ class RunResults:
         >>> bool(np.all(sampler.mean_error() < 0.3 * samples.std(axis=0)))
         True
         """
-        chain = self._chain_of("mean_error", discard, thin)
+        chain = self._chain_of(discard, thin)
         lost = {} if self._verdict is None else self._verdict.lost
         of_lost = [lost.get(f"{OF_MEAN} {j}", 0.0) for j in range(chain.shape[2])]
         return np.hypot(self._error_of_mean(chain, chain), of_lost)
@@ -112,16 +112,16 @@ class RunResults:
         Those of `mean_error`, for the mean of the squared deviations: the error of a variance is 2 sd times the error
         of the standard deviation. Heavy tails that the chain has not met are not accounted for.
         """
-        chain = self._chain_of("sd_error", discard, thin)
+        chain = self._chain_of(discard, thin)
         apart = chain - chain.mean(axis=(0, 1))
         sd = np.sqrt(np.square(apart).mean(axis=(0, 1)))
         return 0.5 * self._error_of_mean(chain, np.square(apart)) / np.where(sd > 0.0, sd, 1.0)
 
-    def _chain_of(self, name: str, discard: int, thin: int) -> np.ndarray:
-        """The chain (nsteps, nwalkers, ndim); ValueError by the method called `name` if it has no step."""
+    def _chain_of(self, discard: int, thin: int) -> np.ndarray:
+        """The chain (nsteps, nwalkers, ndim); ValueError if it has no step."""
         chain = self.get_chain(discard=discard, thin=thin)
         if not len(chain):
-            raise ValueError(f"{name}: expected discard below the number of stored steps; got discard={discard}")
+            raise ValueError(f"expected discard below the number of stored steps; got discard={discard}")
         return chain
 
     def _error_of_mean(self, chain: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -62,7 +62,10 @@ class Target:
         self.called = function, args, kwargs
         self.caught = Caught(*self.called, vectorize)
         self._owner = function if owner is None else owner  # of optional methods
-        names, stated = self.names, getattr(function, "ndim", None)
+        self.names = names = getattr(function, "parameter_names", None) or ()  # of the parameters, if it has them
+        # indices of parameters whose change needs no simulation: points that differ in them count as one
+        self.fast_parameters = getattr(function, "fast_parameters", ())
+        stated = getattr(function, "ndim", None)
         if isinstance(stated, Integral) and stated != ndim:
             listed = f" ({', '.join(map(str, names))})" if names else ""
             raise ValueError(f"ndim is {ndim}, but {name} has {stated} parameters{listed}: pass ndim={stated}")
@@ -73,16 +76,6 @@ class Target:
         return self.name == "log_likelihood_fn"
 
     # ------------------------------------------------------------------ optional attributes of the function
-
-    @property
-    def names(self) -> Sequence[str]:
-        """Names of the parameters, if the function has them; else empty."""
-        return getattr(self.function, "parameter_names", None) or ()
-
-    @property
-    def fast_parameters(self) -> Sequence[int]:
-        """Indices of parameters whose change needs no simulation: points that differ in them count as one."""
-        return getattr(self.function, "fast_parameters", ())
 
     @property
     def slow_parameters(self) -> list[int]:

@@ -283,7 +283,7 @@ def test_summary_with_errors_of_mean_and_standard_deviation():
     assert np.array_equal(result["sd_error"], sampler.sd_error())
     np.testing.assert_allclose(result["cv"], result["sd"] / np.abs(sampler.get_chain(flat=True).mean(axis=0)))
     for error in (sampler.mean_error, sampler.sd_error):
-        with pytest.raises(ValueError, match=f"{error.__name__}: .* the number of stored steps; got discard=99"):
+        with pytest.raises(ValueError, match="below the number of stored steps; got discard=99"):
             error(discard=99)
     with pytest.raises(ValueError, match="does not match length of index"):
         summary(sampler.get_chain(flat=True), mean_error=[0.1, 0.1])
