@@ -23,7 +23,7 @@ PATHS = {
 # per setting: another value, and what else is given so that it can act at all
 CHANGES = {
     "ess_ratio": (0.8, {}),
-    "ess_floor": (30.0, {}),
+    "ess_floor": (10.0, {}),
     "resampling": ("multinomial", {}),
     "min_moves": (7, {}),
     "max_moves": (3, {"max_correlation": 1e-6}),
