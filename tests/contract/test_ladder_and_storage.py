@@ -98,7 +98,7 @@ def test_annealing_is_done_once():
     last, ladder, calls = sampler.get_last_sample(), sampler.ladder, posterior.calls
     sampler.run_mcmc(last.coords, 2)  # as in older emcee scripts: burn in, then continue from the positions
     assert sampler.ladder == ladder
-    assert posterior.calls == calls + 2 * N
+    assert 0.98 * 2 * N < posterior.calls - calls <= 2 * N  # a point that is proposed again is known
     sampler.reset()
     assert sampler.ladder == ladder == sampler._chain.result.ladder
 
