@@ -56,6 +56,13 @@ def student_mixture(weights: np.ndarray, means: Any, covariances: Any, dof: floa
     return Mixture(weights, np.array(means), roots, invert_roots(roots), dof)
 
 
+def around(regions: Sequence[Region], widened: float, dof: float) -> Mixture:
+    """Mixture of t distributions around regions, with covariances times `widened`; small regions keep a share."""
+    shares = normalised_weights(np.array([region.log_evidence for region in regions]))
+    centres, covariances = zip(*((each.centre, widened * each.covariance) for each in regions), strict=True)
+    return student_mixture(0.9 * shares + 0.1 / len(shares), centres, covariances, dof)
+
+
 class EmulatedPosterior:
     """Density of the emulated posterior, from regions with emulators, and a weighted sample of it, the pool.
 
@@ -69,25 +76,20 @@ class EmulatedPosterior:
         wide, size = self._around_runs(), min(_POOL, _NUMBERS // target.ndim)
         scaled = []
         for region in self.regions:
-            around = student_mixture(np.ones(1), [region.centre], [region.covariance], np.inf)
-            moved = target.scaled(region.centre + np.concatenate([around.roots[0].T, -around.roots[0].T]))
+            roots = around([region], 1.0, np.inf).roots[0].T
+            moved = target.scaled(region.centre + np.concatenate([roots, -roots]))
             steps = 0.5 * (moved[: target.ndim] - moved[target.ndim :])
             centre = target.scaled(region.centre[None])[0]
             scaled.append(region._replace(centre=centre, covariance=steps.T @ steps))
         own = 1.0 - sum(share for _, share in wide)
 
-        def mixture(regions: Sequence[Region]) -> Mixture:
-            shares = normalised_weights(np.array([region.log_evidence for region in regions]))
-            covariances = [1.1 * region.covariance for region in regions]
-            freedom, centres = max(_FREEDOM, target.ndim), [region.centre for region in regions]
-            return student_mixture(0.9 * shares + 0.1 / len(shares), centres, covariances, freedom)
-
+        freedom = max(_FREEDOM, target.ndim)
         for _ in range(_ROUNDS):
-            points, coords, log_weights = self._propose([(mixture(scaled), own), *wide], _DRAWS, random)
+            points, coords, log_weights = self._propose([(around(scaled, 1.1, freedom), own), *wide], _DRAWS, random)
             scaled = self._moments(scaled, points, coords, log_weights, 1.5)
             if effective_sample_size(log_weights) > _SETTLED * _DRAWS:
                 break
-        parts = [(mixture(scaled), own), *wide]
+        parts = [(around(scaled, 1.1, freedom), own), *wide]
         points, self._pool, log_weights = self._propose(parts, size, random)
         effective = effective_sample_size(log_weights)
         for _ in range(3):

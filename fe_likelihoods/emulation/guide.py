@@ -2,8 +2,7 @@
 
 Draws come from the emulated posterior q_e (absent before there are enough runs), and, which bounds weights where the
 emulator is wrong or does not reach, from a wide t mixture q_t around the modes and the prior. Every simulation,
-including the search, trains the emulators. Where the response has jumps, no smooth emulator describes it: after a round
-with uneven weights, a share comes from a mixture q_w fitted to all weighted draws.
+including the search, trains the emulators.
 """
 
 import copy
@@ -14,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from samplers.estimates.importance import KnownDensity
-from samplers.estimates.weights import effective_sample_size, normalised_weights
 from samplers.evaluation.values import most_common_reasons
 from samplers.finding import Finding
 from samplers.judgement.guides import (
@@ -25,10 +23,10 @@ from samplers.judgement.guides import (
     check_unseen_modes,
     find_missing_part,
 )
-from samplers.proposals.mixture import Mixture, draw, fit_mixture, log_density
+from samplers.proposals.mixture import Mixture, draw, log_density
 from samplers.tempering.guide import Guide
 
-from .density import EmulatedPosterior, Region, student_mixture, tempered
+from .density import EmulatedPosterior, Region, around, student_mixture
 from .emulator import ResponseEmulator
 from .modes import ModeSearch, Search, check_starts, draw_starts
 from .target import ResponseTarget, Steps, at_once
@@ -36,13 +34,7 @@ from .target import ResponseTarget, Steps, at_once
 logger = logging.getLogger(__name__)
 
 _WIDE_SHARE, _PRIOR_SHARE = 0.10, 0.05
-# Share of a mixture fitted to all weighted draws, after a round with a smaller effective share than `_EVEN`, from twice
-# `_ENOUGH` draws per dimension on. For a cyclic test whose response has jumps, draws of a mixture fitted to 600 draws
-# of the posterior have an effective share of .31, and draws of emulators of .05 to .16; 100 walkers take 858
-# simulations with it, and 1034 without.
-_FITTED_SHARE, _EVEN, _ENOUGH = 0.4, 0.5, 6.0
 _WIDENED, _FREEDOM = 1.5, 5.0  # of the wide components: variances over those of their regions; degrees of freedom
-_SMALLEST_WEIGHT = 0.1  # of a component of the wide mixture, over their number
 _FEWEST_CACHED = 10_000  # simulations that the likelihood must cache in memory
 _MOST_RUNS = 300  # that train the emulator of a region
 _DEPTH = 40.0, 8.0  # log-density below the best within which runs train an emulator: constant, per dimension
@@ -88,7 +80,6 @@ class ResponseGuide(Guide):
         self._regions: list[Region] = []
         self._emulated: EmulatedPosterior | None = None
         self._wide: Mixture | None = None
-        self._fitted: Mixture | None = None  # to weighted draws
 
     @property
     def simulations(self) -> float:
@@ -202,11 +193,7 @@ class ResponseGuide(Guide):
         alive = np.isfinite(log_prob)
         heights = log_prob[alive] - self._target.with_volume(parameters[alive])[1]
         self.highest = max(self.highest, float(np.max(heights, initial=-np.inf)))
-        latest = np.where(alive, np.where(alive, log_prob, 0.0) - self.log_density(parameters), -np.inf)
-        drawn = session.weighted()
-        fitted = None if drawn is None else self._fit_draws(latest, *drawn)
         self._emulate(session.random)
-        self._fitted = fitted
 
     # ------------------------------------------------------------------ parts
 
@@ -220,7 +207,7 @@ class ResponseGuide(Guide):
             except np.linalg.LinAlgError as error:
                 logger.info("no draws of the emulated posterior could be made: %s", error)
         if self._regions:
-            self._wide = self._wide_mixture()
+            self._wide = around(self._regions, _WIDENED, _FREEDOM)
 
     def _fit_region(self, k: int) -> Region:
         """A region with an emulator of its nearest runs."""
@@ -256,8 +243,7 @@ class ResponseGuide(Guide):
         """Shares of the draws, and the densities of coordinates that they are from."""
         d = self._target.ndim
         prior = student_mixture(np.ones(1), np.zeros((1, d)), np.eye(d)[None], np.inf)
-        shares = (_PRIOR_SHARE, prior), (_FITTED_SHARE, self._fitted), (_WIDE_SHARE, self._wide)
-        parts = [(share, part) for share, part in shares if part is not None]
+        parts = [(_PRIOR_SHARE, prior)] + ([] if self._wide is None else [(_WIDE_SHARE, self._wide)])
         # the emulated posterior has the rest; without it the wide mixture, and without modes the prior
         main = self._emulated or parts.pop()[1]
         return [(1.0 - sum(share for share, _ in parts), main), *parts]
@@ -268,17 +254,3 @@ class ResponseGuide(Guide):
             for share, part in self._parts()
         ]
         return np.logaddexp.reduce(densities)
-
-    def _fit_draws(self, latest: np.ndarray, parameters: np.ndarray, log_weights: np.ndarray) -> Mixture | None:
-        """A wide mixture around weighted draws (n, ndim), if the log-weights (m,) of the latest ones are uneven."""
-        enough = _ENOUGH * self._target.ndim
-        if effective_sample_size(latest) >= _EVEN * len(latest) or len(log_weights) < 2.0 * enough:
-            return None
-        weights = normalised_weights(tempered(log_weights, enough))
-        return fit_mixture(self._target.coordinates(parameters), weights, len(self._regions)).widened(np.sqrt(_WIDENED))
-
-    def _wide_mixture(self) -> Mixture:
-        weights = normalised_weights(np.array([region.log_evidence for region in self._regions]))
-        weights = (1.0 - _SMALLEST_WEIGHT) * weights + _SMALLEST_WEIGHT / len(weights)
-        centres, covariances = zip(*((each.centre, _WIDENED * each.covariance) for each in self._regions), strict=True)
-        return student_mixture(weights, centres, covariances, _FREEDOM)

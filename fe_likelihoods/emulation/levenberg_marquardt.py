@@ -20,19 +20,15 @@ _CHECKED_ERROR = 0.05
 # Parameters up to which every start makes differences. Without them, secants of the first ascent lead all starts into
 # its mode: in 8 parameters, a mode was lost in 11 of 12 searches, and with them in 2.
 OWN = 12
-_RETRIES = -1.0, 0.3, -0.3, 0.05  # steps tried where the simulation of a difference fails, as multiples
 _NEAREST_RUNS = 3, 10  # runs that secants are fitted to: per dimension, and in addition
 _TOO_CLOSE = 1e-8  # squared distance of runs that tell nothing about derivatives: residuals have seven digits
 TOLERANCE = 0.5  # log-density still to gain, according to the quadratic approximation
 _MAX_ITERATIONS = 40
 _ROUGH = 5.0  # gain that the quadratic approximation may promise where no step gains anything
-_STALLED = 0.1, 0.02  # gain in log-density below which a step counts as failed, and the same as a share of what is left
-# Share of the promised gain below which an ascent with derivatives of its own makes new differences. Without them,
-# searches need 10 to 30 % fewer simulations, but a column gets a false second mode with 1 of 5 seeds.
-_MISLED = 0.7
+_STALLED = 0.1  # gain in log-density below which a step counts as failed
 # on a part of the record, an ascent is given up after so many iterations, if it is so far below the best one, and needs
 # so many more like the last; on the whole record, where this saves nothing, it may lead to another mode. Without this,
-# _MISLED and the share of _STALLED, the two runs took 717 and 496 simulations
+# searches of the isolated bridge took 509 and 387 simulations instead of 94 and 218
 _PATIENCE, _HOPELESS, _LEFT = 4, 200.0, 6.0
 # Log-density that the error of a prediction which shows the same mode costs. As a share of all that the parameters
 # change, which hides one of them that has two modes, starts joined the other mode in 7 of 12 searches.
@@ -89,8 +85,8 @@ class Climb:
     """Levenberg-Marquardt from one start on a part of the record, where the prior is centred at `centre`.
 
     `known` has where every ascent on this part has arrived, by its number; ends are different where one coordinate
-    differs by `apart`. On the `whole` record, a step of a standard deviation is simulated along every axis of the
-    Laplace approximation at the end.
+    differs by `apart`. Where no shorter part came before the `whole` record, a step of a standard deviation is
+    simulated along every axis of the Laplace approximation at the end.
     """
 
     target: ResponseTarget
@@ -114,16 +110,13 @@ class Climb:
             if steps is not None or not self.derivatives or len(start) <= OWN:
                 yield from self._difference(FIRST_DIFFERENCE * np.eye(len(start)) if steps is None else steps)
         if joined is None:
-            first = max(tolerance, _DESIGN_FROM * len(start)) if self.whole else tolerance
+            first = max(tolerance, _DESIGN_FROM * len(start)) if steps is None else tolerance
             joined = yield from self._climb(True, first)
         if joined is None:
             joined = yield from self._connected()
         if joined is None and self.whole:
-            end = self.known[self.number]
-            if steps is None or (start - end.coords) @ end.hessian @ (start - end.coords) >= _SAME_MODE * len(start):
+            if steps is None:
                 yield from self._design(tolerance)
-            elif tolerance < TOLERANCE:
-                yield from self._climb(False, tolerance)
             end = self._quadratic()
             # where the data leave a direction to the prior, the emulator must reach as far as the prior
             free = axes_of(end)[np.linalg.eigvalsh(end.hessian) < _FREE][:_LONGEST]
@@ -146,19 +139,14 @@ class Climb:
         return found
 
     def _difference(self, steps: np.ndarray, runs: Runs | None = None) -> Requests:
-        """Derivatives at the present point from steps (d, d) of it; zero along a step that fails at every length."""
-        here = self._here
+        """Derivatives at the present point from steps (d, d) of it, `runs` if they have been made; zero along a step
+        that fails: shorter ones saved nothing on two models that fail in a third of the prior.
+        """
         if runs is None:
-            runs = yield here.coords + steps
-        ends, used = np.where(runs.failed, here.run, runs.numbers), steps.copy()
-        for k in np.flatnonzero(runs.failed):
-            for factor in _RETRIES:
-                again = yield here.coords + factor * steps[None, k]
-                if not again.failed[0]:
-                    ends[k], used[k] = again.numbers[0], factor * steps[k]
-                    break
-        changes = _differences(ends, here.run, max(here.run, *ends) + 1)
-        self.derivatives.append((here.coords, np.linalg.solve(used, changes)))
+            runs = yield self._here.coords + steps
+        ends = np.where(runs.failed, self._here.run, runs.numbers)
+        changes = _differences(ends, self._here.run, max(self._here.run, *ends) + 1)
+        self.derivatives.append((self._here.coords, np.linalg.solve(steps, changes)))
 
     def _check(self, slopes: np.ndarray) -> Requests:
         """ValueError if derivatives (d, n), as weights, deny the residuals at a step along all coordinates, which is
@@ -256,26 +244,20 @@ class Climb:
             promised = float(at.gradient @ move - 0.5 * move @ at.hessian @ move)
             if gain > 0.0:
                 self._here = reached[0]
-            if gain > max(_STALLED[0], _STALLED[1] * at.gain_left):
+            if gain > _STALLED:
                 failures = 0
                 damping *= 0.1 if gain > 0.5 * promised else 1.0
-                if gain < _MISLED * promised and not self.target.data.differentiable and not self.whole:
-                    yield from self._own_differences(at, 1.0)
                 continue
             failures += 1
             damping = max(30.0 * damping, _FIRST_DAMPING)
             # the first time, the run that gained nothing has corrected the secants
             if failures > 1 and not self._known_here():
-                yield from self._own_differences(at, failures)
+                steps = failures * _DIFFERENCE_SHARE * np.sqrt(np.diag(np.linalg.inv(at.hessian)))
+                yield from self._difference(np.diag(np.clip(steps, *_DIFFERENCE_LIMITS)))
         return None
 
     def _known_here(self) -> bool:
         return any(np.array_equal(self._here.coords, point) for point, _ in self.derivatives)
-
-    def _own_differences(self, at: Ascent, factor: float) -> Requests:
-        """Derivatives by differences with steps of a share of the standard deviations, times a factor."""
-        spread = factor * _DIFFERENCE_SHARE * np.sqrt(np.diag(np.linalg.inv(at.hessian)))
-        yield from self._difference(np.diag(np.clip(spread, *_DIFFERENCE_LIMITS)))
 
     def _explained(self) -> int | None:
         """Number of another ascent whose derivatives, at a higher point, predict the residuals here; None if none.

@@ -313,8 +313,6 @@ def find_modes(
     target = ResponseTarget(posterior)
     limit = np.inf if max_simulations is None else float(max_simulations)
     random = np.random.default_rng(seed)
-    session = GuideSession(
-        random, nothing_stored, lambda n: search.spent + n <= limit, lambda: limit - search.spent, False
-    )
+    session = GuideSession(random, nothing_stored, lambda n: search.spent + n <= limit, lambda: limit - search.spent)
     search = Search(target, draw_starts(target, starts, random), session, tolerance)
     return at_once(search.run(starts))

@@ -105,9 +105,6 @@ class ResponseTarget:
                     raise  # else a channel has no sample in this part
         for part in parts:
             part.unchecked = self.unchecked
-            share, simulator = part.n_steps / self.n_steps, part.posterior.likelihood.simulator
-            if (announce := likelihood.simulator.when_simulated) is not None:
-                simulator.when_simulated = partial(lambda share, n: announce(share * n), share)
         return parts
 
     # ------------------------------------------------------------------ coordinates

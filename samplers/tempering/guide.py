@@ -34,15 +34,12 @@ class GuideSession(NamedTuple):
     remaining : callable
         ``remaining()``: simulations left, inf without a limit. Decisions that depend on it, except to stop, are to be
         stored with `remember`: otherwise a run that is continued with a larger limit cannot repeat its first part.
-    weighted : callable
-        ``weighted()``: all draws (n, ndim) of complete rounds, and their log-weights (n,); None before the first.
     """
 
     random: np.random.RandomState
     remember: Callable[..., list[np.ndarray] | None]
     fits: Callable[[float], bool]
     remaining: Callable[[], float]
-    weighted: Callable[[], tuple[np.ndarray, np.ndarray] | None] = lambda: None
 
 
 class Guide(ABC):

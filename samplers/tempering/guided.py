@@ -114,7 +114,6 @@ def draw_rounds(
     function of the guide's search, whose result is sent back.
     """
     budget, random = density.record, session.random
-    session = session._replace(weighted=lambda: None if pooled is None else (pooled.coords, pooled.log_weights))
     size, population = len(population.coords), population._replace(effective_sample_size=0.0)
     rounds: list[Round] = []
     pooled = None
