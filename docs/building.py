@@ -84,14 +84,18 @@ def keep_initials(app, what, name, obj, options, lines) -> None:
     lines[:] = [re.sub(r"^(\.\. \[\S+\] )?([A-Z]\. )", r"\1\\\2", line) for line in lines]
 
 
+COMMENTED = ("estimates.importance", "judgement.clusters", "rare_events", "reports", "tempering.guide")
+
+
 @cache
 def commented_fields() -> list:
     """Fields of NamedTuples that have a comment of their own."""
-    modules = [importlib.import_module(f"samplers.{name}") for name in ("reports", "rare_events")]
+    modules = [importlib.import_module(f"samplers.{name}") for name in COMMENTED]
     return [
-        vars(vars(module)[owner])[name]
+        vars(vars(module)[owner]).get(name)
         for module in modules
         for owner, name in ModuleAnalyzer.for_module(module.__name__).find_attr_docs()
+        if owner
     ]
 
 

@@ -23,27 +23,13 @@ FEW_WEIGHTS = 10.0
 
 
 class EvidenceCheck(NamedTuple):
-    """The evidence by importance sampling, independent of the tempering stages.
+    """The evidence by importance sampling, independent of the tempering stages."""
 
-    Attributes
-    ----------
-    log_evidence : float
-        Logarithm of the evidence.
-    error : float
-        Standard error of `log_evidence`; meaningless unless `reliable`.
-    effective_sample_size : float
-        Effective sample size of the weights.
-    pareto_shape : float
-        Pareto shape of the largest weights; below 0.7 the error of the mean is finite in practice.
-    evaluations : int
-        Points for which ``log_prob_fn`` was called.
-    """
-
-    log_evidence: float
-    error: float
-    effective_sample_size: float
-    pareto_shape: float
-    evaluations: int
+    log_evidence: float  #: logarithm of the evidence
+    error: float  #: standard error of `log_evidence`; meaningless unless `reliable`
+    effective_sample_size: float  #: of the weights
+    pareto_shape: float  #: of the largest weights; below 0.7 the error of the mean is finite in practice
+    evaluations: int  #: points for which ``log_prob_fn`` was called
 
     @property
     def reliable(self) -> bool:

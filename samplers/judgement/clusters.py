@@ -24,22 +24,12 @@ POINTS_OF_LINE = 33
 
 
 class Cluster(NamedTuple):
-    """A mode of the posterior, as a cluster of the points of a run.
+    """A mode of the posterior, as a cluster of the points of a run."""
 
-    Attributes
-    ----------
-    share : float
-        Posterior probability of the mode.
-    share_error : float
-        Standard error of `share`.
-    mean, sd : (ndim,) float
-        Mean and standard deviation of the points in the mode, in the units of the parameters.
-    """
-
-    share: float
-    share_error: float
-    mean: np.ndarray
-    sd: np.ndarray
+    share: float  #: posterior probability of the mode
+    share_error: float  #: standard error of `share`
+    mean: np.ndarray  #: mean (ndim,) of the points in the mode, in the units of the parameters
+    sd: np.ndarray  #: their standard deviation (ndim,)
 
 
 def find_clusters(

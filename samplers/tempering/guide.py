@@ -18,27 +18,18 @@ from ..judgement.guides import find_missing_part
 
 
 class GuideSession(NamedTuple):
-    """Functions and random numbers that a sampler provides to its guide.
+    """Functions and random numbers that a sampler provides to its guide."""
 
-    Attributes
-    ----------
-    random : RandomState
-        The sampler's random generator.
-    remember : callable
-        ``remember(key, compute)`` returns the list of arrays that ``compute()`` returns, and stores it in the record
-        of the run under `key` (str). A repeated run gets the stored arrays without a call of `compute`. For equal keys,
-        the arrays that were stored first are returned first. ``remember(key)`` returns None where nothing is stored.
-    fits : callable
-        ``fits(n)``: whether n more simulations fit into the limit. To be called before each batch of simulations; if
-        False, the guide makes none and returns.
-    remaining : callable
-        ``remaining()``: simulations left, inf without a limit. Decisions that depend on it, except to stop, are to be
-        stored with `remember`: otherwise a run that is continued with a larger limit cannot repeat its first part.
-    """
-
-    random: np.random.RandomState
+    random: np.random.RandomState  #: the sampler's random generator
+    #: ``remember(key, compute)`` returns the list of arrays that ``compute()`` returns, and stores it in the record of
+    #: the run under `key` (str). A repeated run gets the stored arrays without a call of `compute`, for equal keys the
+    #: arrays that were stored first. ``remember(key)`` returns None where nothing is stored.
     remember: Callable[..., list[np.ndarray] | None]
+    #: ``fits(n)``: whether n more simulations fit into the limit. To be called before each batch of simulations; if
+    #: False, the guide makes none and returns.
     fits: Callable[[float], bool]
+    #: ``remaining()``: simulations left, inf without a limit. Decisions that depend on it, except to stop, are to be
+    #: stored with `remember`: otherwise a run that is continued with a larger limit cannot repeat its first part.
     remaining: Callable[[], float]
 
 
