@@ -274,14 +274,8 @@ class Chain:
         self._counts = int(backend.iteration), np.array(backend.accepted)
         if self._file is None:
             return
-        contents = {
-            "ladder": result.ladder,
-            "check": result.check,
-            "founders": result.founders,
-            "parents": result.parents,
-            "verdict": self.verdict,
-            "provisional": self.provisional,
-        }
+        contents = {name: getattr(result, name) for name in ("ladder", "check", "founders", "parents")}
+        contents |= {"verdict": self.verdict, "provisional": self.provisional}
         data = np.frombuffer(json.dumps(contents, default=np.ndarray.tolist).encode(), dtype=np.uint8)
         with self.whole(), backend.open("a") as file:
             group = file[backend.name]

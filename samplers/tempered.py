@@ -578,12 +578,12 @@ class TemperedSampler(RunResults, EnsembleSampler):
         said = check_end(result, population.coords) + check_likelihood(log_prob, log_prior)
         said += check_prior(coords, log_prior) if self.guide is None else list(self.guide.findings)
         for finding in said:
-            warn(finding.message)
-        self._result = result._replace(
-            findings=(*result.findings, *said),
-            basis="" if self.guide is None else self.guide.basis,
-            independent_points=independent_points(result, population.coords),
+            self._result = self._result.add(finding, population.founders)
+        basis, independent = (
+            "" if self.guide is None else self.guide.basis,
+            independent_points(result, population.coords),
         )
+        self._result = self._result._replace(basis=basis, independent_points=independent)
         ended = bool(result.ended)
         self._guided = population.coords.copy() if weighted is not None and weighted.guided and not ended else None
         if self._guided is not None:
