@@ -215,22 +215,17 @@ class ResponseGuide(Guide):
         d, archive = target.n_structural, target.archive
         coords, noise = archive.coords, np.repeat(mode.coords[None, d:], len(archive.numbers), axis=0)
         density = target.log_likelihood(archive.statistics, noise) + target.log_prior(coords)
-        # runs where the last emulator was wrong as well: left out, it would be wrong there again
-        expected = density
-        if region.emulator is not None:
-            emulated = region.emulator.log_likelihood(np.column_stack([coords, noise]))
-            expected = np.fmax(density, emulated + target.log_prior(coords))
         inverses = [np.linalg.inv(each.covariance[:d, :d]) for each in self._regions]
         apart = [coords - each.centre[:d] for each in self._regions]
         distances = [np.einsum("ni,ij,nj->n", *each) for each in zip(apart, inverses, apart, strict=True)]
         rows = np.flatnonzero(np.argmin(distances, axis=0) == k)
-        rows = rows[np.argsort(-expected[rows])]
-        good = expected[rows] > density[rows].max(initial=-np.inf) - _DEPTH[0] - _DEPTH[1] * d
+        rows = rows[np.argsort(-density[rows])]
+        good = density[rows] > density[rows].max(initial=-np.inf) - _DEPTH[0] - _DEPTH[1] * d
         good[: _ALWAYS * d] = True
         rows = rows[good][:_MOST_RUNS]
         if len(rows) < d + 4:
             return region
-        best = archive.statistics[rows[np.argmax(density[rows])]]
+        best = archive.statistics[rows[0]]
         slopes = target.slopes(best, target.fit_noise(best, mode.coords[d:]).coords)
         try:
             emulator = ResponseEmulator(target, rows, region.centre[:d], region.covariance[:d, :d], slopes)
