@@ -114,9 +114,7 @@ class RandomWalkMove(_FittedMove):
         self.scale = scale
         self._root: np.ndarray | None = None
 
-    def calibrate(
-        self, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None, mixture: Mixture | None = None
-    ) -> None:
+    def calibrate(self, coords: np.ndarray, weights: np.ndarray, *others: Any) -> None:
         """Fit the covariance to points (n, ndim) with normalised weights (n,)."""
         self.is_fitted = True
         self._root = location_and_root(coords, weights)[1]

@@ -1,5 +1,6 @@
 """Populations of points at one beta, points that wait for their values, and the end by the limit of simulations."""
 
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -68,23 +69,16 @@ def check_size(nwalkers: int, ndim: int) -> None:
         )
 
 
+@dataclass(eq=False)
 class StoppedEarly(Exception):
-    """An annealing has ended with points that have log-weights at beta = 1, at the limit of simulations or else `why`
-    (empty: as wanted). `of_stages` of the log-evidence was reported before, `guided` points are draws of a guide.
-    """
+    """An annealing has ended with points that have log-weights at beta = 1."""
 
-    def __init__(
-        self,
-        population: Population,
-        log_evidence: float,
-        error: float,
-        of_stages: float = 0.0,
-        guided: bool = False,
-        why: str = LIMIT,
-    ):
-        super().__init__(why)
-        self.population, self.log_evidence, self.error = population, log_evidence, error
-        self.of_stages, self.guided, self.why = of_stages, guided, why
+    population: Population
+    log_evidence: float
+    error: float
+    of_stages: float = 0.0  # the part of the log-evidence that was reported before
+    guided: bool = False  # whether the points are draws of a guide
+    why: str = LIMIT  # it has ended; empty: as wanted
 
 
 def stop_at(population: Population, log_evidence: float, variance: float, of_stages: float = 0.0) -> StoppedEarly:
