@@ -76,8 +76,6 @@ def failures_near(samples: np.ndarray, failed: np.ndarray, succeeded: np.ndarray
     has_failed = np.arange(len(points)) < len(points) - len(successes)
     inside = np.square(points).sum(axis=1) <= np.quantile(np.square(white(samples)).sum(axis=1), INSIDE)
     number, evaluated = int(np.count_nonzero(inside & has_failed)), int(np.count_nonzero(inside))
-    if not has_failed.any():
-        return NearFailures(number, evaluated)
     from scipy.spatial import cKDTree  # both are slow to import
     from scipy.stats import binom
 

@@ -56,7 +56,8 @@ def anneal_by_moves(
         # 4. resample
         ancestors = settings.resample(weights, random, n)
         error.resample(ancestors)
-        population = resample(population, ancestors, beta, ess)
+        founders = trace_founders(population.founders, ancestors)
+        population = Population(beta, population.coords[ancestors], population.records[ancestors], ess, founders)
         distinct = len(np.unique(population.coords, axis=0))
 
         # 5. move
@@ -70,9 +71,3 @@ def anneal_by_moves(
             raise stop_at(population, log_evidence, standard_error**2, log_evidence - increment)
         yield population, Stage(beta, ess, moved.acceptance, moved.moves, distinct, increment, standard_error)
     return population, log_evidence
-
-
-def resample(population: Population, ancestors: np.ndarray, beta: float, ess: float) -> Population:
-    """Equally weighted points at `beta`: copies of the points with the indices `ancestors` (n,)."""
-    founders = trace_founders(population.founders, ancestors)
-    return Population(beta, population.coords[ancestors], population.records[ancestors], ess, founders)
