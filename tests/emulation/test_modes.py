@@ -252,6 +252,26 @@ def test_a_search_leaves_the_axis_of_symmetry(seed, first):
     assert [round(abs(mode.parameters[0]), 1) for mode in alone.modes] == [1.2]
 
 
+def test_later_starts_leave_the_mode_of_the_first_one():
+    """Eight parameters, one of which acts by its square. Without differences of their own, they lose a mode in 2 of 6
+    searches."""
+    time = np.linspace(0.0, 1.0, 300)
+
+    def respond(theta):
+        linear = sum(a * np.sin((20.0 + 7.0 * j) * time + 0.3 * a * time) for j, a in enumerate(theta[1:]))
+        return (linear + 0.3 * theta[0] ** 2 * np.cos(33.0 * time))[None]
+
+    names = ["offset", *(f"a{j}" for j in range(7))]
+    model = FunctionModel(respond, names, [Channel("top", "displacement", "mm")], DT, 300)
+    prior = {name: TruncatedNormal(1.0, 0.3) for name in names}
+    prior["offset"] = TruncatedNormal(0.0, 1.0, lower=-4.0, upper=4.0)
+    for seed in range(1, 5):
+        measured = noisy(model, np.array([1.2, *np.linspace(0.8, 1.2, 7)]), np.array([0.1]), seed)
+        posterior = Posterior(FELikelihood(model, measured), prior | {"sigma_top": HalfNormal(0.3)})
+        search = find_modes(posterior.marginal(), seed=seed)
+        assert sorted(round(mode.parameters[0]) for mode in search.modes) == [-1, 1] and search.simulations < 140
+
+
 def _rough(theta, size, key):
     """The response times 1 + `size` * jump, with an independent jump between -1 and 1 in each cell of a lattice.
 
