@@ -198,16 +198,16 @@ class ResponseGuide(Guide):
     # ------------------------------------------------------------------ parts
 
     def _emulate(self, random: np.random.RandomState) -> None:
-        """Fit emulators to all runs, and the emulated posterior."""
-        regions = [self._fit_region(k) for k in range(len(self._regions))]
-        if regions and all(region.emulator is not None for region in regions):
-            try:
-                self._emulated = EmulatedPosterior(self._target, regions, random)
-                self._regions = self._emulated.regions
-            except np.linalg.LinAlgError as error:
-                logger.info("no draws of the emulated posterior could be made: %s", error)
-        if self._regions:
-            self._wide = around(self._regions, _WIDENED, _FREEDOM)
+        """Fit emulators to all runs, and the emulated posterior; the earlier ones stay if runs do not span a region."""
+        if not self._regions:
+            return
+        try:
+            regions = [self._fit_region(k) for k in range(len(self._regions))]
+            self._emulated = EmulatedPosterior(self._target, regions, random)
+            self._regions = self._emulated.regions
+        except np.linalg.LinAlgError as error:
+            logger.info("no emulators could be fitted, or no draws of them made: %s", error)
+        self._wide = around(self._regions, _WIDENED, _FREEDOM)
 
     def _fit_region(self, k: int) -> Region:
         """A region with an emulator of its nearest runs."""
@@ -220,19 +220,14 @@ class ResponseGuide(Guide):
         distances = [np.einsum("ni,ij,nj->n", *each) for each in zip(apart, inverses, apart, strict=True)]
         rows = np.flatnonzero(np.argmin(distances, axis=0) == k)
         rows = rows[np.argsort(-density[rows])]
-        good = density[rows] > density[rows].max(initial=-np.inf) - _DEPTH[0] - _DEPTH[1] * d
-        good[: _ALWAYS * d] = True
-        rows = rows[good][:_MOST_RUNS]
+        deep = int(np.sum(density[rows] > density[rows].max(initial=-np.inf) - _DEPTH[0] - _DEPTH[1] * d))
+        rows = rows[: min(max(deep, _ALWAYS * d), _MOST_RUNS)]
         if len(rows) < d + 4:
-            return region
+            raise np.linalg.LinAlgError(f"a mode has {len(rows)} runs")
         best = archive.statistics[rows[0]]
         slopes = target.slopes(best, target.fit_noise(best, mode.coords[d:]).coords)
-        try:
-            emulator = ResponseEmulator(target, rows, region.centre[:d], region.covariance[:d, :d], slopes)
-        except np.linalg.LinAlgError as error:  # runs that do not span the parameters: the earlier fit stays
-            logger.info("no emulator could be fitted to %d runs: %s", len(rows), error)
-            return region
-        return region._replace(emulator=emulator)
+        covariance = region.covariance[:d, :d]
+        return region._replace(emulator=ResponseEmulator(target, rows, region.centre[:d], covariance, slopes))
 
     def _parts(self) -> list[tuple[float, Any]]:
         """Shares of the draws, and the densities of coordinates that they are from."""
