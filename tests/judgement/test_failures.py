@@ -155,7 +155,7 @@ def scattered(x):
 
 
 @pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
-@pytest.mark.parametrize("seed", [102, 104])  # of 30 seeds, 29 pass the first and the last case
+@pytest.mark.parametrize("seed", [102, 103])  # of 30 seeds, 29, 29, 27, 28 and 30 pass the cases
 @pytest.mark.parametrize(
     ("log_likelihood", "fails", "place", "status"),
     [
