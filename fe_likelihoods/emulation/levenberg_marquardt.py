@@ -165,7 +165,8 @@ class Climb:
 
     def _check(self, slopes: np.ndarray) -> Requests:
         """ValueError if derivatives (d, n), as weights, deny the residuals at a step along all coordinates, which is
-        small beside the residuals. Without a change along it, or a simulation there, the next ones are compared.
+        small beside the residuals. Without a simulation there, or a change that rounded residuals show, the next ones
+        are compared.
         """
         target, here = self.target, self._here
         metric = target.slopes(here.statistics, here.noise.coords)
@@ -181,10 +182,11 @@ class Climb:
         change, predicted = target.archive.weights([runs.numbers[0], steps @ slopes])
         change[here.run] -= 1.0
         *sizes, error = norms(np.array([change, predicted, change - predicted]))
-        if runs.failed[0] or max(sizes) == 0.0:
+        rounding = np.finfo(np.float32).eps * of_residuals
+        if runs.failed[0] or _CHECKED_ERROR * max(sizes) <= rounding:
             target.unchecked.append(True)
             return
-        if error < _CHECKED_ERROR * max(sizes):
+        if error < _CHECKED_ERROR * max(sizes) + rounding:
             return
         raise ValueError(
             f"the derivatives of {target.data.kinds}.jacobian differ from a difference of two simulations by "
