@@ -1,17 +1,21 @@
 """Results of a tempered run: evaluations, failures, the stages, the evidence and Monte Carlo errors."""
 
+from textwrap import shorten
+
 import numpy as np
 
 from .estimates.control_variates import SignedSample
 from .estimates.genealogy import standard_error_of_mean, student_factor
 from .estimates.importance import EvidenceCheck
 from .evaluation.values import most_common_reasons
-from .judgement.checks import OF_MEAN
-from .judgement.clusters import error_between_modes
+from .judgement.checks import OF_MEAN, OF_SHARES
+from .judgement.clusters import Cluster, error_between_modes, find_clusters
 from .judgement.failures import NearFailures
 from .judgement.verdict import Verdict
 from .record import as_limit
 from .reports import GuidedRound, Stage
+
+LONGEST_REASON = 200  # characters
 
 
 class RunResults:
@@ -175,10 +179,33 @@ class RunResults:
 
     @property
     def verdict(self) -> Verdict:
-        """Verdict on the result, with reasons; ``print(sampler.verdict)`` gives sentences.
-
-        Its attribute `modes` is computed on first use, from the present chain.
-        """
+        """Verdict on the result, with reasons; ``print(sampler.verdict)`` gives sentences."""
         if self._verdict is None:
             raise ValueError("there is no verdict before a run: call run_mcmc first")
-        return self._verdict.of(self)
+        return self._verdict
+
+    @property
+    def modes(self) -> tuple[Cluster, ...]:
+        """Modes in which the chain has points, with shares and their standard errors, the largest first."""
+        lost = self.verdict.lost.get(OF_SHARES, 0.0)
+        if self.iteration == 0:
+            raise ValueError("modes are found in a chain, which is empty: call run_mcmc with one step or more")
+        return find_clusters(self.get_chain(), self.founders, self._parents, self._result.error_by_resampling, lost)
+
+    def describe(self) -> str:
+        """One sentence on the result: status, modes, evidence, effective sample size and failures.
+
+        Examples
+        --------
+        >>> sampler.describe()
+        'Converged: one mode; log-evidence ... +- ...; effective sample size ...; no failed evaluations.'
+        """
+        (log_evidence, error), modes, (failed, reasons) = self._result.evidence, self.modes, self._failed
+        shares = ", ".join(f"{mode.share:.2f} +- {mode.share_error:.2g}" for mode in modes)
+        failed = f"{failed} failed ({shorten(reasons, LONGEST_REASON)})" if failed else "no failed evaluations"
+        return (
+            f"{self.verdict.status.capitalize()}: "
+            f"{'one mode' if len(modes) == 1 else f'{len(modes)} modes with shares {shares}'}; log-evidence "
+            f"{log_evidence:.2f} +- {error:.2g}; effective sample size {self.verdict.effective_sample_size:.0f}; "
+            f"{failed}."
+        )

@@ -81,7 +81,7 @@ for Sampler in (SMCSampler, TMCMCSampler):
     sampler = Sampler(500, 2, log_probability, log_prior_fn=prior.logpdf, vectorize=True, seed=1)
     sampler.run_mcmc(prior.rvs(500, random_state=1), 4)
     samplers[Sampler.__name__.removesuffix("Sampler")] = sampler
-    print(f"{Sampler.__name__}: {sampler.evaluations} evaluations. {sampler.verdict.summary}")
+    print(f"{Sampler.__name__}: {sampler.evaluations} evaluations. {sampler.describe()}")
 np.random.seed(1)  # noqa: NPY002 - emcee uses NumPy's global generator
 samplers["emcee"] = emcee.EnsembleSampler(32, 2, log_probability, vectorize=True)
 samplers["emcee"].run_mcmc(TRUTH + 0.01 * rng.standard_normal((32, 2)), 3000)

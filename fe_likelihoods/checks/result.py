@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from samplers.emcee_names import EnsembleSampler
+from samplers.judgement.clusters import Cluster
 from samplers.judgement.verdict import Verdict
 
 from ..likelihood.failure_log import reason_without_numbers
@@ -61,6 +62,7 @@ class FinishedRun(NamedTuple):
     discard: int  # iterations left out at the beginning of the chain
     tempered: bool
     verdict: Verdict | None
+    modes: tuple[Cluster, ...]  # in which the run has points; none where that is not known
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -77,7 +79,7 @@ class FinishedRun(NamedTuple):
     @property
     def n_modes(self) -> int:
         """Number of modes in which the run has points; one where that is not known."""
-        return 1 if self.verdict is None else len(self.verdict.modes)
+        return max(len(self.modes), 1)
 
     @property
     def centre(self) -> np.ndarray:
@@ -131,6 +133,7 @@ def read_run(
         discard,
         tempered,
         sampler.verdict if tempered else None,
+        sampler.modes if tempered else (),
     )
 
 
@@ -366,7 +369,7 @@ def _check_samples(run: FinishedRun) -> list[Finding]:
         text = f"The {n} samples are worth {worth} independent ones: interval ends are rough."
         found.append(Finding("Few independent samples", CARE, text, "Make more iterations, or use more walkers."))
     if run.n_modes > 1 and not run.is_inconclusive:
-        shares = ", ".join(f"{mode.share:.2f} ± {mode.share_error:.2g}" for mode in run.verdict.modes)
+        shares = ", ".join(f"{mode.share:.2f} ± {mode.share_error:.2g}" for mode in run.modes)
         text = f"The posterior has {run.n_modes} regions (shares {shares}); mean and standard deviation describe none."
         action = "The fit is the best sample. Other data or a narrower prior may tell them apart."
         found.append(Finding("Several modes", CARE, text, action))

@@ -11,9 +11,7 @@ No run can see a part of the posterior in which it has no points. The reasons st
 """
 
 from collections.abc import Sequence
-from functools import cached_property
-from textwrap import shorten
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,12 +20,10 @@ from ..estimates.importance import fewest_points, usable
 from ..estimates.pareto import LARGEST_SHAPE
 from ..finding import CARE, NOTE, WRONG, Finding
 from ..reports import LIMIT, AnnealingResult, Weighted
-from .checks import LOST, OF_SHARES
-from .clusters import Cluster, find_clusters
+from .checks import LOST
 from .failures import NearFailures, check_failed_region
 from .guides import UNSEEN
 
-LONGEST_REASON = 200  # characters
 CONVERGED = "converged"
 USABLE = "usable"
 NOT_USABLE = "not usable"
@@ -36,39 +32,8 @@ STATUSES = (CONVERGED, USABLE, NOT_USABLE)
 SEVERITIES = (NOTE, CARE, WRONG)
 
 
-class _Stored(NamedTuple):
-    """The part of a verdict that is stored with the chain."""
-
-    status: str
-    reasons: tuple[str, ...]
-    simulations: float
-    effective_sample_size: float
-    sample: str
-    findings: tuple[Finding, ...] = ()
-
-
-class Verdict(_Stored):
-    """Verdict on the result of a run. ``str`` gives the reasons in sentences, `summary` the results in one sentence.
-
-    The attributes listed here are the judgement, which is stored, compared and pickled. Other attributes are computed
-    on first use from the sampler that returned the verdict, and raise ValueError for a verdict without a sampler;
-    `modes` and `summary` also do for an empty chain.
-
-    Attributes
-    ----------
-    status : {"converged", "usable", "not usable"}
-        The judgement.
-    reasons : tuple of str
-        The reasons for the judgement.
-    simulations : float
-        Simulations made (`samplers.record`).
-    effective_sample_size : float
-        Effective sample size of the points that `sample` names, when beta = 1 was reached.
-    sample : str
-        The points that `effective_sample_size` counts: the walkers, or weighted points that the walkers were resampled
-        from.
-    findings : tuple of `samplers.finding.Finding`
-        What speaks against the result, each with its severity and what to do.
+class Verdict(NamedTuple):
+    """Verdict on the result of a run; ``str`` gives the reasons in sentences.
 
     Examples
     --------
@@ -80,54 +45,18 @@ class Verdict(_Stored):
     ()
     """
 
-    _sampler: Any = None
-
-    def of(self, sampler: Any) -> "Verdict":
-        """This verdict with the sampler from which its other attributes are computed."""
-        verdict = Verdict(*self)
-        verdict._sampler = sampler
-        return verdict
-
-    def __reduce__(self):
-        return Verdict, tuple(self)
-
-    @property
-    def _run(self) -> Any:
-        if self._sampler is None:
-            raise ValueError("this verdict has no run: read it from a sampler, as sampler.verdict")
-        return self._sampler
-
-    @cached_property
-    def modes(self) -> tuple[Cluster, ...]:
-        """Modes in which the run has points, with shares and their standard errors, the largest first."""
-        run = self._run
-        run._result.require_finished()
-        if run.iteration == 0:
-            raise ValueError("modes are found in a chain, which is empty: call run_mcmc with one step or more")
-        lost = self.lost.get(OF_SHARES, 0.0)
-        return find_clusters(run.get_chain(), run.founders, run._parents, run._result.error_by_resampling, lost)
+    status: str  #: "converged", "usable" or "not usable"
+    reasons: tuple[str, ...]  #: the reasons for the judgement
+    simulations: float  #: simulations made (`samplers.record`)
+    effective_sample_size: float  #: of the points that `sample` names, when beta = 1 was reached
+    #: what `effective_sample_size` counts: the walkers, or weighted points that the walkers were resampled from
+    sample: str
+    findings: tuple[Finding, ...] = ()  #: what speaks against the result, each with its severity and what to do
 
     @property
     def lost(self) -> dict[str, float]:
         """How far shares and means of the walkers are from weighted draws, if a mode may be lost; else empty."""
         return next((each.numbers for each in self.findings if each.kind == LOST), {})
-
-    @property
-    def summary(self) -> str:
-        """One sentence: status, modes, evidence, effective sample size and failures."""
-        if len(self.modes) == 1:
-            found = "one mode"
-        else:
-            shares = ", ".join(f"{mode.share:.2f} +- {mode.share_error:.2g}" for mode in self.modes)
-            found = f"{len(self.modes)} modes with shares {shares}"
-        run, (log_evidence, error) = self._run, self._run._result.evidence
-        failed, reasons = run._failed
-        failed = f"{failed} failed" if failed else "no failed evaluations"
-        failed += f" ({shorten(reasons, LONGEST_REASON)})" if reasons else ""
-        return (
-            f"{self.status.capitalize()}: {found}; log-evidence {log_evidence:.2f} +- {error:.2g}; effective sample "
-            f"size {self.effective_sample_size:.0f}; {failed}."
-        )
 
     def __str__(self) -> str:
         first = (

@@ -133,10 +133,10 @@ def test_a_reopened_run_counts_the_failures_of_its_record(what, tmp_path):
     count, before = posterior.report()["failure_count"], failures(read_run(sampler, posterior))
     again, reopened = opened()
     said = f" {len(reopened.failures)} of {reopened.evaluations} evaluations failed"
-    assert len(reopened.failures) >= count > 3 and said in reopened.verdict.summary
+    assert len(reopened.failures) >= count > 3 and said in reopened.describe()
     reopened.run_mcmc(None, 0)
     report = again.report()
-    assert report["simulations"] == 0 and said in reopened.verdict.summary
+    assert report["simulations"] == 0 and said in reopened.describe()
     assert report["failure_count"] == count and report["failures"] == posterior.report()["failures"]
     found = failures(read_run(reopened, again))
     assert (found.count, found.attempts, found.unknown) == (before.count, before.attempts, before.unknown)

@@ -100,7 +100,7 @@ def test_shares_of_modes_that_the_moves_do_not_connect_have_their_errors(Sampler
         sampler = Sampler(150, 11, posterior, vectorize=True, seed=seed, **settings)
         with warnings.catch_warnings(record=True):
             sampler.run_mcmc(None, 1)
-        chain, modes = sampler.get_chain(flat=True), sampler.verdict.modes
+        chain, modes = sampler.get_chain(flat=True), sampler.modes
         found = np.max(np.abs(posterior.responsibilities(chain).mean(axis=0) - posterior.shares))
         silent += found > 0.12 and sampler.verdict.status == "converged"
         if len(modes) == 2:  # with few points in many dimensions, two modes may look like one

@@ -25,7 +25,7 @@ def sampler(two_modes):
 
 
 def test_modes_have_their_shares_and_places(two_modes, sampler):
-    modes = sampler.verdict.modes
+    modes = sampler.modes
     assert len(modes) == 2
     assert sum(mode.share for mode in modes) == pytest.approx(1.0)
     for mode, share in zip(modes, sorted(two_modes.shares, reverse=True), strict=True):
@@ -37,13 +37,13 @@ def test_modes_have_their_shares_and_places(two_modes, sampler):
 
 @pytest.mark.parametrize("posterior", [analytic.gaussian(1), analytic.banana(1), analytic.bounds(1)])
 def test_one_mode_stays_one(posterior):
-    assert len(run(posterior).verdict.modes) == 1
+    assert len(run(posterior).modes) == 1
 
 
 def test_sentence_and_what_it_is_made_of(sampler):
     found = sampler.verdict
-    assert found.summary.startswith(f"{sampler.verdict.status.capitalize()}: 2 modes with shares 0.7")
-    assert "no failed evaluations" in found.summary
+    assert sampler.describe().startswith(f"{sampler.verdict.status.capitalize()}: 2 modes with shares 0.7")
+    assert "no failed evaluations" in sampler.describe()
     assert compare_models({"a": sampler, "b": (-3.0, 0.1)}).verdict.to_dict() == {"a": found.status, "b": ""}
 
 
@@ -54,7 +54,7 @@ def test_the_summary_has_the_evidence_that_counts(higher, sampler, monkeypatch):
     check = check._replace(log_evidence=sampler.log_evidence_ladder + higher)
     monkeypatch.setattr(sampler, "_result", sampler._result._replace(check=check))
     value, error = sampler.log_evidence, sampler.log_evidence_error
-    assert f"; log-evidence {value:.2f} +- {error:.2g};" in sampler.verdict.summary
+    assert f"; log-evidence {value:.2f} +- {error:.2g};" in sampler.describe()
     assert higher < 0.0 or (value, error) == (check.log_evidence, 0.02)
 
 
@@ -64,7 +64,7 @@ def test_modes_need_a_chain(two_modes):
         sampler.verdict  # noqa: B018
     sampler.run_mcmc(None, 0)
     with pytest.raises(ValueError, match="one step or more"):
-        sampler.verdict.modes  # noqa: B018
+        sampler.modes  # noqa: B018
 
 
 @pytest.mark.parametrize("crossed", [0.0, 1.0])
