@@ -5,10 +5,7 @@ or x0, x1, ... matplotlib and corner are imported inside the functions.
 """
 
 from collections.abc import Callable, Sequence
-from functools import cache
-from importlib import util
-from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -42,16 +39,6 @@ class _Drawn(NamedTuple):
     prior_draws: np.ndarray | None  # (m, k)
     limits: np.ndarray  # (k, 2) of the panels
     note: str
-
-
-@cache
-def _corner() -> ModuleType:
-    """The file of `corner` that draws arrays: the package around it imports arviz, which takes longer than a figure."""
-    spec = util.find_spec("corner")
-    spec = util.spec_from_file_location("corner_of_arrays", Path(spec.origin).with_name("core.py"))
-    module = util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def plot_corner(
@@ -88,14 +75,15 @@ def plot_corner(
     --------
     >>> figure = plot_corner(samples, posterior, names=["stiffness", "damping"])
     """
+    import corner  # imports arviz
     import matplotlib.pyplot as plt
 
-    drawn, corner = _choose(samples, posterior, truths, names, MOST_PARAMETERS), _corner()
+    drawn = _choose(samples, posterior, truths, names, MOST_PARAMETERS)
     k, few = len(drawn.labels), len(np.unique(drawn.samples, axis=0)) < FEW_POINTS
     size = float(np.clip(1.8 * k + 1.0, 4.5, 15.0))  # [in]
     figure = plt.figure(figsize=(size, size))
     with plt.rc_context({"axes.formatter.useoffset": False}):
-        corner.corner_impl(
+        corner.corner(
             drawn.samples,
             bins=_bins(drawn.samples),
             range=[tuple(each) for each in drawn.limits],
