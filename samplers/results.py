@@ -35,9 +35,10 @@ class RunResults:
 
     @property
     def _failed(self) -> tuple[str, str]:
-        """How many evaluations failed, and the most frequent reasons; empty without failures."""
-        reasons = most_common_reasons(each["reason"] for each in self.failures)
-        return f"{len(self.failures)} of {self.evaluations} evaluations" if reasons else "", reasons
+        """How many simulations failed, without a guide's search, and the most frequent reasons; empty without any."""
+        failed = {self._record.keys(each["parameters"][None])[0]: each["reason"] for each in self.failures}
+        text = f"{len(failed)} of {len(self._record.simulated)} simulations" if failed else ""
+        return text, most_common_reasons(failed.values())
 
     @property
     def failures(self) -> list[dict]:

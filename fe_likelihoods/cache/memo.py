@@ -87,8 +87,3 @@ class Memo(VerifiedModel):
                 self.failures.count_outcomes(thetas[row : row + 1], [reasons[row]])
                 if reasons[row] or statistics is not None:
                     self.memory_cache.store([key], [reasons[row] or statistics[row].tobytes()])
-
-    def reason(self, point: np.ndarray) -> str:
-        """Reason of a failure that is cached at parameters (n,), the structural ones first; empty for others."""
-        key = (point[: self.n_structural] + 0.0).tobytes()
-        return reason_in(self.memory_cache.look_up([key]).get(key))

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..cache.memory import MemoryCache
 from ..simulation.failure_reasons import TransientReason
 
 __all__ = ["FailureLog", "reason_without_numbers"]
@@ -15,6 +16,7 @@ logger = logging.getLogger(__name__)
 
 _MAX_RECORDS = 1000
 _MAX_REASONS = 100
+_MAX_POINTS = 100_000  # as many as simulations in memory by default, about 250 bytes each
 _OTHER_REASONS = "other reasons"
 # A point without digits after it belongs to the number in arrays, "[1. 2.]", and before an exponent, "2.e-3".
 _DIGITS = r"\d+(?:\.\d+|\.(?=\s*(?:[-+\d\]),]|\.\d)|e[-+]?\d))?|\.\d+"
@@ -41,18 +43,23 @@ class FailureLog:
     and `transient` failures whose cause is not the model, so that a later run simulates the point again. `records` has
     ``{"parameters": {name: value}, "reason": str}`` of the first 1000 failures of each of these two kinds, with
     ``"transient": True`` of the second. `reasons` counts failures per reason; after the first 100 reasons by their text
-    without numbers, and after 100 of these together.
+    without numbers, and after 100 of these together. `reason_at` knows the latest 100 000 failed points, however few
+    simulations are cached in memory.
     """
 
     def __init__(self, parameter_names: Sequence[str]) -> None:
         self.outcomes = self.count = self.transient = 0
         self.records: list[dict] = []
         self.reasons: Counter[str] = Counter()
-        self._names = tuple(parameter_names)
+        self._names, self._points = tuple(parameter_names), MemoryCache(_MAX_POINTS)
 
     def count_outcomes(self, thetas: np.ndarray, reasons: Sequence[str]) -> None:
         """Count simulations at structural parameters (n, n_structural), and record those that have a reason."""
         self.outcomes += len(thetas)
+        keys = [theta.tobytes() for theta in thetas + 0.0]  # adding zero makes 0.0 of -0.0
+        known = self._points.look_up(keys)  # a transient failure may be followed by a success
+        told = {key: reason for key, reason in zip(keys, reasons, strict=True) if reason or key in known}
+        self._points.store(told, told.values())
         for theta, reason in zip(thetas, reasons, strict=True):
             if reason:
                 self.add(theta, reason)
@@ -75,6 +82,11 @@ class FailureLog:
             if transient:
                 self.records[-1]["transient"] = True
         self.reasons[self._counted_under(reason)] += 1
+
+    def reason_at(self, point: np.ndarray) -> str:
+        """Reason of the failure at parameters (n,), the structural ones first; empty where none is known."""
+        key = (point[: len(self._names)] + 0.0).tobytes()
+        return self._points.look_up([key]).get(key, "")
 
     def report(self) -> dict:
         """The entries of `Posterior.report` on failures."""

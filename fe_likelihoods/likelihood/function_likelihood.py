@@ -70,7 +70,7 @@ class FunctionLikelihood(SumOfDataSets):
         self.function, self.parameter_names, self.vectorize = function, names, vectorize
         self.parameter_units, self.nominal, self.nominal_units = {}, {}, {}
         self._failures = FailureLog(names)
-        self._evaluations, self._reasons = 0, dict[bytes, str]()  # reasons of failures, by point
+        self._evaluations = 0
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -102,12 +102,11 @@ class FunctionLikelihood(SumOfDataSets):
         for row in np.flatnonzero(np.isnan(values) | (values == np.inf)):
             reasons[row], values[row] = f"the log-likelihood is {values[row]}", -np.inf
         self._failures.count_outcomes(rows, reasons)
-        self._reasons |= {row.tobytes(): reason for row, reason in zip(rows, reasons, strict=True) if reason}
         return values
 
     def failures_at(self, x: Any) -> list[str]:
         """Reasons of failures at points evaluated in this process."""
-        return [self._reasons.get(row.tobytes(), "") for row in np.atleast_2d(as_points(x, self.parameter_names))]
+        return [self._failures.reason_at(row) for row in np.atleast_2d(as_points(x, self.parameter_names))]
 
     def recall_failures(self, x: Any, reasons: Sequence[str]) -> None:
         """Count failures of an earlier process, see `Posterior.recall_failures`."""

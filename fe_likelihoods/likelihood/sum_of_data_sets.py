@@ -120,9 +120,9 @@ class SumOfDataSets:
 
     def failures_at(self, x: Any) -> list[str]:
         """Reasons of failed simulations at points, after the name of the data set, see `Posterior.failures_at`."""
-        found = []
+        found, logs = [], {key: each.simulator.failures for key, each in self.likelihoods.items()}
         for point in np.atleast_2d(as_points(x, self.parameter_names)):
-            reasons = {key: each.simulator.reason(point[self._columns[key]]) for key, each in self.likelihoods.items()}
+            reasons = {key: log.reason_at(point[self._columns[key]]) for key, log in logs.items()}
             key, reason = next(((key, reason) for key, reason in reasons.items() if reason), ("", ""))
             found.append(type(reason)(f"{key}: {reason}") if key else reason)
         return found

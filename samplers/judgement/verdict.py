@@ -79,7 +79,7 @@ def judge(
     names: Sequence[str] = (),
 ) -> Verdict:
     """Judge an annealing that has reached beta = 1. `missing_steps` at beta = 1 were not allowed by the limit, and
-    `failures` says how many evaluations failed.
+    `failures` says how many simulations failed.
     """
     stage = result.ladder[-1]
     found = [*result.findings, *(() if near is None else check_failed_region(near))]

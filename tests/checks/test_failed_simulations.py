@@ -34,13 +34,13 @@ def free_vibration(theta, limit=1.1, numbers=False):
     return [0.05 * np.exp(-0.02 * theta[1] * omega * TIME) * np.cos(omega * TIME)]
 
 
-def posterior_of(truth, function=free_vibration):
+def posterior_of(truth, function=free_vibration, **options):
     """A model that fails above a stiffness of 1.1, with data of a model that does not."""
     model = FunctionModel(function, ["stiffness", "damping"], [Channel("top", "displacement", "mm")], 0.02, len(TIME))
     noise = 0.002 * np.random.default_rng(1).standard_normal((1, len(TIME)))
     measured = Measurements(model.channels, model.dt, np.array(free_vibration(truth, np.inf)) + noise)
     prior = {name: TruncatedNormal(1.0, 0.3) for name in ("stiffness", "damping")} | {"sigma_top": HalfNormal(0.01)}
-    return Posterior(FELikelihood(model, measured), prior)
+    return Posterior(FELikelihood(model, measured, **options), prior)
 
 
 def run(posterior, walkers=60, steps=4, **options):
@@ -132,8 +132,8 @@ def test_a_reopened_run_counts_the_failures_of_its_record(what, tmp_path):
     sampler.run_mcmc(None, 1)
     count, before = posterior.report()["failure_count"], failures(read_run(sampler, posterior))
     again, reopened = opened()
-    said = f" {len(reopened.failures)} of {reopened.evaluations} evaluations failed"
-    assert len(reopened.failures) >= count > 3 and said in reopened.describe()
+    said = f" {count} of {reopened.simulations:.0f} simulations failed"
+    assert count > 3 and said in reopened.describe()
     reopened.run_mcmc(None, 0)
     report = again.report()
     assert report["simulations"] == 0 and said in reopened.describe()
@@ -151,9 +151,21 @@ def test_runs_on_one_posterior_count_their_own_failures():
         sampler = SMCSampler(20, posterior.ndim, posterior, vectorize=True, seed=seed, max_moves=3)
         sampler.run_mcmc(None, 1)
         counts.append(posterior.report()["failure_count"] - before)
-        assert f"{len(sampler.failures)} of {sampler.evaluations} evaluations failed" in str(sampler.verdict)
+        assert f"{counts[-1]} of {sampler.simulations:.0f} simulations failed" in str(sampler.verdict)
         assert len(sampler.failures) >= counts[-1] > 5
         assert all(posterior(each["parameters"]) == -np.inf and each["reason"] for each in sampler.failures[:3])
+
+
+@pytest.mark.parametrize("memory_rows", [0, 10, 100_000])
+def test_failed_simulations_are_counted_however_few_are_in_memory(memory_rows):
+    """Reasons left the memory with the simulations; points that share a simulation had made the share smaller."""
+    posterior = posterior_of([1.0, 0.8], memory_rows=memory_rows)
+    sampler = run(posterior, steps=1)
+    reasons = {tuple(each["parameters"][:2]): each["reason"] for each in sampler.failures}
+    assert len(reasons) > 20 and set(reasons.values()) == {"no convergence"}
+    assert sampler.simulations < 0.5 * sampler.evaluations
+    assert f"; {len(reasons)} of {sampler.simulations:.0f} simulations failed (" in sampler.describe()
+    assert memory_rows < 1000 or len(reasons) == posterior.report()["failure_count"]
 
 
 def test_a_run_that_ended_before_its_first_evaluation_goes_on(tmp_path):

@@ -1,9 +1,19 @@
-"""What a user reads when all simulations fail."""
+"""What a user reads of simulations that fail, and what samplers record of them."""
 
 import numpy as np
 import pytest
 
-from fe_likelihoods import Channel, FELikelihood, FunctionModel, HalfNormal, Measurements, Posterior, Uniform
+from fe_likelihoods import (
+    Channel,
+    FELikelihood,
+    FunctionModel,
+    HalfNormal,
+    Measurements,
+    Posterior,
+    SimulationFailed,
+    Uniform,
+)
+from fe_likelihoods.simulation.failure_reasons import TransientReason
 from samplers import SMCSampler
 
 
@@ -24,3 +34,29 @@ def test_a_response_of_the_wrong_shape_is_named_where_the_run_ends():
     assert "20 x the response has shape (50,), expected (n_channels, n_steps) = (1, 50)" in caught.value.__notes__[0]
     summary = run(lambda time: lambda theta: [np.sin(theta[0] * time)[: 50 if theta[0] < 4.0 else 49]]).describe()
     assert " x the response has shape (1, 49), expected (n_channels, n_steps) = (1, 50))." in summary
+
+
+@pytest.mark.parametrize("memory_rows", [0, 100])
+def test_reasons_outlast_the_simulations_in_memory_until_one_succeeds(memory_rows):
+    broken = [True]
+
+    def function(theta):
+        if theta[0] > 4.0:
+            raise SimulationFailed("no convergence")
+        if broken and theta[0] == 2.0:
+            raise SimulationFailed(TransientReason("no licence was free"))
+        return [np.full(5, theta[0])]
+
+    channel = Channel("top", "displacement", "m")
+    model = FunctionModel(function, ("rate",), [channel], dt=0.01, n_steps=5)
+    likelihood = FELikelihood(model, Measurements([channel], 0.01, np.ones((1, 5))), memory_rows=memory_rows)
+    posterior = Posterior(likelihood, {"rate": Uniform(1.0, 5.0), "sigma_top": HalfNormal(0.1)})
+    points = np.array([[2.0, 0.1], [4.5, 0.1], [3.0, 0.1]])
+    posterior(points)
+    assert posterior.failures_at(points) == ["no licence was free", "no convergence", ""]
+    assert [posterior.fault(point) for point in points] == ["no licence was free", "", ""]
+    broken.clear()
+    assert np.isfinite(posterior(points[0])) == (memory_rows == 0)
+    assert (
+        posterior.failures_at(points)[0] == posterior.fault(points[0]) == ("no licence was free" if memory_rows else "")
+    )
