@@ -152,7 +152,13 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._must_repeat = reopened = self._record.start is not None  # the annealing, from the record
         self._previous_state = None
         same = pool, copy.deepcopy(moves), args, kwargs, backend, vectorize, blobs_dtype, parameter_names
-        super().__init__(nwalkers, ndim, target.function, *same)
+        try:
+            super().__init__(nwalkers, ndim, target.function, *same)
+        except AssertionError as error:  # emcee's test of the names
+            raise ValueError(
+                f"parameter_names must be a list of {ndim} different names, or a dict of names with their indices, "
+                f"with vectorize=False; got {parameter_names!r}: {error}"
+            ) from error
         self._chain = Chain(self.backend)
         self._result, self._verdict = self._chain.result, self._chain.verdict
         self._must_compare = reopened or self.backend.iteration > 0

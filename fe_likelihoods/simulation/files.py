@@ -102,7 +102,7 @@ class Observer:
         self.alone, self.thread, self.mirror, self.shared = alone, thread, mirror, ""
         self.read, self.written, self.noted = set[str](), set[str](), Opened()
         self._made: list[str] = []  # new files and folders, which belong to this simulation
-        self._modules, self._start = set(sys.modules), time.time_ns()
+        self._modules, self._start, self._moves_output = set(sys.modules), time.time_ns(), False
 
     def result(self, known: Opened) -> Opened:
         """The files that are `known`, and those read and not written, with new modules and shared libraries."""
@@ -112,6 +112,15 @@ class Observer:
         if not new and not any(path not in known and _counts(path) for path in read):
             return known if self.noted.keys() <= known.keys() else known | self.noted
         return known | {path: each for path, each in mapped(read).items() if path not in self.written} | self.noted
+
+    def notes(self, how: str, name: str) -> None:
+        """Note a file by the name that the code has given to it: folders on the way may be links that change."""
+        if how == "moves":
+            self._moves_output = name in self.written
+        if how in ("reads", "loads", "moves"):
+            self.read.add(name)
+        elif how in ("writes", "touches", "makes") or (how == "takes" and self._moves_output):
+            self.written.add(name)
 
     def sees(self, how: str, path: str) -> None:
         """Note a file that others may write, too, if this simulation changes it, or reads what was just written."""
@@ -196,28 +205,28 @@ def _hook(event: str, arguments: tuple) -> None:
     with of_this_library():
         simulation, uses = running_simulation(), []
         with contextlib.suppress(Exception):  # never disturb the code that is observed
-            uses = [(how, _full(path)) for how, path in _uses(event, arguments) if not isinstance(path, int)]
+            uses = [(how, os.path.abspath(os.fsdecode(path))) for how, path in _uses(event, arguments)]
         if simulation is not None and simulation.mirror is not None and event in _STARTS and not of_library:
             simulation.mirror.states = {}  # where the process may still write
-        for how, path in uses:
-            name = path
-            if simulation is not None:
-                name = os.path.realpath(path)
-                if not of_library:
-                    simulation.sees(how, name if how == "reads" else path)
-                if simulation.is_own(path):  # the file that it shows
-                    name = os.path.join(simulation.mirror.base, os.path.relpath(path, simulation.mirror.path))
-                    if not os.path.exists(name):
-                        continue
+        for how, name in uses:
+            path = _full(name)
+            if simulation is not None and not of_library:
+                simulation.sees(how, os.path.realpath(path) if how == "reads" else path)
+            if simulation is not None and simulation.is_own(name):  # the file that it shows
+                name = os.path.join(simulation.mirror.base, os.path.relpath(name, simulation.mirror.path))
+                if how in ("reads", "loads") and not os.path.exists(name):
+                    continue
             for observer in list(_observers):
                 if observer.thread in (0, threading.get_ident()):
-                    (observer.read if how in ("reads", "loads") else observer.written).add(name)
+                    observer.notes(how, name)
 
 
 def _uses(event: str, arguments: tuple) -> list[tuple[str, Any]]:
     """How an event uses files, and their paths."""
     if event == "open":
         path, mode, flags = arguments
+        if isinstance(path, int):  # a descriptor
+            return []
         if not flags & _WRITING:
             return [("reads", path)]
         if flags & os.O_EXCL:
@@ -235,7 +244,13 @@ def _uses(event: str, arguments: tuple) -> list[tuple[str, Any]]:
         return [] if event == "os.fork" else [("changes", "*")]
     if event in _CHANGES:
         is_within = event in ("os.remove", "os.rmdir") and arguments[1] not in (None, -1)  # a folder that is removed
-        return [] if is_within else [("changes", arguments[_CHANGES[event]])]
+        changed = [] if is_within else [("changes", arguments[_CHANGES[event]])]
+        if event == "os.rename":
+            return [("moves", arguments[0]), ("takes", arguments[1]), *changed]
+        if event in ("os.link", "os.symlink"):
+            folder = os.path.dirname(os.fsdecode(arguments[1])) if event == "os.symlink" else ""
+            return [("loads", os.path.join(folder, os.fsdecode(arguments[0]))), *changed]
+        return changed
     return [("makes" if event == "tempfile.mkdtemp" else "loads", arguments[0])]
 
 
@@ -413,8 +428,9 @@ class Group:
                 for pid in _descendants(process.pid) if process.poll() is None else ():
                     with contextlib.suppress(ProcessLookupError, PermissionError):
                         os.kill(pid, signal.SIGKILL)
-            with contextlib.suppress(ProcessLookupError, PermissionError):
-                os.killpg(self.processes[0].pid, signal.SIGKILL)
+            if self.processes[0].returncode is None:  # else its number may be another process's
+                with contextlib.suppress(ProcessLookupError, PermissionError):
+                    os.killpg(self.processes[0].pid, signal.SIGKILL)
             for process in self.processes:
                 process.communicate()
 

@@ -221,7 +221,12 @@ def real_response(response: Any, channels: Sequence[Channel], n_steps: int) -> n
     `SimulationFailed` if it is complex, has another shape, or is not an array of numbers.
     """
     try:
-        response = np.ma.filled(response, np.nan)
+        if np.ma.isMaskedArray(response) or (
+            isinstance(response, Sequence) and any(map(np.ma.isMaskedArray, response))
+        ):
+            response = np.ma.array(response)
+            response = response.astype(np.result_type(response.dtype, float)).filled(np.nan)
+        response = np.asarray(response)
         if np.iscomplexobj(response):
             rows = response if response.ndim == 2 else np.zeros((0, 0))
             named = [channel.name for channel, row in zip(channels, rows, strict=False) if row.imag.any()]

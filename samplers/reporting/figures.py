@@ -97,6 +97,7 @@ def plot_corner(
             smooth=1.0,
             plot_density=False,
             plot_datapoints=few,
+            data_kwargs={"ms": 4.0, "alpha": 0.7},
             plot_contours=not few,
             fill_contours=True,
             quiet=True,
@@ -284,6 +285,7 @@ def plot_run(sampler: Any) -> "Figure":
     figure, panels = plt.subplots(n, 1, figsize=(7.5, 2.2 * n + 1.0), layout="constrained")
     ladder, (points, evidence, *chain) = panels[:several], panels[several:]
     title = f"{sampler.evaluations} evaluations"
+    title += f", {sampler.simulations:.0f} simulations with the search" if rounds else ""
     if stages[-1].beta == 1.0:
         title += f", log Z = {sampler.log_evidence:.2f} ± {sampler.log_evidence_error:.2g}"
     figure.suptitle(title, fontsize="medium")

@@ -282,9 +282,15 @@ def test_a_complex_response_is_refused():
         assert not isinstance(batch.reasons[1], TransientReason)
 
 
-def test_a_masked_sample_is_no_number():
+@pytest.mark.parametrize("form", [lambda rows: rows, list, tuple, lambda rows: [*rows[:-1], rows[-1]]])
+def test_a_masked_sample_is_no_number(form):
     def simulate(theta):
-        return np.ma.masked_where((theta[0] == 0.4) & (np.arange(N_STEPS) == 2)[None], line(theta))
+        return form(np.ma.masked_where((theta[0] == 0.4) & (np.arange(N_STEPS) == 2)[None], line(theta)))
 
     batch = simulate_batch(FunctionModel(simulate, NAMES, CHANNELS, DT, N_STEPS), THETAS)
     assert [bool(reason) for reason in batch.reasons] == [False, True, False]
+
+
+def test_masked_integers_without_a_mask_are_numbers():
+    model = FunctionModel(lambda theta: np.ma.array(np.round(line(theta)), dtype=int), NAMES, CHANNELS, DT, N_STEPS)
+    assert simulate_batch(model, THETAS).reasons == [""] * 3

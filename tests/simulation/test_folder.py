@@ -19,7 +19,7 @@ from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.signals.channels import Channel
 from fe_likelihoods.simulation.executors import LocalPool, as_executor
 from fe_likelihoods.simulation.failure_reasons import UnusableModel
-from fe_likelihoods.simulation.files import Observed
+from fe_likelihoods.simulation.files import Observed, observing, read_again
 from fe_likelihoods.simulation.model import simulate_batch
 from tests.opensees_column import require_opensees
 
@@ -443,3 +443,60 @@ def test_the_workers_of_a_sampler_have_folders_too(start):
     with multiprocessing.get_context("fork").Pool(2) as processes:
         assert processes.map(simulated, THETAS, chunksize=1) == THETAS.tolist()
     assert list(start.iterdir()) == []
+
+
+# names of files that are links ---------------------------------------------------------------------------------------
+
+
+def through_a_link(make):
+    def read():
+        make("data.txt", "in.txt")
+        return Path("in.txt").read_text()
+
+    return read
+
+
+def moved_away_and_back():
+    os.rename("data.txt", "work.txt")
+    Path("work.txt").read_text()
+    os.rename("work.txt", "data.txt")
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links need rights on Windows")
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda: Path("data/k.txt").read_text(),
+        lambda: subprocess.run(["sh", "data/k.txt"], check=False),
+        lambda: subprocess.run(["sh", "k.txt"], cwd="data", check=False),
+        through_a_link(os.symlink),
+        through_a_link(os.link),
+        moved_away_and_back,
+    ],
+)
+def test_a_file_is_known_by_the_name_that_the_code_gives_to_it(use, tmp_path, monkeypatch):
+    """The target of a link may change, and a file that is linked to or moved is an input."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("v1", "v2"):
+        Path(name).mkdir()
+        Path(name, "k.txt").write_text(f"echo {name}")
+    Path("data.txt").write_text("1")
+    os.symlink("v1", "data")
+    with observing() as observer:
+        use()
+    opened = observer.result({})
+    assert read_again(opened) == opened
+    os.remove("data")
+    os.symlink("v2", "data")
+    Path("data.txt").write_text("2222")
+    assert read_again(opened) != opened
+
+
+def test_an_output_that_takes_the_place_of_a_file_is_no_input(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("out.txt").write_text("old")
+    with observing() as observer:
+        Path("new.txt").write_text("new")
+        os.rename("new.txt", "out.txt")
+        Path("out.txt").read_text()
+    assert not observer.result({})
