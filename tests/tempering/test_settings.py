@@ -6,11 +6,11 @@ from dataclasses import replace
 import emcee
 import numpy as np
 import pytest
-from samplers.tmcmc import BURN_IN
 
 from samplers import SMCSampler, TMCMCSampler
 from samplers.presets import CHING_CHEN_2007, RAMANCHA_2022_LITERAL
 from samplers.settings import Settings
+from samplers.smc import BURN_IN
 from tests.contract.targets import Gaussian
 from tests.simulated_cluster import SimulatedCluster
 
@@ -113,7 +113,6 @@ def test_the_share_of_failures_stops_the_run(path):
         (SMCSampler, {"parameter_names": ["a", "a", "b"], "vectorize": False}, "a list of 3 different names"),
         (SMCSampler, {"parameter_names": ["a", "b", "c"]}, "names with their indices, with vectorize=False"),
         (TMCMCSampler, {"burn_in": 2, "chains": "equal"}, 'chains="leaders"'),
-        (TMCMCSampler, {"max_moves": 9, "burn_in": 0}, 'chains="equal"'),
         (TMCMCSampler, {"chains": "leaders", "moves": emcee.moves.StretchMove()}, 'several walkers.*chains="equal"'),
         (TMCMCSampler, {"chains": "leaders", "moves": [(emcee.moves.DEMove(), 1.0)]}, "need several walkers"),
     ],
