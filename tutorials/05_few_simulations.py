@@ -76,7 +76,7 @@ mean, sd = signed.expectation(), signed.standard_deviation()
 for i, (name, true) in enumerate(truth.items()):
     print(f"{name:<8} truth {true:.3f}, mean {mean.value[i]:.4f} +- {mean.error[i]:.4f}, sd {sd.value[i]:.4f}")
 draws = signed.draw(4000, seed=1)
-figure = plot_marginals(draws, posterior, truths=truth)
+figure = plot_marginals(draws, posterior, truths=list(truth.values()))
 figure.suptitle("synthetic data, assumed nominal values")
 figure.savefig("marginals.png")
 

@@ -27,7 +27,7 @@ def pareto_shape(log_weights: np.ndarray) -> float:
     excess = ordered[-count:] - ordered[-count - 1]
     if excess.sum() < SMALLEST_EXCESS * ordered.sum():
         return 0.0
-    excess = excess[excess > 0.0]
+    excess = excess[excess > np.finfo(float).eps]  # of the largest weight: smaller ones are rounding
     return _fit(excess) if len(excess) >= FEWEST_OF_TAIL else float("inf")
 
 
