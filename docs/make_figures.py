@@ -169,7 +169,7 @@ def column_update() -> dict:
     points = {"Before updating (reported values)": np.ones(5), "After updating (posterior mean)": means}
     model = posterior.likelihood.model
     responses = {title: model.simulate(theta) for title, theta in points.items()}
-    corner = plot_corner(sampler.signed_sample.draw(4000, SEED), posterior, truths=truth)
+    corner = plot_corner(sampler.signed_sample.draw(4000, SEED), posterior, truths=list(truth.values()))
     return {"column_corner": corner, "column_fit": plot_fit(measured, responses, title="synthetic data")}
 
 
