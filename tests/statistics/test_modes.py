@@ -7,7 +7,8 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from samplers import SMCSampler, TMCMCSampler
-from samplers.tempering import recycling
+from samplers.tempering import anneal, recycling
+from tests.statistics import analytic_runs
 
 NDIM = 10
 WIDTHS = np.array([0.01, 0.0125])  # a ratio of volumes of 9
@@ -73,3 +74,14 @@ def test_moves_keep_the_narrow_mode():
     sampler, share = finish(TMCMCSampler(500, NDIM, posterior, vectorize=True, seed=2), posterior)
     assert abs(sampler.log_evidence) < 4.0 * sampler.log_evidence_error + 0.1
     assert share == pytest.approx(0.5, abs=0.15)
+
+
+@pytest.mark.parametrize(("explores", "found"), [(True, True), (False, False)])
+def test_a_mode_that_is_met_at_the_end_is_explored(explores, found, monkeypatch):
+    """One draw of the last round before the check hits the flank of the narrow mode."""
+    monkeypatch.setattr(anneal, "first_draws", lambda size: size)
+    monkeypatch.setattr(recycling, "search_draws", lambda size: 0)
+    if not explores:
+        monkeypatch.setattr(recycling, "find_basins", lambda *points: None)
+    result = analytic_runs.run(analytic_runs.Cell("two", 100.0, "SMC", 500), 4, 1, {})
+    assert (min(result["shares"]) > 0.15) == found
