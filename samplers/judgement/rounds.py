@@ -22,11 +22,9 @@ RELIABLE_EFFICIENCY, HIGH_EFFICIENCY = 0.25, 0.5
 # a third, where the draws of the check and their evidence are right; 6 runs each of 17 posteriors have equal verdicts.
 LARGEST_DIFFERENCE = 0.25
 # Reliable rounds have at least this effective share, the latest one and the mean of three, and the latest one a Pareto
-# shape below this value, for which the variance of its weights is finite. With fewer than 100 draws, the shape is
-# uncertain, and a larger share is enough. By the latest one alone, a cyclic test whose response has jumps was converged
-# and wrong by 3.5 errors.
+# shape below this value, for which the variance of its weights is finite. By the latest one alone, a cyclic test whose
+# response has jumps was converged and wrong by 3.5 errors.
 RELIABLE_SHARE, LARGEST_RELIABLE_SHAPE = 0.25, 0.5
-SHORT_TAIL_SHARE, FEW_DRAWS = 0.75, 100
 # After the last round of a guide, the draws are used even if no round was reliable, provided that the last round has at
 # least this effective share, all rounds together have an effective sample size equal to the number of walkers, and the
 # Pareto shape of their weights is below 0.7.
@@ -72,21 +70,15 @@ def doubt_recycling(check: EvidenceCheck | None, log_evidence: float, beta: floa
 
 def is_reliable(rounds: Sequence[Round]) -> bool:
     """Whether fresh rounds show that the guide describes the posterior."""
-    latest = rounds[-1]
-    share = latest.effective_share
-    if min(share, np.mean([each.effective_share for each in rounds[-3:]])) < RELIABLE_SHARE:
-        return False
-    few = len(latest.log_weights) < FEW_DRAWS
-    return latest.pareto_shape < LARGEST_RELIABLE_SHAPE or (few and share >= SHORT_TAIL_SHARE)
+    shares = [each.effective_share for each in rounds[-3:]]
+    return min(shares[-1], np.mean(shares)) >= RELIABLE_SHARE and rounds[-1].pareto_shape < LARGEST_RELIABLE_SHAPE
 
 
 def is_even(pooled: PooledRounds) -> bool:
     """Whether the pooled result does not depend on a few weights: that the shape permits a useful mean is enough, since
     early rounds of a poor guide have heavy-tailed weights but a small share.
     """
-    n, share = len(pooled.log_weights), pooled.effective_sample_size / len(pooled.log_weights)
-    even = pooled.pareto_shape < LARGEST_SHAPE or (n < FEW_DRAWS and share >= SHORT_TAIL_SHARE)
-    return even and bool(np.isfinite(pooled.log_evidence_error))
+    return pooled.pareto_shape < LARGEST_SHAPE and bool(np.isfinite(pooled.log_evidence_error))
 
 
 def grown(pooled: PooledRounds, before: KnownDensity | None, latest: KnownDensity | None) -> float:

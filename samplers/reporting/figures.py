@@ -285,7 +285,6 @@ def plot_run(sampler: Any) -> "Figure":
     figure, panels = plt.subplots(n, 1, figsize=(7.5, 2.2 * n + 1.0), layout="constrained")
     ladder, (points, evidence, *chain) = panels[:several], panels[several:]
     title = f"{sampler.evaluations} evaluations"
-    title += f", {sampler.simulations:.0f} simulations with the search" if rounds else ""
     if stages[-1].beta == 1.0:
         title += f", log Z = {sampler.log_evidence:.2f} ± {sampler.log_evidence_error:.2g}"
     figure.suptitle(title, fontsize="medium")

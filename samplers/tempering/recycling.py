@@ -45,8 +45,7 @@ EVEN_SHARE = 0.25
 # out the thin ends of an arm, whose draws the next fit would need (counts are in `docs/theory/recycling`).
 WIDER_VOLUME = 2.0
 # Before the check, unexplained parts of the target are explored once, with this number of draws for each: a mode may
-# have been met late. Of 112 runs with a narrow mode, 25 lost it, and 24 with up to four such rounds; of the first 48,
-# 13 and 12, without any 15.
+# have been met late. Of 70 asynchronous runs whose narrow mode takes 100 times as long, 1 lost it, without this 15.
 DRAWS_PER_BASIN = 30
 # A failed check is repeated, and so is one after which the draws do not suffice: moves cost up to seven times as much.
 MOST_CHECKS = 4
