@@ -35,7 +35,7 @@ def failure(model, what):
 
 @pytest.fixture(scope="module")
 def guarded():
-    return model_of(time_limit=1.0)
+    return model_of(time_limit=4.0)
 
 
 # responses ---------------------------------------------------------------------------------------------------
@@ -117,9 +117,9 @@ DEADLY = {
     "CRASHES": "the worker process died (signal 11)",
     "KILLED": "the worker process died (signal 9)",
     "LEAVES": "the worker process ended with exit code 3",
-    "HANGS": "stopped at the time limit of 1 s",
-    "HANGS_HARD": "stopped at the time limit of 1 s",
-    "FLOODS": "stopped at the time limit of 1 s",
+    "HANGS": "stopped at the time limit of 4 s",
+    "HANGS_HARD": "stopped at the time limit of 4 s",
+    "FLOODS": "stopped at the time limit of 4 s",
 }
 
 
