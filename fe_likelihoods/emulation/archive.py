@@ -17,33 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from ..noise.sufficient_statistics import sums_of_squares
+from ..noise.sufficient_statistics import bilinear_form
 
 _VALUES = 2**21  # of residuals that are multiplied together: 16 MiB
-_TOLERANCE = 1e-6
-
-
-def _bilinear_form(statistic: Callable[[np.ndarray], np.ndarray], first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """The form (k, l, n_numbers) of a quadratic statistic for histories (k, n_channels, n_steps) and (l, ...)."""
-    if statistic is sums_of_squares:
-        return np.matmul(first.transpose(1, 0, 2), second.transpose(1, 2, 0)).transpose(1, 2, 0)
-    rows = []
-    for a in first:
-        scales = [np.abs(a).max() / (np.abs(b).max() or 1.0) or 1.0 for b in second]
-        rows.append([(statistic(a + s * b) - statistic(a - s * b)) / s for s, b in zip(scales, second, strict=True)])
-    return 0.25 * np.array(rows)
-
-
-def check_quadratic(statistic: Callable[[np.ndarray], np.ndarray], residuals: np.ndarray) -> None:
-    """Raise ValueError if a statistic is not quadratic in the residuals (n_channels, n_steps)."""
-    both = np.stack([residuals, np.roll(residuals, residuals.shape[-1] // 3, axis=-1)])
-    form = _bilinear_form(statistic, both, both)
-    direct, combined = statistic(both[0] + 0.5 * both[1]), form[0, 0] + form[0, 1] + 0.25 * form[1, 1]
-    if not np.allclose(direct, combined, rtol=_TOLERANCE, atol=_TOLERANCE * np.abs(direct).max()):
-        raise ValueError(
-            f"the statistic {statistic!r} of the noise is not quadratic in the residuals, so the posterior cannot be "
-            "emulated from responses: use GaussianNoise, AutoregressiveNoise, or a sampler without a guide"
-        )
 
 
 class Archive:
@@ -57,20 +33,11 @@ class Archive:
         self._statistic, self._shape = statistic, shape
         self.numbers, self.coords, self.statistics = np.empty(0, int), np.empty((0, 0)), np.empty((0, 0))
         self._forms: list[np.ndarray] = []  # (i + 1, n_numbers) of history i with those up to itself
-        self._open(b"")
-
-    def _open(self, content: bytes) -> None:
         self._file = tempfile.TemporaryFile(buffering=0)
         weakref.finalize(self, self._file.close)
-        np.frombuffer(content, np.uint8).tofile(self._file)
 
-    def __getstate__(self) -> dict:
-        self._file.seek(0)
-        return {**self.__dict__, "_file": self._file.read()}
-
-    def __setstate__(self, state: dict) -> None:
-        self.__dict__.update(state)
-        self._open(state["_file"])
+    def __reduce__(self):
+        return Archive, (self._statistic, self._shape)  # without its runs, which fitted emulators do not need
 
     def __len__(self) -> int:
         return len(self._forms)
@@ -92,7 +59,7 @@ class Archive:
         np.asarray(histories, np.float32).tofile(self._file)
         for rows in self._blocks(first, end):
             own = self.read(rows)
-            parts = [_bilinear_form(self._statistic, own, self.read(each)) for each in self._blocks(0, rows.stop)]
+            parts = [bilinear_form(self._statistic, own, self.read(each)) for each in self._blocks(0, rows.stop)]
             products = np.concatenate(parts, axis=1)
             self._forms += [row[: number + 1].copy() for number, row in zip(rows, products, strict=True)]
         return np.arange(first, end)

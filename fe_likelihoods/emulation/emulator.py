@@ -47,8 +47,8 @@ class ResponseEmulator:
         histories[1:] /= lengths[:, None]
         importance = np.minimum(1.0, values[:k] / values[0] * 1e3)
         least, spread = np.inf, np.diag(np.sqrt(np.diag(covariance)))
-        for logarithmic in target.logarithms:  # the scale that predicts left-out runs better
-            scaled = partial(target.scaled, logarithmic=logarithmic)
+        for scales in target.scales:  # the ones that predict left-out runs better
+            scaled = partial(target.scaled, scales=scales)
             # on a bound of the prior, parameters hardly depend on their coordinates, where any scale will do
             apart = scaled(np.ones((1, d))) - scaled(-np.ones((1, d)))
             steps = np.diag(scaled(centre + spread) - scaled(centre - spread)) / (2.0 * np.diag(spread))

@@ -8,6 +8,7 @@ including the search, trains the emulators.
 import copy
 import logging
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -75,7 +76,7 @@ class ResponseGuide(Guide):
         self._target = ResponseTarget(posterior)
         self._posterior, self._starts = posterior, starts
         self.search: ModeSearch | None = None
-        self._searching: Search | None = None
+        self._spent = float  # simulations of a search that has not ended
         self.highest = -np.inf  # log-density of a draw
         self._regions: list[Region] = []
         self._emulated: EmulatedPosterior | None = None
@@ -84,7 +85,7 @@ class ResponseGuide(Guide):
     @property
     def simulations(self) -> float:
         """Simulations run by the guide: parts of a record are fractions, a call of a ``jacobian`` counts as one."""
-        return 0.0 if self._searching is None else self._searching.spent
+        return self._spent() if self.search is None else self.search.simulations
 
     def check(self, log_prob_fn: Callable) -> None:
         """Raise ValueError if a sampler evaluates another object: every draw would be simulated twice."""
@@ -150,8 +151,10 @@ class ResponseGuide(Guide):
     def prepare(self, session: Any) -> Steps:
         """Search for modes; yields as `Search.run`."""
         starts = draw_starts(self._target, self._starts, session.random)
-        self._searching = Search(self._target, starts, session)
-        self.search = yield from self._searching.run(self._starts)
+        searching = Search(self._target, starts, session)
+        self._spent = lambda: searching.spent
+        self.search = yield from searching.run(self._starts)
+        self._spent = float
         self._regions = [Region(mode.coords, mode.covariance, None, mode.log_evidence) for mode in self.search.modes]
         archive = self._target.archive
         if self.search.finished and len(archive.numbers) == 0:
@@ -167,12 +170,8 @@ class ResponseGuide(Guide):
 
     def draw(self, n: int, random: np.random.RandomState) -> np.ndarray:
         """Independent draws (n, ndim) of the parameters, inside the support of the prior."""
-        parts = self._parts()
-        counts = random.multinomial(n, [share for share, _ in parts])
-        drawn = [
-            draw(part, count, random) if isinstance(part, Mixture) else part.draw(count, random)
-            for count, (_, part) in zip(counts, parts, strict=True)
-        ]
+        shares, draws, _ = zip(*self._parts(), strict=True)
+        drawn = [draw(k, random) for draw, k in zip(draws, random.multinomial(n, shares), strict=True)]
         return self._target.parameters(random.permutation(np.concatenate(drawn)))
 
     def log_density(self, parameters: np.ndarray) -> np.ndarray:
@@ -229,18 +228,15 @@ class ResponseGuide(Guide):
         covariance = region.covariance[:d, :d]
         return region._replace(emulator=ResponseEmulator(target, rows, region.centre[:d], covariance, slopes))
 
-    def _parts(self) -> list[tuple[float, Any]]:
-        """Shares of the draws, and the densities of coordinates that they are from."""
+    def _parts(self) -> list[tuple[float, Callable, Callable]]:
+        """Shares of the draws, and functions of coordinates that they are from: draws and log-density."""
         d = self._target.ndim
-        prior = student_mixture(np.ones(1), np.zeros((1, d)), np.eye(d)[None], np.inf)
-        parts = [(_PRIOR_SHARE, prior)] + ([] if self._wide is None else [(_WIDE_SHARE, self._wide)])
+        mixtures = [(_PRIOR_SHARE, student_mixture(np.ones(1), np.zeros((1, d)), np.eye(d)[None], np.inf))]
+        mixtures += [] if self._wide is None else [(_WIDE_SHARE, self._wide)]
+        parts = [(share, partial(draw, mixture), partial(log_density, mixture)) for share, mixture in mixtures]
         # the emulated posterior has the rest; without it the wide mixture, and without modes the prior
-        main = self._emulated or parts.pop()[1]
-        return [(1.0 - sum(share for share, _ in parts), main), *parts]
+        main = parts.pop()[1:] if self._emulated is None else (self._emulated.draw, self._emulated.normalised)
+        return [(1.0 - sum(share for share, *_ in parts), *main), *parts]
 
     def _log_density(self, coords: np.ndarray) -> np.ndarray:
-        densities = [
-            np.log(share) + (log_density(part, coords) if isinstance(part, Mixture) else part.normalised(coords))
-            for share, part in self._parts()
-        ]
-        return np.logaddexp.reduce(densities)
+        return np.logaddexp.reduce([np.log(share) + density(coords) for share, _, density in self._parts()])

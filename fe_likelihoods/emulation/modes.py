@@ -32,59 +32,29 @@ _SHARES = 0.03, 0.1, 0.3, 0.6
 
 
 class Mode(NamedTuple):
-    """A mode of the posterior.
+    """A mode of the posterior, in standard normal coordinates, with its Laplace approximation."""
 
-    Attributes
-    ----------
-    parameters : (ndim,) float
-        All parameters at the mode of the density in standard normal coordinates.
-    parameter_covariance : (ndim, ndim) float
-        Laplace approximation of their covariance.
-    coords : (ndim,) float
-        The mode in these coordinates.
-    covariance : (ndim, ndim) float
-        Covariance of the coordinates in the Laplace approximation.
-    log_density : float
-        Log-density of the coordinates at the mode, without the evidence's normalisation.
-    log_evidence : float
-        Evidence of the mode in the Laplace approximation, which can be wrong by several units.
-    converged : bool
-        False if the ascent stopped before the top.
-    """
-
-    parameters: np.ndarray
-    parameter_covariance: np.ndarray
-    coords: np.ndarray
-    covariance: np.ndarray
-    log_density: float
-    log_evidence: float
-    converged: bool
+    parameters: np.ndarray  #: (ndim,) all parameters at the mode of the density in standard normal coordinates
+    parameter_covariance: np.ndarray  #: (ndim, ndim) Laplace approximation of their covariance
+    coords: np.ndarray  #: (ndim,) the mode in standard normal coordinates
+    covariance: np.ndarray  #: (ndim, ndim) covariance of the coordinates in the Laplace approximation
+    log_density: float  #: log-density of the coordinates at the mode, without the evidence's normalisation
+    log_evidence: float  #: evidence of the mode in the Laplace approximation, which can be wrong by several units
+    converged: bool  #: False if the ascent stopped before the top
 
 
 class ModeSearch(NamedTuple):
-    """Result of a search for modes; printed as a table.
+    """Result of a search for modes; printed as a table."""
 
-    Attributes
-    ----------
-    modes : tuple of Mode
-        Distinct modes, the one with the largest evidence first.
-    ends : tuple of int
-        Mode in which each start ended, -1 where it ended in none (a start that failed, or a mode of no weight).
-    simulations : float
-        Simulations run, parts of a record counted as fractions; a call of the model's ``jacobian`` counts as one.
-    finished : bool
-        False if `max_simulations` ended the search.
-    grown : bool
-        Whether it began with the first part of the record, where most starts are given up, in right runs as well.
-    parameter_names : tuple of str
-    """
-
-    modes: tuple[Mode, ...]
+    modes: tuple[Mode, ...]  #: distinct modes, the one with the largest evidence first
+    #: mode in which each start ended, -1 where it ended in none (a start that failed, or a mode of no weight)
     ends: tuple[int, ...]
+    #: simulations run, parts of a record counted as fractions; a call of the model's ``jacobian`` counts as one
     simulations: float
-    finished: bool
+    finished: bool  #: False if `max_simulations` ended the search
+    #: whether it began with the first part of the record, where most starts are given up, in right runs as well
     grown: bool = False
-    parameter_names: tuple[str, ...] = ()
+    parameter_names: tuple[str, ...] = ()  #: names of all parameters
 
     def __str__(self) -> str:
         rows = [["parameter", *(f"mode {k + 1}" for k in range(len(self.modes)))]]
@@ -160,7 +130,7 @@ class Search:
     def __init__(self, target: ResponseTarget, starts: np.ndarray, session: Any, tolerance: float = TOLERANCE) -> None:
         self._target, self._starts, self._session, self.spent = target, starts, session, 0.0
         self._tolerance = tolerance
-        parts = [*target.shortened(_SHARES), target]
+        parts = [*target.first_parts(_SHARES), target]
         self._parts = [_Part(part, part.n_steps / target.n_steps, {}, []) for part in parts]
         self.standing_for: list[int] = []  # start that has taken the place of each that has begun; -1 for none
 

@@ -12,10 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..signals.channels import Comparison
-from ..signals.records import DisplacementHistory, growing_durations
+from ..priors.scales import Scales
 from .archive import Archive
-from .data_sets import DataSets
 
 Remember = Callable[..., Sequence[np.ndarray] | None]  # `samplers.tempering.guide.GuideSession.remember`
 Steps = Generator[Callable[[], Any] | None, Any, Any]  # functions to call; None after each batch of simulations
@@ -61,17 +59,16 @@ def at_once(steps: Steps) -> Any:
 
 class ResponseTarget:
     """A posterior in standard normal coordinates, first the structural ones, and its `archive` of simulations;
-    ValueError as for its `data`. `unchecked` is not empty until the model's derivatives have been compared with a
-    difference.
+    ValueError as for its `data`. `unchecked` is not empty until the model's derivatives are compared with a difference.
     """
 
     def __init__(self, posterior: Any) -> None:
         self.posterior, self._prior = posterior, posterior.prior
-        self.data = DataSets(posterior.likelihood)
+        self.data = posterior.likelihood.histories()
         self.ndim, self.n_structural = posterior.ndim, len(self.data.parameter_names)
         self.n_noise = self.ndim - self.n_structural
-        self.n_steps = self.data.measured.shape[1]
-        self.archive = Archive(self.data.statistic, self.data.measured.shape)
+        self.n_steps = self.data.shape[1]
+        self.archive = Archive(self.data.statistic, self.data.shape)
         self._simulated: set[bytes] = set()
         self.unchecked = [True] if self.data.differentiable else []
         self._structural = self._prior.subset(self._prior.names[: self.n_structural])
@@ -79,33 +76,17 @@ class ResponseTarget:
         at = np.array([[-_AT_BOUND], [-2.0], [2.0]]) * np.ones(self.n_structural)
         least, low, high = self.structural_parameters(at)
         factors = (least >= 0.0) & (low > 0.0) & (high < _LARGEST_FACTOR * low)
-        self._logarithmic = self._structural.logarithmic | factors
-        # of inputs of emulators: as `scaled`, or only those with lognormal priors
-        self.logarithms = np.unique([self._logarithmic, self._structural.logarithmic], axis=0)
+        # of inputs of emulators: logarithms where priors are lognormal, and in the last ones also of factors
+        lognormal = self._structural.logarithmic
+        self.scales = [Scales(each) for each in np.unique([lognormal, lognormal | factors], axis=0)]
 
-    def shortened(self, shares: Sequence[float]) -> list["ResponseTarget"]:
-        """The same posterior for the first parts of the record, up to shares of the Arias intensity; none if the model
-        has no ``first``, or of a static test, in which no errors of a period add up to a phase.
-        """
-        likelihood, parts = self.posterior.likelihood, []
-        model = getattr(likelihood, "model", None)
-        if isinstance(getattr(model, "loading", None), DisplacementHistory):
-            return []
-        if not hasattr(model, "first") or not likelihood.measurements.simultaneous:
-            return []
-        # differences, because a residual displacement is not motion
-        measurements = likelihood.measurements
-        steps = np.nan_to_num(np.diff(measurements.values, axis=1))
-        for seconds in growing_durations(steps, measurements.dt, shares)[:-1] if steps.any() else ():
-            try:
-                part = likelihood.first(measurements.start + seconds)
-                parts.append(ResponseTarget(type(self.posterior)(part, self._prior)))
-            except ValueError:
-                if not isinstance(likelihood.measured, Comparison):
-                    raise  # else a channel has no sample in this part
-        for part in parts:
-            part.unchecked = self.unchecked
-        return parts
+    def first_parts(self, shares: Sequence[float]) -> list["ResponseTarget"]:
+        """The same posterior for the first parts of the record, see `FELikelihood.first_parts`."""
+        parts = self.posterior.likelihood.first_parts(shares)
+        targets = [ResponseTarget(type(self.posterior)(part, self._prior)) for part in parts]
+        for each in targets:
+            each.unchecked = self.unchecked
+        return targets
 
     # ------------------------------------------------------------------ coordinates
 
@@ -133,26 +114,23 @@ class ResponseTarget:
         inside = np.isfinite(coords).all(axis=1) & np.isfinite(log_prior)
         return coords, np.where(inside, log_prior - self.log_prior(np.where(inside[:, None], coords, 0.0)), -np.inf)
 
-    def scaled(self, coords: np.ndarray, logarithmic: np.ndarray | None = None) -> np.ndarray:
-        """Structural parameters, the logarithms of those that are `logarithmic` (d,), by default those that the prior
-        keeps away from zero, and noise coordinates, at coordinates (n, >= d). Products, as E I, are linear in
-        logarithms, and responses smooth functions of these, unlike of coordinates near a bound.
+    def scaled(self, coords: np.ndarray, scales: Scales | None = None) -> np.ndarray:
+        """Structural parameters on scales, by default with logarithms of those that the prior keeps away from zero, and
+        noise coordinates, at coordinates (n, >= d). Products, as E I, are linear in logarithms, and responses smooth
+        functions of these, unlike of coordinates near a bound.
         """
-        chosen = self._logarithmic if logarithmic is None else logarithmic
-        parameters = self.structural_parameters(coords[:, : self.n_structural])
-        logarithms = np.log(np.where(chosen, np.maximum(parameters, _SMALLEST), 1.0))
-        return np.column_stack([np.where(chosen, logarithms, parameters), coords[:, self.n_structural :]])
+        scales, parameters = scales or self.scales[-1], self.structural_parameters(coords[:, : self.n_structural])
+        positive = np.where(scales.is_log, np.maximum(parameters, _SMALLEST), parameters)
+        return np.column_stack([scales.to_scale(positive), coords[:, self.n_structural :]])
 
     def unscaled(self, scaled: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Coordinates (n, ndim) of what `scaled` returns, and the logarithm (n,) of their volume over its volume.
 
         The logarithm is -inf outside the support of the prior.
         """
-        d = self.n_structural
-        logarithms = np.where(self._logarithmic, scaled[:, :d], 0.0)
-        parameters = np.where(self._logarithmic, np.exp(np.clip(logarithms, -690.0, 690.0)), scaled[:, :d])
-        coords, volume = self.with_volume(parameters)
-        return np.column_stack([coords, scaled[:, d:]]), volume + logarithms.sum(axis=1)
+        points, scales = scaled[:, : self.n_structural], self.scales[-1]
+        coords, volume = self.with_volume(scales.from_scale(points))
+        return np.column_stack([coords, scaled[:, points.shape[1] :]]), volume + scales.log_jacobian(points).sum(axis=1)
 
     def line(self, first: np.ndarray, last: np.ndarray, shares: np.ndarray) -> np.ndarray:
         """Coordinates (n, n_structural) at shares (n,) of the way between two points, straight in scaled parameters."""
@@ -252,9 +230,11 @@ class ResponseTarget:
 
     def slopes(self, statistics: np.ndarray, coords: np.ndarray) -> np.ndarray:
         """Derivatives (n_numbers,) of the log-likelihood by the statistics, at fixed noise parameters."""
-        sizes = np.abs(statistics)  # each by itself: channels in different units differ by any factor
-        zero = sizes == 0.0  # sums of squares are nowhere below
-        steps = _STEP * np.where(zero, 1e-9 * sizes.max() or 1.0, sizes)
-        shifted = np.concatenate([statistics + np.diag(steps), statistics - np.diag(np.where(zero, 0.0, steps))])
-        ahead, behind = np.split(self.log_likelihood(shifted, np.broadcast_to(coords, (len(shifted), len(coords)))), 2)
-        return (ahead - behind) / np.where(zero, steps, 2.0 * steps)
+        sizes, n = (
+            np.abs(statistics),
+            len(statistics),
+        )  # each by itself: channels in different units differ by any factor
+        steps = _STEP * np.where(sizes > 0.0, sizes, 1e-9 * sizes.max() or 1.0)
+        shifted = np.concatenate([statistics + np.diag(steps), statistics - np.diag(steps * (sizes > 0.0))])
+        values = self.log_likelihood(shifted, np.broadcast_to(coords, (2 * n, len(coords))))
+        return (values[:n] - values[n:]) / np.diag(shifted[:n] - shifted[n:])  # sums of squares are nowhere below zero

@@ -9,7 +9,7 @@ residuals, see `fe_likelihoods.noise.gaussian`.) A `Simulator` runs and caches t
 import copy
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from ..noise.protocol import Noise, noise_of_part, noise_statistic, noise_under
 from ..noise.sufficient_statistics import count_samples
 from ..priors.points import as_rows, complete_repr
 from ..signals.channels import Comparison, Measurements
-from ..signals.records import events_of
+from ..signals.records import DisplacementHistory, events_of, growing_durations
 from ..simulation.model import Model, SimulationBatch, first_part
 from .check_inputs import check_model, check_noise, match_measurements
 from .simulator import Simulator
@@ -190,6 +190,25 @@ class FELikelihood(SumOfDataSets):
         model = first_part(self.model, min(steps, self.model.n_steps - 1) * self.model.dt)
         self.shortened.append(self._with(model, measurements, self.noise))
         return self.shortened[-1]
+
+    def first_parts(self, shares: Sequence[float]) -> list["FELikelihood"]:
+        """The likelihoods of the first parts of the measurements, up to shares of their Arias intensity.
+
+        None where the model has no ``first``, channels are not simultaneous, or the test is static: no errors of a
+        period add up to a phase there.
+        """
+        static = isinstance(getattr(self.model, "loading", None), DisplacementHistory)
+        if static or not hasattr(self.model, "first") or not self.measurements.simultaneous:
+            return []
+        found, measured = [], self.measurements
+        steps = np.nan_to_num(np.diff(measured.values, axis=1))  # because a residual displacement is not motion
+        for seconds in growing_durations(steps, measured.dt, shares)[:-1] if steps.any() else ():
+            try:
+                found.append(self.first(measured.start + seconds))
+            except ValueError:
+                if not isinstance(self.measured, Comparison):
+                    raise  # else a channel has no sample in this part
+        return found
 
     def residuals_of(self, response: np.ndarray) -> np.ndarray:
         """Measured minus simulated response (n_channels, n_steps) [SI], in the order of the model's channels.

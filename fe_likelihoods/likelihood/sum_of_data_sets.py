@@ -14,6 +14,7 @@ from ..noise.marginal import MarginalNoise
 from ..priors.distributions import Distribution, RandomState, as_generator
 from ..priors.multivariate import as_distribution
 from ..priors.points import as_points
+from .histories import Histories
 from .parameters import Parameter, describe_parameters
 
 __all__ = ["COUNTS", "SumOfDataSets"]
@@ -137,6 +138,14 @@ class SumOfDataSets:
             data_set.simulator.recall(thetas, None, own)
             left = [not each for each in own]  # later data sets were not simulated where this one failed
             points, reasons = points[left], reasons[left]
+
+    def histories(self) -> Histories:
+        """The residual histories of all data sets as those of one; ValueError if no emulator can predict them."""
+        return Histories(self)
+
+    def first_parts(self, shares: Sequence[float]) -> list[Any]:
+        """None: several data sets have no common record."""
+        return []
 
     # description --------------------------------------------------------------------------------------------------
 

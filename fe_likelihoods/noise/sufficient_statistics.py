@@ -76,6 +76,29 @@ def check_statistic(statistic: Statistic | None, measured: np.ndarray | Comparis
         )
 
 
+def bilinear_form(statistic: Statistic, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """The form (k, l, n_numbers) of a quadratic statistic for histories (k, n_channels, n_steps) and (l, ...)."""
+    if statistic is sums_of_squares:
+        return np.matmul(first.transpose(1, 0, 2), second.transpose(1, 2, 0)).transpose(1, 2, 0)
+    rows = []
+    for a in first:
+        scales = [np.abs(a).max() / (np.abs(b).max() or 1.0) or 1.0 for b in second]
+        rows.append([(statistic(a + s * b) - statistic(a - s * b)) / s for s, b in zip(scales, second, strict=True)])
+    return 0.25 * np.array(rows)
+
+
+def check_quadratic(statistic: Statistic, residuals: np.ndarray) -> None:
+    """Raise ValueError if a statistic is not quadratic in the residuals (n_channels, n_steps)."""
+    both = np.stack([residuals, np.roll(residuals, residuals.shape[-1] // 3, axis=-1)])
+    form = bilinear_form(statistic, both, both)
+    direct, combined = statistic(both[0] + 0.5 * both[1]), form[0, 0] + form[0, 1] + 0.25 * form[1, 1]
+    if not np.allclose(direct, combined, rtol=1e-6, atol=1e-6 * np.abs(direct).max()):
+        raise ValueError(
+            f"the statistic {statistic!r} of the noise is not quadratic in the residuals, so the posterior cannot be "
+            "emulated from responses: use GaussianNoise, AutoregressiveNoise, or a sampler without a guide"
+        )
+
+
 class SampleCounts(NamedTuple):
     """Numbers of samples and of the distances between them, for measurements with missing samples."""
 

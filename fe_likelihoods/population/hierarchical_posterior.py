@@ -28,8 +28,8 @@ from ..priors.distributions import Distribution
 from ..priors.multivariate import as_distribution
 from ..priors.points import as_points, complete_repr
 from ..priors.priors import Prior
+from ..priors.scales import Scales
 from .population_marginal import population_marginal
-from .scales import Scales
 from .stored_posterior import StoredPosterior, describe
 
 __all__ = ["HierarchicalPosterior", "Varying"]

@@ -20,7 +20,7 @@ from ..priors.distributions import TruncatedNormal
 from ..priors.mixture_prior import MixtureDistribution, fit_mixture
 from ..priors.points import as_points
 from ..priors.priors import Prior
-from .scales import Scales
+from ..priors.scales import Scales
 
 if TYPE_CHECKING:
     from ..emulation.modes import ModeSearch

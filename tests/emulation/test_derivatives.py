@@ -198,7 +198,7 @@ PRIORS = {
 
 def histories(target, numbers):
     return np.array([target.archive.read(range(k, k + 1))[0] for k in numbers.ravel()], float).reshape(
-        *numbers.shape, *target.data.measured.shape
+        *numbers.shape, *target.data.shape
     )
 
 

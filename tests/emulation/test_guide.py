@@ -1,5 +1,6 @@
 """The guide behind the samplers: right on small posteriors, exact counts, budgets, refusals."""
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -50,6 +51,14 @@ def test_evidence_and_means_against_quadrature(Sampler):
     assert abs(sampler.log_evidence - log_evidence) < 3.0 * sampler.log_evidence_error < 0.3
     assert (np.abs(sampler.get_chain(flat=True).mean(axis=0) - means) < 4.0 * sampler.mean_error()).all()
     assert posterior.report()["simulations"] == sampler.verdict.simulations <= 600
+
+
+def test_a_pickled_run_goes_on_as_the_run_itself():
+    sampler = guided(vibration(), 600)
+    again = pickle.loads(pickle.dumps(sampler))
+    for each in (sampler, again):
+        each.run_mcmc(None, 3)
+    np.testing.assert_array_equal(sampler.get_chain(), again.get_chain())
 
 
 @pytest.mark.slow

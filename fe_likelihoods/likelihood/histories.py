@@ -1,9 +1,8 @@
-"""The data sets of a likelihood, one or several, as one with the channels of all.
+"""Residual histories of all data sets of a likelihood as those of one, with the channels of all.
 
-Data sets are independent given the parameters, so their log-likelihoods are added. The responses of all models at the
-same parameters are one response, and a statistic that is quadratic in the residuals of each data set is quadratic in
-all residuals. Modes and emulators therefore need no code for several data sets. Data sets of fewer samples are filled
-up with residuals of zero, which no statistic counts.
+The responses of all models at the same parameters are one response, and a statistic that is quadratic in the residuals
+of each data set is quadratic in all residuals. Modes and emulators therefore need no code for several data sets. Data
+sets of fewer samples are filled up with residuals of zero, which no statistic counts.
 """
 
 import json
@@ -14,10 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..noise.protocol import noise_title
-from ..noise.sufficient_statistics import needs_response, sums_of_squares
+from ..noise.sufficient_statistics import check_quadratic, needs_response, sums_of_squares
 from ..signals.channels import Comparison, measured_values
 from ..simulation.model import derivatives_batch, has_jacobian, most_responses
-from .archive import check_quadratic
 
 _MANY = 10_000  # runs of a pool whose size is not known
 
@@ -42,17 +40,17 @@ class _DataSet(NamedTuple):
         return -found
 
 
-class DataSets:
-    """All data sets of a likelihood: values `measured` (n_channels, n_samples) [SI] and the `statistic` of all
-    residuals; ValueError if that is not quadratic. `differentiable`: all models know derivatives; `together`: runs
-    whose responses are in memory at once.
+class Histories:
+    """Residuals of `shape` (n_channels, n_samples) of a likelihood's data sets, and the `statistic` of all residuals;
+    ValueError if that is not quadratic. `differentiable`: all models know derivatives; `together`: runs whose responses
+    are in memory at once.
     """
 
     def __init__(self, likelihood: Any) -> None:
         n_structural = likelihood.ndim - len(likelihood.fast_parameters)
         self.parameter_names = tuple(likelihood.parameter_names[:n_structural])
         self._parts: list[_DataSet] = []
-        channels = numbers = 0
+        channels = samples = numbers = 0
         for part, columns in likelihood.data_sets():
             statistic, values, own = _statistic_of(part), measured_values(part.measured), part.simulator.n_structural
             check_quadratic(statistic, values)
@@ -60,10 +58,8 @@ class DataSets:
             rows = slice(channels, channels + len(values)), slice(values.shape[1])
             sums = slice(numbers, numbers + part.simulator.n_numbers)
             self._parts.append(_DataSet(part, *places, rows, sums, statistic))
-            channels, numbers = rows[0].stop, sums.stop
-        self.measured = np.zeros((channels, max(part.rows[1].stop for part in self._parts)))
-        for part in self._parts:
-            self.measured[part.rows] = measured_values(part.likelihood.measured)
+            channels, samples, numbers = rows[0].stop, max(samples, rows[1].stop), sums.stop
+        self.shape = channels, samples
         # white noise keeps its fast way: zeros add nothing to a sum of squares
         white = all(part.statistic is sums_of_squares for part in self._parts)
         self.statistic = sums_of_squares if white else self._statistic
@@ -94,7 +90,7 @@ class DataSets:
         a list in JSON. A point that fails in one model, with NaN, is not simulated by the later ones.
         """
         reasons = [""] * len(thetas)
-        residuals = np.zeros((len(thetas), *self.measured.shape), np.float32)
+        residuals = np.zeros((len(thetas), *self.shape), np.float32)
         statistics = np.full((len(thetas), self._parts[-1].numbers.stop), np.nan)
         left = np.arange(len(thetas))
         for part in self._parts:
@@ -111,7 +107,7 @@ class DataSets:
 
     def derivatives(self, thetas: np.ndarray) -> list[np.ndarray]:
         """Derivatives (n, n_structural, n_channels, n_samples) of the residuals, in single precision as these."""
-        found = np.zeros((*thetas.shape, *self.measured.shape), np.float32)
+        found = np.zeros((*thetas.shape, *self.shape), np.float32)
         for part in self._parts:
             found[:, part.structural, *part.rows] = part.slopes(thetas)
         return [found]
