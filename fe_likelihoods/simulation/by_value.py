@@ -31,12 +31,11 @@ from cloudpickle.cloudpickle import _dynamic_class_reduce
 
 from samplers.interrupts import become_worker, is_worker, process_name
 
-from .failure_reasons import ChangedModel
+from .failure_reasons import ChangedModel, UnusableModel
 
 __all__ = [
     "LIBRARY",
     "SCRIPTS",
-    "CannotLoad",
     "Pickled",
     "attribute",
     "code_within",
@@ -70,10 +69,6 @@ def without_addresses(message: str) -> str:
 def is_arriving() -> bool:
     """Whether an object from another process is being loaded."""
     return _arriving is not None
-
-
-class CannotLoad(ValueError):
-    """A function that cannot be unpickled in a worker process."""
 
 
 class Pickled:
@@ -112,7 +107,7 @@ class Pickled:
 def load(payload: bytes) -> Callable[[Any], Any]:
     """The function of a `Pickled`, in a worker, with user modules of its own.
 
-    CannotLoad if it cannot be unpickled; ChangedModel if this process has another version of this library, or a file
+    UnusableModel if it cannot be unpickled; ChangedModel if this process has another version of this library, or a file
     that the model depends on differs.
     """
     global _arriving
@@ -131,7 +126,7 @@ def load(payload: bytes) -> Callable[[Any], Any]:
             raise
         except Exception as error:
             text = without_addresses(f"{type(error).__name__}: {error}")
-            raise CannotLoad(f"a function cannot be loaded in a worker process: {text}") from error
+            raise UnusableModel(f"a function cannot be loaded in a worker process: {text}") from error
         finally:
             _arriving = None
 

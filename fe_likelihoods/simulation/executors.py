@@ -43,9 +43,9 @@ from typing import Any
 from samplers.evaluation.pools import submit_all, workers_of
 from samplers.interrupts import Ended, SentFunction, become_worker
 
-from .by_value import CannotLoad, Pickled, load, without_addresses
+from .by_value import Pickled, load, without_addresses
 from .failure_reasons import SimulationFailed, TransientReason, describe_exit, is_transient
-from .files import Group, given_places, working_folder
+from .files import PLACE, Group, working_folder
 
 __all__ = ["Job", "LocalPool", "PoolExecutor", "Sandbox", "Submitting", "Threads", "as_executor", "result_of", "serve"]
 
@@ -53,8 +53,8 @@ MAX_ATTEMPTS = 3
 _CHECK = 0.5  # [s] between checks that a process lives, while waiting for its answer
 _THREADS = [f"{each}_NUM_THREADS" for each in ("OMP", "OPENBLAS", "MKL", "BLIS", "VECLIB_MAXIMUM", "NUMBA")]
 _BOOT = (
-    "import json, sys; sys.path[:], sys.argv, *settings = json.loads(sys.argv[1]); "
-    "from fe_likelihoods.simulation.executors import serve; serve(*settings)"
+    "import json, sys; sys.path[:], sys.argv, fileno = json.loads(sys.argv[1]); "
+    "from fe_likelihoods.simulation.executors import serve; serve(fileno)"
 )
 
 
@@ -245,8 +245,8 @@ class Worker:
             self._group = Group()
             texts = [[str(text) for text in texts] for texts in (sys.path, sys.argv)]
             self._process = self._group.start(
-                [sys.executable, "-c", _BOOT, json.dumps([*texts, theirs.fileno(), self._group.place])],
-                env={**os.environ, **environment},
+                [sys.executable, "-c", _BOOT, json.dumps([*texts, theirs.fileno()])],
+                env={**os.environ, **environment, PLACE: self._group.place},
                 pass_fds=(theirs.fileno(),),
                 stdout=output,
                 stderr=output,
@@ -417,21 +417,17 @@ class Sandbox(threading.local):
     def __call__(self, item: Any) -> Any:
         """Result of the function for an item, or its exception; SimulationFailed if the process died or was stopped."""
         function, limit, _ = self._arguments
-        try:
-            return self._worker.run(Job(Pickled.of(function), item), limit or math.inf)
-        except CannotLoad as error:
-            raise SimulationFailed(TransientReason(str(error))) from error
+        return self._worker.run(Job(Pickled.of(function), item), limit or math.inf)
 
 
 # in the worker ------------------------------------------------------------------------------------------------------
 
 
-def serve(fileno: int, place: str) -> None:
+def serve(fileno: int) -> None:
     """Main loop of a worker process: answer messages until the connection with a file descriptor closes.
 
-    A message is a function to load, or an item for it. `place` is a folder for this process.
+    A message is a function to load, or an item for it.
     """
-    given_places[os.getpid()] = place
     os.set_inheritable(fileno, False)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the parent, which ends this process
     become_worker()

@@ -29,6 +29,7 @@ import time
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from hashlib import blake2b
+from importlib.util import source_from_cache
 from pathlib import Path
 from typing import Any
 
@@ -37,12 +38,12 @@ from samplers.interrupts import process_name
 from .failure_reasons import SimulationFailed, TransientReason, UnusableModel
 
 __all__ = [
+    "PLACE",
     "Group",
     "Observed",
     "Opened",
     "digests_by_name",
     "file_digest",
-    "given_places",
     "mapped",
     "note",
     "observing",
@@ -51,6 +52,7 @@ __all__ = [
     "working_folder",
 ]
 
+PLACE = "FE_LIKELIHOODS_PLACE"  # environment variable of a worker: the folder of its group
 _CLOCK_TICK = 2.0  # [s]; a file changed more recently may change again with the same modification time
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 _SYSTEM = ("/proc/", "/sys/", "/dev/", "/run/")
@@ -71,8 +73,6 @@ _EVENTS = _STARTS | _CHANGES.keys() | {"open", "tempfile.mkdtemp", "sqlite3.conn
 _observers: "list[Observer]" = []
 _own = threading.local()
 _digests: dict[str, tuple[tuple, float, str]] = {}
-_mirror: "_Mirror | None" = None
-given_places: dict[int, str] = {}  # folder of a process, by its id, since a fork copies it
 _fresh: set[str] = set()  # files that simulations have read and that were written while they ran
 
 Opened = dict[str, str]  # what simulations opened: digests of the contents of files, by path
@@ -100,27 +100,22 @@ class Observer:
 
     def __init__(self, alone: bool = True, thread: int = 0, mirror: "_Mirror | None" = None) -> None:
         self.alone, self.thread, self.mirror, self.shared = alone, thread, mirror, ""
-        self.read, self.written, self.noted = set[str](), set[str](), Opened()
+        self.noted = Opened()
+        self._used: dict[str, tuple | None] = {}  # states of files at their first use; None if it has made them
         self._made: list[str] = []  # new files and folders, which belong to this simulation
-        self._modules, self._start, self._moves_output = set(sys.modules), time.time_ns(), False
+        self._start = time.time_ns()
 
     def result(self, known: Opened) -> Opened:
-        """The files that are `known`, and those read and not written, with new modules and shared libraries."""
-        new = sys.modules.keys() - self._modules if len(sys.modules) != len(self._modules) else ()
-        read = {file for name in new if isinstance(file := getattr(sys.modules[name], "__file__", None), str)}
-        read |= self.read - self.written
-        if not new and not any(path not in known and _counts(path) for path in read):
-            return known if self.noted.keys() <= known.keys() else known | self.noted
-        return known | {path: each for path, each in mapped(read).items() if path not in self.written} | self.noted
+        """The files that are `known`, and those that were used and are as before, with new shared libraries."""
+        changed = {name for name, state in self._used.items() if state is None or state != _state(name)}
+        if any(name not in known and name not in changed and _counts(name) for name in self._used):
+            known = known | {name: digest for name, digest in mapped(self._used).items() if name not in changed}
+        return known | self.noted
 
     def notes(self, how: str, name: str) -> None:
         """Note a file by the name that the code has given to it: folders on the way may be links that change."""
-        if how == "moves":
-            self._moves_output = name in self.written
-        if how in ("reads", "loads", "moves"):
-            self.read.add(name)
-        elif how in ("writes", "touches", "makes") or (how == "takes" and self._moves_output):
-            self.written.add(name)
+        if how != "changes" and name not in self._used:
+            self._used[name] = _state(name) if how in ("reads", "loads") else None
 
     def sees(self, how: str, path: str) -> None:
         """Note a file that others may write, too, if this simulation changes it, or reads what was just written."""
@@ -214,8 +209,6 @@ def _hook(event: str, arguments: tuple) -> None:
                 simulation.sees(how, os.path.realpath(path) if how == "reads" else path)
             if simulation is not None and simulation.is_own(name):  # the file that it shows
                 name = os.path.join(simulation.mirror.base, os.path.relpath(name, simulation.mirror.path))
-                if how in ("reads", "loads") and not os.path.exists(name):
-                    continue
             for observer in list(_observers):
                 if observer.thread in (0, threading.get_ident()):
                     observer.notes(how, name)
@@ -227,13 +220,14 @@ def _uses(event: str, arguments: tuple) -> list[tuple[str, Any]]:
         path, mode, flags = arguments
         if isinstance(path, int):  # a descriptor
             return []
-        if not flags & _WRITING:
-            return [("reads", path)]
+        if not flags & _WRITING:  # a source is read in its compiled form
+            return [("reads", source_from_cache(path) if str(path).endswith(".pyc") else path)]
         if flags & os.O_EXCL:
             return [("makes", path)]
         # what is appended stays apart, and Path.touch writes nothing
         is_changed = (mode is not None or flags & (os.O_RDWR | os.O_TRUNC)) and not flags & os.O_APPEND
-        return [("writes" if is_changed else "touches", path)]
+        is_read = flags & os.O_RDWR and not flags & os.O_TRUNC
+        return [*([("loads", path)] if is_read else []), ("writes" if is_changed else "touches", path)]
     if event == "subprocess.Popen":
         program, command, folder, _ = arguments
         words = [command] if isinstance(command, str | bytes | os.PathLike) else list(command)
@@ -245,11 +239,10 @@ def _uses(event: str, arguments: tuple) -> list[tuple[str, Any]]:
     if event in _CHANGES:
         is_within = event in ("os.remove", "os.rmdir") and arguments[1] not in (None, -1)  # a folder that is removed
         changed = [] if is_within else [("changes", arguments[_CHANGES[event]])]
-        if event == "os.rename":
-            return [("moves", arguments[0]), ("takes", arguments[1]), *changed]
-        if event in ("os.link", "os.symlink"):
+        if event in ("os.rename", "os.link", "os.symlink"):
             folder = os.path.dirname(os.fsdecode(arguments[1])) if event == "os.symlink" else ""
-            return [("loads", os.path.join(folder, os.fsdecode(arguments[0]))), *changed]
+            source = os.path.join(folder, os.fsdecode(arguments[0]))
+            return [("loads", source), ("touches", arguments[1]), *changed]
         return changed
     return [("makes" if event == "tempfile.mkdtemp" else "loads", arguments[0])]
 
@@ -345,28 +338,24 @@ class Observed:
 
     def __call__(self, item: Any) -> tuple[Any, Opened]:
         """The result for an item, and what was opened."""
-        return self._in_folder(item), self._known
-
-    def _in_folder(self, item: Any) -> Any:
+        is_main, simulation, before = _is_main(), (bool(self._alone), threading.get_ident()), working_folder()
         is_home = self._sender is None or self._sender[0] == process_name()
-        if running_simulation() is not None or (is_home and _is_main()):  # one after the other
-            return self._observe(item)
-        if is_home or not (_is_main() or _is_only_thread_of_dask()):
-            return self._observe(item, bool(self._alone), threading.get_ident())
-        mirror, before = _mirror_of(self._sender[1]), working_folder()
-        os.chdir(mirror.path)
+        if running_simulation() is not None or (is_home and is_main):  # one after the other
+            simulation = ()
+        elif not is_home and (is_main or _is_only_thread_of_dask()):
+            mirror = _mirror_of(self._sender[1], os.getpid())
+            simulation = bool(self._alone), 0 if is_main else threading.get_ident(), mirror
+            os.chdir(mirror.shown())
         try:
-            return self._observe(item, bool(self._alone), 0 if _is_main() else threading.get_ident(), mirror)
+            with observing(*simulation) as observer:
+                result = self.function(item)
         finally:
-            with contextlib.suppress(FileNotFoundError):
-                os.chdir(before)
-
-    def _observe(self, item: Any, *simulation: Any) -> Any:
-        with observing(*simulation) as observer:
-            result = self.function(item)
+            if len(simulation) == 3:
+                with contextlib.suppress(FileNotFoundError):
+                    os.chdir(before)
         with of_this_library():
             self._known = observer.result(self._known)
-        return result
+        return result, self._known
 
 
 def _is_main() -> bool:
@@ -424,15 +413,7 @@ class Group:
                 waiter.join(watch(time.monotonic() - start))
             return program.returncode
         finally:
-            for process in self.processes[1:]:  # and what a program has started in other groups, while it waits for it
-                for pid in _descendants(process.pid) if process.poll() is None else ():
-                    with contextlib.suppress(ProcessLookupError, PermissionError):
-                        os.kill(pid, signal.SIGKILL)
-            if self.processes[0].returncode is None:  # else its number may be another process's
-                with contextlib.suppress(ProcessLookupError, PermissionError):
-                    os.killpg(self.processes[0].pid, signal.SIGKILL)
-            for process in self.processes:
-                process.communicate()
+            _kill(self.processes)
 
 
 _groups: weakref.WeakSet[Group] = weakref.WeakSet()
@@ -442,45 +423,43 @@ if hasattr(os, "register_at_fork"):  # a forked process must not keep the groups
 
 def _end(processes: Sequence[subprocess.Popen], place: str, owner: int) -> None:
     if owner == os.getpid():  # else it has only a forked copy of the objects
-        for process in processes[1:]:
-            process.kill()
-        for process in processes:  # the shell kills the others and removes the folder, even if this process ends now
-            process.communicate()
+        _kill(processes)
         with of_this_library():
             shutil.rmtree(place, ignore_errors=True)
 
 
-def _descendants(pid: int) -> list[int]:
-    """Process ids of a process's descendants, from /proc; none on other systems than Linux."""
-    parents = {}
+def _kill(processes: Sequence[subprocess.Popen]) -> None:
+    """Kill a group, whose first process is its shell, and what the others have started in other groups."""
+    for process in processes[1:]:
+        for pid in _family(process.pid) if process.poll() is None else ():
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.kill(pid, signal.SIGKILL)
+    if processes[0].returncode is None:  # else its number may be another process's
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(processes[0].pid, signal.SIGKILL)
+    for process in processes:
+        process.communicate()
+
+
+def _family(pid: int) -> list[int]:
+    """Ids of a process and, from /proc, its descendants; on other systems than Linux of the process only."""
+    parents, found = {}, [pid]
     for name in filter(str.isdigit, os.listdir("/proc") if os.path.isdir("/proc") else ()):
         with contextlib.suppress(OSError), open(f"/proc/{name}/stat", "rb") as file:
             parents[int(name)] = int(file.read().rpartition(b")")[2].split()[1])
-    found, new = [], [pid]
-    while new:
-        new = [child for child, parent in parents.items() if parent in new]
-        found += new
+    for each in found:
+        found += [child for child, parent in parents.items() if parent == each]
     return found
 
 
 @functools.cache
-def _group_of(_pid: int) -> Group:
+def _own_group() -> Group:
     return Group()
 
 
-def _mirror_of(base: str) -> "_Mirror":
-    """The folder of this process, which shows what the sender's working folder contains now."""
-    global _mirror
-    try:
-        if _mirror is None or _mirror.base != base or _mirror.owner != os.getpid():
-            sys.path[:] = map(os.path.abspath, sys.path)
-            _mirror = _Mirror(base)
-        if not _mirror.states or _mirror.states != {path: _state(path) for path in _mirror.states}:
-            _mirror.make()
-    except OSError as failure:
-        text = f"the working folder of a simulation could not be made: {failure}"
-        raise SimulationFailed(TransientReason(text)) from failure
-    return _mirror
+@functools.cache
+def _mirror_of(base: str, _pid: int) -> "_Mirror":
+    return _Mirror(base)
 
 
 class _Mirror:
@@ -490,21 +469,30 @@ class _Mirror:
     """
 
     def __init__(self, base: str) -> None:
-        self.base, self.owner, self.path = base, os.getpid(), ""
+        self.base, self.path = base, ""
         self.states: dict[str, tuple | None] = {}
-        self._place = os.path.join(given_places.get(self.owner) or _group_of(self.owner).place, "shown")
-        shutil.rmtree(self._place, ignore_errors=True)  # of a mirror of another folder
-        os.mkdir(self._place)
+
+    def shown(self) -> str:
+        """The folder, which shows what `base` contains now, and nothing that another simulation has left."""
+        try:
+            if not self.path:
+                self._begin()
+            if not self.states or self.states != {path: _state(path) for path in self.states}:
+                shutil.rmtree(self.path, ignore_errors=True)
+                self.path = tempfile.mkdtemp(prefix="run_", dir=self._place)
+                self.states, self._left = {}, _MOST_ENTRIES
+                self._show(self.base, self.path)
+        except OSError as failure:
+            text = f"the working folder of a simulation could not be made: {failure}"
+            raise SimulationFailed(TransientReason(text)) from failure
+        return self.path
+
+    def _begin(self) -> None:
+        sys.path[:] = map(os.path.abspath, sys.path)
+        self._place = tempfile.mkdtemp(prefix="shown_", dir=os.environ.get(PLACE) or _own_group().place)
         for entry in _scan(os.path.dirname(self.base), _MOST_BESIDE) if self.base else ():
             with contextlib.suppress(FileExistsError):
                 os.symlink(entry.path, os.path.join(self._place, entry.name))
-
-    def make(self) -> None:
-        """Show what `base` contains now, and nothing that another simulation has left."""
-        shutil.rmtree(self.path, ignore_errors=True)
-        self.path = tempfile.mkdtemp(prefix="run_", dir=self._place)
-        self.states, self._left = {}, _MOST_ENTRIES
-        self._show(self.base, self.path)
 
     def _show(self, base: str, own: str) -> None:
         """Show a folder in another one; folders that are hidden, too large, or contain the mirror, are links."""

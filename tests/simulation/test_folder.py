@@ -467,6 +467,7 @@ def moved_away_and_back():
     "use",
     [
         lambda: Path("data/k.txt").read_text(),
+        lambda: open("data/k.txt", "r+").close(),
         lambda: subprocess.run(["sh", "data/k.txt"], check=False),
         lambda: subprocess.run(["sh", "k.txt"], cwd="data", check=False),
         through_a_link(os.symlink),
