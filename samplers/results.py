@@ -199,11 +199,11 @@ class RunResults:
         Examples
         --------
         >>> sampler.describe()
-        'Converged: one mode; log-evidence ... +- ...; effective sample size ...; no failed evaluations.'
+        'Converged: one mode; log-evidence ... +- ...; effective sample size ...; no failed simulations.'
         """
         (log_evidence, error), modes, (failed, reasons) = self._result.evidence, self.modes, self._failed
         shares = ", ".join(f"{mode.share:.2f} +- {mode.share_error:.2g}" for mode in modes)
-        failed = f"{failed} failed ({shorten(reasons, LONGEST_REASON)})" if failed else "no failed evaluations"
+        failed = f"{failed} failed ({shorten(reasons, LONGEST_REASON)})" if failed else "no failed simulations"
         return (
             f"{self.verdict.status.capitalize()}: "
             f"{'one mode' if len(modes) == 1 else f'{len(modes)} modes with shares {shares}'}; log-evidence "

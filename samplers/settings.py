@@ -82,9 +82,6 @@ class Settings:
     def __post_init__(self):
         for name in ("min_moves", "max_moves", "burn_in", "fast_sweeps"):
             object.__setattr__(self, name, as_whole_number(name, vars(self)[name]))
-        for name in ("asynchronous", "recycle"):
-            if isinstance(vars(self)[name], np.bool_):
-                object.__setattr__(self, name, bool(vars(self)[name]))
         for name, possible, wanted in (
             ("asynchronous", isinstance(self.asynchronous, bool), "True or False"),
             ("recycle", isinstance(self.recycle, bool | None), "True, False or None"),

@@ -54,10 +54,9 @@ sampler = SMCSampler(50, posterior.ndim, posterior, vectorize=True, seed=1, guid
 sampler.run_mcmc(None, 1)
 print(sampler.verdict)
 samples = sampler.get_chain(flat=True)
-moments = summary(samples, posterior.parameter_names)
-print(moments)
-means = moments["mean"].to_numpy()
-print("(mean - truth) / sd: " + ", ".join(f"{z:+.1f}" for z in (means - truth) / moments["sd"]))
+print(summary(samples, posterior.parameters))
+means = samples.mean(axis=0)
+print("(mean - truth) / sd: " + ", ".join(f"{z:+.1f}" for z in (means - truth) / samples.std(axis=0)))
 plot_run(sampler).savefig("run.png")
 
 # %%

@@ -107,7 +107,7 @@ sampler, posterior = update(program, pool=2, cache=folder / "simulations.db")
 print(sampler.verdict)
 report = posterior.report()
 print(f"{report['simulations']} simulations, {report['failure_count']} failed")
-print(summary(sampler.get_chain(flat=True), posterior.parameter_names))
+print(summary(sampler.get_chain(flat=True), posterior.parameters))
 
 # %%
 # The same as a Python function

@@ -46,7 +46,7 @@ def update(pool=None) -> SMCSampler:
     sampler = SMCSampler(WALKERS, posterior.ndim, posterior, vectorize=True, seed=1, backend=backend, asynchronous=True)
     sampler.run_mcmc(None, 4 - sampler.iteration, progress=True)  # in the output of a job, a line per minute
     samples = sampler.get_chain(flat=True)
-    print(summary(samples, posterior.parameter_names, mean_error=sampler.mean_error()))
+    print(summary(samples, posterior.parameters, mean_error=sampler.mean_error()))
     print(f"log-evidence {sampler.log_evidence:.2f} +- {sampler.log_evidence_error:.2f}")
     print(f"{posterior.report()['simulations']} simulations by this process")
     return sampler

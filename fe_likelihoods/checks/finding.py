@@ -14,12 +14,21 @@ STATUS = {WRONG: "do not use", CARE: "use with care", NOTE: "use"}
 ORDER = ("input", "data", "fit", "samples")
 
 
-def in_order(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+class Findings(tuple[Finding, ...]):
+    """Findings, printed as one line each."""
+
+    def __str__(self) -> str:
+        return "\n".join(labelled(self)) or "Nothing was found."
+
+    __repr__ = __str__
+
+
+def in_order(findings: Iterable[Finding]) -> Findings:
     """Findings with causes before what may follow from them, and notes last.
 
     A check relies on what stands before it in `ORDER`: a fit on right data, samples on a fit.
     """
-    return tuple(sorted(findings, key=lambda each: (each.severity == NOTE, ORDER.index(each.about), _rank(each))))
+    return Findings(sorted(findings, key=lambda each: (each.severity == NOTE, ORDER.index(each.about), _rank(each))))
 
 
 def _rank(finding: Finding) -> int:
@@ -30,7 +39,7 @@ class Judgement(NamedTuple):
     """Whether a result can be used, from all that was found; ``str`` gives it in one sentence."""
 
     status: str  # "use", "use with care" or "do not use"
-    findings: tuple[Finding, ...]  # causes first, then what may follow from them, notes last
+    findings: Findings  # causes first, then what may follow from them, notes last
     tests: tuple[tuple[str, str], ...] = ()  # names of the tests, and what was tested or why it was not
 
     def __str__(self) -> str:

@@ -25,7 +25,7 @@ from ..priors.between_events import BETWEEN_EVENTS
 from ..priors.priors import Prior
 from ..signals.records import find_events
 from ..text_tables import listed
-from .finding import CARE, NOTE, TAIL, WRONG, Finding, Judgement, in_order, judge, percent
+from .finding import CARE, NOTE, TAIL, WRONG, Finding, Findings, Judgement, in_order, judge, percent
 from .model import (
     STEP,
     at_mean,
@@ -190,10 +190,15 @@ def failures(run: FinishedRun) -> Failures:
 
 
 class ModelCheck(NamedTuple):
-    """What `check_model` has found, causes first."""
+    """What `check_model` has found, causes first; ``str`` gives the findings."""
 
-    findings: tuple[Finding, ...]
+    findings: Findings
     fits: tuple[Fit, ...]  # measurements beside the draws of the prior that were simulated
+
+    def __str__(self) -> str:
+        return str(self.findings)
+
+    __repr__ = __str__
 
 
 class JudgedRun(NamedTuple):
@@ -228,9 +233,9 @@ def check_model(posterior: Posterior) -> ModelCheck:
     Examples
     --------
     >>> wrong_sign = Measurements(measurements.channels, record.dt, -measurements.values)
-    >>> checked = check_model(Posterior(FELikelihood(model, wrong_sign), prior))
-    >>> [finding.kind for finding in checked.findings if finding.severity == "wrong"]
-    ['A sign may be wrong']
+    >>> check_model(Posterior(FELikelihood(model, wrong_sign), prior))
+    CAUTION: A channel drifts: ...
+    CAUTION: A sign may be wrong: ...
     """
     first = list(at_mean(posterior))
     if failed := next((reason for _, _, reason, _ in first if reason), ""):

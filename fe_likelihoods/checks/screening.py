@@ -16,7 +16,7 @@ import numpy as np
 from ..signals.channels import Measurements
 from ..signals.records import Record
 from ..units import from_si
-from .finding import CARE, HALF, Finding
+from .finding import CARE, HALF, Finding, Findings
 
 FEWEST = 50  # samples that are judged, and for each spike
 MATTERS = 0.25  # of the peak, or of the standard deviation: smaller parts hardly change a sum of squares
@@ -206,7 +206,7 @@ def _baseline(x: np.ndarray) -> tuple[float, ...]:
     return (float(np.median(parts)),) if large else ()
 
 
-def check_data(measurements: Measurements, record: Record | Sequence[Record] | None = None) -> tuple[Finding, ...]:
+def check_data(measurements: Measurements, record: Record | Sequence[Record] | None = None) -> Findings:
     """Look for faults that measurements and motions show by themselves; nothing is simulated.
 
     A channel is clipped, was stuck, or has spikes, gaps, an offset or a drift: each finding says when, and has the line
@@ -221,15 +221,14 @@ def check_data(measurements: Measurements, record: Record | Sequence[Record] | N
 
     Returns
     -------
-    tuple of Finding
-        Faults of sensors, and channels that never change; empty if nothing was found.
+    Findings
+        A tuple: faults of sensors, and channels that never change; empty if nothing was found.
 
     Examples
     --------
     >>> dead = np.where(measurements.time < 5.0, measurements.values, 0.0)
-    >>> for finding in check_data(Measurements(measurements.channels, record.dt, dead), record):
-    ...     print(finding.severity, finding)
-    care A sensor was stuck: ...
+    >>> check_data(Measurements(measurements.channels, record.dt, dead), record)
+    CAUTION: A sensor was stuck: ...
     """
     given = record if isinstance(record, list | tuple) else [] if record is None else [record]
     motions = [part for each in given for part in getattr(each, "records", (each,))]
@@ -241,7 +240,7 @@ def check_data(measurements: Measurements, record: Record | Sequence[Record] | N
     if silent:
         text, action = f"All samples of {', '.join(silent)} are equal.", "Leave it out, or read another column."
         found.append(Finding("A sensor was silent", CARE, text, action, about="input"))
-    return tuple(found)
+    return Findings(found)
 
 
 def screen(measurements: Measurements, motions: Iterable[Record] = ()) -> list[SensorFault]:

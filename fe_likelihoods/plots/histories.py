@@ -18,6 +18,7 @@ from ..units import from_si
 from .style import (
     BLUE,
     GREY,
+    MEASURED,
     ORANGE,
     add_figure_legend,
     add_legend,
@@ -219,8 +220,7 @@ def plot_residuals(residuals: np.ndarray, channels: Sequence[Channel], dt: float
     return figure
 
 
-_OF_RESPONSES = (ORANGE, BLUE, "#5b8c5a", "#b03a48", "#7b5ea7")
-_MEASURED = "0.45"
+_OF_RESPONSES = (GREY, BLUE, "#5b8c5a", "#b03a48", "#7b5ea7")
 _STRONGEST = 5.0  # length of the part that is drawn on a longer scale [s]
 
 
@@ -284,15 +284,14 @@ def plot_fit(
     for i, (row, channel) in enumerate(zip(rows, measurements.channels, strict=True)):
         name, window, own = channel.name, windows.get(channel.name), measurements.channel(channel.name)
         measured = from_si(own, channel.unit)
-        style = {"color": _MEASURED, "linewidth": 1.0, "label": "measured", "marker": marker_of(measured)}
         for axes in row:
-            axes.plot(times_of[name], measured, markersize=2.0, **style)
+            axes.plot(times_of[name], measured, marker=marker_of(measured), markersize=3.0, **MEASURED)
             axes.set_xlim(*whole)
         for k, (text, response) in enumerate(shown.items()):
             drawn = from_si(response[i], channel.unit)
             shade = _OF_RESPONSES[k % len(_OF_RESPONSES)] if len(shown) > 1 else BLUE
             for axes in (row[k], *row[len(shown) :]):
-                axes.plot(times_of[name], drawn, color=shade, linewidth=0.9, label=text)
+                axes.plot(times_of[name], drawn, color=shade, linewidth=1.0, label=text)
             error = relative_errors(response[i] - own, own)
             row[k].set_title(text + (f", RRMSE {_percent(error)} %" if np.isfinite(error) else ""), fontsize="small")
         row[0].set_ylabel(channel_label(channel))
@@ -365,8 +364,7 @@ def plot_bands(prediction: Prediction, measurements: Measurements | None = None)
             axes.fill_between(time, *band, color=BLUE, alpha=0.3, linewidth=0.0, label=label)
         if channel.name in measured:
             values = from_si(measurements.channel(channel.name), channel.unit)
-            drawn = {"color": ORANGE, "linewidth": 2.2, "alpha": 0.6, "label": "measured"}
-            axes.plot(measurements.times(channel.name), values, marker=marker_of(values), markersize=3.0, **drawn)
+            axes.plot(measurements.times(channel.name), values, marker=marker_of(values), markersize=3.0, **MEASURED)
         axes.plot(time, from_si(prediction.mean[k], channel.unit), color=BLUE, linewidth=0.8, label="mean")
         axes.set_ylabel(channel_label(channel))
     add_legend_row(rows[0], 3)

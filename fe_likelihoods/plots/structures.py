@@ -211,7 +211,8 @@ def _draw_loop(axes: Axes, x: np.ndarray, y: np.ndarray, x_label: str, y_label: 
     for line in (axes.axhline, axes.axvline):
         line(0.0, color="0.75", linewidth=0.7, zorder=0)
     axes.plot(x, y, color=BLUE, linewidth=0.7)
-    axes.plot(x[-1], y[-1], "o", color=ORANGE, markersize=4)
+    axes.plot(x[-1], y[-1], "o", color=ORANGE, markersize=4, label="end")
+    add_legend(axes, loc="upper left")
     axes.set(xlabel=x_label, ylabel=y_label, title=title)
 
 

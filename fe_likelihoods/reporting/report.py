@@ -118,7 +118,7 @@ def draw_posterior(run: FinishedRun) -> list[Picture]:
         _picture(
             "Pairs of parameters",
             "A narrow, inclined cloud: the data determine a combination of two parameters better than each of them. "
-            "Separate clouds: separate explanations of the data. Values outside of a panel are written at its edge. "
+            "Separate clouds: separate explanations of the data. Values outside of a panel are written above it. "
             + drawn,
             f"Posterior samples of each parameter and each pair of {', '.join(run.names)}.",
             lambda: plot_corner(samples, posterior=described),

@@ -20,10 +20,10 @@ BLUE = "#1f5a8c"
 ORANGE = "#d9822b"
 GREY = "#8a8f98"
 RED = "#b03a48"
-HISTOGRAM = {"density": True, "linewidth": 1.2, "histtype": "stepfilled", "fc": BLUE + "40", "ec": BLUE}
+HISTOGRAM = {"density": True, "histtype": "stepfilled", "fc": BLUE + "40", "ec": BLUE, "label": "posterior"}
 LEVELS = (0.5, 0.9)
 FEW_POINTS = 150  # fewer distinct samples are drawn as points, since a contour through them shows chance
-MOST_PARAMETERS = 12  # of a corner plot without names
+MOST_PARAMETERS = 12  # of a corner plot without var_names
 PRIOR_DRAWS = 20_000  # for densities of parameters without a distribution and for the range of a prior
 LARGEST_PANEL = 2.5  # largest panel width in `plot_marginals`, as a multiple of the range of the samples
 
@@ -46,7 +46,7 @@ def plot_corner(
     posterior: Any = None,
     *,
     truths: Sequence[float] | None = None,
-    names: Sequence[str] | None = None,
+    var_names: Sequence[str] | None = None,
 ) -> "Figure":
     """Plot the posterior for all pairs of parameters by `corner.corner`, with the prior on the diagonal.
 
@@ -63,8 +63,8 @@ def plot_corner(
     truths : sequence of float, shape (ndim,), optional
         True values in the units of the samples, as red lines; NaN for none. The panels are widened to show a true or
         nominal value if that is near.
-    names : sequence of str, optional
-        Names of the parameters to draw. Default: all, or the first 12; the figure says how many are left out.
+    var_names : sequence of str, optional
+        Parameters to draw, in this order. Default: all, or the first 12; the figure says how many are left out.
 
     Returns
     -------
@@ -73,24 +73,25 @@ def plot_corner(
 
     Examples
     --------
-    >>> figure = plot_corner(samples, posterior, names=["stiffness", "damping"])
+    >>> figure = plot_corner(samples, posterior, var_names=["stiffness", "damping"])
     """
     import corner  # imports arviz
     import matplotlib.pyplot as plt
 
-    drawn = _choose(samples, posterior, truths, names, MOST_PARAMETERS)
+    drawn = _choose(samples, posterior, truths, var_names, MOST_PARAMETERS)
     k, few = len(drawn.labels), len(np.unique(drawn.samples, axis=0)) < FEW_POINTS
-    size = float(np.clip(1.8 * k + 1.0, 4.5, 15.0))  # [in]
+    size = float(np.clip(1.8 * k + 1.5, 4.5, 16.0))  # [in]
+    top = 0.4 if k > 1 else 1.3  # margin [in], with the legend above a single panel
     figure = plt.figure(figsize=(size, size))
-    with plt.rc_context({"axes.formatter.useoffset": False}):
+    with plt.rc_context({"axes.formatter.useoffset": False, "font.size": 8.0}):
         corner.corner(
             drawn.samples,
             bins=_bins(drawn.samples),
             range=[tuple(each) for each in drawn.limits],
             color=BLUE,
-            labels=drawn.labels,
+            labels=[label.replace(" [", "\n[") for label in drawn.labels],
             fig=figure,
-            labelpad=0.08,  # beside rotated numbers
+            labelpad=0.6 * k / (size - top - 1.1) - 0.3,  # 0.6 in from the axes, beside rotated numbers
             max_n_ticks=4,
             hist_kwargs=HISTOGRAM,
             levels=LEVELS,
@@ -102,14 +103,16 @@ def plot_corner(
             fill_contours=True,
             quiet=True,
         )
-    for values, colour, dashes in ((drawn.nominal, GREY, "--"), (drawn.truths, RED, "-")):
-        marks = [x if np.isfinite(x) else None for x in values]
-        corner.overplot_lines(figure, marks, color=colour, linestyle=dashes, linewidth=1.1)
-    for i, axes in enumerate(np.array(figure.axes).reshape(k, k).diagonal()):
-        _finish_panel(axes, drawn, i)
+    figure.subplots_adjust(left=1.1 / size, bottom=1.1 / size, top=1.0 - top / size)
+    grid = np.array(figure.axes).reshape(k, k)
+    for i, limits in enumerate(drawn.limits):
+        ticks = grid[-1, i].get_xticks()
+        ticks = ticks[np.abs(ticks - limits.mean()) < 0.4 * np.ptp(limits)]  # numbers at an edge touch the next panel's
+        plt.setp(grid[i:, i], xticks=ticks)
+        plt.setp(grid[i, :i], yticks=ticks)
+        _finish_panel(grid[i:, i], drawn, i, row=grid[i, :i])
     note = f"points: fewer than {FEW_POINTS} samples" if few else "contours hold 50 and 90 % of the samples"
-    note += f"\n{drawn.note}" if drawn.note else ""
-    figure.legend(handles=_legend_handles(drawn), loc="upper right", title=note, frameon=False)
+    _add_legend(figure, loc="upper right", title=note + drawn.note)
     return figure
 
 
@@ -142,13 +145,11 @@ def plot_marginals(samples: np.ndarray, posterior: Any = None, *, truths: Sequen
                 note = f"\nprior {float(f'{draws.std() / spread:.2g}'):.0f} times wider"
             low, high = min(low, max(prior[0], low - room)), max(high, min(prior[1], high + room))
         drawn.limits[i] = low, high
-        for value, colour, dashes in ((drawn.nominal[i], GREY, "--"), (drawn.truths[i], RED, "-")):
-            axes.axvline(value, color=colour, linestyle=dashes, linewidth=1.1)
         axes.set_xlim(low, high)
-        _finish_panel(axes, drawn, i, note)
+        _finish_panel([axes], drawn, i, note)
         axes.xaxis.set_major_locator(plt.MaxNLocator(4))
         axes.ticklabel_format(useOffset=False)
-    figure.legend(handles=_legend_handles(drawn), loc="outside lower center", ncols=4, fontsize=9, frameon=False)
+    _add_legend(figure, loc="outside lower center", ncols=4, fontsize=9)
     return figure
 
 
@@ -156,12 +157,11 @@ def _choose(
     samples: Any, posterior: Any, truths: Any, names: Sequence[str] | None = None, most: int | None = None
 ) -> _Drawn:
     """Check the arguments of a figure, and convert what it shows to the units of its labels."""
+    if posterior is not None and not hasattr(posterior, "parameter_names"):
+        raise ValueError(f"posterior must have parameter_names (var_names= chooses parameters); got {posterior!r}")
     samples = np.asarray(samples, dtype=float)
     if samples.ndim != 2 or len(samples) < 2 or not 1 <= samples.shape[1] <= len(samples):
-        raise ValueError(
-            "samples must be an array (n, ndim) with n >= 2 and n >= ndim, as get_chain(flat=True) returns; "
-            f"got {samples.shape}"
-        )
+        raise ValueError(f"samples must be an array (n, ndim) with n >= 2 and n >= ndim; got {samples.shape}")
     if bad := np.count_nonzero(~np.isfinite(samples).all(axis=1)):
         raise ValueError(f"samples must be finite; {bad} of {len(samples)} rows are not: leave these rows out")
     ndim, parameters = samples.shape[1], getattr(posterior, "parameters", None)
@@ -173,12 +173,11 @@ def _choose(
         raise ValueError(
             f"the posterior has {len(known)} parameters ({', '.join(known)}), but the samples have {ndim} columns"
         )
-    wanted, note = known[:most] if names is None else names, ""
-    if names is None and len(wanted) < ndim:
-        note = f"the first {most} of {ndim} parameters; names= chooses others"
-    if not len(wanted) or (unknown := [str(name) for name in wanted if name not in known]):
-        what = f"unknown: {', '.join(unknown)}" if len(wanted) else "got none"
-        raise ValueError(f"names must be some of the parameters {', '.join(known)}; {what}")
+    wanted = known[:most] if names is None else names
+    left_out = names is None and len(wanted) < ndim
+    note = f"\nthe first {most} of {ndim} parameters; var_names= chooses others" if left_out else ""
+    if not len(wanted) or not set(wanted) <= set(known):
+        raise ValueError(f"var_names must be some of the parameters {', '.join(known)}; got {wanted!r}")
     columns = [known.index(name) for name in wanted]
     shown = [parameters[i] for i in columns]
     factors = np.array([each.factor for each in shown])
@@ -226,38 +225,41 @@ def _bins(x: np.ndarray) -> int:
     return int(np.clip(np.sqrt(len(np.unique(x[:, 0]))), 12, 36))
 
 
-def _finish_panel(axes: "Axes", drawn: _Drawn, i: int, note: str = "") -> None:
-    """Prior density of one parameter, and a title with mean and standard deviation, or marks outside the panel."""
-    low, high = drawn.limits[i]
+def _finish_panel(column: "Sequence[Axes]", drawn: _Drawn, i: int, note: str = "", row: "Sequence[Axes]" = ()) -> None:
+    """Marks of one parameter in its column and row, and its prior density and moments in the first axes of the column.
+
+    Marks outside the panel are part of the title.
+    """
+    axes, (low, high) = column[0], drawn.limits[i]
     highest = 1.1 * max(patch.get_xy()[:, 1].max() for patch in axes.patches)
     if drawn.densities:
         places = np.linspace(low, high, 200)
         density = drawn.densities[i](places)
-        axes.plot(places, density, color="0.25", linestyle=":", linewidth=1.4)
+        axes.plot(places, density, color="0.25", linestyle=":", linewidth=1.4, label="prior")
         highest = max(highest, min(1.1 * density[np.isfinite(density)].max(initial=0.0), 3.0 * highest))
     axes.set_ylim(0.0, highest)
-    for value, name in ((drawn.nominal[i], "nominal"), (drawn.truths[i], "true")):
+    for values, name, *style in ((drawn.nominal, "nominal", GREY, "--"), (drawn.truths, "true", RED, "-")):
+        value, style = values[i], dict(zip(("color", "linestyle"), style, strict=True), linewidth=1.1)
+        for each in column if np.isfinite(value) else ():
+            each.axvline(value, label=f"{name} value", **style)
+        for each in row if np.isfinite(value) else ():
+            each.axhline(value, **style)
         if value < low or value > high:
             note += f"\n{name}: {value:.4g}"
     mean, deviation = float(drawn.samples[:, i].mean()), float(drawn.samples[:, i].std())
-    decimals = max(0, 1 - int(np.floor(np.log10(deviation)))) if deviation > 0.0 else 0
-    form = f".{decimals}f" if decimals < 5 else ".4g"
-    axes.set_title(f"{mean:{form}} ± {deviation:{form if decimals < 5 else '.2g'}}{note}", fontsize=8.0)
+    decimals = max(0, 1 - int(np.floor(np.log10(max(deviation, 1e-8)))))
+    axes.set_title(f"{mean:.{decimals}f} ± {deviation:.{decimals}f}{note}", fontsize=8.0)
 
 
-def _legend_handles(drawn: _Drawn) -> list:
-    """Lines of the legend: posterior, prior, nominal and true values, as far as they are drawn."""
-    from matplotlib.lines import Line2D
-
-    entries = [("posterior", BLUE, "-")]
-    entries += [("prior", "0.25", ":")] if drawn.densities else []
-    entries += [("nominal value", GREY, "--")] if np.isfinite(drawn.nominal).any() else []
-    entries += [("true value", RED, "-")] if np.isfinite(drawn.truths).any() else []
-    return [Line2D([], [], color=c, linestyle=s, linewidth=1.4, label=label) for label, c, s in entries]
+def _add_legend(figure: "Figure", **options: Any) -> None:
+    """A legend of what is drawn, with each label once."""
+    found = [axes.get_legend_handles_labels() for axes in figure.axes]
+    entries = {label: handle for each in found for handle, label in zip(*each, strict=True)}
+    figure.legend(entries.values(), entries, frameon=False, **options)
 
 
 def plot_run(sampler: Any) -> "Figure":
-    """Plot what a sampler did: what was known after each step, against the evaluations.
+    """Plot what a sampler did: what was known after each step, against the evaluations; the title has the simulations.
 
     From above: the exponent beta and the acceptance of each stage, if there are several; the effective sample size; the
     log-evidence with two standard errors, after each round of a guide and each stage; and the log-probability of the
@@ -284,7 +286,7 @@ def plot_run(sampler: Any) -> "Figure":
     n = 2 + several + (len(steps) > 1)
     figure, panels = plt.subplots(n, 1, figsize=(7.5, 2.2 * n + 1.0), layout="constrained")
     ladder, (points, evidence, *chain) = panels[:several], panels[several:]
-    title = f"{sampler.evaluations} evaluations"
+    title = f"{sampler.simulations:.0f} simulations"
     if stages[-1].beta == 1.0:
         title += f", log Z = {sampler.log_evidence:.2f} ± {sampler.log_evidence_error:.2g}"
     figure.suptitle(title, fontsize="medium")
@@ -306,7 +308,8 @@ def plot_run(sampler: Any) -> "Figure":
     points.set(ylim=(0.0, 1.3 * points.get_ylim()[1]), ylabel="number of points")
     if stages[-1].beta == 1.0:
         evidence.axhline(sampler.log_evidence, color=GREY, linewidth=1, linestyle=":", label="result")
-    evidence.set(xlabel="evaluations of the log-probability", ylabel="log-evidence so far")
+    before = f", after {sampler.simulations_of_guides:.0f} simulations by the guide" if rounds else ""
+    evidence.set(xlabel=f"evaluations of the log-probability{before}", ylabel="log-evidence so far")
     evidence.ticklabel_format(axis="y", useOffset=False)
     for axes in chain:
         levels = np.quantile(np.asarray(sampler.get_log_prob(), dtype=float), [0.05, 0.5, 0.95], axis=1)
@@ -316,8 +319,7 @@ def plot_run(sampler: Any) -> "Figure":
         axes.xaxis.get_major_locator().set_params(integer=True)
     for axes in panels:
         axes.grid(alpha=0.25)
-        if axes.get_legend_handles_labels()[0]:
-            axes.legend(frameon=False, fontsize="small", ncols=3)
+        axes.legend(frameon=False, fontsize="small", ncols=3)
     for axes in (*ladder, points):
         axes.sharex(evidence)
         axes.tick_params(labelbottom=False)

@@ -29,7 +29,7 @@ def names_of_parameters(names: Sequence[str] | None, ndim: int) -> tuple[str, ..
 
 def summary(
     samples: np.ndarray,
-    names: Sequence[str] | None = None,
+    names: Sequence[Any] | None = None,
     mean_error: np.ndarray | None = None,
     sd_error: np.ndarray | None = None,
 ) -> "pandas.DataFrame":
@@ -40,7 +40,8 @@ def summary(
     samples : array_like, shape (n, ndim)
         Samples of the posterior.
     names : sequence of str, optional
-        One name per parameter; theta_0, theta_1, ... by default.
+        One name per parameter; theta_0, theta_1, ... by default. With ``posterior.parameters``, all values are in the
+        units of the parameters, which the rows name.
     mean_error, sd_error : array_like, shape (ndim,), optional
         Standard errors of mean and standard deviation, from ``sampler.mean_error()`` and ``sampler.sd_error()``, since
         copies made by resampling are correlated; NaN where they are unknown.
@@ -53,12 +54,12 @@ def summary(
 
     Examples
     --------
-    >>> print(summary(samples, posterior.parameter_names))  # doctest: +SAMPLED
-                            mean  mean_error        sd  sd_error        cv
-    stiffness           1.102246         NaN  0.002427       NaN  0.002202
-    damping             0.857993         NaN  0.022188       NaN  0.025860
-    sigma_acceleration  0.461220         NaN  0.022175       NaN  0.048078
-    sigma_displacement  0.018123         NaN  0.000849       NaN  0.046850
+    >>> print(summary(samples, posterior.parameters))  # doctest: +SAMPLED
+                                mean  mean_error        sd  sd_error        cv
+    stiffness [x nominal]   1.102246         NaN  0.002427       NaN  0.002202
+    damping [x nominal]     0.857993         NaN  0.022188       NaN  0.025860
+    sigma_acceleration [g]  0.047031         NaN  0.002261       NaN  0.048078
+    sigma_displacement [cm] 1.812300         NaN  0.084900       NaN  0.046850
     """
     import pandas  # slow to import
 
@@ -67,9 +68,9 @@ def summary(
         raise ValueError(
             f"samples must be an array (n, ndim) with n >= 2, as get_chain(flat=True) returns; got {samples.shape}"
         )
+    names = names_of_parameters(names, samples.shape[1])
     mean, sd = samples.mean(axis=0), samples.std(axis=0)
-    errors = (np.nan if error is None else error for error in (mean_error, sd_error))
-    columns = dict(zip(("mean", "sd", "mean_error", "sd_error"), (mean, sd, *errors), strict=True))
-    found = pandas.DataFrame(columns, index=names_of_parameters(names, samples.shape[1]))
-    found["cv"] = found["sd"] / found["mean"].abs()
-    return found[["mean", "mean_error", "sd", "sd_error", "cv"]]
+    columns = {"mean": mean, "mean_error": mean_error, "sd": sd, "sd_error": sd_error}
+    found = pandas.DataFrame(columns, [getattr(each, "label", each) for each in names], dtype=float)
+    found = found.div([getattr(each, "factor", 1.0) for each in names], axis=0)
+    return found.assign(cv=found["sd"] / found["mean"].abs())

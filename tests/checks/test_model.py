@@ -62,7 +62,7 @@ def test_a_good_model_has_no_findings():
         return central_differences(theta, record, 8)
 
     found = check_model(posterior_of(fine))
-    assert names(found) == [] and len(made) > 100
+    assert names(found) == [] and len(made) > 100 and repr(found) == "Nothing was found."
 
 
 @pytest.mark.parametrize(("noise", "weight"), [(0.003, ["care"]), (0.2, ["care"]), (1.5, [])])

@@ -115,7 +115,8 @@ def test_a_finding_says_when_and_has_a_line():
     deck, top = Channel("deck@1", "acceleration", "g"), Channel("top", "acceleration", "mm/s2")
     drifting = spoil(response(2), "drift")[0]
     measured = Measurements([deck, top], STEP, [values, drifting], start=0.5)
-    first, second = check_data(measured)
+    first, second = found = check_data(measured)
+    assert repr(found) == f"CAUTION: {first}\nCAUTION: {second}", "lines at the prompt"
     assert first.kind == "A sensor was stuck" and "7.500 to 7.990 s" in first.text
     assert 'missing = [["deck@1", 7.500, 7.990]]' in first.action
     assert second.kind == "A channel drifts" and "top = [[0.500, " in second.action

@@ -7,6 +7,7 @@ import emcee
 import numpy as np
 import pytest
 
+from fe_likelihoods.likelihood.parameters import Parameter
 from samplers import SamplingWarning, SMCSampler, TMCMCSampler
 from samplers.presets import CHING_CHEN_2007, RAMANCHA_2022_CONSTANT, RAMANCHA_2022_LITERAL
 from samplers.reporting.summary import summary
@@ -285,5 +286,10 @@ def test_summary_with_errors_of_mean_and_standard_deviation():
     for error in (sampler.mean_error, sampler.sd_error):
         with pytest.raises(ValueError, match="below the number of stored steps; got discard=99"):
             error(discard=99)
+    parameters = [Parameter("k"), Parameter("c", "-"), Parameter("sigma_top", "mm", 1e-3)]
+    shown = summary(sampler.get_chain(flat=True), parameters, sampler.mean_error())
+    assert list(shown.index) == ["k", "c [-]", "sigma_top [mm]"] and np.isnan(shown["sd_error"]).all()
+    for name in ("mean", "sd", "mean_error"):
+        np.testing.assert_allclose(shown[name], result[name] * [1.0, 1.0, 1e3])
     with pytest.raises(ValueError, match="does not match length of index"):
         summary(sampler.get_chain(flat=True), mean_error=[0.1, 0.1])

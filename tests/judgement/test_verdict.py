@@ -43,7 +43,7 @@ def test_one_mode_stays_one(posterior):
 def test_sentence_and_what_it_is_made_of(sampler):
     found = sampler.verdict
     assert sampler.describe().startswith(f"{sampler.verdict.status.capitalize()}: 2 modes with shares 0.7")
-    assert "no failed evaluations" in sampler.describe()
+    assert "no failed simulations" in sampler.describe()
     assert compare_models({"a": sampler, "b": (-3.0, 0.1)}).verdict.to_dict() == {"a": found.status, "b": ""}
 
 

@@ -29,6 +29,7 @@ def test_rows_are_channels_and_columns_responses(measured):
         assert [axes.get_title() for axes in (before, after)] == ["before, RRMSE 100 %", "after, RRMSE 7.0 %"]
         np.testing.assert_allclose(before.lines[0].get_ydata(), factor * measured.values[k])
         np.testing.assert_allclose(after.lines[1].get_ydata(), 1.07 * factor * measured.values[k])
+        assert before.lines[0].get_linewidth() > 2.0 * after.lines[1].get_linewidth(), "seen where the lines agree"
         (span,) = before.patches
         assert (span.get_x(), span.get_x() + span.get_width()) == pytest.approx(zoom.get_xlim())
     assert [np.round(axes.get_xlim(), 1).tolist() for axes in rows[:, 2]] == [

@@ -72,7 +72,7 @@ def legend(figure) -> list[str]:
 def test_corner_shows_units_prior_truth_and_nominal_values(updated):
     figure = plot_corner(updated, Posterior(), truths=[1.25, 0.95, 0.0021])
     axes = grid(figure)
-    labels = ["k [x 3 kN/m]", "c [x 0.02]", "sigma [mm]"]
+    labels = ["k\n[x 3 kN/m]", "c\n[x 0.02]", "sigma\n[mm]"]
     assert [each.get_xlabel() for each in axes[-1]] == labels
     assert [each.get_ylabel() for each in axes[:, 0]] == ["", *labels[1:]]
     assert legend(figure) == ["posterior", "prior", "nominal value", "true value"]
@@ -88,6 +88,31 @@ def test_corner_shows_units_prior_truth_and_nominal_values(updated):
     assert axes[0, 0].get_title() == f"{updated[:, 0].mean():.3f} ± {updated[:, 0].std():.3f}"
 
 
+def test_numbers_of_eight_parameters_do_not_touch(rng):
+    """Those of one axis among each other, and those of a panel and the next one."""
+    means, deviations = (
+        [0.59, 0.96, 0.27, 4.73, 2.43, 12.0, 0.004947, 0.02247],
+        [1.2e-4, 1e-4, 5e-4, 0.04, 6e-4, 3, 2e-5, 1e-4],
+    )
+    figure = plot_corner(rng.normal(means, deviations, size=(400, 8)))
+    figure.canvas.draw()
+    axes = grid(figure)
+    for texts in ([each.get_xticklabels() for each in axes[-1]], [each.get_yticklabels() for each in axes[1:, 0]]):
+        ends = [text.get_window_extent() for each in texts for text in each]
+        assert len(ends) >= 14
+        # rotated by 45 degrees: boxes of neighbours overlap, their baselines are a letter apart
+        places = np.array([[box.x1, box.y1] for box in ends])
+        assert np.linalg.norm(np.diff(places, axis=0), axis=1).min() > 20.0
+
+
+def test_chosen_parameters_keep_their_marks(updated):
+    axes = grid(plot_corner(updated, Posterior(), truths=[1.25, 0.95, 0.0021], var_names=["sigma", "k"]))
+    assert [each.get_xlabel() for each in axes[-1]] == ["sigma\n[mm]", "k\n[x 3 kN/m]"]
+    assert lines(axes[1, 0], RED) == [pytest.approx(2.1)] and lines(axes[1, 1], RED) == [1.25]
+    (axes,) = plot_corner(updated, Posterior(), var_names=["k"]).axes
+    assert lines(axes, GREY) == [1.0], "a single parameter"
+
+
 @pytest.mark.parametrize(
     ("change", "arguments", "message"),
     [
@@ -100,6 +125,12 @@ def test_corner_shows_units_prior_truth_and_nominal_values(updated):
         ),
         (lambda x: x, {"truths": [1.0]}, "truths must have one value for each of 3"),
         (lambda x: x[:2], {}, "n >= ndim"),
+        (
+            lambda x: x,
+            {"posterior": ["k", "c", "sigma"]},
+            r"var_names= chooses parameters\); got \['k', 'c', 'sigma'\]",
+        ),
+        (lambda x: x, {"posterior": Posterior(), "var_names": ["c", "m"]}, r"k, c, sigma; got \['c', 'm'\]"),
     ],
 )
 def test_wrong_arguments_are_refused(change, arguments, message, updated):

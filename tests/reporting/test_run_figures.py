@@ -21,7 +21,9 @@ def test_run_shows_every_stage_or_round_at_its_cost(guided):
     run.run_mcmc(None, 5)
     figure = plot_run(run)
     *_, sizes, evidence, chain = figure.axes
-    assert figure.get_suptitle().startswith(f"{run.evaluations} evaluations, ")
+    assert figure.get_suptitle().startswith(f"{run.simulations:.0f} simulations, ")
+    made = f", after {run.simulations_of_guides:.0f} simulations by the guide" if guided else ""
+    assert evidence.get_xlabel() == f"evaluations of the log-probability{made}"
     parts = run.rounds if guided else run.ladder
     assert list(sizes.lines[0].get_ydata()) == [part.effective_sample_size for part in parts]
     so_far = evidence.containers[0].lines[0].get_ydata()
