@@ -24,7 +24,7 @@ from samplers.interrupts import process_name
 
 from ..noise.sufficient_statistics import relative_changes
 from ..simulation.failure_reasons import ChangedModel, TransientReason
-from ..simulation.files import digests_by_name, observing, read_again
+from ..simulation.files import Observer, digests_by_name, read_again
 from ..simulation.label import ModelLabel
 from ..simulation.model import SimulationBatch, misfit_of_responses, most_responses, simulate_batch
 from .memory import thetas_of
@@ -152,7 +152,7 @@ class VerifiedModel:
         if not self.label.observes:
             yield
             return
-        with observing() as observer:
+        with Observer() as observer:
             yield
         self.label.add(observer.result(self.label.opened) if self.pool is None else observer.noted)
 

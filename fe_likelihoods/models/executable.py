@@ -253,7 +253,9 @@ class ExecutableModel(UserModel):
             return min(_WATCH_INTERVAL, self.time_limit - seconds + 1e-3)
 
         outputs = place / "stdout.txt", place / "stderr.txt"
-        exit_code = group.run([self.command[0], *arguments], place / "run", *outputs, watch)
+        with open(outputs[0], "wb") as stdout, open(outputs[1], "wb") as stderr:
+            command = [self.command[0], *arguments]
+            exit_code = group.run(command, watch, cwd=place / "run", stdout=stdout, stderr=stderr)
         if exit_code:
             with open(outputs[1], "rb") as stderr:
                 reason = ": ".join(filter(None, [describe_exit(exit_code, "the program"), _last_lines(stderr, 3)]))

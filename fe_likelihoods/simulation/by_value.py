@@ -39,7 +39,6 @@ __all__ = [
     "Pickled",
     "attribute",
     "code_within",
-    "dumps",
     "is_arriving",
     "is_of_user",
     "load",
@@ -85,8 +84,11 @@ class Pickled:
     @property
     def payload(self) -> bytes:
         """Digest of the library, name of the sending process, and the pickled function."""
+        if self._payload:
+            return self._payload
         try:
-            self._payload = self._payload or sources_digest() + process_name() + dumps(self._function)
+            _Pickler(file := io.BytesIO()).dump(self._function)
+            self._payload = sources_digest() + process_name() + file.getvalue()
         except Exception as error:
             name = getattr(self._function, "__qualname__", type(self._function).__qualname__)
             raise ValueError(
@@ -138,38 +140,27 @@ def load(payload: bytes) -> Callable[[Any], Any]:
     return call
 
 
-def dumps(thing: Any) -> bytes:
-    """Pickle an object, with user code and its values by value."""
-    _Pickler(file := io.BytesIO()).dump(thing)
-    return file.getvalue()
+def _sent_module(name: Any) -> types.ModuleType | None:
+    """The module with a name if it is sent; None if the worker imports it."""
+    module = sys.modules.get(name) if isinstance(name, str) else None
+    if module is None or attribute(module, "__name__") != name or not is_of_user(name):
+        return None
+    return None if str(vars(module).get("__file__")).endswith(_COMPILED) else module
 
 
 class _Pickler(cloudpickle.Pickler):
     """Pickler whose functions keep their module: all functions of a module share one namespace with its values."""
 
-    def __init__(self, file: io.BytesIO) -> None:
-        super().__init__(file, protocol=5)
-        self._of_user: dict[Any, types.ModuleType | None] = {}
-
-    def _module(self, name: Any) -> types.ModuleType | None:
-        """The module with a name if it is sent; None if the worker imports it."""
-        if name not in self._of_user:
-            module = sys.modules.get(name) if isinstance(name, str) else None
-            is_sent = attribute(module, "__name__") == name and is_of_user(name)
-            is_sent = is_sent and not str(vars(module).get("__file__")).endswith(_COMPILED)
-            self._of_user[name] = module if is_sent else None
-        return self._of_user[name]
-
     def reducer_override(self, obj: Any) -> Any:
         if isinstance(obj, types.FunctionType):
             return self._function(obj)
         if isinstance(obj, types.ModuleType):
-            return self._reduce_module(obj) if self._module(obj.__name__) is obj else NotImplemented
-        if isinstance(obj, _CACHED) and self._module(obj.__module__) is not None:  # pickled by its name otherwise
+            return self._reduce_module(obj) if _sent_module(obj.__name__) is obj else NotImplemented
+        if isinstance(obj, _CACHED) and _sent_module(obj.__module__) is not None:  # pickled by its name otherwise
             return _new_cached, (obj.__wrapped__, *obj.cache_parameters().values())
         if isinstance(obj, _LOCKS):
             return (threading.RLock if isinstance(obj, _LOCKS[1]) else threading.Lock), ()
-        if not isinstance(obj, type) or self._module(obj.__module__) is None:
+        if not isinstance(obj, type) or _sent_module(obj.__module__) is None:
             return super().reducer_override(obj)
         # a new class for each function, since the methods of an earlier class may refer to earlier values
         make, (*arguments, _, extra), (state, slots), *tail = _dynamic_class_reduce(obj)
@@ -182,20 +173,20 @@ class _Pickler(cloudpickle.Pickler):
         sent = {key: values[key] for key in ("__file__", "__package__") if key in values}
         if name not in SCRIPTS:  # modules of a package are sent where a function names them
             present = values.copy().items()  # other threads may change it
-            sent |= {k: v for k, v in present if k not in _OF_THE_IMPORT and self._module(f"{name}.{k}") is None}
-        return _new_module, (name,), (self._module(name.rpartition(".")[0]), sent), None, None, _fill_module
+            sent |= {k: v for k, v in present if k not in _OF_THE_IMPORT and _sent_module(f"{name}.{k}") is None}
+        return _new_module, (name,), (_sent_module(name.rpartition(".")[0]), sent), None, None, _fill_module
 
     def _function(self, function: types.FunctionType) -> Any:
         """Reduce a function; a user function gets the namespace of its module, and the modules that it imports."""
-        module = self._module(function.__globals__.get("__name__"))
+        module = _sent_module(function.__globals__.get("__name__"))
         if module is None or vars(module) is not function.__globals__:
-            is_sent = self._module(function.__module__) is not None
+            is_sent = _sent_module(function.__module__) is not None
             return self._dynamic_function_reduce(function) if is_sent else super().reducer_override(function)
         # where cloudpickle keeps the future globals of the functions of a module
         self.globals_ref.setdefault(id(function.__globals__), _Namespace(module))
         reduced = self._dynamic_function_reduce(function)
         used = _possible_modules(function.__code__, module.__dict__.get("__package__") or "")
-        reduced[2][1]["_cloudpickle_submodules"].extend(filter(None, map(self._module, used)))
+        reduced[2][1]["_cloudpickle_submodules"].extend(filter(None, map(_sent_module, used)))
         return reduced
 
 
@@ -205,24 +196,19 @@ def names_in(code: types.CodeType) -> frozenset[str]:
     return frozenset(name for each in _codes(code) for name in each.co_names)
 
 
-@functools.lru_cache(maxsize=4096)
-def _imported_in(code: types.CodeType) -> frozenset[str]:
-    """Modules of import statements in the code, without the dots of relative ones."""
-    steps = [step for each in _codes(code) for step in dis.get_instructions(each)]
-    return frozenset(step.argval for step in steps if step.opname == "IMPORT_NAME")
-
-
 def _codes(code: types.CodeType) -> list[types.CodeType]:
     inner = [each for each in code.co_consts if isinstance(each, types.CodeType)]
     return [code, *(each for part in inner for each in _codes(part))]
 
 
+@functools.lru_cache(maxsize=4096)
 def _possible_modules(code: types.CodeType, package: str) -> list[str]:
-    """Full names of modules that the code of a package may import."""
-    imported, parts = _imported_in(code), package.split(".")
-    packages = [".".join(parts[:n]) for n in range(1, len(parts) + 1)] if imported else []
+    """Full names of modules that import statements in the code of a package may name."""
+    steps = [step for each in _codes(code) for step in dis.get_instructions(each) if step.opname == "IMPORT_NAME"]
+    parts, imported = package.split("."), {step.argval for step in steps}  # without the dots of relative ones
+    packages = [".".join(parts[:n]) for n in range(1, len(parts) + 1)]
     found = imported | {f"{each}.{name}".rstrip(".") for each in packages for name in imported}
-    return sorted(found | {f"{each}.{name}" for each in found & sys.modules.keys() for name in names_in(code)})
+    return sorted(found | {f"{each}.{name}" for each in found for name in names_in(code)})
 
 
 class _Namespace(NamedTuple):

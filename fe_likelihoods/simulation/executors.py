@@ -1,21 +1,16 @@
 """Executors: the same ``map`` and ``submit`` for all pools, which run simulations in other processes or machines.
 
-The rule for ``pool=``:
-
-* None: in this process.
-* a whole number: a `LocalPool` of that many processes.
-* any other object with ``map``: ``list(pool.map(function, items))``, and for single items ``submit`` if it has that.
-  This covers executors of concurrent.futures, loky, mpi4py.futures and dask, pools of multiprocessing and schwimmbad.
+The rule for ``pool=``: None is this process, a whole number a `LocalPool` of that many processes. Any other object with
+``map`` gets ``list(pool.map(function, items))``, and single items if it has ``submit``: executors of
+concurrent.futures, loky, mpi4py.futures and dask, pools of multiprocessing and schwimmbad.
 
 The function (model and measurements) is sent by value (`fe_likelihoods.simulation.by_value`): by a `LocalPool` to each
 worker once, and again when anything that it uses has changed; by other pools with each item. Workers load it once.
-A pool that only has ``map`` runs items when they are submitted: its attribute ``submits`` is False. Results do not
-depend on the pool, to the last bit.
+Results do not depend on the pool, to the last bit.
 
-When a worker dies, the standard library's pools hang or break, and cannot say which item killed it. Each worker of a
-`LocalPool` has a pipe, and a thread in this process sends it one item at a time, which is run again if the worker dies.
-It is started with `subprocess`, in a group that ends with it (`fe_likelihoods.simulation.files.Group`): pool processes,
-in which it must also work, often may not use `multiprocessing`.
+When a worker dies, the standard library's pools hang or break, and cannot say which item killed it. A `LocalPool` has a
+thread for each worker, which sends it one item at a time through a pipe, again if it dies. Workers are started with
+`subprocess`: pool processes, in which they must also work, often may not use `multiprocessing`.
 """
 
 import json
@@ -59,7 +54,7 @@ _BOOT = (
 
 
 class Submitting:
-    """Base class of executors, which have `submit_all` and `give_up`."""
+    """Base class of executors, which have `submit_all` and `give_up`; `submits` if items are not run at once."""
 
     def map(self, function: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
         """Results of a function for every item, in order; ``(None, reason)`` for one that kills all its processes.
@@ -191,11 +186,10 @@ class Died(SimulationFailed):
 
 
 class Worker:
-    """Calls functions in one process after the other. Its methods may be called from one thread, apart from `kill`.
+    """Calls functions in one process after the other, from one thread; only `kill` may be called from others.
 
-    The process is started for a call, and replaced if it has died or after `most_calls`. It is killed by `kill`, when
-    this object is garbage-collected, or when this process ends. `environment` adds variables; with `quiet`,
-    its output is not shown.
+    A process that has died, or has had `most_calls`, is replaced at the next call. `environment` adds variables; with
+    `quiet`, its output is not shown.
     """
 
     def __init__(self, environment: Mapping[str, str], quiet: bool = False, most_calls: float = math.inf) -> None:
@@ -208,7 +202,9 @@ class Worker:
         Died if the process dies, or does not answer within `seconds` after it was given the item and is killed.
         """
         message = b"\0" + pickle.dumps(job.item, protocol=5)
-        if not self._is_ready() and not job.given_up:
+        is_own = self._process is not None and self._owner == os.getpid()  # not of the process that has forked this one
+        is_ready = is_own and self._process.poll() is None and self._calls < self._most_calls
+        if not is_ready and not job.given_up:
             self._renew()
         if job.given_up:  # before, there was no process to kill
             raise CancelledError
@@ -220,30 +216,24 @@ class Worker:
 
     def run_until_it_ends(self, job: Job) -> Any:
         """Result as from `run`, from another process if one dies; ``(None, reason)`` after the third death."""
-        deaths, job.worker = 0, self
+        job.worker = self
         try:
-            while True:
+            for _ in range(MAX_ATTEMPTS):
                 try:
                     return self.run(job)
                 except Died as error:
-                    deaths += 1
-                    if deaths == MAX_ATTEMPTS:
-                        return None, error.reason
+                    reason = error.reason
+            return None, reason
         finally:
             job.worker = None
-
-    def _is_ready(self) -> bool:
-        is_own = self._process is not None and self._owner == os.getpid()  # not of the process that has forked this one
-        return is_own and self._process.poll() is None and self._calls < self._most_calls
 
     def _renew(self) -> None:
         environment, quiet = self._settings
         self.kill()
         self._connection, theirs = Pipe()
-        output = subprocess.DEVNULL if quiet else None
+        output, self._group = subprocess.DEVNULL if quiet else None, Group()
+        texts = [[str(text) for text in texts] for texts in (sys.path, sys.argv)]
         with theirs:
-            self._group = Group()
-            texts = [[str(text) for text in texts] for texts in (sys.path, sys.argv)]
             self._process = self._group.start(
                 [sys.executable, "-c", _BOOT, json.dumps([*texts, theirs.fileno()])],
                 env={**os.environ, **environment, PLACE: self._group.place},
@@ -290,10 +280,9 @@ class Worker:
 class LocalPool(Submitting, AbstractContextManager):
     """Pool of local processes.
 
-    The processes start with the first items. They end with `close`, when this object is garbage-collected, or when this
-    process ends, even if it is killed. A process that dies is replaced and its item run again; it is given up after the
-    third death. Linear algebra and numba use one thread per process, unless environment variables such as
-    OMP_NUM_THREADS are set. Lambdas and functions of a script or notebook can be used.
+    The processes start with the first items, and end with `close` or this process. One that dies is replaced and its
+    item run again, given up after the third death. Linear algebra and numba use one thread per process, unless
+    environment variables such as OMP_NUM_THREADS are set. Lambdas and functions of a script or notebook can be used.
 
     Likelihoods and samplers can share a pool, and its methods may be called from several threads.
 
@@ -396,9 +385,8 @@ class PoolExecutor(Submitting):
 class Sandbox(threading.local):
     """Callable that runs a function of one argument in another process, whose output is not shown.
 
-    The process is replaced after a call that did not end by itself, and after `runs_per_process` calls. Each thread has
-    a process of its own. The function is sent by value, in its state at the call; ValueError if it cannot be sent.
-    `time_limit` [s] is for a call, without the start of the process.
+    Each thread has a process of its own, replaced after a call that did not end by itself, and after `runs_per_process`
+    calls. The function is sent in its state at the call. `time_limit` [s] is without the start of the process.
     """
 
     def __init__(
@@ -424,10 +412,7 @@ class Sandbox(threading.local):
 
 
 def serve(fileno: int) -> None:
-    """Main loop of a worker process: answer messages until the connection with a file descriptor closes.
-
-    A message is a function to load, or an item for it.
-    """
+    """Main loop of a worker process: answer functions to load, and items for them, until the connection closes."""
     os.set_inheritable(fileno, False)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the parent, which ends this process
     become_worker()

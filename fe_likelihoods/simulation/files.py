@@ -2,15 +2,14 @@
 
 One audit hook (`sys.addaudithook`) sees what Python code of this process opens, writes and starts.
 
-* Observers note the files, modules, shared libraries and programs that simulations use. Not counted are files that a
-  simulation writes itself, and files of Python and installed packages.
+* Files, modules, shared libraries and programs that a simulation uses are inputs, apart from those that it changes, and
+  those of Python and installed packages.
 * User code often writes files of fixed names and reads them back: input of a program, output of an OpenSees recorder.
   So a worker process changes into a temporary folder for each simulation, which shows the sender's working folder:
   files as copies, large ones as links, subfolders as folders. If Python code opens a link for writing, a private file
   takes its place first. Threads of one process share its working folder: there, simulations that write are refused.
-* A file outside of this folder that a simulation writes, unless it has made it exclusively, is refused where several
-  run at once. Compiled code and programs write without an event: a file that they have written is noticed when Python
-  code reads it.
+* So is a file outside of this folder that a simulation writes while others run, unless it has made it exclusively.
+  Compiled code and programs write without an event: their files are noticed when Python code reads them.
 """
 
 import contextlib
@@ -40,14 +39,13 @@ from .failure_reasons import SimulationFailed, TransientReason, UnusableModel
 __all__ = [
     "PLACE",
     "Group",
+    "Observer",
     "Observed",
     "Opened",
     "digests_by_name",
     "file_digest",
     "mapped",
     "note",
-    "observing",
-    "of_this_library",
     "read_again",
     "working_folder",
 ]
@@ -57,6 +55,8 @@ _CLOCK_TICK = 2.0  # [s]; a file changed more recently may change again with the
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 _SYSTEM = ("/proc/", "/sys/", "/dev/", "/run/")
 _INSTALLED = ("/usr/", "/lib", "/etc/", "/bin/", "/opt/", "/memfd:", "/SYSV")
+_PREFIXES = Path(__file__).parents[1], Path(sys.prefix, "lib"), Path(sys.base_prefix, "lib")
+_INSTALLED += tuple(os.path.realpath(each) + os.sep for each in _PREFIXES)
 # written once per machine, by installed packages and numba
 _CACHES = (*(f"{os.sep}{name}{os.sep}" for name in ("__pycache__", ".cache", ".config")), ".nbi", ".nbc")
 
@@ -71,6 +71,7 @@ _CHANGES |= {"os.link": 1, "os.rename": 1, "os.symlink": 1}
 _EVENTS = _STARTS | _CHANGES.keys() | {"open", "tempfile.mkdtemp", "sqlite3.connect", "ctypes.dlopen"}
 
 _observers: "list[Observer]" = []
+_add_hook = functools.cache(sys.addaudithook)  # for the life of the process
 _own = threading.local()
 _digests: dict[str, tuple[tuple, float, str]] = {}
 _fresh: set[str] = set()  # files that simulations have read and that were written while they ran
@@ -88,14 +89,18 @@ def digests_by_name(opened: Opened) -> dict[str, str]:
 
 def read_again(opened: Opened) -> Opened:
     """The same files with their present digests; files that are not found, as on other machines, keep theirs."""
-    return {path: _digest_or(path, digest) for path, digest in opened.items()}
+    found = dict(opened)
+    for path in filter(os.path.isfile, opened):
+        with contextlib.suppress(OSError):
+            found[path] = file_digest(path)
+    return found
 
 
 class Observer:
-    """Notes what is opened, written and started, by one `thread` or by all (0), while it is in the list of observers.
+    """Context that notes what is opened, written and started, by one `thread` or by all (0).
 
-    A simulation has a thread, or a folder of its own, the `mirror`. It must not write a file that other simulations may
-    write too, unless it runs `alone`; `shared` is the first such file.
+    A simulation has a thread, or a folder of its own, the `mirror`; `shared` is the first file that it and others may
+    write. There must be none unless it runs `alone`: `UnusableModel` at the end of the context.
     """
 
     def __init__(self, alone: bool = True, thread: int = 0, mirror: "_Mirror | None" = None) -> None:
@@ -104,6 +109,21 @@ class Observer:
         self._used: dict[str, tuple | None] = {}  # states of files at their first use; None if it has made them
         self._made: list[str] = []  # new files and folders, which belong to this simulation
         self._start = time.time_ns()
+
+    def __enter__(self) -> "Observer":
+        _add_hook(_hook)
+        _observers.append(self)
+        return self
+
+    def __exit__(self, kind: type | None, *_: Any) -> None:
+        _observers.remove(self)
+        if kind is None and self.shared and not self.alone:
+            raise UnusableModel(
+                f"The simulations write to {self.shared.removesuffix('/*')}, or read there what is written while they "
+                "run, and simulations in other workers may do the same at that moment, so that results would be mixed "
+                "up. Use a pool of processes (dask: workers with one thread) and a relative file name, which is "
+                "private to each simulation, or a folder from tempfile (docs/parallel.rst); or use one worker, pool=1"
+            )
 
     def result(self, known: Opened) -> Opened:
         """The files that are `known`, and those that were used and are as before, with new shared libraries."""
@@ -148,24 +168,6 @@ class Observer:
         return self.mirror is not None and path.startswith(self.mirror.path + os.sep)
 
 
-@contextlib.contextmanager
-def observing(alone: bool = True, thread: int = 0, mirror: "_Mirror | None" = None) -> Iterator[Observer]:
-    """Observe this process; `UnusableModel` for a file that simulations share, see `Observer`."""
-    _add_hook()
-    _observers.append(observer := Observer(alone, thread, mirror))
-    try:
-        yield observer
-    finally:
-        _observers.remove(observer)
-    if observer.shared and not alone:
-        raise UnusableModel(
-            f"The simulations write to {observer.shared.removesuffix('/*')}, or read there what is written while they "
-            "run, and simulations in other workers may do the same at that moment, so that results would be mixed up. "
-            "Use a pool of processes (dask: workers with one thread) and a relative file name, which is private to "
-            "each simulation, or a folder from tempfile (docs/parallel.rst); or use one worker, pool=1"
-        )
-
-
 def note(opened: Opened) -> None:
     """Tell the observers of this process what another process has opened for it."""
     for observer in list(_observers):
@@ -179,7 +181,7 @@ def running_simulation() -> Observer | None:
 
 
 @contextlib.contextmanager
-def of_this_library() -> Iterator[None]:
+def _of_this_library() -> Iterator[None]:
     """Files and programs in the ``with`` block do not belong to the simulation."""
     before, _own.is_quiet = getattr(_own, "is_quiet", False), True
     try:
@@ -188,23 +190,18 @@ def of_this_library() -> Iterator[None]:
         _own.is_quiet = before
 
 
-@functools.cache
-def _add_hook() -> None:
-    sys.addaudithook(_hook)  # for the life of the process
-
-
 def _hook(event: str, arguments: tuple) -> None:
     if not _observers or event not in _EVENTS:
         return
     of_library = getattr(_own, "is_quiet", False)
-    with of_this_library():
+    with _of_this_library():
         simulation, uses = running_simulation(), []
         with contextlib.suppress(Exception):  # never disturb the code that is observed
             uses = [(how, os.path.abspath(os.fsdecode(path))) for how, path in _uses(event, arguments)]
         if simulation is not None and simulation.mirror is not None and event in _STARTS and not of_library:
             simulation.mirror.states = {}  # where the process may still write
         for how, name in uses:
-            path = _full(name)
+            path = os.path.join(os.path.realpath(os.path.dirname(name)), os.path.basename(name))
             if simulation is not None and not of_library:
                 simulation.sees(how, os.path.realpath(path) if how == "reads" else path)
             if simulation is not None and simulation.is_own(name):  # the file that it shows
@@ -263,43 +260,21 @@ def file_digest(path: str | os.PathLike) -> str:
     return digest
 
 
-def _digest_or(path: str, otherwise: str) -> str:
-    try:
-        return file_digest(path) if os.path.isfile(path) else otherwise
-    except OSError:
-        return otherwise
-
-
 def mapped(read: Iterable[str] = ()) -> Opened:
     """Files that were read, and those mapped into this process's memory, such as shared libraries (on Linux only)."""
     paths = set(read)
     with contextlib.suppress(OSError):
         lines = [line.split(None, 5)[5:] for line in Path("/proc/self/maps").read_text().splitlines()]
         paths |= {path for (path,) in filter(None, lines) if path.startswith("/") and not path.endswith("(deleted)")}
-    files = {path: _digest_or(path, "") for path in paths if _counts(path)}
-    return {path: digest for path, digest in files.items() if digest}
+    found = read_again(dict.fromkeys(filter(_counts, paths), ""))
+    return {path: digest for path, digest in found.items() if digest}
 
 
 def _counts(path: str) -> bool:
     """Whether a file counts: it does not belong to the system, Python or an installed package."""
     if path.startswith((*_SYSTEM, *_INSTALLED)) or path.endswith((".pyc", "-shm", "-wal")):
         return False
-    if "-packages" + os.sep in path or path.startswith(_installed()):
-        return False
-    return os.path.realpath(path) != os.path.realpath(sys.executable)
-
-
-@functools.cache
-def _installed() -> tuple[str, ...]:
-    library = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
-    prefixes = [os.path.join(prefix, "lib") for prefix in (sys.prefix, sys.base_prefix)]
-    return tuple(os.path.realpath(folder) + os.sep for folder in (library, *prefixes))
-
-
-def _full(path: Any) -> str:
-    """Absolute path, without links among its folders."""
-    folder, name = os.path.split(os.path.abspath(os.fsdecode(path)))
-    return os.path.join(os.path.realpath(folder), name)
+    return "-packages" + os.sep not in path and os.path.realpath(path) != os.path.realpath(sys.executable)
 
 
 # working folders ----------------------------------------------------------------------------------------------------
@@ -319,8 +294,8 @@ class Observed:
     """A function of one item, whose results include what it opened; other processes call it in a folder of its own.
 
     A call returns the result, and all files that calls in this process have opened, since earlier results may have been
-    lost. It raises `UnusableModel` if it writes a file that other simulations may write too, unless it runs `alone`; by
-    default, what holds where it is sent. `sender` is the name and the working folder of the process that has sent it.
+    lost. `alone` as for an `Observer`, by default what holds where it is sent; `sender` is the name and the working
+    folder of the process that has sent it.
     """
 
     def __init__(
@@ -333,33 +308,30 @@ class Observed:
     def __reduce__(self) -> tuple:
         alone, simulation = self._alone, running_simulation()
         if alone is None:
-            alone = _is_main() if simulation is None else simulation.alone
+            is_main = threading.current_thread() is threading.main_thread()
+            alone = is_main if simulation is None else simulation.alone
         return Observed, (self.function, alone, self._sender or (process_name(), working_folder()))
 
     def __call__(self, item: Any) -> tuple[Any, Opened]:
         """The result for an item, and what was opened."""
-        is_main, simulation, before = _is_main(), (bool(self._alone), threading.get_ident()), working_folder()
+        is_main, before, mirror = threading.current_thread() is threading.main_thread(), working_folder(), None
+        alone, thread = bool(self._alone), 0 if is_main else threading.get_ident()
         is_home = self._sender is None or self._sender[0] == process_name()
         if running_simulation() is not None or (is_home and is_main):  # one after the other
-            simulation = ()
+            alone, thread = True, 0
         elif not is_home and (is_main or _is_only_thread_of_dask()):
             mirror = _mirror_of(self._sender[1], os.getpid())
-            simulation = bool(self._alone), 0 if is_main else threading.get_ident(), mirror
             os.chdir(mirror.shown())
         try:
-            with observing(*simulation) as observer:
+            with Observer(alone, thread, mirror) as observer:
                 result = self.function(item)
         finally:
-            if len(simulation) == 3:
+            if mirror is not None:
                 with contextlib.suppress(FileNotFoundError):
                     os.chdir(before)
-        with of_this_library():
+        with _of_this_library():
             self._known = observer.result(self._known)
         return result, self._known
-
-
-def _is_main() -> bool:
-    return threading.current_thread() is threading.main_thread()
 
 
 def _is_only_thread_of_dask() -> bool:
@@ -380,7 +352,7 @@ class Group:
 
     def __init__(self) -> None:
         self.place, nothing = os.path.realpath(tempfile.mkdtemp(prefix="fe_likelihoods_")), subprocess.DEVNULL
-        with of_this_library():
+        with _of_this_library():
             options = {"stdin": subprocess.PIPE, "stdout": nothing, "stderr": nothing, "process_group": 0}
             self.processes = [subprocess.Popen(["/bin/sh", "-c", _WATCH, self.place], **options)]
         self.end = weakref.finalize(self, _end, self.processes, self.place, os.getpid())
@@ -388,25 +360,20 @@ class Group:
 
     def start(self, command: Sequence[str], **options: Any) -> subprocess.Popen:
         """A new process of the group, without standard input; `options` are those of `subprocess.Popen`."""
-        with of_this_library():
+        with _of_this_library():
             group = self.processes[0].pid
             process = subprocess.Popen(command, stdin=subprocess.DEVNULL, process_group=group, **options)
         self.processes.append(process)
         return process
 
-    def run(
-        self, command: Sequence[str], folder: Path, stdout: Path, stderr: Path, watch: Callable[[float], float]
-    ) -> int:
-        """Run a program to its end, kill the group, and return the exit code, as in `subprocess`; the folder stays.
+    def run(self, command: Sequence[str], watch: Callable[[float], float], **options: Any) -> int:
+        """Run a program to its end, kill the group, and return the exit code; the folder stays.
 
-        The command has an absolute path; no shell is used. `watch` is called with the time since the start [s] and
-        returns the time until the next call [s], or raises an exception, which stops the program and is passed on.
-        OSError if the program cannot be started.
+        `watch` is called with the time since the start [s] and returns the time until the next call [s], or raises an
+        exception, which stops the program and is passed on.
         """
         try:
-            with of_this_library(), open(stdout, "wb") as out, open(stderr, "wb") as error:
-                program = self.start(command, cwd=folder, stdout=out, stderr=error)
-            start = time.monotonic()
+            program, start = self.start(command, **options), time.monotonic()
             waiter = threading.Thread(target=program.wait, daemon=True)  # without the pauses of a wait with a limit
             waiter.start()
             while waiter.is_alive():
@@ -417,14 +384,14 @@ class Group:
 
 
 _groups: weakref.WeakSet[Group] = weakref.WeakSet()
-if hasattr(os, "register_at_fork"):  # a forked process must not keep the groups alive
-    os.register_at_fork(after_in_child=lambda: [each.processes[0].stdin.close() for each in list(_groups)])
+# a forked process must not keep the groups alive
+os.register_at_fork(after_in_child=lambda: [each.processes[0].stdin.close() for each in list(_groups)])
 
 
 def _end(processes: Sequence[subprocess.Popen], place: str, owner: int) -> None:
     if owner == os.getpid():  # else it has only a forked copy of the objects
         _kill(processes)
-        with of_this_library():
+        with _of_this_library():
             shutil.rmtree(place, ignore_errors=True)
 
 
@@ -452,14 +419,7 @@ def _family(pid: int) -> list[int]:
     return found
 
 
-@functools.cache
-def _own_group() -> Group:
-    return Group()
-
-
-@functools.cache
-def _mirror_of(base: str, _pid: int) -> "_Mirror":
-    return _Mirror(base)
+_own_group = functools.cache(Group)
 
 
 class _Mirror:
@@ -468,7 +428,7 @@ class _Mirror:
     It is made anew for the next one if a file or folder, here or there, is not in one of the `states` that it was in.
     """
 
-    def __init__(self, base: str) -> None:
+    def __init__(self, base: str, _pid: int) -> None:
         self.base, self.path = base, ""
         self.states: dict[str, tuple | None] = {}
 
@@ -499,9 +459,7 @@ class _Mirror:
         self.states[base] = _state(base)
         for entry in _scan(base):
             place, inside = os.path.join(own, entry.name), os.path.realpath(entry.path) + os.sep
-            is_shown = entry.is_dir() and not entry.name.startswith(".")
-            contained = os.path.realpath(self.base) + os.sep, self._place
-            is_shown &= not any(each.startswith(inside) for each in contained)
+            is_shown = entry.is_dir() and not entry.name.startswith(".") and not self._place.startswith(inside)
             if is_shown and (below := len(_scan(entry.path, self._left + 1))) <= self._left:
                 self._left -= below
                 os.mkdir(place)
@@ -516,6 +474,9 @@ class _Mirror:
             os.symlink(entry.path, place)
         os.utime(own, ns=(0, 0))  # so that whatever is added or removed changes it
         self.states[own] = _state(own)
+
+
+_mirror_of = functools.cache(_Mirror)
 
 
 def _scan(folder: str, most: int | None = None) -> list[os.DirEntry]:

@@ -19,7 +19,7 @@ from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.signals.channels import Channel
 from fe_likelihoods.simulation.executors import LocalPool, as_executor
 from fe_likelihoods.simulation.failure_reasons import UnusableModel
-from fe_likelihoods.simulation.files import Observed, observing, read_again
+from fe_likelihoods.simulation.files import Observed, Observer, read_again
 from fe_likelihoods.simulation.model import simulate_batch
 from tests.opensees_column import require_opensees
 
@@ -483,7 +483,7 @@ def test_a_file_is_known_by_the_name_that_the_code_gives_to_it(use, tmp_path, mo
         Path(name, "k.txt").write_text(f"echo {name}")
     Path("data.txt").write_text("1")
     os.symlink("v1", "data")
-    with observing() as observer:
+    with Observer() as observer:
         use()
     opened = observer.result({})
     assert read_again(opened) == opened
@@ -496,7 +496,7 @@ def test_a_file_is_known_by_the_name_that_the_code_gives_to_it(use, tmp_path, mo
 def test_an_output_that_takes_the_place_of_a_file_is_no_input(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("out.txt").write_text("old")
-    with observing() as observer:
+    with Observer() as observer:
         Path("new.txt").write_text("new")
         os.rename("new.txt", "out.txt")
         Path("out.txt").read_text()
