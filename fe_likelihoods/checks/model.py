@@ -190,13 +190,16 @@ def describe_residuals(checks: ResidualChecks | None) -> list[str]:
     return found
 
 
-def halve_steps(posterior: Posterior, point: np.ndarray, sd: np.ndarray) -> tuple[list[Finding], str]:
+def halve_steps(posterior: Posterior, point: np.ndarray, sd: np.ndarray | None = None) -> tuple[list[Finding], str]:
     """Halve step and mesh at a fit (ndim,), and compare the parameters' change with their standard deviations (ndim,).
 
-    Returns findings, and what was tested. A model that fails with half a step, or whose response does not change, keeps
-    a step of its own, which is not tested.
+    Before a run the point is a draw of the prior, and the standard deviations follow from the errors that a linear fit
+    from there leaves, which are too large rather than too small. Returns findings, and what was tested. A model that
+    fails with half a step, or whose response does not change, keeps a step of its own, which is not tested.
     """
-    widths = sd / np.array([row[3] for row in posterior.prior.table()[1]])
+    before, prior_sd = sd is None, np.array([row[3] for row in posterior.prior.table()[1]])
+    sd = 0.1 * prior_sd if before else sd
+    widths = sd / prior_sd
     precision = np.diag(np.square(np.where(np.isfinite(widths), widths, 0.0)))
     pull, squares, halved, tests = np.zeros(len(sd)), np.zeros(2), dict[str, str](), list[str]()
     for likelihood, columns in posterior.likelihood.data_sets():
@@ -206,9 +209,13 @@ def halve_steps(posterior: Posterior, point: np.ndarray, sd: np.ndarray) -> tupl
         if reason := next(filter(None, batch.reasons), ""):
             return [], f"not tested: a simulation failed ({reason})"
         response = batch.response[0]
-        sigma = np.sqrt(np.nanmean(np.square(likelihood.residuals_of(response)), axis=1))[:, None]
-        weights = np.divide(1.0, sigma, out=np.zeros_like(sigma), where=sigma > 0.0)
-        jacobian = ((batch.response[1:] - response) * weights).reshape(n, -1)
+        residuals, differences = likelihood.residuals_of(response), batch.response[1:] - response
+        weights = _weights(residuals)
+        if before:
+            weighted = (differences * weights).reshape(n, -1).T
+            step = np.linalg.lstsq(weighted, (np.nan_to_num(residuals) * weights).ravel())[0]
+            weights = _weights(residuals - np.tensordot(step, differences, 1))
+        jacobian = (differences * weights).reshape(n, -1)
         precision[np.ix_(at, at)] += jacobian @ jacobian.T
         if (found := _finer(model)) is None:
             tests.append("not tested: the model takes neither a motion nor a step that could be halved")
@@ -224,11 +231,14 @@ def halve_steps(posterior: Posterior, point: np.ndarray, sd: np.ndarray) -> tupl
         tests.append(own if same else f"the {what} was halved at the fit")
         pull[at] += jacobian @ (change * weights).ravel()
         squares += [np.square(each).sum() for each in (change, response)]
-    shift = np.abs(np.linalg.lstsq(precision, pull)[0])
+    covariance = np.linalg.pinv(precision)
+    narrower = np.sqrt(np.maximum(np.diag(covariance), 1e-300)) if before else 1.0
+    shift, sd = np.abs(covariance @ pull) / narrower, sd * narrower
     numbers = {posterior.parameter_names[i]: float(shift[i]) for i in np.flatnonzero(shift >= HALF)}
     shares = dict(zip(posterior.parameter_names, shift * sd / np.maximum(np.abs(point), 1e-300), strict=True))
     moves = [
-        f"{name} by {by:.2g} posterior standard deviations ({percent(shares[name])})" for name, by in numbers.items()
+        f"{name} by {'at least ' * before}{by:.2g} posterior standard deviations ({percent(shares[name])})"
+        for name, by in numbers.items()
     ]
     change = percent(np.sqrt(squares[0] / max(squares[1], 1e-300)))
     text = f"Half of the {' and '.join(halved)} changes the response by {change}, which moves {listed(moves)}."
@@ -236,6 +246,12 @@ def halve_steps(posterior: Posterior, point: np.ndarray, sd: np.ndarray) -> tupl
     title = "The model is too coarse for its data"
     found = [Finding(title, CARE, text, action, numbers, "fit")] if numbers else []
     return found, "; ".join(dict.fromkeys(tests))
+
+
+def _weights(residuals: np.ndarray) -> np.ndarray:
+    """Weights (n_channels, n_steps) of samples by the mean square of each channel's residuals; zero if missing."""
+    sigma = np.sqrt(np.nanmean(np.square(residuals), axis=1))[:, None]
+    return np.isfinite(residuals) / np.where(sigma > 0.0, sigma, np.inf)
 
 
 def check_motion(model: Any, theta: np.ndarray, response: np.ndarray) -> list[Finding]:

@@ -16,11 +16,12 @@ from samplers.judgement.clusters import Cluster
 from samplers.judgement.verdict import Verdict
 
 from ..likelihood.failure_log import reason_without_numbers
-from ..likelihood.fits import SECONDS, Fit, compare
+from ..likelihood.fits import SECONDS, Fit, compare, draws_to_compare
 from ..likelihood.joint import JointLikelihood
 from ..likelihood.likelihood import FELikelihood
 from ..likelihood.parameters import Parameter
 from ..likelihood.posterior import Posterior
+from ..noise.marginal import sampled_noise
 from ..priors.between_events import BETWEEN_EVENTS
 from ..priors.priors import Prior
 from ..signals.records import find_events
@@ -214,8 +215,9 @@ def check_model(posterior: Posterior) -> ModelCheck:
 
     It simulates the mean of the prior three times, under twice the motion, and up to 100 draws of the prior (as many as
     ten seconds allow, and five at least), in which it looks for wrong units, signs, clocks and channels of the data.
-    `fe_likelihoods.check_data` looks at the data alone. Whether step and mesh are fine enough is judged after a run
-    (`fe_likelihoods.check_result`), where the precision of the parameters is known.
+    `fe_likelihoods.check_data` looks at the data alone. For histories with white noise it halves step and mesh at the
+    best draw (a simulation for each parameter and two more, if ten seconds allow it), which shows what
+    `fe_likelihoods.check_result` will find if parameters move by half a standard deviation or more.
 
     Parameters
     ----------
@@ -245,6 +247,11 @@ def check_model(posterior: Posterior) -> ModelCheck:
     for part, theta, _, response in first:
         # generators of workers have moved on meanwhile; where responses differ by chance, other differences say nothing
         found += check_chance(part, theta, response) or check_motion(part.model, theta, response)
+    noises = [sampled_noise(part.noise) for part, *_ in first if part.measurements.is_history]
+    white = len(noises) == len(first) and all(getattr(each, "effective_samples", 0) is None for each in noises)
+    if white and isinstance(posterior.prior, Prior) and all(each.severity != WRONG for each in found):
+        draws = draws_to_compare(posterior)[: min(len(each.draws) for each in fits)]
+        found += _check_steps(posterior, draws[np.argmax(posterior(draws))])[0] if len(draws) else []
     report, attempts = posterior.report(), sum(part.simulator.failures.outcomes for part, *_ in first)
     reasons = report["failure_reasons"]
     found += check_failures(report["failure_count"], attempts, max(reasons, key=reasons.get, default=""))
@@ -294,7 +301,11 @@ def judge_run(run: FinishedRun) -> JudgedRun:
     parts = [] if run.likelihood is None else run.likelihood.data_sets()
     fits = tuple(compare(run.posterior, run.samples, run.centre)) if parts else ()
     histories = not parts or any(part.measurements.is_history for part, _ in parts)
-    found, tested = _check_steps(run) if parts and histories else ([], "")
+    found, tested = list[Finding](), ""
+    if parts and histories and run.prior is not None and not run.is_inconclusive:
+        tested = "not tested: the samples have several modes, which have no common standard deviation"
+        if run.n_modes == 1:
+            found, tested = _check_steps(run.posterior, run.centre, run.samples.std(axis=0))
     failed = failures(run)  # those of the fits included
     found += _check_inputs(run.likelihood, fits) + _check_samples(run)
     found += check_failures(failed.count, failed.attempts, failed.rows[0][0] if failed.rows else "")
@@ -329,21 +340,17 @@ def _check_inputs(likelihood: Any, fits: Iterable[Fit]) -> list[Finding]:
     return found
 
 
-def _check_steps(run: FinishedRun) -> tuple[list[Finding], str]:
-    """The error of step and mesh at the centre of the samples, and what was tested.
+def _check_steps(posterior: Posterior, *point: np.ndarray) -> tuple[list[Finding], str]:
+    """`halve_steps`, and what was tested.
 
-    This takes a simulation for each parameter and more; more than a twentieth of the run's that take long are not made.
+    This takes a simulation for each parameter and more; more than a twentieth of all that take long are not made.
     """
-    if run.prior is None or run.is_inconclusive:
-        return [], ""
-    report = run.likelihood.report()
-    needed = sum(2 + len(likelihood.model.parameter_names) for likelihood, _ in run.likelihood.data_sets())
+    report = posterior.likelihood.report()
+    needed = sum(2 + len(likelihood.model.parameter_names) for likelihood, _ in posterior.likelihood.data_sets())
     seconds = report["seconds"] / max(report["simulations"], 1)
-    if run.n_modes > 1:
-        return [], "not tested: the samples have several modes, which have no common standard deviation"
     if needed > TAIL * report["simulations"] and needed * seconds > SECONDS:
         return [], f"not tested: the test takes about {needed} simulations of {seconds:.2g} s"
-    return halve_steps(run.posterior, run.centre, run.samples.std(axis=0))
+    return halve_steps(posterior, *point)
 
 
 def _check_other_events(run: FinishedRun, n: int) -> list[Finding]:

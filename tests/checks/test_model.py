@@ -74,6 +74,10 @@ def test_a_coarse_step_is_compared_with_the_width_that_the_data_give(noise, weig
     sd = posterior.prior.from_normal(coords).std(axis=0)
     found = halve_steps(posterior, mode.parameters, sd)[0]
     assert [each.severity for each in found] == weight
+    before = check_model(posterior).findings
+    assert [each.kind for each in before] == [each.kind for each in found], "known before a run"
+    for each, after in zip(before, found, strict=True):
+        assert 0.5 <= each.numbers["stiffness"] < 1.1 * after.numbers["stiffness"] and "by at least" in each.text
     for each in found:
         moved = float(re.search(r"stiffness by .*? posterior standard deviations \((.*?) %\)", each.text)[1])
         number = each.numbers["stiffness"] * sd[0] / mode.parameters[0]
