@@ -56,6 +56,8 @@ class FailureLog:
     def count_outcomes(self, thetas: np.ndarray, reasons: Sequence[str]) -> None:
         """Count simulations at structural parameters (n, n_structural), and record those that have a reason."""
         self.outcomes += len(thetas)
+        if not self.count and not any(reasons):
+            return
         keys = [theta.tobytes() for theta in thetas + 0.0]  # adding zero makes 0.0 of -0.0
         known = self._points.look_up(keys)  # a transient failure may be followed by a success
         told = {key: reason for key, reason in zip(keys, reasons, strict=True) if reason or key in known}

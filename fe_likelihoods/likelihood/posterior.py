@@ -431,14 +431,14 @@ class Posterior:
         for likelihood, _ in parts:
             likelihood.simulator.when_simulated = None if callback is None else lambda n: callback(n * share)
 
-    def fault(self, x: Any) -> str:
-        """Reason of a failed simulation at a point (ndim,) evaluated in this process, if the cause is not the model.
+    def failure(self, x: Any) -> tuple[str, float]:
+        """Reason of a failed simulation at a point (ndim,) evaluated in this process, empty where there was none.
 
-        Such as a worker that was killed; empty where there was none. Samplers record it where they evaluate points in
-        other processes.
+        And its log-density: -inf, or NaN if the cause is not the model, such as a worker that was killed. Samplers
+        record both where they evaluate points in other processes.
         """
         (reason,) = self.likelihood.failures_at(x)
-        return reason if isinstance(reason, TransientReason) else ""
+        return reason, np.nan if isinstance(reason, TransientReason) else -np.inf
 
     def failures_at(self, x: Any) -> list[str]:
         """Reasons of the failed simulations at points (n, ndim) evaluated in this process, empty for others.

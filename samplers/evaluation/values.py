@@ -27,15 +27,15 @@ def most_common_reasons(reasons: Iterable[str] | Mapping[str, int], number: int 
 
 
 class Failed:
-    """Takes the place of a result if a function raised an exception or reports a fault; `reason` is text."""
+    """Takes the place of a result that failed; `reason` is text. `log_prob` is -inf if the function counts failures."""
 
-    def __init__(self, error: BaseException | str):
-        self.reason = error if isinstance(error, str) else f"{type(error).__name__}: {error}"
+    def __init__(self, error: BaseException | str, log_prob: float = np.nan):
+        self.reason, self.log_prob = error if isinstance(error, str) else f"{type(error).__name__}: {error}", log_prob
 
 
 class Caught:
     """A function that returns `Failed` instead of raising; it can be sent to a worker if the function can. Its method
-    ``fault(point)``, or its object's, says in this process why a fault of the infrastructure prevented an evaluation.
+    ``failure(point)``, or its object's, returns the reason of a failure in this process, and its log-density.
     """
 
     def __init__(self, function: Callable, args: Sequence | None, kwargs: Mapping[str, Any] | None, vectorize: bool):
@@ -48,8 +48,8 @@ class Caught:
             result = self.function(copy.deepcopy(points), *self.args, **self.kwargs)
             raise_if_interrupted(known)
             owner = getattr(self.function, "__self__", self.function)  # of a method such as log_likelihood
-            fault = "" if self.vectorize or not hasattr(owner, "fault") else owner.fault(points)
-            return Failed(fault) if fault else result
+            failure = ("",) if self.vectorize or not hasattr(owner, "failure") else owner.failure(points)
+            return Failed(*failure) if failure[0] else result
         except (Exception, SystemExit) as error:
             raise_if_it_ends_the_run(error, before)
             raise_if_interrupted(known)
@@ -89,7 +89,7 @@ def outcomes(results: Any, n: int, blobs_dtype: Any, name: str) -> tuple[np.ndar
     else:
         for row, each in enumerate(results):
             if isinstance(each, Failed):
-                reasons[row] = each.reason
+                reasons[row], log_prob[row] = each.reason, each.log_prob
             elif isinstance(each, tuple) and len(each) == 2 and each[0] is None and isinstance(each[1], str):
                 reasons[row] = each[1]  # every process of a pool that evaluated the point has died
             else:
