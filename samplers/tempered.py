@@ -9,6 +9,7 @@ are pinned by `tests.contract.test_emcee_contract`.
 """
 
 import copy
+import inspect
 import json
 import logging
 import time
@@ -131,9 +132,9 @@ class TemperedSampler(RunResults, EnsembleSampler):
         nwalkers, ndim = as_whole_number("nwalkers", nwalkers), as_whole_number("ndim", ndim)
         check_arguments(pool, backend, seed)
         if unknown := settings.keys() - (names := [each.name for each in fields(Settings)]):
-            text = f"{type(self).__name__}() got an unexpected keyword argument {min(unknown)!r}; settings are "
-            ours = TemperedSampler.__init__.__kwdefaults__
-            raise TypeError(f"{text}{', '.join(names)}, other arguments are those of emcee and {', '.join(ours)}")
+            text = f"{type(self).__name__}() got an unexpected keyword argument {min(unknown)!r}; arguments are "
+            *others, _ = inspect.signature(TemperedSampler).parameters
+            raise TypeError(f"{text}{', '.join(others)}, and the settings {', '.join(names)}")
         functions = log_prob_fn, log_likelihood_fn, log_prior_fn
         self._target = target = Target(*functions, ndim, args, kwargs, vectorize, blobs_dtype)
         self.log_prior_fn = target.log_prior_fn

@@ -141,7 +141,7 @@ for axes, (label, found) in zip(panels, (("one event", from_one), ("population o
     low, middle, measured, high = from_si(np.array(values), "cm")
     axes.vlines(range(len(order)), low, high, linewidth=5, alpha=0.5, label="90 % interval")
     axes.plot(range(len(order)), middle, "_", color="C0", markersize=8, label="median")
-    axes.plot(range(len(order)), measured, "k.", label="measured")
+    axes.plot(range(len(order)), measured, "C1o", markersize=4, label="measured")
     axes.set(xlabel="new events, by their peak", title=f"{label}: {inside[label].value * 100:.0f} % inside", xticks=[])
 panels[0].set_ylabel("peak displacement [cm]")
 panels[0].legend()

@@ -122,9 +122,10 @@ for row, (name, truth) in zip(rows, truths.items(), strict=True):
     losses["two calibrations alone"] = alone(name)
     for axes, (title, draws) in zip(row, losses.items(), strict=True):
         low, middle, high = 100.0 * np.quantile(draws, [0.05, 0.5, 0.95], axis=0)
-        axes.errorbar(range(1, STOREYS + 1), middle, [middle - low, high - middle], fmt="o", markersize=4, capsize=2)
+        style = {"fmt": "o", "markersize": 4, "capsize": 2, "label": "median and 90 % interval"}
+        axes.errorbar(range(1, STOREYS + 1), middle, [middle - low, high - middle], **style)
         axes.plot(range(1, STOREYS + 1), 100.0 * truth, "kx", label="truth")
-        axes.axhline(10.0, color="0.5", linewidth=1.0)
+        axes.axhline(10.0, color="0.5", linewidth=1.0, label="loss to be found")
         axes.set(title=f"{name}: {title}", xticks=range(1, STOREYS + 1))
     row[0].set_ylabel("stiffness loss [%]")
 rows[0, 0].legend()

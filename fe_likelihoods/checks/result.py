@@ -377,8 +377,8 @@ def _check_samples(run: FinishedRun) -> list[Finding]:
         action = "Continue it, or use SMCSampler for the same posterior."
         found.append(Finding("The chain is short", WRONG, text, action))
     if not size >= FEW_SAMPLES:
-        worth = f"about {size:.0f}" if np.isfinite(size) else "an unknown number of"
-        text = f"The {n} samples are worth {worth} independent ones: interval ends are rough."
+        worth = f"{size:.0f}" if np.isfinite(size) else "unknown"
+        text = f"The effective sample size of the {n} samples is {worth}: interval ends are rough."
         found.append(Finding("Few independent samples", CARE, text, "Make more iterations, or use more walkers."))
     if run.n_modes > 1 and not run.is_inconclusive:
         shares = ", ".join(f"{mode.share:.2f} ± {mode.share_error:.2g}" for mode in run.modes)

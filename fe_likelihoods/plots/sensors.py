@@ -43,11 +43,11 @@ def plot_ranking(ranking: SensorRanking) -> Figure:
     first.barh(rows, ranking.gains, 0.45, xerr=ranking.errors["gains"], color=BLUE, label="added to those above")
     first.set_yticks(rows, ranking.chosen)
     first.invert_yaxis()
-    first.set_xlabel("expected information [nat]")
+    first.set_xlabel("expected information, ± standard error [nat]")
     add_legend(figure, loc="outside upper center", ncols=2)
     if with_target:
         share, error = 100.0 * ranking.target_left, 100.0 * ranking.errors["target_left"]
         axes[0, 1].errorbar(share, rows, xerr=error, color=ORANGE, marker="o", capsize=3.0)
-        axes[0, 1].set_xlabel("variance of the target that is left [%]")
+        axes[0, 1].set_xlabel("variance of the target that is left, ± standard error [%]")
         axes[0, 1].set_xlim(0.0, None)
     return figure

@@ -131,8 +131,8 @@ def summary_sentences(
     fast = set(getattr(run.posterior, "fast_parameters", ()))
     if run.is_inconclusive:
         nothing = "Nothing can be said about the parameters yet: the table shows what the run has so far."
-        return [*first, what, nothing, _worth(run)]
-    return [*first, what, _finding([row for i, row in enumerate(rows) if i not in fast], fits), _worth(run)]
+        return [*first, what, nothing, *_worth(run)]
+    return [*first, what, _finding([row for i, row in enumerate(rows) if i not in fast], fits), *_worth(run)]
 
 
 def _finding(rows: Sequence[Any], fits: Sequence[Fit]) -> str:
@@ -162,15 +162,14 @@ def _assurance(fit: Fit) -> tuple[float, float]:
     return float(np.nanmin(middle)), float(np.nanmax(middle))
 
 
-def _worth(run: FinishedRun) -> str:
+def _worth(run: FinishedRun) -> list[str]:
+    """The effective sample size of a Markov chain; other runs have it in their verdict."""
     if run.tempered:
-        return f"{len(run.samples)} samples, worth about {run.effective_sample_size:.0f} independent ones."
-    if np.isfinite(run.effective_sample_size):
-        return (
-            f"{len(run.samples)} samples of a Markov chain are worth about {run.effective_sample_size:.0f} independent "
-            "ones; a Markov chain gives no verdict of its own, and no evidence."
-        )
-    return "The chain is too short to say how many independent samples it is worth."
+        return []
+    if not np.isfinite(run.effective_sample_size):
+        return ["The chain is too short to have an effective sample size."]
+    text = f"Effective sample size {run.effective_sample_size:.0f} (of {len(run.samples)} samples of a Markov chain)"
+    return [f"{text}; a Markov chain gives no verdict of its own, and no evidence."]
 
 
 def evidence(run: FinishedRun) -> list[str]:

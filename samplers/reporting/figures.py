@@ -174,8 +174,7 @@ def _choose(
             f"the posterior has {len(known)} parameters ({', '.join(known)}), but the samples have {ndim} columns"
         )
     wanted = known[:most] if names is None else names
-    left_out = names is None and len(wanted) < ndim
-    note = f"\nthe first {most} of {ndim} parameters; var_names= chooses others" if left_out else ""
+    note = f"\nthe first {most} of {ndim} parameters; see var_names=" if names is None and len(wanted) < ndim else ""
     if not len(wanted) or not set(wanted) <= set(known):
         raise ValueError(f"var_names must be some of the parameters {', '.join(known)}; got {wanted!r}")
     columns = [known.index(name) for name in wanted]

@@ -127,6 +127,8 @@ def test_what_a_reader_has_to_know_is_said(page, vibrating):
     assert f"{sampler.log_evidence:.2f} ± {sampler.log_evidence_error:.2f}" in page.text
     assert "top: White: no correlation" in page.text and "Verdict of the sampler: " in page.text
     assert sampler.verdict.status in page.text
+    size = f"effective sample size {sampler.verdict.effective_sample_size:.0f}"
+    assert size in page.text and "independent ones" not in page.text, "one number, as in the verdict"
     for digest in (posterior.fingerprint, posterior.data_fingerprint, posterior.likelihood.model.fingerprint):
         assert digest in page.text
     assert "SMCSampler( 60, posterior.ndim, posterior, vectorize=True, seed=1, )" in page.text

@@ -179,7 +179,7 @@ def test_settings_as_keywords_and_as_a_preset():
         recycle=False, **{k: v for k, v in RAMANCHA_2022_LITERAL.items() if k in CHANGES and k != "recycle"}
     )
     assert TMCMCSampler(300, 3, Gaussian(), **CHING_CHEN_2007).settings.chains == "leaders"
-    with pytest.raises(TypeError, match="unexpected keyword argument 'essratio'.*ess_ratio.*guide"):
+    with pytest.raises(TypeError, match="unexpected keyword argument 'essratio'.*vectorize.*guide.*ess_ratio"):
         SMCSampler(60, 3, Gaussian(), essratio=0.7)
 
 
