@@ -80,6 +80,8 @@ class Settings:
     asynchronous: bool = False
 
     def __post_init__(self):
+        for name, value in [*vars(self).items()]:
+            object.__setattr__(self, name, value.item() if isinstance(value, np.generic) else value)
         for name in ("min_moves", "max_moves", "burn_in", "fast_sweeps"):
             object.__setattr__(self, name, as_whole_number(name, vars(self)[name]))
         for name, possible, wanted in (

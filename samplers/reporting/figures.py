@@ -286,9 +286,6 @@ def plot_run(sampler: Any) -> "Figure":
     figure, panels = plt.subplots(n, 1, figsize=(7.5, 2.2 * n + 1.0), layout="constrained")
     ladder, (points, evidence, *chain) = panels[:several], panels[several:]
     title = f"{sampler.simulations:.0f} simulations"
-    if stages[-1].beta == 1.0:
-        title += f", log Z = {sampler.log_evidence:.2f} ± {sampler.log_evidence_error:.2g}"
-    figure.suptitle(title, fontsize="medium")
     made, beta, ess, share, increments, errors = np.array([(s.evaluations, *s[:3], *s[5:7]) for s in stages]).T
     ends = np.cumsum(made)
     for axes in ladder:
@@ -306,7 +303,9 @@ def plot_run(sampler: Any) -> "Figure":
     points.axhline(sampler.nwalkers, color=GREY, linewidth=1, linestyle=":", label="walkers")
     points.set(ylim=(0.0, 1.3 * points.get_ylim()[1]), ylabel="number of points")
     if stages[-1].beta == 1.0:
+        title += f", log Z = {sampler.log_evidence:.2f} ± {sampler.log_evidence_error:.2g}"
         evidence.axhline(sampler.log_evidence, color=GREY, linewidth=1, linestyle=":", label="result")
+    figure.suptitle(title, fontsize="medium")
     before = f", after {sampler.simulations_of_guides:.0f} simulations by the guide" if rounds else ""
     evidence.set(xlabel=f"evaluations of the log-probability{before}", ylabel="log-evidence so far")
     evidence.ticklabel_format(axis="y", useOffset=False)

@@ -69,8 +69,7 @@ def summary(
             f"samples must be an array (n, ndim) with n >= 2, as get_chain(flat=True) returns; got {samples.shape}"
         )
     names = names_of_parameters(names, samples.shape[1])
-    mean, sd = samples.mean(axis=0), samples.std(axis=0)
-    columns = {"mean": mean, "mean_error": mean_error, "sd": sd, "sd_error": sd_error}
+    columns = {"mean": samples.mean(axis=0), "mean_error": mean_error, "sd": samples.std(axis=0), "sd_error": sd_error}
     found = pandas.DataFrame(columns, [getattr(each, "label", each) for each in names], dtype=float)
     found = found.div([getattr(each, "factor", 1.0) for each in names], axis=0)
     return found.assign(cv=found["sd"] / found["mean"].abs())
