@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.linalg import orth
 
-from ..models.base import digest
+from ..models.base import code_within, digest
 from ..signals.channels import Channel, Measurements
 from ..signals.sampling import array_digest
-from ..simulation.by_value import code_within, is_of_user
+from ..simulation.by_value import is_of_user
 from ..simulation.model import Model, SimulationBatch, SimulationFailed
 from .modal_data import ModalData, close_groups
 from .mode_models import ABSENT

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 from ..signals.channels import Channel
 from ..signals.records import DisplacementHistory, Record
 from ..signals.sampling import array_digest
+from ..simulation.by_value import is_of_user
 from ..simulation.model import SimulationBatch, SimulationFailed
 from .validation import check_theta, check_thetas, invalid
 
@@ -30,6 +31,12 @@ logger = logging.getLogger(__name__)
 def digest(*parts: str) -> str:
     """Hexadecimal digest of texts, in order."""
     return hashlib.blake2b("|".join(parts).encode(), digest_size=16).hexdigest()
+
+
+def code_within(model: Any) -> dict[str, Any]:
+    """User code of a model that another one contains, as ``code_parts()`` of that one; empty if there is none."""
+    own = {"model": model} if is_of_user(type(model).__module__) else {}
+    return own | (model.code_parts() if hasattr(model, "code_parts") else {})
 
 
 @dataclass(frozen=True)

@@ -19,9 +19,9 @@ from ..priors.distributions import Distribution
 from ..signals.channels import Channel
 from ..signals.records import Record
 from ..signals.sampling import interpolate, make_interpolation
-from ..simulation.by_value import code_within, is_of_user
+from ..simulation.by_value import is_of_user
 from ..simulation.model import Model, SimulationBatch, first_part, simulate_batch
-from .base import digest
+from .base import code_within, digest
 from .validation import check_theta
 
 _OF_THE_MODEL = ("code_parts", "nominal", "nominal_units", "path_dependent", "range_remark", "time_limit")

@@ -5,8 +5,8 @@ Functions, classes and modules of the user are sent in their present state, with
 notebook functions work. The worker imports this library, installed packages and the standard library.
 
 * A module is sent once, with all of its values; sent functions that import it while they run find it under its name. Of
-  the script or notebook (``__main__``), only the values that the sent functions use are sent.
-* A lock becomes a new lock. Other values that cannot be sent, such as an open file, are refused with their type.
+  the script or notebook (``__main__``), only the values that the sent functions use are sent. A lock becomes a new one;
+  other values that cannot be sent, such as an open file, are refused with their type.
 * A worker refuses everything if its version of this library has different source code.
 """
 
@@ -16,7 +16,6 @@ import importlib.machinery
 import importlib.metadata
 import io
 import pickle
-import re
 import sys
 import sysconfig
 import threading
@@ -38,14 +37,12 @@ __all__ = [
     "SCRIPTS",
     "Pickled",
     "attribute",
-    "code_within",
     "is_arriving",
     "is_of_user",
     "load",
     "names_in",
     "package_version",
     "sources_digest",
-    "without_addresses",
 ]
 
 LIBRARY = __name__.split(".")[0]
@@ -60,11 +57,6 @@ _lock = threading.RLock()
 _arriving: dict[str, types.ModuleType] | None = None  # modules of the function that is being loaded
 
 
-def without_addresses(message: str) -> str:
-    """A message without object addresses, which differ between runs."""
-    return re.sub(r" at 0x[0-9a-fA-F]+", "", message)
-
-
 def is_arriving() -> bool:
     """Whether an object from another process is being loaded."""
     return _arriving is not None
@@ -74,28 +66,27 @@ class Pickled:
     """A function for other processes, by value in its state when it is first pickled; in this one it is itself."""
 
     def __init__(self, function: Any, payload: bytes = b"") -> None:
-        self._function, self._payload = function, payload
+        self._function = function
+        if payload:
+            self.payload = payload
 
     @classmethod
     def of(cls, function: Any) -> "Pickled":
         """Pickle a function with everything that it uses at present; ValueError, with a type, if that is impossible."""
         return cls(function, cls(function).payload)
 
-    @property
+    @functools.cached_property
     def payload(self) -> bytes:
         """Digest of the library, name of the sending process, and the pickled function."""
-        if self._payload:
-            return self._payload
         try:
             _Pickler(file := io.BytesIO()).dump(self._function)
-            self._payload = sources_digest() + process_name() + file.getvalue()
         except Exception as error:
             name = getattr(self._function, "__qualname__", type(self._function).__qualname__)
             raise ValueError(
-                f"{name} cannot be sent to another process ({type(error).__name__}: {without_addresses(str(error))}). "
+                f"{name} cannot be sent to another process ({type(error).__name__}: {error}). "
                 "Objects that it uses must not contain open files and connections: make them inside the function"
             ) from error
-        return self._payload
+        return sources_digest() + process_name() + file.getvalue()
 
     def __reduce__(self) -> tuple:
         return Pickled, (None, self.payload)
@@ -109,8 +100,7 @@ class Pickled:
 def load(payload: bytes) -> Callable[[Any], Any]:
     """The function of a `Pickled`, in a worker, with user modules of its own.
 
-    UnusableModel if it cannot be unpickled; ChangedModel if this process has another version of this library, or a file
-    that the model depends on differs.
+    UnusableModel if that fails; ChangedModel for another version of this library, or another content of a file.
     """
     global _arriving
     if payload[:16] != sources_digest():
@@ -127,8 +117,8 @@ def load(payload: bytes) -> Callable[[Any], Any]:
         except ChangedModel:
             raise
         except Exception as error:
-            text = without_addresses(f"{type(error).__name__}: {error}")
-            raise UnusableModel(f"a function cannot be loaded in a worker process: {text}") from error
+            text = f"a function cannot be loaded in a worker process: {type(error).__name__}: {error}"
+            raise UnusableModel(text) from error
         finally:
             _arriving = None
 
@@ -163,10 +153,8 @@ class _Pickler(cloudpickle.Pickler):
         if not isinstance(obj, type) or _sent_module(obj.__module__) is None:
             return super().reducer_override(obj)
         # a new class for each function, since the methods of an earlier class may refer to earlier values
-        make, (*arguments, _, extra), (state, slots), *tail = _dynamic_class_reduce(obj)
-        members = types.MemberDescriptorType  # of slots with private names, which cloudpickle leaves
-        state = {name: each for name, each in state.items() if not isinstance(each, members)}
-        return make, (*arguments, None, extra), (state, slots), *tail
+        make, (*arguments, _, extra), *state = _dynamic_class_reduce(obj)
+        return make, (*arguments, None, extra), *state
 
     def _reduce_module(self, module: types.ModuleType) -> tuple:
         name, values = module.__name__, vars(module)
@@ -248,12 +236,6 @@ def is_of_user(module: Any) -> bool:
     return _is_of_user(module, _places(sys.modules.get(module)) or _places(sys.modules.get(module.partition(".")[0])))
 
 
-def code_within(model: Any) -> dict[str, Any]:
-    """User code of a model that another one contains, as ``code_parts()`` of that one; empty if there is none."""
-    own = {"model": model} if is_of_user(type(model).__module__) else {}
-    return own | (model.code_parts() if hasattr(model, "code_parts") else {})
-
-
 def attribute(value: Any, name: str) -> Any:
     """An attribute, found without running user code, or importing a lazy module; None if there is none."""
     try:
@@ -273,7 +255,7 @@ def _is_of_user(name: str, places: tuple[str, ...]) -> bool:
     top = name.partition(".")[0]
     if top in SCRIPTS:
         return True
-    if not top or top in (LIBRARY, "samplers") or top in sys.builtin_module_names:
+    if not top or top in (LIBRARY, "samplers"):
         return False
     for path in map(Path, places):
         if {"site-packages", "dist-packages"} & set(path.resolve().parts):

@@ -24,10 +24,9 @@ import sys
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecutor
-from concurrent.futures import wait as wait_for
-from contextlib import AbstractContextManager, closing, suppress
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecutor, wait
+from contextlib import AbstractContextManager, suppress
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from multiprocessing.pool import Pool, ThreadPool
@@ -38,15 +37,15 @@ from typing import Any
 from samplers.evaluation.pools import submit_all, workers_of
 from samplers.interrupts import Ended, SentFunction, become_worker
 
-from .by_value import Pickled, load, without_addresses
+from .by_value import Pickled, load
 from .failure_reasons import SimulationFailed, TransientReason, describe_exit, is_transient
 from .files import PLACE, Group, working_folder
 
 __all__ = ["Job", "LocalPool", "PoolExecutor", "Sandbox", "Submitting", "Threads", "as_executor", "result_of", "serve"]
 
-MAX_ATTEMPTS = 3
 _CHECK = 0.5  # [s] between checks that a process lives, while waiting for its answer
-_THREADS = [f"{each}_NUM_THREADS" for each in ("OMP", "OPENBLAS", "MKL", "BLIS", "VECLIB_MAXIMUM", "NUMBA")]
+_LIBRARIES = ("OMP", "OPENBLAS", "MKL", "BLIS", "VECLIB_MAXIMUM", "NUMBA")
+_ONE_THREAD = {f"{each}_NUM_THREADS": "1" for each in _LIBRARIES}
 _BOOT = (
     "import json, sys; sys.path[:], sys.argv, fileno = json.loads(sys.argv[1]); "
     "from fe_likelihoods.simulation.executors import serve; serve(fileno)"
@@ -59,13 +58,11 @@ class Submitting:
     def map(self, function: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
         """Results of a function for every item, in order; ``(None, reason)`` for one that kills all its processes.
 
-        ValueError if the function or an item cannot be sent or loaded, or the first exception of the function: the
-        other items are given up then.
+        ValueError for what cannot be sent or loaded. The first exception of the function gives up the other items.
         """
         found: dict[int, Any] = {}
-        with closing(self.as_they_end(function, list(items))) as arriving:
-            for each in arriving:
-                found |= each
+        for each in self.as_they_end(function, list(items)):
+            found |= each
         return [found[number] for number in range(len(found))]
 
     def as_they_end(self, function: Callable[[Any], Any], items: Sequence[Any]) -> Iterator[dict[int, Any]]:
@@ -101,18 +98,15 @@ def _results(left: dict[Any, int], ended: Sequence[Any]) -> tuple[dict[int, Any]
         number = left.pop(future)
         try:
             found[number] = result_of(future)
-        except CancelledError:
-            error = error or RuntimeError("the pool was closed before a simulation had finished")
         except BaseException as raised:
             error = error or raised
     return found, error
 
 
 def result_of(future: Any, is_last: bool = False) -> Any:
-    """The result of an item; raises KeyboardInterrupt or SystemExit if the function has raised it in a pool.
+    """The result of an item; raises what has ended the function in a pool, KeyboardInterrupt or SystemExit.
 
-    Dask gives up all items that ran beside one that killed their worker: an item is run once more, apart from the
-    others. If it is lost again, it is the cause.
+    Dask also gives up items that ran beside one that killed their worker: they are run once more, apart from it.
     """
     try:
         result = future.result()
@@ -188,12 +182,12 @@ class Died(SimulationFailed):
 class Worker:
     """Calls functions in one process after the other, from one thread; only `kill` may be called from others.
 
-    A process that has died, or has had `most_calls`, is replaced at the next call. `environment` adds variables; with
-    `quiet`, its output is not shown.
+    A process that has died, or has had `most_calls`, is replaced at the next call. With `alone`, its output is not
+    shown, and it has as many threads as this process.
     """
 
-    def __init__(self, environment: Mapping[str, str], quiet: bool = False, most_calls: float = math.inf) -> None:
-        self._settings, self._most_calls = (environment, quiet), most_calls
+    def __init__(self, alone: bool = False, most_calls: float = math.inf) -> None:
+        self._alone, self._most_calls = alone, most_calls
         self._process: subprocess.Popen | None = None
 
     def run(self, job: Job, seconds: float = math.inf) -> Any:
@@ -218,7 +212,7 @@ class Worker:
         """Result as from `run`, from another process if one dies; ``(None, reason)`` after the third death."""
         job.worker = self
         try:
-            for _ in range(MAX_ATTEMPTS):
+            for _ in range(3):
                 try:
                     return self.run(job)
                 except Died as error:
@@ -228,15 +222,14 @@ class Worker:
             job.worker = None
 
     def _renew(self) -> None:
-        environment, quiet = self._settings
         self.kill()
         self._connection, theirs = Pipe()
-        output, self._group = subprocess.DEVNULL if quiet else None, Group()
+        output, self._group = subprocess.DEVNULL if self._alone else None, Group()
         texts = [[str(text) for text in texts] for texts in (sys.path, sys.argv)]
         with theirs:
             self._process = self._group.start(
                 [sys.executable, "-c", _BOOT, json.dumps([*texts, theirs.fileno()])],
-                env={**os.environ, **environment, PLACE: self._group.place},
+                env=({} if self._alone else _ONE_THREAD) | os.environ | {PLACE: self._group.place},
                 pass_fds=(theirs.fileno(),),
                 stdout=output,
                 stderr=output,
@@ -283,8 +276,7 @@ class LocalPool(Submitting, AbstractContextManager):
     The processes start with the first items, and end with `close` or this process. One that dies is replaced and its
     item run again, given up after the third death. Linear algebra and numba use one thread per process, unless
     environment variables such as OMP_NUM_THREADS are set. Lambdas and functions of a script or notebook can be used.
-
-    Likelihoods and samplers can share a pool, and its methods may be called from several threads.
+    Likelihoods and samplers can share a pool, also in several threads.
 
     Parameters
     ----------
@@ -302,7 +294,6 @@ class LocalPool(Submitting, AbstractContextManager):
                 f"got {workers!r}"
             )
         self.n_workers = int(workers)  # items that run at once
-        self._environment = {name: "1" for name in _THREADS if name not in os.environ}
         self._threads: dict[int, Threads] = {}  # by the process, since a fork copies it
 
     def __exit__(self, *exception: object) -> None:
@@ -321,8 +312,7 @@ class LocalPool(Submitting, AbstractContextManager):
         """Futures as from `submit`, for several items; ValueError if the function cannot be sent to the processes."""
         pickled = Pickled.of(function)  # each time: the values that it uses may have changed
         jobs = [Job(pickled, item) for item in items]
-        environment = self._environment  # not this object, which ends its threads when it is garbage-collected
-        threads = self._threads.setdefault(os.getpid(), Threads(lambda: Worker(environment).run_until_it_ends))
+        threads = self._threads.setdefault(os.getpid(), Threads(lambda: Worker().run_until_it_ends))
         threads.submit_all(jobs, self.n_workers)
         return jobs
 
@@ -333,7 +323,7 @@ class LocalPool(Submitting, AbstractContextManager):
             job.given_up = True  # before the question for its process: one of the two threads sees what the other did
             if (worker := job.worker) is not None:
                 worker.kill()
-        wait_for(started)
+        wait(started)
 
 
 def as_executor(pool: Any, model: Any = None) -> "LocalPool | PoolExecutor | None":
@@ -353,7 +343,6 @@ class PoolExecutor(Submitting):
     """Executor for any object with ``map(function, items)``.
 
     A `multiprocessing.Pool` replaces a process that dies but does not run its item again, so the call never returns.
-    Dask runs the items of a worker that dies on other workers; see `result_of`.
     """
 
     def __init__(self, pool: Any) -> None:
@@ -397,7 +386,7 @@ class Sandbox(threading.local):
     ) -> None:
         Pickled.of(function)  # an error is raised here instead of in the first call
         self._arguments = function, time_limit, runs_per_process
-        self._worker = Worker({}, True, runs_per_process or math.inf)
+        self._worker = Worker(True, runs_per_process or math.inf)
 
     def __reduce__(self) -> tuple:
         return Sandbox, self._arguments
@@ -444,5 +433,5 @@ def _packed(value: Any, error: BaseException | None = None) -> bytes:
             return data
     except Exception as failure:
         error = error or failure
-    text = without_addresses(f"{type(error).__name__}: {error}")
+    text = f"{type(error).__name__}: {error}"
     return pickle.dumps((None, SimulationFailed(TransientReason(text) if is_transient(error) else text)), protocol=5)

@@ -34,7 +34,7 @@ from typing import Any
 
 from samplers.interrupts import process_name
 
-from .failure_reasons import SimulationFailed, TransientReason, UnusableModel
+from .failure_reasons import UnusableModel
 
 __all__ = [
     "PLACE",
@@ -106,7 +106,7 @@ class Observer:
     def __init__(self, alone: bool = True, thread: int = 0, mirror: "_Mirror | None" = None) -> None:
         self.alone, self.thread, self.mirror, self.shared = alone, thread, mirror, ""
         self.noted = Opened()
-        self._used: dict[str, tuple | None] = {}  # states of files at their first use; None if it has made them
+        self.used: dict[str, tuple | None] = {}  # states of files at their first use; None if it has made them
         self._made: list[str] = []  # new files and folders, which belong to this simulation
         self._start = time.time_ns()
 
@@ -120,22 +120,20 @@ class Observer:
         if kind is None and self.shared and not self.alone:
             raise UnusableModel(
                 f"The simulations write to {self.shared.removesuffix('/*')}, or read there what is written while they "
-                "run, and simulations in other workers may do the same at that moment, so that results would be mixed "
-                "up. Use a pool of processes (dask: workers with one thread) and a relative file name, which is "
-                "private to each simulation, or a folder from tempfile (docs/parallel.rst); or use one worker, pool=1"
+                "run, as others may do at that moment, so that results would be mixed up. Use a pool of processes "
+                "(dask: workers with one thread) and a relative file name, which is private to each simulation, or a "
+                "folder from tempfile (docs/parallel.rst); or use one worker, pool=1"
             )
 
     def result(self, known: Opened) -> Opened:
-        """The files that are `known`, and those that were used and are as before, with new shared libraries."""
-        changed = {name for name, state in self._used.items() if state is None or state != _state(name)}
-        if any(name not in known and name not in changed and _counts(name) for name in self._used):
-            known = known | {name: digest for name, digest in mapped(self._used).items() if name not in changed}
-        return known | self.noted
+        """The files that are `known`, and those that were used and are as before, with new shared libraries.
 
-    def notes(self, how: str, name: str) -> None:
-        """Note a file by the name that the code has given to it: folders on the way may be links that change."""
-        if how != "changes" and name not in self._used:
-            self._used[name] = _state(name) if how in ("reads", "loads") else None
+        They have the names that the code has given to them: folders on the way may be links that change.
+        """
+        changed = {name for name, state in self.used.items() if state is None or state != _state(name)}
+        if any(name not in known and name not in changed and _counts(name) for name in self.used):
+            known = known | {name: digest for name, digest in mapped(self.used).items() if name not in changed}
+        return known | self.noted
 
     def sees(self, how: str, path: str) -> None:
         """Note a file that others may write, too, if this simulation changes it, or reads what was just written."""
@@ -206,9 +204,9 @@ def _hook(event: str, arguments: tuple) -> None:
                 simulation.sees(how, os.path.realpath(path) if how == "reads" else path)
             if simulation is not None and simulation.is_own(name):  # the file that it shows
                 name = os.path.join(simulation.mirror.base, os.path.relpath(name, simulation.mirror.path))
-            for observer in list(_observers):
-                if observer.thread in (0, threading.get_ident()):
-                    observer.notes(how, name)
+            for observer in list(_observers) if how != "changes" else ():
+                if observer.thread in (0, threading.get_ident()) and name not in observer.used:
+                    observer.used[name] = _state(name) if how in ("reads", "loads") else None
 
 
 def _uses(event: str, arguments: tuple) -> list[tuple[str, Any]]:
@@ -242,9 +240,6 @@ def _uses(event: str, arguments: tuple) -> list[tuple[str, Any]]:
             return [("loads", source), ("touches", arguments[1]), *changed]
         return changed
     return [("makes" if event == "tempfile.mkdtemp" else "loads", arguments[0])]
-
-
-# paths --------------------------------------------------------------------------------------------------------------
 
 
 def file_digest(path: str | os.PathLike) -> str:
@@ -329,8 +324,7 @@ class Observed:
             if mirror is not None:
                 with contextlib.suppress(FileNotFoundError):
                     os.chdir(before)
-        with _of_this_library():
-            self._known = observer.result(self._known)
+        self._known = observer.result(self._known)
         return result, self._known
 
 
@@ -431,28 +425,20 @@ class _Mirror:
     def __init__(self, base: str, _pid: int) -> None:
         self.base, self.path = base, ""
         self.states: dict[str, tuple | None] = {}
+        sys.path[:] = map(os.path.abspath, sys.path)
+        self._place = tempfile.mkdtemp(prefix="shown_", dir=os.environ.get(PLACE) or _own_group().place)
+        for entry in _scan(os.path.dirname(base), _MOST_BESIDE) if base else ():
+            with contextlib.suppress(FileExistsError):
+                os.symlink(entry.path, os.path.join(self._place, entry.name))
 
     def shown(self) -> str:
         """The folder, which shows what `base` contains now, and nothing that another simulation has left."""
-        try:
-            if not self.path:
-                self._begin()
-            if not self.states or self.states != {path: _state(path) for path in self.states}:
-                shutil.rmtree(self.path, ignore_errors=True)
-                self.path = tempfile.mkdtemp(prefix="run_", dir=self._place)
-                self.states, self._left = {}, _MOST_ENTRIES
-                self._show(self.base, self.path)
-        except OSError as failure:
-            text = f"the working folder of a simulation could not be made: {failure}"
-            raise SimulationFailed(TransientReason(text)) from failure
+        if not self.states or self.states != {path: _state(path) for path in self.states}:
+            shutil.rmtree(self.path, ignore_errors=True)
+            self.path = tempfile.mkdtemp(prefix="run_", dir=self._place)
+            self.states, self._left = {}, _MOST_ENTRIES
+            self._show(self.base, self.path)
         return self.path
-
-    def _begin(self) -> None:
-        sys.path[:] = map(os.path.abspath, sys.path)
-        self._place = tempfile.mkdtemp(prefix="shown_", dir=os.environ.get(PLACE) or _own_group().place)
-        for entry in _scan(os.path.dirname(self.base), _MOST_BESIDE) if self.base else ():
-            with contextlib.suppress(FileExistsError):
-                os.symlink(entry.path, os.path.join(self._place, entry.name))
 
     def _show(self, base: str, own: str) -> None:
         """Show a folder in another one; folders that are hidden, too large, or contain the mirror, are links."""
