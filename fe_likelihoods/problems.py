@@ -139,7 +139,7 @@ def bridge_column(
     -------
     Posterior
         Parameters Ec, Es, a0, a1, ft (multiples of nominal values), sigma_acceleration [m/s²] and sigma_displacement
-        [m], or those of another noise.
+        [m], or parameters of another noise.
 
     Raises
     ------
@@ -269,11 +269,11 @@ def isolated_bridge(
     Parameters
     ----------
     data : {"twin", "means"} or Dataset
-        Bundled synthetic test, or your own, whose step may be a multiple of that of its record. "twin" has a known
+        Bundled synthetic test, or your own, whose step may be a multiple of its record's. "twin" has a known
         truth and one mode. "means" has only means over the two piers, so that the devices of the piers can be
         exchanged: its posterior has exactly two modes, whose masses are proportional to the prior densities.
     channels : tuple of str, optional
-        Measured channels to use. Default: those of pier 1 and ``Ub_2`` of "twin", all of any other data.
+        Measured channels to use. Default: pier 1 and ``Ub_2`` of "twin", all of any other data.
     noise : Noise, optional
         Default: white noise with one sigma for all channels, in root mean squares of the measured channels.
         Correlations ``rho_...`` of another noise are uniform between -1 and 1.

@@ -28,7 +28,7 @@ from .settings import as_whole_number
 LEVEL_PROBABILITY = 0.1  # share of the points that each level keeps (Au & Beck 2001)
 FEWEST = 10  # points that a level keeps, and groups of points for the error
 LEAST_PROBABILITY = 1e-15
-FIRST_SCALE, TARGET_ACCEPTANCE = 0.6, 0.44  # of the moves; the target is that of Papaioannou et al. (2015)
+FIRST_SCALE, TARGET_ACCEPTANCE = 0.6, 0.44  # of the moves; the target is from Papaioannou et al. (2015)
 MOST_EQUAL = 0.75  # share of points of one value above which levels make no progress
 
 

@@ -3,7 +3,7 @@ Updating a reinforced-concrete bridge column
 ============================================
 
 A nonlinear fiber finite-element model of a full-scale bridge column is updated with the acceleration and the
-displacement of its top: five structural parameters and two noise levels. Model, priors and likelihood are those of
+displacement of its top: five structural parameters and two noise levels. Model, priors and likelihood are from
 Ramancha, Astroza, Conte, Restrepo & Todd (2022), "Bayesian nonlinear finite element model updating of a full-scale
 bridge-column using sequential Monte Carlo". Their measurements are not public: **the data are synthetic**, ten seconds
 of a motion that cracks the column, computed by a finer model. ::

@@ -6,7 +6,7 @@ import signal
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    cores = len(os.sched_getaffinity(0))  # those that this job may use, not those of the machine
+    cores = len(os.sched_getaffinity(0))  # the cores of this job, not of the machine
     parser.add_argument("--cores", type=int, default=cores)
     parser.add_argument("--threads", type=int, default=1, help="cores that one simulation uses")
     args = parser.parse_args()

@@ -156,7 +156,7 @@ def _fitted(y: np.ndarray, r: np.ndarray, steps: np.ndarray, n: int) -> tuple[np
 
 
 def _ratios(one: Channel, other: Channel) -> set[float]:
-    """Units of one channel by those of another one: of the channels, or those of a model, which are mostly SI."""
+    """Units of one channel by units of another one: of the channels, or of a model, which are mostly SI."""
     units = ({1.0, find_unit(each.unit).factor} for each in (one, other))
     return {1.0} if one.dimension == other.dimension else {a / b for a, b in product(*units)}
 

@@ -35,7 +35,7 @@ FAR = 5.0  # mean square of residuals, relative to the stated one, from which on
 NOTHING = 1e-6  # difference of two responses, relative to their norm, well above the round-off of a long response
 # of a predicted peak to the calibrated ones: named in 1 of 100 right runs, and in 96 of 100 at three times the strength
 PEAK_RATIO = 2.0
-NARROW = 0.2  # bandwidth of a motion by that of the calibration; earthquakes of one structure differ by 0.38 or more
+NARROW = 0.2  # bandwidth of a motion by the calibrated one; earthquakes of one structure differ by 0.38 or more
 # half the range in the last two seconds by the final value, which is then known to 10 % at best; a smaller one than a
 # tenth of the largest response counts as a tenth
 UNSETTLED = 0.1
@@ -267,7 +267,7 @@ def check_same_response(difference: float | None, motion: str = "this motion") -
     """Whether another motion gives the response of the calibration; `difference` is relative to this response."""
     if difference is None or difference > NOTHING:
         return []
-    text = f"The response to {motion} equals that of the calibration, and so will predictions of other events."
+    text = f"The response to {motion} equals the calibrated one, and so will predictions of other events."
     action = "Let the model read the motion that it is given, and not one file that is always the same."
     return [Finding("The motion changes nothing", WRONG, text, action, {"difference": difference}, "input")]
 

@@ -178,7 +178,7 @@ def _static_steps(column, total, share, imposed, targets, iteration, history, ou
     """Add `share` of the load `total` (n,) at each target, in halved steps if they do not converge.
 
     The degree of freedom `imposed` moves to the targets from an equilibrium. With -1, none moves, the column is made
-    virgin first, and nothing is recorded. The other arguments are those of `impose_displacement`, as is the result.
+    virgin first, and nothing is recorded. Other arguments and result are as in `impose_displacement`.
     """
     if imposed < 0:
         initialise_column(column)

@@ -56,7 +56,7 @@ def likelihood_gradient(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Gradient (n, ndim) of the log-likelihood at rows (n, ndim), and where (n,) all simulations succeeded; else zeros.
 
-    `sd` (ndim,) are scales of the parameters and `bounds` (ndim, 2) those of the prior.
+    `sd` (ndim,) are scales of the parameters and `bounds` (ndim, 2) bounds of the prior.
     """
     total, good = np.zeros(rows.shape), np.ones(len(rows), dtype=bool)
     for part, columns in likelihood.data_sets():

@@ -450,7 +450,7 @@ class Posterior:
     def recall_failures(self, x: Any, reasons: Sequence[str]) -> None:
         """Count what an earlier process has simulated at points (n, ndim), so that `report` has its failures.
 
-        `reasons` are those of `failures_at`. A sampler that goes on from a file calls this; points whose simulations
+        `reasons` come from `failures_at`. A sampler that goes on from a file calls this; points whose simulations
         are known here are not counted again.
         """
         self.likelihood.recall_failures(x, reasons)

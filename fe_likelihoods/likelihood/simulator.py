@@ -50,7 +50,7 @@ _ROUNDS_PER_CHUNK = 8  # simulations per worker and chunk: at the end of a chunk
 class Simulator(Memo):
     """A model's simulations, compared with measurements in the order of the model's channels; each is run once.
 
-    Options are those of `FELikelihood`; the statistic is the sums of squares by default. `measured` are values
+    Options are as in `FELikelihood`; the statistic is the sums of squares by default. `measured` are values
     (n_channels, n_steps), or a `Comparison` where samples are missing. `simulations`, `cache_hits` and `disk_hits`
     count simulations run by this object in this process, cached rows, and rows from the disk; `failures` include known
     ones from the disk. `when_simulated` is called with the number that have ended, in this process only. A subclass

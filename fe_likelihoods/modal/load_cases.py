@@ -97,7 +97,7 @@ def read_load_test(
     `columns` has names of columns by the names of channels, where the column has not the name of the channel (with or
     without a unit); `units` are for files that state none, as in `read_columns`. `cases` is the column with the
     names of the load cases, or with numbers such as positions; default: the first column, if it is no channel, else
-    numbers from 1. `errors` are those of `LoadTest`. Raises ValueError if a column is missing, or a unit is unknown or
+    numbers from 1. `errors` are as in `LoadTest`. Raises ValueError if a column is missing, or a unit is unknown or
     not stated.
     """
     table, wanted = read_table(path, labels=cases or ""), []

@@ -133,7 +133,7 @@ class FunctionModes(FunctionModel):
 class StructureModes(ExternalModel):
     """All modes of a linear structure of this library, such as a `ShearFrame`, as a model with derivatives.
 
-    Its parameters are those of the structure except dampings, which the undamped modes do not depend on. Its sensors
+    Its parameters are the structure's except dampings, which the undamped modes do not depend on. Its sensors
     are the channels of the structure.
     """
 

@@ -159,7 +159,7 @@ class ExecutableModel(UserModel):
     def _check_units(self) -> np.ndarray:
         """SI values of the units in the output file, shape (n_channels, 1)."""
         if callable(self.output) and self.output_units:
-            raise ValueError("ExecutableModel: output_units are those of a file; let the function return SI units")
+            raise ValueError("ExecutableModel: output_units belong to a file; let the function return SI units")
         names = [channel.name for channel in self.channels]
         if unknown := [name for name in self.output_units if name not in names]:
             raise ValueError(

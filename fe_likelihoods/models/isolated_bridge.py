@@ -119,7 +119,7 @@ class IsolatedBridge(BuiltInModel):
     nominal_units: ClassVar[dict[str, str]] = _NOMINAL_UNITS
     friction: str = described("", '"bouc-wen" (regularised), or "coulomb" (exact)', default="bouc-wen")
     step: float | None = described(
-        "s", "Integration step, which divides that of the record; default: the longest up to 0.25 ms", "positive", None
+        "s", "Integration step, which divides the record's; default: the longest up to 0.25 ms", "positive", None
     )
     every: int = described("", "The response has one sample per ``every`` samples of the record", default=1)
     vertical: Record | None = described(

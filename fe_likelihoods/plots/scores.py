@@ -72,7 +72,7 @@ def _draw(intervals: Axes, shares: Axes, events: Mapping[str, QuantityScores]) -
     labels = [_label(event, each, k) for event, each in events.items() for k in range(len(each.names))]
     measured, pit = joined["measured"], joined["pit"]
     if not measured.all():
-        raise ValueError(f"plot_scores: intervals are divided by the measured values; zero is among those of {labels}")
+        raise ValueError(f"plot_scores: intervals are divided by the measured values; zero is among {labels}")
     n = len(measured)
     places = np.arange(n)[::-1]
     for ends, width, text in ("", 1.2, f"{probability:.0%}"), ("_quartile", 3.5, "50%"):

@@ -43,7 +43,7 @@ class HeldOutScores(dict[str, HeldOutScore]):
 
 
 class LeftOutTests(dict[str, Hierarchy]):
-    """The population without each test, by its name; `covariates` are those of the test that is left out."""
+    """The population without each test, by its name; `covariates` belong to the test that is left out."""
 
     covariates: Mapping[str, Mapping[str, float]] = MappingProxyType({})
 

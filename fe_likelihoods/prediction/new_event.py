@@ -149,7 +149,7 @@ def predict_new_event(
         prediction says how much of the width is due to the scatter that is expected before the events.
     covariates : mapping of str to float, optional
         Conditions of the new event for a population with `Varying.slopes`, such as ``{"temperature": -5.0}``. Default:
-        their means over the events. Beyond those of the events, intervals grow with the uncertainty of the slopes.
+        their means over the events. Beyond covariates of the events, intervals grow with the uncertainty of the slopes.
     noise : bool or str
         Whether histories are predicted with noise, as for `propagate`. The noise parameters must be varying, common, or
         have the same prior in all events. Shares of the response (`GaussianNoise`)

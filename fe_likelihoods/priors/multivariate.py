@@ -201,7 +201,7 @@ def as_multivariate(names: tuple[str, ...], distribution: Any) -> MultivariateDi
         )
     if distribution.names and sorted(distribution.names) != sorted(names):
         raise ValueError(
-            f"Prior: the names {', '.join(names)} differ from those of the distribution, "
+            f"Prior: the names {', '.join(names)} differ from the distribution's, "
             f"{', '.join(distribution.names)}; use its names, in any order"
         )
     return distribution

@@ -75,7 +75,7 @@ def _named(excitation: Any) -> str:
 def moments_of(run: FinishedRun) -> np.ndarray:
     """Mean, its error, standard deviation, its error, and 5 %, 50 % and 95 % quantiles (7, ndim).
 
-    They are those of the chain, or of the signed sample if that has smaller errors and determines all deviations.
+    They belong to the chain, or to the signed sample if that has smaller errors and determines all deviations.
     """
     probabilities = (0.05, 0.5, 0.95)
     if (signed := getattr(run.sampler, "signed_sample", None)) is not None:
@@ -486,5 +486,5 @@ def _sentence(
         )
         text += f" The {percent(LEVEL)} band contains {shares}."
     if not first.noise:
-        text += " A band without noise is that of the response, and contains fewer measurements."
+        text += " A band without noise shows the response, and contains fewer measurements."
     return text

@@ -160,7 +160,7 @@ def _draw_modes(fit: Fit) -> list[Picture]:
     if fit.modal.samples is not None:
         caption = (
             "Intervals of frequencies contain the errors of an identification, known and unknown ones, so they should "
-            "hold nine of ten measured values; those of shapes contain the uncertainty of the parameters alone. MAC is "
+            "hold nine of ten measured values; intervals of shapes contain the uncertainty of parameters alone. MAC is "
             "1 for equal shapes and 0 for orthogonal ones. Scale and sign of a shape are arbitrary."
         )
         alt = "Frequencies over measured frequencies, and shapes of the measured modes."

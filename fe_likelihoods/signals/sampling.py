@@ -193,7 +193,7 @@ def uniform_times(times: NDArray[np.float64], step: float | None, where: str) ->
     increments = np.diff(times, append=np.inf if times.size > 1 else -np.inf)
     place = int(np.argmin(increments > 0.0))
     got = f"{times[(place + 1) % times.size]:.15g} s after {times[place]:.15g} s"
-    advice = "if the times are those of packets, leave the column of times out and give dt="
+    advice = "if the times are of packets, leave the column of times out and give dt="
     advice += "; if the clock was set back, correct the later times"
     expect(increments[place] > 0.0, where, "times that increase", got, advice)
     increments = increments[:-1]

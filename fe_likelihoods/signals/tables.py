@@ -420,7 +420,7 @@ def read_table(
 ) -> Table:
     """Read columns of numbers from a text file, or from the first sheet of an Excel workbook (needs openpyxl).
 
-    Arguments are those of `read_record`; with `along_rows` the numbers are one column, row after row, and the column
+    Arguments are as in `read_record`; with `along_rows` the numbers are one column, row after row, and the column
     `labels` ("": the first one) is text if not all its cells are numbers.
     """
     if skip is not None and (isinstance(skip, bool) or not isinstance(skip, int) or skip < 0):

@@ -353,7 +353,7 @@ class Group:
         _groups.add(self)
 
     def start(self, command: Sequence[str], **options: Any) -> subprocess.Popen:
-        """A new process of the group, without standard input; `options` are those of `subprocess.Popen`."""
+        """A new process of the group, without standard input; `options` are for `subprocess.Popen`."""
         with _of_this_library():
             group = self.processes[0].pid
             process = subprocess.Popen(command, stdin=subprocess.DEVNULL, process_group=group, **options)

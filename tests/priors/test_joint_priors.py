@@ -107,7 +107,7 @@ def test_a_mixture_gets_its_parameters_by_name(bent):
     np.testing.assert_allclose(swapped.rvs(4000, 1).mean(axis=0), samples[:, [1, 0]].mean(axis=0), atol=0.05)
     np.testing.assert_array_equal(swapped.bounds, mixture.bounds[::-1])
     assert swapped.reorder(["k", "c"]).subset(["k", "c"]).logpdf(samples[0, :2]) == mixture.logpdf(samples[0, :2])
-    with pytest.raises(ValueError, match="the names k, m differ from those of the distribution, k, c"):
+    with pytest.raises(ValueError, match="the names k, m differ from the distribution's, k, c"):
         Prior({("k", "m"): mixture})
 
 

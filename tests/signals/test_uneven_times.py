@@ -69,7 +69,7 @@ def test_marks_of_missing_samples_are_not_interpolated(path):
 @pytest.mark.parametrize(
     ("times", "given", "message"),
     [
-        ([0, 0.01, 0.01, 0.02], {"resample": 0.01}, "got 0.01 s after 0.01 s; if the times are those of packets"),
+        ([0, 0.01, 0.01, 0.02], {"resample": 0.01}, "got 0.01 s after 0.01 s; if the times are of packets"),
         (
             [0, 0.01, 0.0201, 0.03],
             {"resample": 0.02},
