@@ -100,7 +100,7 @@ def _kept(belongs: np.ndarray, parents: np.ndarray) -> np.ndarray:
 def _groups(mixture: Mixture) -> np.ndarray:
     """Mode number of each component (K,)."""
     # the components are defined after the shears, so lines are straight there
-    straight = mixture._replace(shears=(), bounds=None)
+    straight = mixture._replace(shears=(), bounds=())
     count = len(mixture.means)
     line = np.linspace(0.0, 1.0, POINTS_OF_LINE)[:, None]
     connected = np.eye(count, dtype=bool)

@@ -28,7 +28,7 @@ from ..proposals.mixture import (
     log_responsibilities,
     to_component_space,
 )
-from ..proposals.transforms import SupportBounds, find_support_bounds, log_abs_det_jacobian
+from ..proposals.transforms import find_support_bounds, log_abs_det_jacobian
 
 # Probabilities of the three kernels of MixtureMove: independence, local walk, differences.
 KERNEL_PROBABILITIES = (0.5, 0.25, 0.25)
@@ -150,7 +150,7 @@ class MixtureMove(_FittedMove):
     def __init__(self):
         super().__init__()
         self._mixture: Mixture | None = None
-        self._bounds: SupportBounds | None = None
+        self._bounds: np.ndarray | None = None  # (2, ndim), of the support
         self._kernels = (self.draw_independence, self.draw_local_walk, self.draw_differences)
         self._log_factors = [0.0, 0.0, 0.0]
         self._part: np.ndarray | None = None  # of each walker, see `follow`
@@ -241,8 +241,6 @@ class MixtureMove(_FittedMove):
     def _step(self, coords, steps):
         """Make steps in the space of the components; also return the log ratio of volumes that the acceptance needs."""
         proposed = from_component_space(self._mixture, to_component_space(self._mixture, coords) + steps)
-        if self._mixture.bounds is None:
-            return proposed, np.zeros(len(coords))
         before, after = (log_abs_det_jacobian(self._mixture.bounds, points) for points in (coords, proposed))
         possible = (before > -np.inf) & (after > -np.inf)
         return proposed, np.where(possible, np.where(possible, before, 0.0) - np.where(possible, after, 0.0), -np.inf)

@@ -54,14 +54,6 @@ GRID = 4096.0
 RIDGE = 1e-9
 
 
-class _Basin(NamedTuple):
-    """A new component, in the coordinates that standardise its neighbour, and its estimated log-mass."""
-
-    log_mass: float
-    mean: np.ndarray
-    root: np.ndarray
-
-
 class _Quadratic(NamedTuple):
     """Coefficients a, g and A."""
 
@@ -95,27 +87,21 @@ def find_basins(mixture: Mixture, coords: np.ndarray, log_target: np.ndarray) ->
     ndim, variance = coords.shape[1], mixture.dof / (mixture.dof - 2.0)
     kept = np.flatnonzero(log_target > log_target.max() - DEPTH * ndim)
     target = np.round(log_target[kept] * GRID) / GRID
-    if mixture.bounds is not None:
-        target = target - log_abs_det_jacobian(mixture.bounds, coords[kept])
+    target -= log_abs_det_jacobian(mixture.bounds, coords[kept])
     found = _basins_of_points(mixture, to_component_space(mixture, coords[kept]), target)
     if not found:
         return None
-    found = sorted(found, key=lambda item: -item[1].log_mass)
-    shares = np.array(
-        [max(SMALLEST_SHARE, min(math.exp(min(basin.log_mass, 0.0)), LARGEST_SHARE)) for _, basin in found]
-    )
+    log_masses, means, roots = (np.array(each) for each in zip(*sorted(found, key=lambda each: -each[0]), strict=True))
+    shares = np.clip(np.exp(np.minimum(log_masses, 0.0)), SMALLEST_SHARE, LARGEST_SHARE)
     shares *= min(1.0, LARGEST_SHARE_OF_ALL / shares.sum())
-    roots = np.array([mixture.roots[k] @ basin.root / math.sqrt(variance) for k, basin in found])
-    return mixture._replace(
-        weights=shares,
-        means=np.array([mixture.means[k] + mixture.roots[k] @ basin.mean for k, basin in found]),
-        roots=roots,
-        inverses=invert_roots(roots),
-    )
+    roots /= math.sqrt(variance)
+    return mixture._replace(weights=shares, means=means, roots=roots, inverses=invert_roots(roots))
 
 
-def _basins_of_points(mixture: Mixture, points: np.ndarray, target: np.ndarray) -> list[tuple[int, _Basin]]:
-    """Basins among points (n, d) of the component space, each with the component whose coordinates it is given in."""
+def _basins_of_points(
+    mixture: Mixture, points: np.ndarray, target: np.ndarray
+) -> list[tuple[float, np.ndarray, np.ndarray]]:
+    """Basins among points (n, d) of the component space: estimated log-mass, mean, and root of the covariance."""
     ndim = points.shape[1]
     owner = log_components(mixture, points).argmax(axis=1)
     log_volumes = np.sum(np.log(np.diagonal(mixture.roots, axis1=1, axis2=2)), axis=1)
@@ -140,9 +126,9 @@ def _basins_of_points(mixture: Mixture, points: np.ndarray, target: np.ndarray) 
         if not left.any():
             break
         k = owner[left][np.argmax(target[left])]
-        basin, in_it = _highest_basin(_standard(mixture, k, points[left]), target[left] + log_volumes[k])
+        log_mass, mean, root, in_it = _highest_basin(_standard(mixture, k, points[left]), target[left] + log_volumes[k])
         left[left] = ~in_it
-        found.append((int(k), basin))
+        found.append((log_mass, mixture.means[k] + mixture.roots[k] @ mean, mixture.roots[k] @ root))
     return found
 
 
@@ -199,8 +185,8 @@ def _fit_most(points: np.ndarray, target: np.ndarray, full: bool) -> tuple[_Quad
     return _quadratic(coefficients, points.shape[1]), spread, uncertainty
 
 
-def _highest_basin(points: np.ndarray, target: np.ndarray) -> tuple[_Basin, np.ndarray]:
-    """The basin of the highest point among points (n, d), and which points it explains (n,)."""
+def _highest_basin(points: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+    """Log-mass, mean and root of the basin of the highest of points (n, d), and which points it explains (n,)."""
     ndim, top = points.shape[1], np.argmax(target)
     apart, below = points - points[top], target - target[top]
     spread = math.inf
@@ -217,7 +203,7 @@ def _highest_basin(points: np.ndarray, target: np.ndarray) -> tuple[_Basin, np.n
     explained = np.abs(below - quadratic.at(apart)) < SIGNIFICANT + 3.0 * spread
     explained[top] = True
     root = math.sqrt(WIDER) * np.linalg.cholesky((vectors / curvatures) @ vectors.T)
-    return _Basin(log_mass, points[top] + step, root), explained
+    return log_mass, points[top] + step, root, explained
 
 
 def _fit_near(points: np.ndarray, target: np.ndarray) -> tuple[_Quadratic, float]:

@@ -16,8 +16,8 @@ from scipy.special import gammaln
 
 from ..resampling import systematic
 from .transforms import (
+    Bound,
     Shear,
-    SupportBounds,
     apply_shears,
     find_shears,
     from_unbounded,
@@ -63,7 +63,7 @@ class Mixture(NamedTuple):
     inverses: np.ndarray  # (K, ndim, ndim), of the roots
     dof: float  # degrees of freedom
     shears: tuple[Shear, ...] = ()  # maps that remove curvature
-    bounds: SupportBounds | None = None  # removed by the transformation to the whole real line
+    bounds: tuple[Bound, ...] = ()  # removed by the transformation to the whole real line
 
     @property
     def covariances(self) -> np.ndarray:
@@ -115,13 +115,12 @@ def log_components(mixture: Mixture, points: np.ndarray) -> np.ndarray:
 
 def to_component_space(mixture: Mixture, coords: np.ndarray) -> np.ndarray:
     """Transform points (n, ndim) to the space in which the components are defined: first bounds, then shears."""
-    return apply_shears(mixture.shears, coords if mixture.bounds is None else to_unbounded(mixture.bounds, coords))
+    return apply_shears(mixture.shears, to_unbounded(mixture.bounds, coords))
 
 
 def from_component_space(mixture: Mixture, coords: np.ndarray) -> np.ndarray:
     """Transform points (n, ndim) back to the parameters: the inverse of `to_component_space`."""
-    coords = invert_shears(mixture.shears, coords)
-    return coords if mixture.bounds is None else from_unbounded(mixture.bounds, coords)
+    return from_unbounded(mixture.bounds, invert_shears(mixture.shears, coords))
 
 
 def _log_sum(parts: np.ndarray) -> np.ndarray:
@@ -133,7 +132,7 @@ def _log_sum(parts: np.ndarray) -> np.ndarray:
 def log_density(mixture: Mixture, coords: np.ndarray) -> np.ndarray:
     """Log density (n,) of the mixture at points (n, ndim), in the parameters; -inf beyond a bound."""
     log_sum = _log_sum(log_components(mixture, to_component_space(mixture, coords)))
-    return log_sum if mixture.bounds is None else log_sum + log_abs_det_jacobian(mixture.bounds, coords)
+    return log_sum + log_abs_det_jacobian(mixture.bounds, coords)
 
 
 def draw(mixture: Mixture, n: int, random: np.random.RandomState) -> np.ndarray:
@@ -174,21 +173,47 @@ def draw_inside(
 
 
 def fit_mixture(
-    coords: np.ndarray, weights: np.ndarray, max_components: int = 6, bounds: SupportBounds | None = None
+    coords: np.ndarray, weights: np.ndarray, max_components: int = 6, bounds: np.ndarray | None = None
 ) -> Mixture:
     """Fit a mixture to points (n, ndim) with weights (n,) of sum 1. The Bayesian information criterion chooses
-    components, degrees of freedom, shears, and a transformation that removes `bounds` near the population.
+    components, degrees of freedom, shears, and which `bounds` (2, ndim) near the population a transformation removes.
     """
-    kept, effective, tried = weights > 0.0, 1.0 / (weights @ weights), []
-    near = None if bounds is None else near_bounds(bounds, coords, weights)
-    for edges in [None] if near is None or not np.any(np.isfinite([near.low, near.high])) else [None, near]:
-        points = coords if edges is None else to_unbounded(edges, coords)
+    near = () if bounds is None else near_bounds(bounds, coords, weights)
+    effective, tried = 1.0 / (weights @ weights), []
+    for removed in dict.fromkeys([(), near, _worth_removing(near, coords, weights)]):
+        points = to_unbounded(removed, coords)
         # the criterion of a density in the parameters contains the Jacobian determinant of the transformation
-        volume = 0.0 if edges is None else weights[kept] @ log_abs_det_jacobian(edges, coords[kept])
+        volume = _mean_log_volume(removed, coords, weights)
         for shears in dict.fromkeys([(), find_shears(points, weights)]):
             mixture, criterion = _fit_components(shears, points, weights, max_components)
-            tried.append((criterion - 2.0 * effective * volume, mixture._replace(bounds=edges)))
+            tried.append((criterion - 2.0 * effective * volume, mixture._replace(bounds=removed)))
     return min(tried, key=lambda each: each[0])[1]
+
+
+def _worth_removing(bounds: tuple[Bound, ...], coords: np.ndarray, weights: np.ndarray) -> tuple[Bound, ...]:
+    """The bounds without those that a normal distribution follows better in place, dropped one after the other: a
+    transformation bends a parameter that depends linearly on others.
+    """
+    effective = 1.0 / (weights @ weights)
+
+    def misfit(removed: tuple[Bound, ...]) -> float:
+        _, root = location_and_root(to_unbounded(removed, coords), weights)
+        return float(np.log(root.diagonal()).sum() - _mean_log_volume(removed, coords, weights))
+
+    while bounds:
+        fewer = [bounds[:i] + bounds[i + 1 :] for i in range(len(bounds))]
+        best = min(fewer, key=misfit)
+        # as in the criterion, a choice costs as much as a parameter of the density
+        if not 2.0 * effective * (misfit(bounds) - misfit(best)) > math.log(max(effective, 2.0)):
+            break
+        bounds = best
+    return bounds
+
+
+def _mean_log_volume(bounds: tuple[Bound, ...], coords: np.ndarray, weights: np.ndarray) -> float:
+    """Weighted mean of the log-determinant of the transformation that removes bounds."""
+    kept = weights > 0.0
+    return float(weights[kept] @ log_abs_det_jacobian(bounds, coords[kept]))
 
 
 def fit_normals(coords: np.ndarray, effective: float, start: Mixture | None = None) -> Mixture:

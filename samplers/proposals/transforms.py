@@ -21,21 +21,22 @@ BISECTIONS = 55
 NEAR = 4.0
 
 
-class SupportBounds(NamedTuple):
-    """Lower and upper bounds (ndim,) of the parameters, infinite where there is none, and length scales (ndim,).
-
-    For a single bound, the scale is the distance at which the map changes from logarithmic to linear.
+class Bound(NamedTuple):
+    """Bounds of one parameter times a sign, which is -1 for an upper bound alone: a single bound is always the lower
+    one. Its scale is the distance at which the map changes from logarithmic to linear.
     """
 
-    low: np.ndarray
-    high: np.ndarray
-    span: np.ndarray
+    index: int  # of the parameter
+    sign: float
+    low: float
+    high: float
+    scale: float  # 1 for two bounds
 
 
-def find_support_bounds(inside: Callable[[np.ndarray], np.ndarray], coords: np.ndarray) -> SupportBounds:
-    """Find the bounds of the support along the axes through the first of points (n, ndim) in it, by about 85 calls of
-    `inside`, (m, ndim) -> (m,). Each finite bound lies at most one bisection step outside the support, and beyond all
-    points: otherwise the support is not a box.
+def find_support_bounds(inside: Callable[[np.ndarray], np.ndarray], coords: np.ndarray) -> np.ndarray:
+    """Find the bounds (2, ndim) of the support along the axes through the first of points (n, ndim) in it, by about 85
+    calls of `inside`, (m, ndim) -> (m,). Each lies at most one bisection step outside the support, and beyond all
+    points, or is infinite: otherwise the support is not a box.
     """
     ndim, span = coords.shape[1], np.ptp(coords, axis=0)
     parameter, side = np.repeat(np.arange(ndim), 2), np.tile([-1.0, 1.0], ndim)
@@ -63,82 +64,73 @@ def find_support_bounds(inside: Callable[[np.ndarray], np.ndarray], coords: np.n
         within[which[found]] = middle[found]
         beyond[which[~found]] = middle[~found]
     low, high = (start + side * beyond).reshape(ndim, 2).T
-    low = np.where(low < coords.min(axis=0), low, -np.inf)
-    high = np.where(high > coords.max(axis=0), high, np.inf)
-    return SupportBounds(low, high, np.where(span > 0.0, span, 1.0))
+    return np.array(
+        [np.where(low < coords.min(axis=0), low, -np.inf), np.where(high > coords.max(axis=0), high, np.inf)]
+    )
 
 
-def near_bounds(bounds: SupportBounds, coords: np.ndarray, weights: np.ndarray) -> SupportBounds:
-    """Keep the bounds within four standard deviations from the mean of a weighted population (n, ndim), (n,). The scale
-    of a single one is the variance of the parameter over the distance between mean and bound.
+def near_bounds(bounds: np.ndarray, coords: np.ndarray, weights: np.ndarray) -> tuple[Bound, ...]:
+    """Those of the bounds (2, ndim) within four standard deviations from the mean of a weighted population (n, ndim),
+    (n,). The scale of a single one is the variance of the parameter over the distance between mean and bound.
     """
     mean = weights @ coords
-    reach = NEAR * np.sqrt(weights @ (coords - mean) ** 2)
-    low = np.where(mean - bounds.low < reach, bounds.low, -np.inf)
-    high = np.where(bounds.high - mean < reach, bounds.high, np.inf)
-    distance = np.where(np.isfinite(low), mean - low, high - mean)
-    one_sided = (np.isfinite(low) != np.isfinite(high)) & (reach > 0.0) & (distance > 0.0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        scale = (reach / NEAR) ** 2 / distance
-    return SupportBounds(low, high, np.where(one_sided, scale, bounds.span))
+    sd, found = np.sqrt(weights @ (coords - mean) ** 2), []
+    for j, distances in enumerate(np.transpose([mean - bounds[0], bounds[1] - mean])):
+        low, high = (0.0 < distances) & (distances < NEAR * sd[j])
+        if low and high:
+            found.append(Bound(j, 1.0, *bounds[:, j], 1.0))
+        elif low:
+            found.append(Bound(j, 1.0, bounds[0, j], np.inf, sd[j] ** 2 / distances[0]))
+        elif high:
+            found.append(Bound(j, -1.0, -bounds[1, j], np.inf, sd[j] ** 2 / distances[1]))
+    return tuple(found)
 
 
-def _bounded_parameters(bounds: SupportBounds) -> list[tuple[int, float, float, float, float]]:
-    """Bounded parameters: index, sign, lower and upper bound, and scale of the parameter times the sign.
-
-    The sign is -1 for an upper bound alone, and a single bound is always the lower one.
-    """
-    found = []
-    for j in np.flatnonzero(np.isfinite(bounds.low) | np.isfinite(bounds.high)).tolist():
-        low, high, span = (float(each[j]) for each in bounds)
-        found.append((j, 1.0, low, high, span) if np.isfinite(low) else (j, -1.0, -high, np.inf, span))
-    return found
-
-
-def to_unbounded(bounds: SupportBounds, coords: np.ndarray) -> np.ndarray:
-    """Transform points (n, ndim) to the whole real line: ``log(exp((x - low) / span) - 1)`` for a lower bound, likewise
-    for an upper bound, the logit between two. Points on or beyond a bound become zero.
+def to_unbounded(bounds: Sequence[Bound], coords: np.ndarray) -> np.ndarray:
+    """Transform points (n, ndim) to the whole real line: ``log(exp((x - low) / scale) - 1)`` for a lower bound,
+    likewise for an upper bound, the logit between two. Points on or beyond a bound become zero.
     """
     coords = coords.copy()
-    for j, sign, low, high, span in _bounded_parameters(bounds):
-        from_low, from_high, _ = _distances(sign * coords[:, j], low, high, span)
-        if high < np.inf:
-            coords[:, j] = np.log(from_low) - np.log(from_high)
+    for bound in bounds:
+        from_low, from_high, _ = _distances(bound, coords)
+        if bound.high < np.inf:
+            coords[:, bound.index] = np.log(from_low) - np.log(from_high)
         else:  # near log(t) if t is small, near t if t is large
-            coords[:, j] = sign * (from_low + np.log(-np.expm1(-from_low)))
+            coords[:, bound.index] = bound.sign * (from_low + np.log(-np.expm1(-from_low)))
     return coords
 
 
-def _distances(x: np.ndarray, low: float, high: float, span: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _distances(bound: Bound, coords: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Distances (n,) from both bounds over a scale, 1 where one is not positive, and whether both are positive."""
-    from_low, from_high = np.maximum((x - low) / span, 0.0), np.maximum((high - x) / span, 0.0)
+    x = bound.sign * coords[:, bound.index]
+    from_low, from_high = (x - bound.low) / bound.scale, (bound.high - x) / bound.scale
     good = (from_low > 0.0) & (from_high > 0.0)
     return np.where(good, from_low, 1.0), np.where(good, from_high, 1.0), good
 
 
-def from_unbounded(bounds: SupportBounds, coords: np.ndarray) -> np.ndarray:
+def from_unbounded(bounds: Sequence[Bound], coords: np.ndarray) -> np.ndarray:
     """Transform points (n, ndim) back: the inverse of `to_unbounded`."""
     coords = coords.copy()
-    for j, sign, low, high, span in _bounded_parameters(bounds):
-        z = coords[:, j]
+    for index, sign, low, high, scale in bounds:
+        z = coords[:, index]
         if high < np.inf:
             width = high - low
             # measured from the nearer bound, to keep the last digits
-            coords[:, j] = np.where(z < 0.0, low + width * expit(z), high - width * expit(-z))
+            coords[:, index] = np.where(z < 0.0, low + width * expit(z), high - width * expit(-z))
         else:
-            coords[:, j] = sign * (low + span * np.logaddexp(0.0, sign * z))
+            coords[:, index] = sign * (low + scale * np.logaddexp(0.0, sign * z))
     return coords
 
 
-def log_abs_det_jacobian(bounds: SupportBounds, coords: np.ndarray) -> np.ndarray:
+def log_abs_det_jacobian(bounds: Sequence[Bound], coords: np.ndarray) -> np.ndarray:
     """Log-determinant (n,) of the Jacobian of `to_unbounded` at points (n, ndim); -inf on and beyond a bound."""
     total = np.zeros(len(coords))
-    for j, sign, low, high, span in _bounded_parameters(bounds):
-        from_low, from_high, good = _distances(sign * coords[:, j], low, high, 1.0)
-        if high < np.inf:
-            slope = np.log(high - low) - np.log(from_low) - np.log(from_high)
+    for bound in bounds:
+        from_low, from_high, good = _distances(bound, coords)
+        if bound.high < np.inf:
+            slope = np.log(bound.high - bound.low) - np.log(from_low) - np.log(from_high)
         else:
-            slope = -np.log(span) - np.log(-np.expm1(-from_low / span))
+            slope = -np.log(bound.scale) - np.log(-np.expm1(-from_low))
         total = np.where(good, total + slope, -np.inf)
     return total
 

@@ -121,7 +121,7 @@ def test_each_kernel_keeps_the_target(kernel, target, n, rng):
     start, log_target, inside, *mixture = target(rng, n)
     x, move, random = start.copy(), MixtureMove(), np.random.RandomState(rng.integers(2**31))
     move.calibrate(x[:300] * np.array([1.1, 0.9, 1.0])[: x.shape[1]], uniform(300), inside, *mixture)
-    assert (move._mixture.bounds is not None) == (inside is not None)
+    assert bool(move._mixture.bounds) == (inside is not None)
     for _ in range(5):
         proposed, factors = getattr(move, kernel)(x, random)
         accepted = np.log(random.uniform(size=n)) < log_target(proposed) - log_target(x) + factors
@@ -131,6 +131,31 @@ def test_each_kernel_keeps_the_target(kernel, target, n, rng):
         assert stats.ks_2samp(ours, theirs).pvalue > 1e-4
     if target is curved:
         assert abs(np.mean(x[:, 0] > 0.2) - np.mean(start[:, 0] > 0.2)) < 4.5 * np.sqrt(0.5 / n)
+
+
+def test_bounds_of_a_parameter_that_others_follow_linearly_stay(rng):
+    """Beside two exponentials at their bounds, four parameters follow a bounded one closely: to remove its bounds too,
+    or none, leaves 11 to 21 % of the draws effective instead of 44 to 47 %."""
+    n, low, high = 300, np.r_[np.full(4, -np.inf), 0.0, 0.0, -np.inf], np.r_[np.full(4, np.inf), 1.0, np.inf, 1.0]
+    slope, width = np.array([0.6, -0.3, 0.2, 0.5]), np.array([0.002, 0.005, 0.01, 0.003])
+    x = np.column_stack([np.zeros((n, 4)), stats.truncexpon.rvs(3.0, scale=1 / 3, size=n, random_state=rng)])
+    x = np.column_stack([x, rng.exponential(1 / 40, n), 1.0 - rng.exponential(1 / 200, n)])
+    x[:, :4] = x[:, 4:5] * slope + width * rng.standard_normal((n, 4))
+    mixture = fit_mixture(x, uniform(n), bounds=np.array([low, high]))
+    assert [bound.index for bound in mixture.bounds] == [5, 6]
+
+    y = draw(mixture, 20_000, np.random.RandomState(1))
+    inside = np.all((y >= low) & (y <= high), axis=1)
+    weights = (
+        np.exp(
+            stats.norm.logpdf(y[:, :4], y[:, 4:5] * slope, width).sum(axis=1)
+            - y[:, 4:7] @ [3.0, 40.0, -200.0]
+            - 200.0
+            - log_density(mixture, y)
+        )
+        * inside
+    )
+    assert weights.sum() ** 2 / (weights @ weights) > 0.3 * len(y)
 
 
 @pytest.mark.parametrize("distinct", [1, 2, 3, 4])
