@@ -25,7 +25,6 @@ _NEAREST_RUNS = 3, 10  # runs that secants are fitted to: per dimension, and in 
 _TOO_CLOSE = 1e-8  # squared distance of runs that tell nothing about derivatives: residuals have seven digits
 TOLERANCE = 0.5  # log-density still to gain, according to the quadratic approximation
 _MAX_ITERATIONS = 40
-_ROUGH = 5.0  # gain that the quadratic approximation may promise where no step gains anything
 _STALLED = 0.1  # gain in log-density below which a step counts as failed
 # Share of the promised gain below which an ascent with derivatives of its own makes new differences. Without them,
 # searches need 5 to 23 % fewer simulations, but fewer starts of a column end at a mode: its right runs are doubted.
@@ -77,11 +76,6 @@ class Ascent(NamedTuple):
     def gain_left(self) -> float:
         """Log-density still to gain according to the quadratic approximation."""
         return 0.5 * float(self.gradient @ np.linalg.solve(self.hessian, self.gradient))
-
-    @property
-    def converged(self) -> bool:
-        """Whether little is left to gain; differences of a rough likelihood promise a few units at its top as well."""
-        return self.gain_left < _ROUGH
 
 
 @dataclass

@@ -22,6 +22,7 @@ from .target import ResponseTarget, Runs, Steps, at_once, nothing_stored
 _NEGLIGIBLE = 15.0  # a mode whose log-evidence is lower than the largest by more than this is dropped
 _LOOSEST = 5.0  # largest tolerance of a short part of the record
 _FLATTEST = 0.2  # smallest curvature of the Laplace approximation: five times the variance of the prior
+_ROUGH = 5.0  # gain that the quadratic approximation may promise at the top of a rough likelihood
 _APART = 0.25  # prior standard deviations in one coordinate that part ends on a part of the record
 _FEW = 6  # parameters whose differences cost about as much as two steps
 _MOST_STARTS, _DRAWN = 2, 4  # times the number asked for: that begin, and of which the highest begin
@@ -106,7 +107,7 @@ def laplace(target: ResponseTarget, end: Ascent) -> Mode:
     ahead, behind = (target.parameters(at + sign * _STEP * np.eye(target.ndim)) for sign in (1.0, -1.0))
     tangents = (ahead - behind) / (2.0 * _STEP)
     spread = tangents.T @ covariance @ tangents
-    return Mode(target.parameters(at[None])[0], spread, at, covariance, top, log_evidence, end.converged)
+    return Mode(target.parameters(at[None])[0], spread, at, covariance, top, log_evidence, end.gain_left < _ROUGH)
 
 
 class _OutOfBudget(Exception):
