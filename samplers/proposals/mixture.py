@@ -179,41 +179,37 @@ def fit_mixture(
     components, degrees of freedom, shears, and which `bounds` (2, ndim) near the population a transformation removes.
     """
     near = () if bounds is None else near_bounds(bounds, coords, weights)
-    effective, tried = 1.0 / (weights @ weights), []
-    for removed in dict.fromkeys([(), near, _worth_removing(near, coords, weights)]):
+    kept, effective, tried = weights > 0.0, 1.0 / (weights @ weights), []
+    # the criterion of a density in the parameters contains the Jacobian determinant of the transformation
+    volumes = {bound: float(weights[kept] @ log_abs_det_jacobian([bound], coords[kept])) for bound in near}
+    for removed in dict.fromkeys([(), near, _worth_removing(volumes, coords, weights)]):
         points = to_unbounded(removed, coords)
-        # the criterion of a density in the parameters contains the Jacobian determinant of the transformation
-        volume = _mean_log_volume(removed, coords, weights)
+        volume = sum(volumes[bound] for bound in removed)
         for shears in dict.fromkeys([(), find_shears(points, weights)]):
             mixture, criterion = _fit_components(shears, points, weights, max_components)
             tried.append((criterion - 2.0 * effective * volume, mixture._replace(bounds=removed)))
     return min(tried, key=lambda each: each[0])[1]
 
 
-def _worth_removing(bounds: tuple[Bound, ...], coords: np.ndarray, weights: np.ndarray) -> tuple[Bound, ...]:
+def _worth_removing(volumes: dict[Bound, float], coords: np.ndarray, weights: np.ndarray) -> tuple[Bound, ...]:
     """The bounds without those that a normal distribution follows better in place, dropped one after the other: a
-    transformation bends a parameter that depends linearly on others.
+    transformation bends a parameter that depends linearly on others. `volumes` are mean log-determinants.
     """
-    effective = 1.0 / (weights @ weights)
+    bounds, unbounded, effective = tuple(volumes), to_unbounded(tuple(volumes), coords), 1.0 / (weights @ weights)
 
     def misfit(removed: tuple[Bound, ...]) -> float:
-        _, root = location_and_root(to_unbounded(removed, coords), weights)
-        return float(np.log(root.diagonal()).sum() - _mean_log_volume(removed, coords, weights))
+        indices = [bound.index for bound in removed]
+        points = np.where(np.isin(np.arange(coords.shape[1]), indices), unbounded, coords)
+        _, root = location_and_root(points, weights)
+        return float(np.log(root.diagonal()).sum()) - sum(volumes[bound] for bound in removed)
 
     while bounds:
-        fewer = [bounds[:i] + bounds[i + 1 :] for i in range(len(bounds))]
-        best = min(fewer, key=misfit)
+        best = min([bounds[:i] + bounds[i + 1 :] for i in range(len(bounds))], key=misfit)
         # as in the criterion, a choice costs as much as a parameter of the density
         if not 2.0 * effective * (misfit(bounds) - misfit(best)) > math.log(max(effective, 2.0)):
             break
         bounds = best
     return bounds
-
-
-def _mean_log_volume(bounds: tuple[Bound, ...], coords: np.ndarray, weights: np.ndarray) -> float:
-    """Weighted mean of the log-determinant of the transformation that removes bounds."""
-    kept = weights > 0.0
-    return float(weights[kept] @ log_abs_det_jacobian(bounds, coords[kept]))
 
 
 def fit_normals(coords: np.ndarray, effective: float, start: Mixture | None = None) -> Mixture:
