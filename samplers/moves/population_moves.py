@@ -37,8 +37,9 @@ KERNEL_PROBABILITIES = (0.5, 0.25, 0.25)
 TARGET_ACCEPTANCE, HIGH_ACCEPTANCE = 0.25, 0.5
 KERNEL_PROBABILITIES_IF_ACCEPTED = (0.8, 0.1, 0.1)
 # Parts of the fitted points, where they are fewer than this per number of a mean and a covariance; the points of a part
-# are moved by a fit to the others. Without, means of two modes in 11 dimensions are off by 1.3 stated errors (0.93,
-# 160 runs of 150 walkers), and the log-evidence in 20 dimensions by 1.9 (0.4; six runs); in 10 dimensions by 0.4.
+# are moved by a fit to the others. Without, means of two modes in 11 dimensions are off by 1.3 stated errors with 1.9
+# points per number (0.93 with parts, 160 runs), by 1.1 with 2.6, and by 1.0 with 3.2, 3.9 and 6.5 (24 to 38 runs), so
+# 3 and 8 would do too; the log-evidence in 20 dimensions by 1.9 (0.4; six runs); in 10 dimensions by 0.4.
 PARTS, FEW_POINTS = 10, 5.0
 # Share of the difference steps with scale 1, which lead from mode to mode (ter Braak 2006). Without differences, the
 # means of 24 runs with two modes in 11 dimensions are off by 1.6 stated errors.
