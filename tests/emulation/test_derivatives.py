@@ -17,6 +17,7 @@ from fe_likelihoods import (
     Measurements,
     Posterior,
     Record,
+    SimulationFailed,
     TruncatedNormal,
     Uniform,
 )
@@ -25,7 +26,7 @@ from fe_likelihoods.emulation.target import ResponseTarget, at_once
 from fe_likelihoods.priors.multivariate import MultivariateNormal
 from samplers import SMCSampler
 
-from .problems import CHANNELS, DT, N_STEPS, TRUTH, free_vibration, noisy
+from .problems import CHANNELS, DT, N_STEPS, TRUTH, Shortened, free_vibration, noisy
 
 NAMES = ("stiffness", "damping")
 
@@ -260,6 +261,44 @@ def test_wrong_derivatives_are_refused(factors):
         find_modes(
             posterior_of(lambda theta: slopes(theta)[::-1] if scales is None else scales * slopes(theta)), seed=1
         )
+
+
+class QuietBeginning(Shortened):
+    """The first third of the record does not depend on the parameters; the derivatives have the wrong sign."""
+
+    def first(self, seconds):
+        return QuietBeginning(self.respond, self.parameter_names, self.whole, round(seconds / self.dt) + 1)
+
+    def jacobian(self, theta):
+        return -np.array([self.simulate(one) - self.simulate(np.zeros(2)) for one in np.eye(2)])
+
+
+def after_a_quiet_beginning(theta, phase):
+    return (phase > 0.33) * (theta[0] * np.sin(40.0 * phase) + theta[1] * np.cos(33.0 * phase))
+
+
+def test_wrong_derivatives_are_refused_where_the_first_comparison_shows_nothing():
+    """It changes nothing at the beginning of a record, or its simulation fails."""
+    model = QuietBeginning(after_a_quiet_beginning, NAMES)
+    measured = noisy(model, np.array([1.2, 0.8]), np.array([0.05]))
+    prior = {name: TruncatedNormal(1.0, 0.3) for name in NAMES} | {"sigma_top": HalfNormal(0.5)}
+    fails = [False]
+
+    def simulate(theta):
+        if fails == [True]:
+            fails.append(False)
+            raise SimulationFailed("no convergence")
+        return model.simulate(theta)
+
+    def jacobian(theta):
+        fails[:1] = [True]
+        return model.jacobian(theta)
+
+    fragile = FunctionModel(simulate, NAMES, model.channels, DT, model.n_steps, jacobian=jacobian)
+    for each in (model, fragile):
+        with pytest.raises(ValueError, match=r"by \d+ % of the norm"):
+            find_modes(Posterior(FELikelihood(each, measured), prior), seed=1)
+    assert len(fails) == 2
 
 
 @pytest.mark.parametrize("prior", [0.3, 1e-4, 0.9])
