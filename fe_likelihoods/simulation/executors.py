@@ -331,12 +331,11 @@ def as_executor(pool: Any, model: Any = None) -> "LocalPool | PoolExecutor | Non
 
     ValueError if `pool` is of no such kind, or its workers are other processes and the model cannot be sent to them.
     """
-    executor = pool
     if pool is not None and not isinstance(pool, Submitting):
-        executor = PoolExecutor(pool) if hasattr(pool, "map") else LocalPool(pool)
-    if executor is not None and executor.other_processes:
+        pool = PoolExecutor(pool) if hasattr(pool, "map") else LocalPool(pool)
+    if pool is not None and pool.other_processes:
         Pickled.of(model)
-    return executor
+    return pool
 
 
 class PoolExecutor(Submitting):

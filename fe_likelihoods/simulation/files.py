@@ -63,6 +63,7 @@ _CACHES = (*(f"{os.sep}{name}{os.sep}" for name in ("__pycache__", ".cache", ".c
 _WATCH = 'trap "" TERM; read -r _; kill -TERM 0; rm -rf "$0" || { sleep 1; rm -rf "$0"; }; kill -KILL 0'
 _MOST_ENTRIES = 100  # in subfolders that are shown as folders; other subfolders are links. A copy takes 60 us
 _MOST_BYTES = 2**20  # of a copy
+_OF_SQLITE = "-shm", "-wal", "-journal"  # of a data base in use; closing it here again would release SQLite's locks
 _MOST_BESIDE = 3000  # entries beside the working folder, which ``..`` shows
 
 _STARTS = {"os.fork", "os.posix_spawn", "os.system", "subprocess.Popen"}
@@ -180,7 +181,7 @@ def running_simulation() -> Observer | None:
 
 @contextlib.contextmanager
 def _of_this_library() -> Iterator[None]:
-    """Files and programs in the ``with`` block do not belong to the simulation."""
+    """Files in the ``with`` block do not belong to the simulation; the programs count as inputs."""
     before, _own.is_quiet = getattr(_own, "is_quiet", False), True
     try:
         yield
@@ -189,9 +190,9 @@ def _of_this_library() -> Iterator[None]:
 
 
 def _hook(event: str, arguments: tuple) -> None:
-    if not _observers or event not in _EVENTS:
-        return
     of_library = getattr(_own, "is_quiet", False)
+    if not _observers or event not in (_STARTS if of_library else _EVENTS):
+        return
     with _of_this_library():
         simulation, uses = running_simulation(), []
         with contextlib.suppress(Exception):  # never disturb the code that is observed
@@ -236,8 +237,7 @@ def _uses(event: str, arguments: tuple) -> list[tuple[str, Any]]:
         changed = [] if is_within else [("changes", arguments[_CHANGES[event]])]
         if event in ("os.rename", "os.link", "os.symlink"):
             folder = os.path.dirname(os.fsdecode(arguments[1])) if event == "os.symlink" else ""
-            source = os.path.join(folder, os.fsdecode(arguments[0]))
-            return [("loads", source), ("touches", arguments[1]), *changed]
+            return [("loads", os.path.join(folder, os.fsdecode(arguments[0]))), ("touches", arguments[1]), *changed]
         return changed
     return [("makes" if event == "tempfile.mkdtemp" else "loads", arguments[0])]
 
@@ -267,7 +267,7 @@ def mapped(read: Iterable[str] = ()) -> Opened:
 
 def _counts(path: str) -> bool:
     """Whether a file counts: it does not belong to the system, Python or an installed package."""
-    if path.startswith((*_SYSTEM, *_INSTALLED)) or path.endswith((".pyc", "-shm", "-wal")):
+    if path.startswith((*_SYSTEM, *_INSTALLED)) or path.endswith((".pyc", *_OF_SQLITE)):
         return False
     return "-packages" + os.sep not in path and os.path.realpath(path) != os.path.realpath(sys.executable)
 
@@ -315,8 +315,9 @@ class Observed:
         if running_simulation() is not None or (is_home and is_main):  # one after the other
             alone, thread = True, 0
         elif not is_home and (is_main or _is_only_thread_of_dask()):
-            mirror = _mirror_of(self._sender[1], os.getpid())
-            os.chdir(mirror.shown())
+            with _of_this_library():
+                mirror = _mirror_of(self._sender[1], os.getpid())
+                os.chdir(mirror.shown())
         try:
             with Observer(alone, thread, mirror) as observer:
                 result = self.function(item)
@@ -355,10 +356,9 @@ class Group:
     def start(self, command: Sequence[str], **options: Any) -> subprocess.Popen:
         """A new process of the group, without standard input; `options` are for `subprocess.Popen`."""
         with _of_this_library():
-            group = self.processes[0].pid
-            process = subprocess.Popen(command, stdin=subprocess.DEVNULL, process_group=group, **options)
-        self.processes.append(process)
-        return process
+            options |= {"stdin": subprocess.DEVNULL, "process_group": self.processes[0].pid}
+            self.processes.append(subprocess.Popen(command, **options))
+        return self.processes[-1]
 
     def run(self, command: Sequence[str], watch: Callable[[float], float], **options: Any) -> int:
         """Run a program to its end, kill the group, and return the exit code; the folder stays.
@@ -452,7 +452,8 @@ class _Mirror:
                 self._show(entry.path, place)
                 continue
             with contextlib.suppress(OSError):  # the user may not read it, or it is not there any more
-                if entry.is_file() and entry.stat().st_size <= _MOST_BYTES:
+                in_use = any(os.path.exists(entry.path.removesuffix(each) + each) for each in _OF_SQLITE)
+                if entry.is_file() and entry.stat().st_size <= _MOST_BYTES and not in_use:
                     self.states[entry.path] = _state(entry.path)
                     shutil.copy2(entry.path, place)
                     self.states[place] = _state(place)

@@ -2,6 +2,7 @@
 
 import os
 from multiprocessing import get_context
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -51,6 +52,25 @@ def test_reasons_come_back_from_the_pool_of_a_sampler():
         pooled = run(lambda time: limited, vectorize=False, pool=pool)
     assert {each["reason"] for each in pooled.failures} == {"no convergence"}
     assert pooled.failure_count == 0 and len(pooled.failures) > 0  # as in this process
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="the pool forks")
+def test_what_a_run_writes_is_no_input_of_simulations_in_the_pool_of_a_sampler(tmp_path, monkeypatch):
+    (folder := tmp_path / "run").mkdir()
+    (tmp_path / "log.txt").write_text("of another program")
+    monkeypatch.chdir(folder)  # with the cache, whose SQLite locks must hold
+    channel = Channel("top", "displacement", "m")
+    model = FunctionModel(limited, ("rate",), [channel], dt=0.01, n_steps=50)
+    likelihood = FELikelihood(model, Measurements([channel], 0.01, np.ones((1, 50))), cache="cache.sqlite")
+    points = np.column_stack([np.linspace(1.0, 3.9, 40), np.full(40, 0.1)])
+    with get_context("fork").Pool(2) as pool:
+        for start in range(4):
+            Path("chain.txt").write_text(f"{start} batches")
+            values = pool.map_async(likelihood.log_likelihood, points[start::4], chunksize=1).get(60.0)
+            assert np.isfinite(values).all()
+    cache = likelihood.simulator.cache
+    assert cache.info().simulations == 40
+    assert not [path for _, files, _ in cache.labels_of(model.fingerprint) for path in files if str(tmp_path) in path]
 
 
 @pytest.mark.parametrize("memory_rows", [0, 100])
