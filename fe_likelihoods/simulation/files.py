@@ -2,8 +2,8 @@
 
 One audit hook (`sys.addaudithook`) sees what Python code of this process opens, writes and starts.
 
-* Files, modules, shared libraries and programs that a simulation uses are inputs, apart from those that it changes, and
-  those of Python and installed packages.
+* Files, modules, shared libraries and programs that a simulation uses are inputs, apart from those whose content it
+  changes, and those of Python and installed packages.
 * User code often writes files of fixed names and reads them back: input of a program, output of an OpenSees recorder.
   So a worker process changes into a temporary folder for each simulation, which shows the sender's working folder:
   files as copies, large ones as links, subfolders as folders. If Python code opens a link for writing, a private file
@@ -107,7 +107,7 @@ class Observer:
     def __init__(self, alone: bool = True, thread: int = 0, mirror: "_Mirror | None" = None) -> None:
         self.alone, self.thread, self.mirror, self.shared = alone, thread, mirror, ""
         self.noted = Opened()
-        self.used: dict[str, tuple | None] = {}  # states of files at their first use; None if it has made them
+        self.used = Opened()  # files at their first use; empty digests of what it has made, and what does not count
         self._made: list[str] = []  # new files and folders, which belong to this simulation
         self._start = time.time_ns()
 
@@ -127,13 +127,12 @@ class Observer:
             )
 
     def result(self, known: Opened) -> Opened:
-        """The files that are `known`, and those that were used and are as before, with new shared libraries.
+        """The files that are `known`, and those that were used and have their content still, with new shared libraries.
 
         They have the names that the code has given to them: folders on the way may be links that change.
         """
-        changed = {name for name, state in self.used.items() if state is None or state != _state(name)}
-        if any(name not in known and name not in changed and _counts(name) for name in self.used):
-            known = known | {name: digest for name, digest in mapped(self.used).items() if name not in changed}
+        if any(digest and name not in known for name, digest in self.used.items()):
+            known = known | {name: now for name, now in mapped(self.used).items() if self.used.get(name, now) == now}
         return known | self.noted
 
     def sees(self, how: str, path: str) -> None:
@@ -207,7 +206,8 @@ def _hook(event: str, arguments: tuple) -> None:
                 name = os.path.join(simulation.mirror.base, os.path.relpath(name, simulation.mirror.path))
             for observer in list(_observers) if how != "changes" else ():
                 if observer.thread in (0, threading.get_ident()) and name not in observer.used:
-                    observer.used[name] = _state(name) if how in ("reads", "loads") else None
+                    counts = how in ("reads", "loads") and _counts(name)
+                    observer.used[name] = read_again({name: ""})[name] if counts else ""
 
 
 def _uses(event: str, arguments: tuple) -> list[tuple[str, Any]]:

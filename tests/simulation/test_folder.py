@@ -456,6 +456,12 @@ def through_a_link(make):
     return read
 
 
+def made_again():
+    text = Path("data/k.txt").read_text()
+    os.remove("data/k.txt")
+    Path("data/k.txt").write_text(text)
+
+
 def moved_away_and_back():
     os.rename("data.txt", "work.txt")
     Path("work.txt").read_text()
@@ -473,6 +479,8 @@ def moved_away_and_back():
         through_a_link(os.symlink),
         through_a_link(os.link),
         moved_away_and_back,
+        lambda: (Path("data/k.txt").read_text(), Path("data/k.txt").touch()),
+        made_again,
     ],
 )
 def test_a_file_is_known_by_the_name_that_the_code_gives_to_it(use, tmp_path, monkeypatch):
