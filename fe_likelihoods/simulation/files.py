@@ -436,7 +436,7 @@ class _Mirror:
         if not self.states or self.states != {path: _state(path) for path in self.states}:
             shutil.rmtree(self.path, ignore_errors=True)
             self.path = tempfile.mkdtemp(prefix="run_", dir=self._place)
-            self.states, self._left = {}, _MOST_ENTRIES
+            self.states, self._left = {self.path: None}, _MOST_ENTRIES  # not shown until it has another state
             self._show(self.base, self.path)
         return self.path
 
@@ -451,7 +451,7 @@ class _Mirror:
                 os.mkdir(place)
                 self._show(entry.path, place)
                 continue
-            with contextlib.suppress(OSError):  # the user may not read it, or it is not there any more
+            with contextlib.suppress(PermissionError, FileNotFoundError):
                 in_use = any(os.path.exists(entry.path.removesuffix(each) + each) for each in _OF_SQLITE)
                 if entry.is_file() and entry.stat().st_size <= _MOST_BYTES and not in_use:
                     self.states[entry.path] = _state(entry.path)

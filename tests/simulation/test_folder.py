@@ -1,5 +1,6 @@
 """Each simulation in a worker has a working folder of its own; simulations that write elsewhere at once are refused."""
 
+import errno
 import logging
 import multiprocessing
 import os
@@ -454,6 +455,24 @@ def through_a_link(make):
         return Path("in.txt").read_text()
 
     return read
+
+
+def test_a_folder_that_could_not_be_shown_is_shown_anew(tmp_path, monkeypatch):
+    """Half of it would make results without the other files."""
+    for name in ("a.txt", "b.txt", "c.txt"):
+        old(tmp_path / name, name)
+    copy, left = shutil.copy2, [None, OSError(errno.ENOSPC, "No space left on device"), None, None, None]
+
+    def on_a_full_disk(source, target):
+        copy(source, target)
+        if error := left.pop(0):
+            raise error
+
+    monkeypatch.setattr(shutil, "copy2", on_a_full_disk)
+    observed = Observed(lambda _: sorted(os.listdir()), True, (b"another process", str(tmp_path)))
+    with pytest.raises(OSError, match="No space left"):
+        observed(None)
+    assert observed(None)[0] == ["a.txt", "b.txt", "c.txt"]
 
 
 def made_again():
