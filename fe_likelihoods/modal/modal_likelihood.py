@@ -282,7 +282,8 @@ class PredictedModes(NamedTuple):
         for k, number in enumerate(self.data.mode_numbers):
             values = [self.data.mean_frequencies[k], np.median(self.frequencies[:, k]), low[k], high[k]]
             pairs = " or ".join(map(str, np.unique(self.numbers[:, k])))  # several: the pairing changes
-            rows.append([str(number), *(f"{x:.4g}" for x in values), f"{np.median(self.assurance[:, k]):.3f}", pairs])
+            assurance = f"{np.median(self.assurance[:, k]):.3f}".replace("nan", "-")  # of a mode without a shape
+            rows.append([str(number), *(f"{x:.4g}" for x in values), assurance, pairs])
         return rows
 
     def __str__(self) -> str:

@@ -467,7 +467,11 @@ class Prediction:
             rows = [("value", "unit", "mean", "MC error", "sd", *(f"{100 * p:g} %" for p in self.probabilities))]
             table = np.vstack([np.ravel(each) for each in (self.mean, self.standard_error, self.sd, *self.quantiles)])
             for (name, unit, factor), column in zip(known, table.T, strict=True):
-                rows.append((name, unit, *map(number, column / factor)))
+                column /= factor
+                digits, mean, sd = 3, abs(column[0]), column[2]
+                if sd > 1e-12 * mean > 0.0:
+                    digits = max(digits, int(np.floor(np.log10(mean)) - np.floor(np.log10(sd))) + 1)  # shows the sd
+                rows.append((name, unit, *(number(each, digits) for each in column)))
         return "\n".join([*lines, text_table(rows)])
 
     __repr__ = __str__

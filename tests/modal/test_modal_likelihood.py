@@ -184,7 +184,7 @@ def test_frequencies_alone_are_paired_by_number():
     assert likelihood.parameter_names == ("f",)
     assert likelihood([2.02]) == pytest.approx(2 * norm.logpdf(0.01, 0.0, 0.01))
     predicted = likelihood.predict_modes([[2.0]])
-    assert np.isnan(predicted.assurance).all()
+    assert np.isnan(predicted.assurance).all() and [row[5] for row in predicted.rows()] == ["MAC", "-", "-"]
     assert np.diff(predicted.interval(0.9), axis=0)[0] == pytest.approx(
         2 * 1.645 * 0.01 * np.array([2.0, 8.0]), rel=0.1
     )

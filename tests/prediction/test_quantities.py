@@ -74,6 +74,8 @@ def test_an_energy_has_its_own_name_dimension_and_unit():
     ]
     row = str(both.score(DATA, interval_probability=0.5)).splitlines()[2].split()
     assert row[:5] == ["energy", "of", "force", "kJ", f"{measured_quantity(WORK, DATA) / 1e3:.3g}"]
+    narrow = str(propagate(MODEL, 1.0 + 1e-5 * SAMPLES, quantity=peak("deck"), progress=False)).splitlines()[-1].split()
+    assert len(set(narrow[5:])) == 3, "quantiles of a narrow prediction are told apart"
     work = propagate(MODEL, SAMPLES, quantity=WORK, progress=False)
     assert exceedance(work, 7.5, unit="kJ").probability == 0.25
     with pytest.raises(ValueError, match="a unit of energy, got 'kip'"):

@@ -41,7 +41,7 @@ def test_events_have_tables_sentences_and_figures(vibrating, tmp_path):
     for row, factor in zip(numbers, (1.0, 1.5), strict=True):
         largest = 1e3 * factor * np.abs(posterior.likelihood.measurements.values).max()
         assert float(row[5]) == pytest.approx(largest, rel=5e-3)
-        assert float(row[2]) == pytest.approx(1e3 * np.median(peaks.values), rel=5e-3)
+        assert float(row[2]) == pytest.approx(1e3 * np.median(peaks.values), rel=1e-4)
         values = np.sort(1e3 * peaks.values.ravel())
         assert [float(end) for end in row[4].split(" to ")] == pytest.approx([values[2], values[-3]], rel=0.05)
     assert numbers[0][6].startswith("within") and numbers[1][6:] == ["above", "0.99"]
