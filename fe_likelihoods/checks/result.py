@@ -217,7 +217,7 @@ def check_model(posterior: Posterior) -> ModelCheck:
     ten seconds allow, and five at least), in which it looks for wrong units, signs, clocks and channels of the data.
     `fe_likelihoods.check_data` looks at the data alone. For histories with white noise it halves step and mesh at the
     best draw (a simulation for each parameter and two more, if ten seconds allow it), and names what moves parameters
-    by two posterior standard deviations; `fe_likelihoods.check_result` knows these and names half of one.
+    by one posterior standard deviation; `fe_likelihoods.check_result` knows these and names half of one.
 
     Parameters
     ----------

@@ -70,7 +70,7 @@ def test_what_speaks_against_an_event_is_said(vibrating, tmp_path):
     found = {name: replace(each, findings=far) for name, each in few.items()}
     assert describe_event("far", found, None).findings == far  # once for all quantities
     silent = describe_event("silent", predicted(vibrating), posterior.likelihood.measurements)
-    assert "A band without noise is that of the response" in silent.sentence
+    assert "A band without noise shows the response" in silent.sentence
     other = describe_event("other", few, Measurements(posterior.likelihood.measurements.channels, 0.02, [[0.0] * 9]))
     assert "No scores: " in other.sentence
 
