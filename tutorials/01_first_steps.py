@@ -109,7 +109,7 @@ sampler = SMCSampler(500, posterior.ndim, posterior, vectorize=True, seed=1)
 sampler.run_mcmc(None, 4)
 samples = sampler.get_chain(flat=True)
 print(sampler.verdict)
-print(summary(samples, posterior.parameters))
+print(summary(samples, posterior.parameters, sampler.mean_error(), sampler.sd_error()))
 plot_corner(samples, posterior, truths=truth).savefig("corner.png")
 
 # %%

@@ -54,7 +54,7 @@ sampler = SMCSampler(50, posterior.ndim, posterior, vectorize=True, seed=1, guid
 sampler.run_mcmc(None, 1)
 print(sampler.verdict)
 samples = sampler.get_chain(flat=True)
-print(summary(samples, posterior.parameters))
+print(summary(samples, posterior.parameters, sampler.mean_error(), sampler.sd_error()))
 means = samples.mean(axis=0)
 print("(mean - truth) / sd: " + ", ".join(f"{z:+.1f}" for z in (means - truth) / samples.std(axis=0)))
 plot_run(sampler).savefig("run.png")

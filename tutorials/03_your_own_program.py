@@ -107,7 +107,8 @@ sampler, posterior = update(program, pool=2, cache=folder / "simulations.db")
 print(sampler.verdict)
 report = posterior.report()
 print(f"{report['simulations']} simulations, {report['failure_count']} failed")
-print(summary(sampler.get_chain(flat=True), posterior.parameters))
+errors = sampler.mean_error(), sampler.sd_error()
+print(summary(sampler.get_chain(flat=True), posterior.parameters, *errors))
 
 # %%
 # The same as a Python function
