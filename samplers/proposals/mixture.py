@@ -7,7 +7,7 @@ effective number of points as sample size. Equations, constants and their reason
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache
 from typing import NamedTuple
 
@@ -182,7 +182,7 @@ def fit_mixture(
     kept, effective, tried = weights > 0.0, 1.0 / (weights @ weights), []
     # the criterion of a density in the parameters contains the Jacobian determinant of the transformation
     volumes = {bound: float(weights[kept] @ log_abs_det_jacobian([bound], coords[kept])) for bound in near}
-    for removed in dict.fromkeys([(), near, _worth_removing(volumes, coords, weights)]):
+    for removed in dict.fromkeys(_bounds_to_remove(volumes, coords, weights)):
         points = to_unbounded(removed, coords)
         volume = sum(volumes[bound] for bound in removed)
         for shears in dict.fromkeys([(), find_shears(points, weights)]):
@@ -191,25 +191,27 @@ def fit_mixture(
     return min(tried, key=lambda each: each[0])[1]
 
 
-def _worth_removing(volumes: dict[Bound, float], coords: np.ndarray, weights: np.ndarray) -> tuple[Bound, ...]:
-    """The bounds without those that a normal distribution follows better in place, dropped one after the other: a
-    transformation bends a parameter that depends linearly on others. `volumes` are mean log-determinants.
+def _bounds_to_remove(volumes: dict[Bound, float], coords: np.ndarray, weights: np.ndarray) -> Iterator[tuple]:
+    """Choices of bounds: none and all, and where these lead if one after the other is removed or put back that a normal
+    distribution follows better so. A transformation bends a parameter that depends linearly on others: of several that
+    are tied to each other, none alone is worth putting back. `volumes` are mean log-determinants.
     """
-    bounds, unbounded, effective = tuple(volumes), to_unbounded(tuple(volumes), coords), 1.0 / (weights @ weights)
+    _, root = location_and_root(np.column_stack([coords, to_unbounded(tuple(volumes), coords)]), weights)
+    effective = max(1.0 / (weights @ weights), 2.0)
+    cost = 0.5 * math.log(effective) / effective  # as much as a parameter of the density in the criterion
 
-    def misfit(removed: tuple[Bound, ...]) -> float:
-        indices = [bound.index for bound in removed]
-        points = np.where(np.isin(np.arange(coords.shape[1]), indices), unbounded, coords)
-        _, root = location_and_root(points, weights)
-        return float(np.log(root.diagonal()).sum()) - sum(volumes[bound] for bound in removed)
+    @cache
+    def misfit(removed: frozenset[Bound]) -> float:
+        columns = np.arange(coords.shape[1])
+        columns[[bound.index for bound in removed]] += len(columns)
+        own = np.linalg.qr(root[columns].T, mode="r").diagonal()
+        return float(np.log(np.abs(own)).sum()) - sum(volumes[bound] for bound in removed)
 
-    while bounds:
-        best = min([bounds[:i] + bounds[i + 1 :] for i in range(len(bounds))], key=misfit)
-        # as in the criterion, a choice costs as much as a parameter of the density
-        if not 2.0 * effective * (misfit(bounds) - misfit(best)) > math.log(max(effective, 2.0)):
-            break
-        bounds = best
-    return bounds
+    for bounds in (frozenset(), frozenset(volumes)):
+        yield tuple(sorted(bounds))
+        while volumes and misfit(best := min((bounds ^ {one} for one in volumes), key=misfit)) < misfit(bounds) - cost:
+            bounds = best
+        yield tuple(sorted(bounds))
 
 
 def fit_normals(coords: np.ndarray, effective: float, start: Mixture | None = None) -> Mixture:
