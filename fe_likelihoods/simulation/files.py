@@ -137,7 +137,7 @@ class Observer:
 
     def sees(self, how: str, path: str) -> None:
         """Note a file that others may write, too, if this simulation changes it, or reads what was just written."""
-        if self.is_own(path):
+        if self.mirror is not None and path.startswith(self.mirror.path + os.sep):
             if how in ("writes", "touches") and os.path.islink(path):  # a private file takes its place
                 target = os.path.realpath(path)
                 os.unlink(path)
@@ -160,10 +160,6 @@ class Observer:
             self._made.append(path)
         elif how in ("writes", "changes"):
             self.shared = path
-
-    def is_own(self, path: str) -> bool:
-        """Whether a file is in the folder of this simulation."""
-        return self.mirror is not None and path.startswith(self.mirror.path + os.sep)
 
 
 def note(opened: Opened) -> None:
@@ -196,14 +192,15 @@ def _hook(event: str, arguments: tuple) -> None:
         simulation, uses = running_simulation(), []
         with contextlib.suppress(Exception):  # never disturb the code that is observed
             uses = [(how, os.path.abspath(os.fsdecode(path))) for how, path in _uses(event, arguments)]
-        if simulation is not None and simulation.mirror is not None and event in _STARTS and not of_library:
-            simulation.mirror.states = {}  # where the process may still write
+        mirror = None if simulation is None else simulation.mirror
+        if mirror is not None and event in _STARTS and not of_library:
+            mirror.states = {}  # where the process may still write
         for how, name in uses:
             path = os.path.join(os.path.realpath(os.path.dirname(name)), os.path.basename(name))
             if simulation is not None and not of_library:
                 simulation.sees(how, os.path.realpath(path) if how == "reads" else path)
-            if simulation is not None and simulation.is_own(name):  # the file that it shows
-                name = os.path.join(simulation.mirror.base, os.path.relpath(name, simulation.mirror.path))
+            if mirror is not None and name.startswith(mirror.place):  # the file that it shows, or one beside the folder
+                name = os.path.abspath(os.path.join(mirror.base, os.path.relpath(name, mirror.path)))
             for observer in list(_observers) if how != "changes" else ():
                 if observer.thread in (0, threading.get_ident()) and name not in observer.used:
                     counts = how in ("reads", "loads") and _counts(name)
@@ -217,7 +214,8 @@ def _uses(event: str, arguments: tuple) -> list[tuple[str, Any]]:
         if isinstance(path, int):  # a descriptor
             return []
         if not flags & _WRITING:  # a source is read in its compiled form
-            return [("reads", source_from_cache(path) if str(path).endswith(".pyc") else path)]
+            is_cached = str(path).endswith(".pyc") and f".{sys.implementation.cache_tag}." in str(path)
+            return [("reads", source_from_cache(path) if is_cached else path)]
         if flags & os.O_EXCL:
             return [("makes", path)]
         # what is appended stays apart, and Path.touch writes nothing
@@ -267,7 +265,7 @@ def mapped(read: Iterable[str] = ()) -> Opened:
 
 def _counts(path: str) -> bool:
     """Whether a file counts: it does not belong to the system, Python or an installed package."""
-    if path.startswith((*_SYSTEM, *_INSTALLED)) or path.endswith((".pyc", *_OF_SQLITE)):
+    if path.startswith((*_SYSTEM, *_INSTALLED)) or path.endswith(_OF_SQLITE):
         return False
     return "-packages" + os.sep not in path and os.path.realpath(path) != os.path.realpath(sys.executable)
 
@@ -426,16 +424,16 @@ class _Mirror:
         self.base, self.path = base, ""
         self.states: dict[str, tuple | None] = {}
         sys.path[:] = map(os.path.abspath, sys.path)
-        self._place = tempfile.mkdtemp(prefix="shown_", dir=os.environ.get(PLACE) or _own_group().place)
+        self.place = tempfile.mkdtemp(prefix="shown_", dir=os.environ.get(PLACE) or _own_group().place)
         for entry in _scan(os.path.dirname(base), _MOST_BESIDE) if base else ():
             with contextlib.suppress(FileExistsError):
-                os.symlink(entry.path, os.path.join(self._place, entry.name))
+                os.symlink(entry.path, os.path.join(self.place, entry.name))
 
     def shown(self) -> str:
         """The folder, which shows what `base` contains now, and nothing that another simulation has left."""
         if not self.states or self.states != {path: _state(path) for path in self.states}:
             shutil.rmtree(self.path, ignore_errors=True)
-            self.path = tempfile.mkdtemp(prefix="run_", dir=self._place)
+            self.path = tempfile.mkdtemp(prefix="run_", dir=self.place)
             self.states, self._left = {self.path: None}, _MOST_ENTRIES  # not shown until it has another state
             self._show(self.base, self.path)
         return self.path
@@ -445,7 +443,7 @@ class _Mirror:
         self.states[base] = _state(base)
         for entry in _scan(base):
             place, inside = os.path.join(own, entry.name), os.path.realpath(entry.path) + os.sep
-            is_shown = entry.is_dir() and not entry.name.startswith(".") and not self._place.startswith(inside)
+            is_shown = entry.is_dir() and not entry.name.startswith(".") and not self.place.startswith(inside)
             if is_shown and (below := len(_scan(entry.path, self._left + 1))) <= self._left:
                 self._left -= below
                 os.mkdir(place)

@@ -270,7 +270,8 @@ def _source(module: types.ModuleType) -> tuple[str, frozenset[str]]:
 
     The file is read once for each import, which makes a new ``__spec__``: a later edit is not what runs.
     """
-    file, spec = getattr(module, "__file__", None), getattr(module, "__spec__", None)
+    spec = getattr(module, "__spec__", None)
+    file = getattr(getattr(spec, "loader", None), "archive", None) or getattr(module, "__file__", None)  # a zip file
     known = _sources.get(module.__name__)
     if known is None or known[0] is not module or known[1] is not spec:
         text = source = ""

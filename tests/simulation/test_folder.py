@@ -1,15 +1,18 @@
 """Each simulation in a worker has a working folder of its own; simulations that write elsewhere at once are refused."""
 
 import errno
+import importlib
 import logging
 import multiprocessing
 import os
+import py_compile
 import shutil
 import subprocess
 import sys
 import tempfile
 import threading
 import time
+import zipfile
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
 
@@ -21,6 +24,7 @@ from fe_likelihoods.signals.channels import Channel
 from fe_likelihoods.simulation.executors import LocalPool, as_executor
 from fe_likelihoods.simulation.failure_reasons import UnusableModel
 from fe_likelihoods.simulation.files import Observed, Observer, read_again
+from fe_likelihoods.simulation.label import items_of
 from fe_likelihoods.simulation.model import simulate_batch
 from tests.opensees_column import require_opensees
 
@@ -271,13 +275,15 @@ def test_modules_beside_the_script_are_found(start, monkeypatch):
 def test_the_label_names_files_of_the_starting_folder(start):
     def read(theta):
         Path("made.txt").write_text("own")
-        return Path("made.txt").read_text() + Path("input.txt").read_text()
+        return Path("made.txt").read_text() + Path("input.txt").read_text() + Path("../beside/input.txt").read_text()
 
-    old(start / "input.txt", "1")
+    inputs = start.parent / "beside" / "input.txt", start / "input.txt"
+    for path in inputs:
+        old(path, "1")
     with LocalPool(1) as one:
         [(text, opened)] = one.map(Observed(read), [THETAS[0]])
-    assert text == "own1"
-    assert [path for path in opened if path.endswith(".txt")] == [str(start / "input.txt")]
+    assert text == "own11"
+    assert sorted(path for path in opened if path.endswith(".txt")) == sorted(map(str, inputs))
 
 
 def test_folders_are_removed_with_the_process(tmp_path):
@@ -518,6 +524,27 @@ def test_a_file_is_known_by_the_name_that_the_code_gives_to_it(use, tmp_path, mo
     os.symlink("v2", "data")
     Path("data.txt").write_text("2222")
     assert read_again(opened) != opened
+
+
+def test_a_module_without_its_source_counts(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "law.txt").write_text("K = 2.5")
+    py_compile.compile(tmp_path / "law.txt", tmp_path / "law_without_source.pyc")
+    with Observer() as observer:
+        importlib.import_module("law_without_source")
+    assert str(tmp_path / "law_without_source.pyc") in observer.result({})
+
+
+def test_modules_of_a_zip_file_have_its_content_in_the_label(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path / "laws.zip")
+    labels = []
+    for factor in ("2.5", "3.5"):
+        with zipfile.ZipFile(tmp_path / "laws.zip", "w") as file:
+            file.writestr("law_of_zip.py", f"def law(a):\n    return {factor} * a\n")
+        importlib.invalidate_caches()
+        sys.modules.pop("law_of_zip", None)
+        labels.append(items_of({"function": importlib.import_module("law_of_zip")})["source of law_of_zip"])
+    assert labels[0] != labels[1]
 
 
 def test_an_output_that_takes_the_place_of_a_file_is_no_input(tmp_path, monkeypatch):
