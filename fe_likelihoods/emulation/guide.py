@@ -153,8 +153,10 @@ class ResponseGuide(Guide):
         starts = draw_starts(self._target, self._starts, session.random)
         searching = Search(self._target, starts, session)
         self._spent = lambda: searching.spent
-        self.search = yield from searching.run(self._starts)
-        self._spent = float
+        try:
+            self.search = yield from searching.run(self._starts)
+        finally:  # a search that raised an error is counted, and not kept: its session cannot be pickled
+            self._spent = partial(float, searching.spent)
         self._regions = [Region(mode.coords, mode.covariance, None, mode.log_evidence) for mode in self.search.modes]
         archive = self._target.archive
         if self.search.finished and len(archive.numbers) == 0:

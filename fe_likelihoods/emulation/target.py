@@ -230,10 +230,8 @@ class ResponseTarget:
 
     def slopes(self, statistics: np.ndarray, coords: np.ndarray) -> np.ndarray:
         """Derivatives (n_numbers,) of the log-likelihood by the statistics, at fixed noise parameters."""
-        sizes, n = (
-            np.abs(statistics),
-            len(statistics),
-        )  # each by itself: channels in different units differ by any factor
+        # each by itself: channels in different units differ by any factor
+        sizes, n = np.abs(statistics), len(statistics)
         steps = _STEP * np.where(sizes > 0.0, sizes, 1e-9 * sizes.max() or 1.0)
         shifted = np.concatenate([statistics + np.diag(steps), statistics - np.diag(steps * (sizes > 0.0))])
         values = self.log_likelihood(shifted, np.broadcast_to(coords, (2 * n, len(coords))))

@@ -1,5 +1,6 @@
 """The model's own derivatives in the search for modes: chain rule, pools, parts of the record, wrong derivatives."""
 
+import pickle
 import warnings
 from functools import partial
 
@@ -299,6 +300,19 @@ def test_wrong_derivatives_are_refused_where_the_first_comparison_shows_nothing(
         with pytest.raises(ValueError, match=r"by \d+ % of the norm"):
             find_modes(Posterior(FELikelihood(each, measured), prior), seed=1)
     assert len(fails) == 2
+
+
+def minus_slopes(theta):
+    return -slopes(theta)
+
+
+def test_a_sampler_whose_search_raised_an_error_can_be_pickled():
+    posterior = posterior_of(minus_slopes)
+    sampler = SMCSampler(20, 2, posterior, vectorize=True, seed=1, guide=posterior.guide())
+    with pytest.raises(ValueError, match="of the norm"):
+        sampler.run_mcmc(None, 1)
+    again = pickle.loads(pickle.dumps(sampler))
+    assert again.guide.simulations == sampler.guide.simulations > 0
 
 
 @pytest.mark.parametrize("prior", [0.3, 1e-4, 0.9])
