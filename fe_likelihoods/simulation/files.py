@@ -263,6 +263,7 @@ def mapped(read: Iterable[str] = ()) -> Opened:
     return {path: digest for path, digest in found.items() if digest}
 
 
+@functools.lru_cache(1000)
 def _counts(path: str) -> bool:
     """Whether a file counts: it does not belong to the system, Python or an installed package."""
     if path.startswith((*_SYSTEM, *_INSTALLED)) or path.endswith(_OF_SQLITE):
