@@ -281,12 +281,19 @@ class SimulationCache:
         query = f"SELECT {LABEL_COLUMNS} FROM labels WHERE source = ? ORDER BY rowid"
         rows = self.file.select(query, (source_number(fingerprint),))
         good = [row for row in rows if row[4] == zlib.crc32(repr(row[:4]).encode())]
-        return [(code.decode(), json.loads(files), generation) for _, code, files, generation, _ in good]
+        found = [(code.decode(), json.loads(files), generation) for _, code, files, generation, _ in good]
+        return [
+            (code, {os.path.join(self.path.parent, name): files[name] for name in files}, n) for code, files, n in found
+        ]
 
     def store_label(self, fingerprint: str, label: tuple, before: tuple | None) -> None:
-        """Store a label of a model, see `labels_of`, in the place of an earlier one."""
+        """Store a label of a model, see `labels_of`, in the place of an earlier one.
+
+        Files below the folder of the cache are known by their places there, also where this folder is copied.
+        """
         source, rows = source_number(fingerprint), []
         for code, files, *generation in filter(None, (before, label)):
+            files = {name.removeprefix(f"{self.path.parent}{os.sep}"): digest for name, digest in files.items()}
             values = source, code.encode(), json.dumps(files, sort_keys=True).encode(), *generation
             rows.append((*values, zlib.crc32(repr(values).encode())))
         delete = "DELETE FROM labels WHERE source = ? AND code = ? AND files = ?"

@@ -2,9 +2,11 @@
 
 import importlib
 import os
+import shutil
 import subprocess
 import sys
 import textwrap
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -190,6 +192,20 @@ def test_workers_of_a_pool_tell_what_they_open(workshop):
     assert [os.path.basename(path) for path in likelihood.simulator.label.opened] == ["k.txt"]
     alone = workshop.run()
     assert (alone.simulations, alone.simulator.verifications) == (0, USUAL)
+
+
+def test_a_copied_folder_has_its_own_files(workshop, monkeypatch):
+    workshop.write(
+        model="import numpy as np\ndef f(t):\n    return t[0] * np.loadtxt('k.txt') * np.linspace(0, 1, 20)[None]\n"
+    )
+    (workshop.folder / "k.txt").write_text("2.5")
+    workshop.run().simulator.cache.close()
+    workshop.folder = Path(shutil.copytree(workshop.folder, f"{workshop.folder}_copy"))
+    monkeypatch.chdir(workshop.folder)
+    unchanged = workshop.run()
+    assert (unchanged.simulations, unchanged.simulator.verifications) == (0, USUAL)
+    (workshop.folder / "k.txt").write_text("3.5")
+    assert workshop.run().simulations == len(POINTS)
 
 
 def test_variables_of_the_environment_that_the_code_names(workshop, monkeypatch):
