@@ -92,10 +92,11 @@ def test_first_examples_print_what_is_shown(page, tmp_path, capsys):
     assert number.sub("", printed).split() == number.sub("", shown).split()
     numbers = zip(number.findall(printed), number.findall(shown), strict=True)
     assert all(0.3 < float(one) / float(other) < 3.0 for one, other in numbers)
-    for name, mean in zip(
-        found["posterior"].parameter_names, found["sampler"].get_chain(flat=True).mean(0), strict=True
+    for parameter, mean in zip(
+        found["posterior"].parameters, found["sampler"].get_chain(flat=True).mean(0), strict=True
     ):
-        assert float(re.search(rf"^{name} +(\S+)", shown, re.MULTILINE)[1]) == pytest.approx(mean, rel=0.01)
+        (value,) = re.findall(rf"^{re.escape(parameter.label)} +(\S+)", shown, re.MULTILINE)
+        assert float(value) == pytest.approx(parameter.shown(mean), rel=0.01)
     (stated,) = re.findall(r"After (\d+) simulations", page.read_text())
     assert 0.7 < found["sampler"].verdict.simulations / int(stated) < 1.4
 

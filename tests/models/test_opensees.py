@@ -31,7 +31,7 @@ def model_of(record, substeps, **options):
 
 @pytest.fixture(scope="module")
 def model(record):
-    return model_of(record, 5, time_limit=2.0)
+    return model_of(record, 5, time_limit=4.0)
 
 
 def test_converges_to_the_exact_response_with_second_order(record):
@@ -61,7 +61,7 @@ def test_the_run_after_a_failure_is_not_affected(model):
     expected = model.simulate([1.0, 1.0])
     reasons = {
         9.0: "the worker process died (signal 6)",
-        10.0: "stopped at the time limit of 2 s",
+        10.0: "stopped at the time limit of 4 s",
         11.0: "RuntimeError: OpenSees did not converge at step 1",
         np.nan: "",
     }
