@@ -152,9 +152,10 @@ class _Pickler(cloudpickle.Pickler):
             return (threading.RLock if isinstance(obj, _LOCKS[1]) else threading.Lock), ()
         if not isinstance(obj, type) or _sent_module(obj.__module__) is None:
             return super().reducer_override(obj)
-        # a new class for each function, since the methods of an earlier class may refer to earlier values
-        make, (*arguments, _, extra), *state = _dynamic_class_reduce(obj)
-        return make, (*arguments, None, extra), *state
+        # a new class for each function: methods of an earlier one may refer to earlier values; without members of slots
+        make, (*arguments, _, extra), (state, slots), *tail = _dynamic_class_reduce(obj)
+        state = {name: each for name, each in state.items() if not isinstance(each, types.MemberDescriptorType)}
+        return make, (*arguments, None, extra), (state, slots), *tail
 
     def _reduce_module(self, module: types.ModuleType) -> tuple:
         name, values = module.__name__, vars(module)

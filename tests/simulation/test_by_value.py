@@ -50,6 +50,15 @@ class Cached:
     @functools.lru_cache(maxsize=3)
     def force(self, x):
         return K * x
+class Private:
+    __slots__ = ("__k", "__dict__")
+    def __init__(self):
+        self.__k = K
+    @functools.cached_property
+    def stiffness(self):
+        return self.__k
+def through_private_slots(x):
+    return Private().stiffness * x
 class Named:  # is pickled by its name, as compiled functions are
     def __reduce__(self):
         return "bad"
@@ -189,6 +198,7 @@ def test_lambdas_closures_and_arrays_are_sent(pool):
 def test_cached_functions_and_numpy_are_sent(user, pool):
     assert pool.map(user.law.through_a_cache, [1.0]) == pool.map(user.law.cached, [1.0]) == [3.0]
     assert pool.map(user.law.through_numpy, [3.0]) == [3.0]
+    assert pool.map(user.law.through_private_slots, [1.0]) == [3.0]
 
 
 def test_another_version_of_the_library_is_refused(monkeypatch):
