@@ -27,5 +27,5 @@ class Finding(NamedTuple):
     def __hash__(self) -> int:
         return hash(self[:4])
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         return f"{self.kind}: {self.message}"

@@ -30,7 +30,7 @@ from cloudpickle.cloudpickle import _dynamic_class_reduce
 
 from samplers.interrupts import become_worker, is_worker, process_name
 
-from .failure_reasons import ChangedModel, UnusableModel
+from .failure_reasons import ChangedModel, UnusableModel, text_of
 
 __all__ = [
     "LIBRARY",
@@ -83,7 +83,7 @@ class Pickled:
         except Exception as error:
             name = getattr(self._function, "__qualname__", type(self._function).__qualname__)
             raise ValueError(
-                f"{name} cannot be sent to another process ({type(error).__name__}: {error}). "
+                f"{name} cannot be sent to another process ({text_of(error)}). "
                 "Objects that it uses must not contain open files and connections: make them inside the function"
             ) from error
         return sources_digest() + process_name() + file.getvalue()
@@ -117,8 +117,7 @@ def load(payload: bytes) -> Callable[[Any], Any]:
         except ChangedModel:
             raise
         except Exception as error:
-            text = f"a function cannot be loaded in a worker process: {type(error).__name__}: {error}"
-            raise UnusableModel(text) from error
+            raise UnusableModel(f"a function cannot be loaded in a worker process: {text_of(error)}") from error
         finally:
             _arriving = None
 

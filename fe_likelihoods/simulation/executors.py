@@ -38,7 +38,7 @@ from samplers.evaluation.pools import submit_all, workers_of
 from samplers.interrupts import Ended, SentFunction, become_worker
 
 from .by_value import Pickled, load
-from .failure_reasons import SimulationFailed, TransientReason, describe_exit, is_transient
+from .failure_reasons import ClosedPool, SimulationFailed, TransientReason, describe_exit, is_transient, text_of
 from .files import PLACE, Group, working_folder
 
 __all__ = ["Job", "LocalPool", "PoolExecutor", "Sandbox", "Submitting", "Threads", "as_executor", "result_of", "serve"]
@@ -99,7 +99,7 @@ def _results(left: dict[Any, int], ended: Sequence[Any]) -> tuple[dict[int, Any]
         try:
             found[number] = result_of(future)
         except BaseException as raised:
-            error = error or raised
+            error = error or (ClosedPool() if type(raised).__name__.endswith("CancelledError") else raised)
     return found, error
 
 
@@ -432,5 +432,5 @@ def _packed(value: Any, error: BaseException | None = None) -> bytes:
             return data
     except Exception as failure:
         error = error or failure
-    text = f"{type(error).__name__}: {error}"
+    text = text_of(error)
     return pickle.dumps((None, SimulationFailed(TransientReason(text) if is_transient(error) else text)), protocol=5)

@@ -7,11 +7,13 @@ folder or library. The log-likelihood is -inf in this run, but the next run simu
 depends on the measurements, so it does not apply to other measurements.
 """
 
+import re
 import subprocess
 from concurrent.futures import BrokenExecutor
 
 __all__ = [
     "ChangedModel",
+    "ClosedPool",
     "MisfitReason",
     "SimulationFailed",
     "TransientReason",
@@ -20,6 +22,7 @@ __all__ = [
     "is_transient",
     "reason_of",
     "shortened",
+    "text_of",
 ]
 
 _FAULTS = (OSError, MemoryError, ImportError, BrokenExecutor, subprocess.TimeoutExpired)
@@ -59,6 +62,18 @@ class ChangedModel(UnusableModel):
     """A model has changed since its fingerprint was computed."""
 
 
+class ClosedPool(RuntimeError):
+    """A pool was closed, or gave up simulations, while a run waited for them: samplers stop (`ends_run`)."""
+
+    ends_run = True
+
+    def __init__(self) -> None:
+        super().__init__(
+            "the pool was closed, or has cancelled simulations, while they were running: run again with an open pool, "
+            "and close it after the run. Simulations that have ended are kept"
+        )
+
+
 class TransientReason(str):
     """Reason of a failure whose cause is not the model."""
 
@@ -83,8 +98,13 @@ def reason_of(error: BaseException) -> str:
     """Reason of a simulation that raised an exception; a `TransientReason` for faults of the infrastructure."""
     if isinstance(error, SimulationFailed):
         return shortened(error.reason)
-    text = shortened(f"{type(error).__name__}: {error}")
+    text = shortened(text_of(error))
     return TransientReason(text) if is_transient(error) else text
+
+
+def text_of(error: BaseException) -> str:
+    """Type and text of an exception without addresses of objects, which differ from run to run and say nothing."""
+    return re.sub(r" at 0x[0-9a-fA-F]+", "", f"{type(error).__name__}: {error}")
 
 
 def shortened(reason: str) -> str:

@@ -17,7 +17,7 @@ import numpy as np
 from ..interrupts import Ended, deferred_interrupts, interrupts_end_the_run
 from ..tempering.population import PendingPoints
 from .evaluator import Evaluator
-from .pools import submit_all, workers_of
+from .pools import CLOSED, submit_all, workers_of
 from .user_target import Target
 from .values import Caught, Failed
 
@@ -145,10 +145,8 @@ class AsynchronousEvaluator(Evaluator):
                 for number in values:
                     del self._futures[number]
             self.count(0, len(values))
-        if wait and isinstance(fault, CancelledError):
-            raise RuntimeError("the pool has cancelled a point: run again with a new pool") from fault
         if wait and fault is not None:
-            raise fault
+            raise RuntimeError(CLOSED) if type(fault).__name__.endswith("CancelledError") else fault
 
     def _arrive(self, numbers: list[int]) -> None:
         """Let points that were submitted together arrive, and check how many have failed."""

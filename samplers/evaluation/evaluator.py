@@ -16,7 +16,7 @@ from ..chain import check_storable
 from ..interrupts import interrupts_end_the_run
 from ..record import BudgetExhausted, EvaluatedBatch, Incomplete, Record, Remember
 from ..tempering.population import RECORD, PendingPoints
-from .pools import map_in
+from .pools import CLOSED, map_in
 from .user_target import Target
 
 SECONDS_BETWEEN_NOTES = 0.05
@@ -111,9 +111,11 @@ class Evaluator:
                 failed, total = np.count_nonzero(rest.failed), self.record.count + len(rest.coords)
                 self.check_failures(rest, len(self.record.failed) + failed, total, not (known.any() or before.any()))
                 self.record.evaluated(rest)
-            except BaseException:  # Ctrl-C, a pool that cannot go on, or too many failures
+            except BaseException as error:  # Ctrl-C, a pool that cannot go on, or too many failures
                 with suppress(TypeError, ValueError):  # of values that are none
                     self._enter_successes(new, results)
+                if type(error).__name__.endswith("CancelledError"):
+                    raise RuntimeError(CLOSED) from error
                 raise
         self.evaluations += len(asked)
         return then(coords, self._records(coords, log_prior, asked))

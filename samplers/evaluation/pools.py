@@ -5,6 +5,7 @@ from typing import Any
 
 from ..interrupts import SentFunction
 
+CLOSED = "the pool was closed, or has cancelled a point, during the run: run again with an open pool"
 SIZES = ("n_workers", "_max_workers", "_processes", "size")  # attributes of pools with the number of workers
 
 

@@ -29,7 +29,7 @@ def names_of_parameters(names: Sequence[str] | None, ndim: int) -> tuple[str, ..
 
 def summary(
     samples: np.ndarray,
-    names: Sequence[Any] | None = None,
+    names: Any = None,
     mean_error: np.ndarray | None = None,
     sd_error: np.ndarray | None = None,
 ) -> "pandas.DataFrame":
@@ -39,9 +39,9 @@ def summary(
     ----------
     samples : array_like, shape (n, ndim)
         Samples of the posterior.
-    names : sequence of str, optional
-        One name per parameter; theta_0, theta_1, ... by default. With ``posterior.parameters``, all values are in the
-        units of the parameters, which the rows name.
+    names : sequence of str, or a posterior, optional
+        One name per parameter; theta_0, theta_1, ... by default. With a posterior, or its ``parameters``, all are in
+        the units of the parameters, which the rows name.
     mean_error, sd_error : array_like, shape (ndim,), optional
         Standard errors of mean and standard deviation, from ``sampler.mean_error()`` and ``sampler.sd_error()``, since
         copies made by resampling are correlated; NaN where they are unknown.
@@ -54,7 +54,7 @@ def summary(
 
     Examples
     --------
-    >>> print(summary(samples, posterior.parameters))  # doctest: +SAMPLED
+    >>> print(summary(samples, posterior))  # doctest: +SAMPLED
                                 mean  mean_error        sd  sd_error        cv
     stiffness [x nominal]   1.102246         NaN  0.002427       NaN  0.002202
     damping [x nominal]     0.857993         NaN  0.022188       NaN  0.025860
@@ -68,7 +68,7 @@ def summary(
         raise ValueError(
             f"samples must be an array (n, ndim) with n >= 2, as get_chain(flat=True) returns; got {samples.shape}"
         )
-    names = names_of_parameters(names, samples.shape[1])
+    names = names_of_parameters(getattr(names, "parameters", names), samples.shape[1])
     columns = {"mean": samples.mean(axis=0), "mean_error": mean_error, "sd": samples.std(axis=0), "sd_error": sd_error}
     found = pandas.DataFrame(columns, [getattr(each, "label", each) for each in names], dtype=float)
     found = found.div([getattr(each, "factor", 1.0) for each in names], axis=0)

@@ -3,6 +3,7 @@
 import inspect
 import multiprocessing
 import pickle
+from concurrent.futures import CancelledError, Future
 from multiprocessing.pool import ThreadPool
 
 import emcee
@@ -159,6 +160,25 @@ def test_a_pool_of_processes(Sampler):
     with pytest.warns(SamplingWarning):
         batched = run(Sampler, posterior=fragile, vectorize=True)
     assert np.array_equal(batched.get_chain(), sampler.get_chain())
+
+
+class Closed:
+    """A pool that is closed while it has points."""
+
+    n_workers = 2
+
+    def map(self, function, items):
+        raise CancelledError
+
+    def submit(self, function, item):
+        (future := Future()).cancel()
+        return future
+
+
+@pytest.mark.parametrize("settings", [{}, {"recycle": True, "asynchronous": True}], ids=["moves", "asynchronous"])
+def test_a_pool_that_is_closed_during_a_run(settings):
+    with pytest.raises(RuntimeError, match="the pool was closed.*run again with an open pool"):
+        run(SMCSampler, pool=Closed(), **settings)
 
 
 @pytest.mark.parametrize("Sampler", [SMCSampler, TMCMCSampler])

@@ -2,6 +2,7 @@
 
 import warnings
 from pathlib import Path
+from types import SimpleNamespace
 
 import emcee
 import numpy as np
@@ -291,5 +292,7 @@ def test_summary_with_errors_of_mean_and_standard_deviation():
     assert list(shown.index) == ["k", "c [-]", "sigma_top [mm]"] and np.isnan(shown["sd_error"]).all()
     for name in ("mean", "sd", "mean_error"):
         np.testing.assert_allclose(shown[name], result[name] * [1.0, 1.0, 1e3])
+    posterior = SimpleNamespace(parameters=parameters)
+    assert summary(sampler.get_chain(flat=True), posterior, sampler.mean_error()).equals(shown)
     with pytest.raises(ValueError, match="does not match length of index"):
         summary(sampler.get_chain(flat=True), mean_error=[0.1, 0.1])

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from samplers import SMCSampler, compare_models
+from samplers.finding import Finding
 from samplers.judgement.clusters import error_between_modes, find_clusters
 from tests.statistics import analytic_posteriors as analytic
 
@@ -45,6 +46,11 @@ def test_sentence_and_what_it_is_made_of(sampler):
     assert sampler.describe().startswith(f"{sampler.verdict.status.capitalize()}: 2 modes with shares 0.7")
     assert "no failed simulations" in sampler.describe()
     assert compare_models({"a": sampler, "b": (-3.0, 0.1)}).verdict.to_dict() == {"a": found.status, "b": ""}
+
+
+def test_findings_print_as_sentences():
+    found = Finding("A mode may be lost", "care", "Two of three were.", "Use more walkers.", {"lost": 2.0})
+    assert f"{(found,)}" == "(A mode may be lost: Two of three were. Use more walkers.,)"
 
 
 @pytest.mark.parametrize("higher", [-3.0, 0.0, 3.0])

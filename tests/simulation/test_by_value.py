@@ -172,12 +172,20 @@ def test_a_module_is_one_namespace_in_the_worker(user, pool):
     assert user.law.K == 3.0
 
 
+class Unsendable:
+    def __reduce__(self):
+        raise TypeError(f"cannot pickle <Unsendable object at {id(self):#x}>")
+
+
 def test_locks_are_new_and_values_that_cannot_be_sent_are_refused_with_their_type(user, pool):
     assert pool.map(user.law.with_a_lock, [1.0]) == [3.0]
     user.law.bad = (number for number in (1, 2))
     for function in (user.law.direct, user.by_name):
         with pytest.raises(ValueError, match=f"{function.__name__} cannot be sent .*cannot pickle 'generator'"):
             pool.map(function, [1.0])
+    user.law.bad = Unsendable()
+    with pytest.raises(ValueError, match="direct cannot be sent .*cannot pickle <Unsendable object>"):
+        pool.map(user.law.direct, [1.0])
     user.law.bad = user.law.Named()
     with pytest.raises(ValueError, match="cannot be loaded in a worker process: AttributeError.*'bad'"):
         pool.map(user.law.direct, [1.0])

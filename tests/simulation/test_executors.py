@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 from concurrent.futures import CancelledError, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from functools import partial
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.signals.records import Record
 from fe_likelihoods.simulation import by_value
 from fe_likelihoods.simulation.executors import LocalPool, as_executor
+from fe_likelihoods.simulation.failure_reasons import ClosedPool
 from fe_likelihoods.simulation.model import sent_simulation, simulate_batch
 from tests.faults.treacherous import Absent, Gated, Large, Treacherous, Unpicklable, gone, posterior_of
 from tests.lines import misfit_batch
@@ -234,6 +236,20 @@ def test_items_are_given_up(function, tmp_path):
     with pytest.raises(CancelledError):  # the pool was closed
         left.result(SECONDS)
     assert not (tmp_path / f"started {SHORT[0][0]!r}").exists()
+
+
+@pytest.mark.parametrize("name", ["three processes", "threads"])
+def test_a_run_whose_pool_is_closed_says_what_to_do(name, function, tmp_path):
+    pool = POOLS[name]()
+    close = partial(pool.shutdown, wait=False, cancel_futures=True) if name == "threads" else pool.close
+    closing = threading.Thread(
+        target=lambda: (wait_until(lambda: (tmp_path / f"started {LONG[0]!r}").exists()), close())
+    )
+    closing.start()
+    with pytest.raises(ClosedPool, match="the pool was closed.*run again with an open pool"):
+        as_executor(pool).map(function, [LONG] * 5)
+    (tmp_path / "go").touch()
+    closing.join()
 
 
 def test_cancelled_items_are_not_run(function, tmp_path, shared_pool):
