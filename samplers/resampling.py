@@ -12,6 +12,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+GRID = 4096.0  # logarithms are rounded to 1 / 4096, so that a constant added to all of them changes nothing
+
 Random = np.random.RandomState | np.random.Generator
 
 

@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..simulation.failure_reasons import MisfitReason, TransientReason
+from ..simulation.failure_reasons import MisfitReason, TransientReason, shortened
 from .file import CacheFile, transaction
 
 __all__ = [
@@ -44,7 +44,6 @@ STORE = f"INSERT OR REPLACE INTO rows ({COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?
 LABEL_COLUMNS = "source, code, files, generation, crc"
 STORE_LABEL = f"INSERT OR REPLACE INTO labels ({LABEL_COLUMNS}) VALUES (?, ?, ?, ?, ?)"
 KEY_BYTES = 16
-MAX_REASON_LENGTH = 2000
 NUMBERS = struct.Struct("<qqq")
 
 
@@ -107,7 +106,7 @@ def pack_rows(
         if isinstance(reason, TransientReason) or (of_model and isinstance(reason, MisfitReason)):
             continue
         data = b"" if reason else np.asarray(value, dtype="<f8").tobytes()
-        text = reason[:MAX_REASON_LENGTH].encode("utf-8", "backslashreplace")
+        text = shortened(reason).encode("utf-8", "backslashreplace")
         packed = key, source, generation, np.asarray(theta, dtype="<f8").tobytes(), data, text, session
         rows.append(Row(*packed, _checksum(*packed), len(data) if of_model else None))
     return rows

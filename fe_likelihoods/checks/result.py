@@ -44,7 +44,7 @@ from .screening import check_data
 LONGEST_AUTOCORRELATION = 50.0  # iterations per autocorrelation time that emcee recommends
 # effective, below which the interval between the 5 % and 95 % quantiles of n samples, which holds a further sample with
 # the probability 0.9 (n - 1) / (n + 1), loses as much as a tail of it: 0.85; with 57 it is 0.87
-FEW_SAMPLES = 36.0
+FEW_SAMPLES = 2.0 / TAIL - 5.0
 
 
 class FinishedRun(NamedTuple):

@@ -20,6 +20,7 @@ import numpy as np
 from ..prediction.quantities import ChannelQuantity, MeanOfLast, dissipated_energy, peak
 from ..signals.channels import Channel
 from ..signals.records import Events, Record
+from ..signals.sampling import SAME_TIME
 from .park_ang import ParkAng, park_ang_constants
 
 if TYPE_CHECKING:
@@ -202,6 +203,6 @@ def _windows(events: Record, n_steps: int, dt: float) -> list[tuple[str, int, in
     """Of each event: name, first sample, one past its last, and one past the last in the pause that follows."""
     if not isinstance(events, Events):
         return [(events.name, 0, n_steps, n_steps)]
-    firsts = [math.ceil(w.start / dt - 1e-6) for w in events.windows]
-    stops = [min(math.floor(w.end / dt + 1e-6) + 1, n_steps) for w in events.windows]
+    firsts = [math.ceil(w.start / dt - SAME_TIME) for w in events.windows]
+    stops = [min(math.floor(w.end / dt + SAME_TIME) + 1, n_steps) for w in events.windows]
     return list(zip(events.names, firsts, stops, [*firsts[1:], n_steps], strict=True))

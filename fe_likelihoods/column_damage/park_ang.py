@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from ..prediction.quantities import FAILED
 from ..signals.records import DisplacementHistory
 from ..text_tables import number
 
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
 
 _DRIFTS = (0.03, 0.06, 0.12, 0.2)  # of the static analyses; the next one is run only if the column survives
 _STEPS = 150
-_LOSS = 0.8  # share of the largest force at which the column has failed
 
 
 class ParkAng(NamedTuple):
@@ -84,7 +84,7 @@ def park_ang_constants(column: RCColumn, beta: float = 0.05) -> ParkAng:
         expect_fracture(static)
         force, tension, compression = static.simulate(np.ones(1))
         after = np.arange(force.size) > np.argmax(force)
-        low = _LOSS * force.max()
+        low = FAILED * force.max()
         failures = {
             "bars at their ultimate strain": _first(tension >= limits[0], tension - limits[0], push.displacement),
             "fracture of the hoops": _first(-compression >= limits[1], -compression - limits[1], push.displacement),

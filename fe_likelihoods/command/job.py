@@ -12,6 +12,7 @@ from ..signals.channels import Channel, Measurements
 from ..signals.datasets import Dataset, read_dataset
 from ..signals.read import read_columns, read_record
 from ..signals.records import Record
+from ..signals.sampling import SAME_TIME
 from .keys import (
     FREE_SECTIONS,
     MODEL_KINDS,
@@ -304,7 +305,7 @@ def _within(measured: Measurements, record: Record) -> Measurements:
     end, rows, starts, notes = record.time[-1], [], [], []
     for channel, values, step in zip(measured.channels, measured.values, measured.steps, strict=True):
         times, name = measured.times(channel.name), channel.name
-        inside = np.flatnonzero((times >= -1e-6 * step) & (times <= end + 1e-6 * step))
+        inside = np.flatnonzero((times >= -SAME_TIME * step) & (times <= end + SAME_TIME * step))
         found, used = np.isfinite(values).sum(), np.isfinite(values[inside]).sum()
         share = f"{used} of {found} samples of {name} lie within the record"
         if not used or used < min(found, FEWEST_SAMPLES):
@@ -313,9 +314,9 @@ def _within(measured: Measurements, record: Record) -> Measurements:
                 f"{times[-1]:g} s: check time_unit, and set zero to the time in the file at which the base motion "
                 'begins (a clock time such as "10:32:07" where the file has clock times)'
             )
-        missing = int((end - times[inside[-1]]) / step + 1e-6)
+        missing = int((end - times[inside[-1]]) / step + SAME_TIME)
         rows.append(np.append(values[inside], np.full(missing, np.nan)))
-        starts.append(0.0 if abs(times[inside[0]]) <= 1e-6 * step else float(times[inside[0]]))
+        starts.append(0.0 if abs(times[inside[0]]) <= SAME_TIME * step else float(times[inside[0]]))
         notes += [f"without {found - used} samples of {name} before or after the record"] if used < found else []
         notes += [f"CAUTION: only {share}: check time_unit and zero, and the record"] if used < found - used else []
         notes += [f"{name} ends {missing * step:.3g} s before the record"] if missing else []

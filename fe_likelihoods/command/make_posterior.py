@@ -26,6 +26,7 @@ from ..models.sensor_errors import SensedModel, Sensor
 from ..noise.autoregressive import AutoregressiveNoise
 from ..noise.gaussian import GaussianNoise
 from ..priors.distributions import Distribution, HalfNormal, LogNormal, TruncatedNormal, Uniform
+from ..priors.problem_priors import NOISE_SCALE
 from ..signals.channels import Channel, Measurements
 from ..signals.records import Record
 from ..simulation.model import Model
@@ -34,7 +35,6 @@ from .keys import USER_MODELS, check_known, did_you_mean, parse_prior, read_by_c
 
 ERRORS_OF_MODES = {"frequency_error": 0.01, "shape_error": 0.03}  # medians of log-normal priors without one (assumed)
 TEMPERATURE_SLOPE = 2e-3  # [1/K], its sd without a prior (assumed): -1e-4 to -5e-4 in concrete, more if frozen
-NOISE_SCALE = 0.3  # half-normal prior of a sigma without one in the file, in root mean squares of the channel (assumed)
 STRUCTURES = "frame", "bridge deck"  # built-in ones that have modes
 
 

@@ -33,7 +33,7 @@ KEPT = 0.9  # share from which the data say little
 MUCH_BETTER = 0.5  # share left of a combination, over the smallest one of its parameters
 MOST_NAMED = 4  # parameters of a combination whose exponents are given
 LARGEST_FACTOR = 30.0  # between the ends of the prior's central 95 %, up to which a parameter is a factor
-STEP = 1e-4  # of coordinates, for the slopes of the parameters
+MAP_STEP = 1e-4  # of coordinates, for the slopes of the parameters
 FARTHEST = 4.0  # coordinate up to which slopes are taken: beyond, parameters may be rounded to a bound
 AT_BOUND = 8.5  # coordinate of a parameter that is rounded to a bound of its prior
 FEWEST = 10  # samples for each parameter
@@ -205,9 +205,9 @@ def _of_covariance(prior: Prior, centre: np.ndarray, covariance: np.ndarray, cho
     prior are combinations of these parameters: each parameter is linearised there and divided by its prior deviation.
     """
     centre = np.clip(centre, -FARTHEST, FARTHEST)
-    unit = STEP * np.eye(prior.dim)
+    unit = MAP_STEP * np.eye(prior.dim)
     ahead, behind = prior.from_normal(centre + unit), prior.from_normal(centre - unit)
-    gradient = ((ahead - behind) / (2.0 * STEP)).T[chosen]
+    gradient = ((ahead - behind) / (2.0 * MAP_STEP)).T[chosen]
     slopes = np.linalg.norm(gradient, axis=1)
     if (slopes == 0.0).any():
         raise ValueError(

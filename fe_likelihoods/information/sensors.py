@@ -32,11 +32,10 @@ from ..priors.priors import Prior
 from ..signals.channels import Channel
 from ..simulation.model import Model, derivatives_batch, has_jacobian, most_responses, simulate_batch
 from ..text_tables import number, text_table
+from .identifiability import FEWEST, MAP_STEP
 
 SHARE = 0.05  # of the channel's RMS, the default noise
 STEP = 0.1  # of differences, in standard deviations
-MAP_STEP = 1e-4  # of coordinates, for the derivatives of the parameters
-FEWEST = 10  # samples for each parameter
 
 
 class Slopes(NamedTuple):

@@ -21,6 +21,7 @@ from ..noise.sufficient_statistics import count_samples
 from ..priors.points import as_rows, complete_repr
 from ..signals.channels import Comparison, Measurements
 from ..signals.records import DisplacementHistory, events_of, growing_durations
+from ..signals.sampling import SAME_TIME
 from ..simulation.model import Model, SimulationBatch, first_part
 from .check_inputs import check_model, check_noise, match_measurements
 from .simulator import Simulator
@@ -186,7 +187,7 @@ class FELikelihood(SumOfDataSets):
         """
         measurements = self.measurements.trim(0.0, seconds)
         # the time of a sample, which leaves no doubt about the length of the response
-        steps = math.ceil(measurements.end / self.model.dt - 1e-6)
+        steps = math.ceil(measurements.end / self.model.dt - SAME_TIME)
         model = first_part(self.model, min(steps, self.model.n_steps - 1) * self.model.dt)
         self.shortened.append(self._with(model, measurements, self.noise))
         return self.shortened[-1]

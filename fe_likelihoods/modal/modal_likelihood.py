@@ -9,9 +9,9 @@ from scipy.special import ndtri, stdtrit
 from ..likelihood.likelihood import FELikelihood
 from ..likelihood.simulator import Simulator
 from ..models.linear_structure import LinearStructure
-from ..noise.gaussian import HALF_LOG_TWO_PI
 from ..noise.student import check_degrees, student_constant
 from ..priors.points import as_points
+from ..priors.truncated_normal_integrals import HALF_LOG_TWO_PI
 from ..signals.channels import Measurements
 from ..simulation.model import Model, SimulationBatch, SimulationFailed
 from ..text_tables import text_table

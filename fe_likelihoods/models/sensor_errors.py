@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from ..priors.distributions import Distribution
 from ..signals.channels import Channel
 from ..signals.records import Record
-from ..signals.sampling import interpolate, make_interpolation
+from ..signals.sampling import SAME_TIME, interpolate, make_interpolation
 from ..simulation.by_value import is_of_user
 from ..simulation.model import Model, SimulationBatch, first_part, simulate_batch
 from .base import code_within, digest
@@ -150,7 +150,7 @@ class SensedModel:
 
     def _first(self, seconds: float) -> SensedModel:
         """The same model under the first part of its excitation, as `first_part`."""
-        last = int(seconds / self.dt + 1e-6)
+        last = int(seconds / self.dt + SAME_TIME)
         later = sum(
             max((np.abs(each.lag.ppf(ENDS)).max() for each in sensors.values() if each.lag is not None), default=0.0)
             for sensors in (self.outputs, self.inputs)

@@ -8,8 +8,8 @@ from dataclasses import KW_ONLY, dataclass
 
 import numpy as np
 
+from ..priors.truncated_normal_integrals import HALF_LOG_TWO_PI
 from ..signals.channels import Channel
-from .gaussian import HALF_LOG_TWO_PI
 from .option_checks import PerChannel, checked_channels, sensor_levels, shown, weighted
 from .residuals import innovations, lag_one_sums
 from .sufficient_statistics import SampleCounts

@@ -25,8 +25,10 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ..priors.truncated_normal_integrals import HALF_LOG_TWO_PI
 from ..signals.channels import Channel, Measurements
 from ..signals.records import EventWindow, events_of, find_events
+from ..signals.sampling import SAME_TIME
 from .groups import EventSums, GroupSums, Layout, PartSums, split_sums
 from .option_checks import (
     PerChannel,
@@ -41,9 +43,7 @@ from .option_checks import (
 from .response_level import events_of_parts, local_level, squared_levels
 from .sufficient_statistics import SampleCounts, samples_per_channel
 
-HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 _PARTS = 3  # parts of a window; the window moves by one part
-_ROUND_OFF = 1e-6  # of a step
 _LOCAL = 0.25  # see docs/theory/noise.rst
 _RESPONSE, _SHARES = 'shares_of="response"', 'shares_of="measured" or "response"'
 
@@ -260,7 +260,7 @@ class GaussianNoise:
             step = layout.steps[0]
             return EventSums(
                 tuple(
-                    (math.ceil(each.start / step - _ROUND_OFF), math.floor(each.end / step + _ROUND_OFF) + 1)
+                    (math.ceil(each.start / step - SAME_TIME), math.floor(each.end / step + SAME_TIME) + 1)
                     for each in self.events
                 )
             )
@@ -292,7 +292,7 @@ class GaussianNoise:
         self._check_step(model.dt)
         events = find_events(model)
         for each in () if events is None else events.windows:
-            if self.window > each.end - each.start + (1.0 + _ROUND_OFF) * model.dt:
+            if self.window > each.end - each.start + (1.0 + SAME_TIME) * model.dt:
                 raise ValueError(
                     f"GaussianNoise: the window of {self.window:g} s must not be longer than an event; {each.name!r} "
                     f"has {each.end - each.start:g} s: give a shorter window, or leave out this event"
@@ -337,7 +337,7 @@ class GaussianNoise:
         return replace(placed, layout=layout._replace(counts=tuple(map(tuple, counts.tolist()))), measured=measured)
 
     def _check_step(self, dt: float) -> None:
-        if self.window < (_PARTS - _ROUND_OFF) * dt:
+        if self.window < (_PARTS - SAME_TIME) * dt:
             raise ValueError(
                 f"GaussianNoise: the window of {self.window:g} s must be at least three steps of {dt:g} s; give a "
                 "longer one, or a motion with a shorter time step (Record.resample)"

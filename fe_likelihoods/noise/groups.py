@@ -11,7 +11,7 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-_ROUND_OFF = 1e-6  # of a part
+from ..signals.sampling import SAME_TIME
 
 
 class Layout(NamedTuple):
@@ -102,7 +102,7 @@ class PartSums(GroupSums):
 def _places(sums: PartSums, n_steps: int) -> np.ndarray:
     """Part of each sample (n_channels, n_steps)."""
     times = np.array(sums.starts)[:, None] + np.array(sums.steps)[:, None] * np.arange(n_steps)
-    places = np.maximum(np.floor(times / sums.part + _ROUND_OFF).astype(int), 0)
+    places = np.maximum(np.floor(times / sums.part + SAME_TIME).astype(int), 0)
     places.flags.writeable = False
     return places
 

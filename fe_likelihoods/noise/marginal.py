@@ -17,12 +17,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..priors.truncated_normal_integrals import HALF_LOG_TWO_PI
 from ..signals.channels import Channel
 from .gaussian import GaussianNoise
 from .protocol import Noise, noise_title
 from .sufficient_statistics import SampleCounts, samples_per_channel
 
-_HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 _FALL = 36.0  # decrease of the logarithm at which the integrand is negligible in double precision
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(48)
 _GRID = np.linspace(0.0, 1.0, 17)
@@ -137,7 +137,7 @@ class _Peak(NamedTuple):
 def _log_integrand(t: np.ndarray, fit: np.ndarray, count: float, prior: Any) -> np.ndarray:
     """Logarithm of the integrand at t = log sigma (n, k); `fit` (n, 1) is the likelihood's maximum, log sqrt(J / n)."""
     with np.errstate(over="ignore", invalid="ignore"):
-        likelihood = -count * (_HALF_LOG_TWO_PI + t + 0.5 * np.exp(2.0 * (fit - t)))
+        likelihood = -count * (HALF_LOG_TWO_PI + t + 0.5 * np.exp(2.0 * (fit - t)))
     return likelihood + prior.logpdf(np.exp(t)) + t
 
 

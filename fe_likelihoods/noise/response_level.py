@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..signals.records import find_events
-
-_ROUND_OFF = 1e-6  # of a part
+from ..signals.sampling import SAME_TIME
 
 
 def events_of_parts(model: Any, part: float, first: int = 0) -> tuple[int, ...]:
@@ -27,7 +26,7 @@ def events_of_parts(model: Any, part: float, first: int = 0) -> tuple[int, ...]:
     if events is None:
         return ()
     last = model.dt * (model.n_steps - 1 - first)
-    middle = part * (np.arange(int(np.floor(last / part + _ROUND_OFF)) + 1) + 0.5)
+    middle = part * (np.arange(int(np.floor(last / part + SAME_TIME)) + 1) + 0.5)
     edges = np.ravel([(each.start, each.end) for each in events.windows]) - first * model.dt
     return tuple(np.searchsorted(edges, middle).tolist())
 

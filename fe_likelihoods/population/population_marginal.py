@@ -17,11 +17,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..priors.truncated_normal_integrals import HALF_LOG_TWO_PI
 from .stored_posterior import DescribedPosterior
 
 __all__ = ["draw_products", "inverse_prior", "population_marginal"]
 
-_LOG_TWO_PI = np.log(2.0 * np.pi)
 _LARGEST_EXCESS = 3.0  # by which the log inverse prior density may exceed its largest value at the samples
 _CHUNK = 2**15  # values of a temporary array, which fits into the cache of the processor
 _RANDOM_NODES = 128
@@ -80,7 +80,7 @@ def product_with_population(described: DescribedPosterior, center: np.ndarray, s
     lower = np.linalg.cholesky(total)
     offset = center[:, None] - described.means
     scaled = np.linalg.solve(lower, offset[..., None])[..., 0]
-    log_masses = described.log_shares - 0.5 * np.square(scaled).sum(axis=-1) - 0.5 * dim * _LOG_TWO_PI
+    log_masses = described.log_shares - 0.5 * np.square(scaled).sum(axis=-1) - dim * HALF_LOG_TWO_PI
     log_masses = log_masses - np.log(np.diagonal(lower, axis1=-2, axis2=-1)).sum(axis=-1)
     gain = np.linalg.solve(total, np.tile(described.covariances[..., :varying], (len(center), 1, 1, 1)))
     means = described.means[:, :varying] + np.einsum("ncdv,ncd->ncv", gain, offset)

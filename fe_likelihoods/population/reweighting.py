@@ -8,6 +8,7 @@ from samplers.estimates.pareto import pareto_shape
 
 from ..checks.finding import Finding
 from ..checks.population import check_reweighting
+from ..priors.mixture_prior import REFITS
 from ..text_tables import text_table
 from .population_marginal import draw_products, inverse_prior, population_marginal
 from .stored_posterior import resampled_description
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
 __all__ = ["HierarchyChecks", "ReweightingCheck", "check_hierarchy"]
 
 _HYPER_SAMPLES = 100
-_RESAMPLINGS = 12
 _DRAWS = 500
 _QUANTILE = 0.9  # of the Pareto shapes over the hyper-samples
 
@@ -62,7 +62,7 @@ def check_hierarchy(posterior: "HierarchicalPosterior", samples: np.ndarray, see
     found, changes = {}, []
     for name, described in posterior.described.items():
         center, sd = posterior.population(used, posterior.tests[name].covariates)
-        change = np.empty((_RESAMPLINGS, len(used)))
+        change = np.empty((REFITS, len(used)))
         for row in change:
             row[:] = population_marginal(resampled_description(described, rng), center, sd)
         change -= population_marginal(described, center, sd)

@@ -26,6 +26,7 @@ from ..noise.marginal import sampled_noise
 from ..noise.protocol import follows_response, noise_channels, noise_title, noise_under
 from ..priors.points import as_points
 from ..signals.records import Record, find_events
+from ..signals.sampling import SAME_TIME
 from ..simulation.executors import as_executor
 from ..simulation.model import Model, SimulationBatch, simulate_batch
 
@@ -193,7 +194,7 @@ def _noise_of_events(
                 f"hold for it, noise= one of {names}"
             )
         steps = [(each.start / model.dt, each.end / model.dt) for each in events.windows]
-        events = tuple(slice(math.ceil(start - 1e-6), math.floor(end + 1e-6) + 1) for start, end in steps)
+        events = tuple(slice(math.ceil(start - SAME_TIME), math.floor(end + SAME_TIME) + 1) for start, end in steps)
         return SampleNoise(np.nan_to_num(deviations), None, events)
     if noise not in known:
         raise ValueError(f"noise={noise!r} is no event of the noise; give one of {names}")

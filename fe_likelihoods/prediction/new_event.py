@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from ..checks.finding import TAIL
 from ..likelihood.likelihood import FELikelihood
 from ..population.event_ratios import PRIOR_EVENTS, PRIOR_SD, EventRatios
 from ..population.event_scatter import REMAINDER, log_variance, remainder_variance, spread_rows
@@ -30,8 +31,6 @@ from .model_and_motion import read_source
 from .prediction import Prediction
 from .propagation import propagate
 from .quantities import ChannelQuantity, Quantity, evaluator, measured_quantity
-
-_IMPOSSIBLE = 0.05  # share of draws that may be left out: as much as a tail of a 90 % interval
 
 
 def event_ratios(
@@ -316,7 +315,7 @@ def _possible(draws: dict[str, np.ndarray], noise: Any) -> dict[str, np.ndarray]
         return draws
     deviations = noise.standard_deviations(np.stack([draws[name] for name in noise.parameter_names], axis=1))
     possible = (deviations > 0.0).all(axis=1)
-    if (share := 1.0 - possible.mean()) > _IMPOSSIBLE:
+    if (share := 1.0 - possible.mean()) > TAIL:
         raise ValueError(
             f"{share:.0%} of the draws have an impossible noise, a share of the signal of 1 or more: use "
             "shares_of='response', or a narrower prior of the spread of shares between events"

@@ -21,7 +21,7 @@ from ..units import G0
 
 _WORK = {"force": ("energy", "kJ"), "moment": ("energy", "kJ"), "stress": ("stress", "MPa")}  # dimension and unit
 
-_FAILED = 0.8  # of the largest force, below which a structure has failed
+FAILED = 0.8  # of the largest force, below which a structure has failed (by convention a loss of 20 %)
 _AS_FAR, _MOVED = 0.97, 0.01  # of the largest displacement so far, as far as which an excursion goes; of all, at rest
 
 
@@ -323,7 +323,7 @@ def find_failure(force: np.ndarray, displacement: np.ndarray) -> int:
     for start, stop in itertools.pairwise(ends):
         largest = size[start:stop].max()
         if largest > _AS_FAR * reached and reached > _MOVED * size.max() and start > np.argmax(np.abs(force)):
-            if np.abs(force[start:stop]).max() < _FAILED * largest_force:
+            if np.abs(force[start:stop]).max() < FAILED * largest_force:
                 return int(start)
         reached = max(reached, largest)
     return len(displacement)

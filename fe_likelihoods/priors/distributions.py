@@ -16,11 +16,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from .truncated_normal_integrals import quantile_of_normal, score_of_quantile, standard_moments
+from .truncated_normal_integrals import HALF_LOG_TWO_PI, quantile_of_normal, score_of_quantile, standard_moments
 
 RandomState = int | np.random.Generator | np.random.RandomState | None
 
-_HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 _LARGEST_SCORE = 38.0  # Phi(-38) is close to the smallest float
 
 
@@ -230,7 +229,7 @@ class TruncatedNormal(Distribution):
                 f"and sd {self.sd} is smaller than a float can hold; move the mean towards the bounds or raise the sd"
             )
         object.__setattr__(self, "_mass", float(mass))
-        object.__setattr__(self, "_log_constant", -math.log(self.sd) - _HALF_LOG_TWO_PI - math.log(mass))
+        object.__setattr__(self, "_log_constant", -math.log(self.sd) - HALF_LOG_TWO_PI - math.log(mass))
 
     @property
     def _standard_bounds(self) -> tuple[float, float]:
@@ -294,7 +293,7 @@ class HalfNormal(Distribution):
 
     def __post_init__(self) -> None:
         _set_positive(self, sd=self.sd)
-        object.__setattr__(self, "_log_constant", math.log(2.0) - math.log(self.sd) - _HALF_LOG_TWO_PI)
+        object.__setattr__(self, "_log_constant", math.log(2.0) - math.log(self.sd) - HALF_LOG_TWO_PI)
 
     @property
     def bounds(self) -> tuple[float, float]:
@@ -419,10 +418,7 @@ class LogNormal(Distribution):
         log_ratio = np.log(x) - log_median
         # a product, because a sum would be a difference of two infinities at x = 0
         return (
-            -log_ratio * (0.5 * log_ratio / self.log_sd**2 + 1.0)
-            - math.log(self.log_sd)
-            - _HALF_LOG_TWO_PI
-            - log_median
+            -log_ratio * (0.5 * log_ratio / self.log_sd**2 + 1.0) - math.log(self.log_sd) - HALF_LOG_TWO_PI - log_median
         )
 
     def _quantile(self, u: np.ndarray) -> np.ndarray:

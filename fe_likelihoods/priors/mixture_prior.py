@@ -15,13 +15,13 @@ from samplers.proposals.mixture import Mixture, fit_normals, invert_roots, log_d
 from .distributions import RandomState, as_generator
 from .multivariate import MultivariateDistribution
 from .points import as_points
+from .truncated_normal_integrals import HALF_LOG_TWO_PI
 
 if TYPE_CHECKING:
     from .priors import Prior
 
-_LOG_TWO_PI = np.log(2.0 * np.pi)
 _LARGEST_SCORE = 12.0  # samples at a bound of the prior have infinite scores
-_REFITS = 16
+REFITS = 16  # to resampled samples: a standard deviation of 16 has an error of 18 %
 _FEWEST_SAMPLES = 5  # different ones per parameter: populations from 46 samples of 8 differ by .1 to .2 sd
 _SMALLEST_EIGENVALUE = 1e-10  # of the correlations, below which the samples are linearly dependent
 
@@ -90,7 +90,7 @@ class MixtureDistribution(MultivariateDistribution):
             finite = np.isfinite(z).all(axis=1)
             z = np.where(finite[:, None], z, 0.0)
             # the density of z, times dz / dx = p(x) / phi(z) of every parameter
-            slope = base[inside] + 0.5 * np.square(z).sum(axis=1) + 0.5 * self.dim * _LOG_TWO_PI
+            slope = base[inside] + 0.5 * np.square(z).sum(axis=1) + self.dim * HALF_LOG_TWO_PI
             value[inside] = np.where(finite, log_density(self._mixture, z) + slope, -np.inf)
         return value.reshape(x.shape[:-1])
 
@@ -211,7 +211,7 @@ def fit_mixture(
     fitted = fit_normals(z, effective)
     density = log_density(fitted, z)
     refits = []
-    for _ in range(_REFITS):
+    for _ in range(REFITS):
         rows = rng.integers(len(z), size=max(round(effective), 2 * dim))
         refits.append(log_density(fit_normals(z[rows], effective, start=fitted), z))
     fit_error = np.sqrt(np.mean(np.var(refits, axis=0, ddof=1)))

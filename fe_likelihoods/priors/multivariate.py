@@ -3,7 +3,6 @@
 A distribution has a normalised density, and a map between the parameters and independent standard normal variables.
 """
 
-import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any
@@ -12,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .distributions import Distribution, RandomState, as_generator
+from .truncated_normal_integrals import HALF_LOG_TWO_PI
 
-_LOG_TWO_PI = math.log(2.0 * math.pi)
 _LARGEST_ASYMMETRY = 1e-8  # of a covariance, in standard deviations of the two parameters
 
 
@@ -106,7 +105,7 @@ class MultivariateNormal(MultivariateDistribution):
                 f"{kind} expects a positive definite covariance; got eigenvalues {np.linalg.eigvalsh(self.covariance)}"
             ) from None
         self._inverse = np.linalg.inv(self._factor)
-        self._constant = -0.5 * n * _LOG_TWO_PI - np.log(np.diag(self._factor)).sum()
+        self._constant = -n * HALF_LOG_TWO_PI - np.log(np.diag(self._factor)).sum()
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.mean!r}, {self.covariance!r})"

@@ -7,7 +7,7 @@ from ..units import to_si
 from .distributions import HalfNormal, TruncatedNormal, Uniform
 from .priors import Prior
 
-_NOISE_SCALE = 0.3  # half-normal prior of a sigma in root mean squares of the measured channels (assumed)
+NOISE_SCALE = 0.3  # half-normal prior of a sigma in root mean squares of the measured channels (assumed)
 
 
 def bridge_column_prior(
@@ -27,10 +27,10 @@ def bridge_column_prior(
     Raises ValueError if there is no default prior for a noise parameter.
     """
     structural = {"Ec": 0.30, "Es": 0.20, "a0": 0.60, "a1": 0.60, "ft": 0.40}
-    scales = {f"sigma_{name}": _NOISE_SCALE * value for name, value in measured.items()} | {
+    scales = {f"sigma_{name}": NOISE_SCALE * value for name, value in measured.items()} | {
         "sigma_acceleration": to_si(0.1, "g").item(),
         "sigma_displacement": to_si(1.2, "in").item(),
-        "sigma": _NOISE_SCALE,
+        "sigma": NOISE_SCALE,
     }
     noise = {name: HalfNormal(scales[name]) for name in noise_parameters if name in scales}
     return Prior(
@@ -60,4 +60,4 @@ def isolated_bridge_prior(parameter_names: Sequence[str], sigmas: Mapping[str, f
     measured root mean square of the channel [SI] for a sigma per channel.
     """
     structural = {name: TruncatedNormal(1.0, 0.5, 0.2, 2.5) for name in parameter_names}
-    return Prior(structural | {name: TruncatedNormal(0.0, _NOISE_SCALE * s, 1e-3 * s) for name, s in sigmas.items()})
+    return Prior(structural | {name: TruncatedNormal(0.0, NOISE_SCALE * s, 1e-3 * s) for name, s in sigmas.items()})

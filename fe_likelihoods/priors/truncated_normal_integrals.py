@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-_HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
+HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(20)
 
 
@@ -30,7 +30,7 @@ def standard_moments(a: float, b: float) -> tuple[float, float, float]:
             return 0.0, math.nan, math.nan
         offset = weights @ _NODES / total
         variance = half**2 * (weights @ (_NODES - offset) ** 2 / total)
-        return half * total * math.exp(-_HALF_LOG_TWO_PI), 0.5 * (a + b) + half * offset, variance
+        return half * total * math.exp(-HALF_LOG_TWO_PI), 0.5 * (a + b) + half * offset, variance
     if a > 0.0:
         mass = ndtr(-a) - ndtr(-b)
     elif b < 0.0:
@@ -39,7 +39,7 @@ def standard_moments(a: float, b: float) -> tuple[float, float, float]:
         mass = 0.5 * (erf(b / math.sqrt(2.0)) - erf(a / math.sqrt(2.0)))
     if mass <= 0.0:
         return 0.0, math.nan, math.nan
-    density_a, density_b = (math.exp(-0.5 * t * t - _HALF_LOG_TWO_PI) / mass for t in (a, b))
+    density_a, density_b = (math.exp(-0.5 * t * t - HALF_LOG_TWO_PI) / mass for t in (a, b))
     mean = density_a - density_b
     slope = sum(t * density for t, density in ((a, density_a), (-b, density_b)) if density > 0.0)
     return mass, mean, 1.0 + slope - mean**2
@@ -80,7 +80,7 @@ def _lower_half(z: np.ndarray, mean: float, sd: float, lower: float, upper: floa
     x = mean + sd * np.where(below < above, ndtri_exp(np.minimum(below, 0.0)), -ndtri_exp(np.minimum(above, 0.0)))
     if np.isneginf(a):
         return x
-    area = np.exp(log_share + 0.5 * a * a + _HALF_LOG_TWO_PI)
+    area = np.exp(log_share + 0.5 * a * a + HALF_LOG_TWO_PI)
     near = area * max(1.0, abs(a)) < 1.2  # contains the whole half z <= 0 if a >= 0
     if not near.any():
         return x
@@ -107,7 +107,7 @@ def _lower_score(x: np.ndarray, mean: float, sd: float, lower: float, upper: flo
     if np.isfinite(a):
         distance = (x - lower) / sd
         near = distance * max(1.0, abs(a)) < 1.0
-        log_share[near] = np.log(_area(distance[near], a)) - 0.5 * a * a - _HALF_LOG_TWO_PI
+        log_share[near] = np.log(_area(distance[near], a)) - 0.5 * a * a - HALF_LOG_TWO_PI
     return ndtri_exp(np.minimum(log_share - log_mass, 0.0))
 
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from ..units import DIMENSIONS, find_unit
 from .sampling import (
+    SAME_TIME,
     Interpolation,
     as_number,
     check_step,
@@ -280,10 +281,10 @@ class Measurements:
         rows, starts = [], []
         for channel, values, dt in zip(self.channels, self.values, self.steps, strict=True):
             times = self.times(channel.name)
-            inside = np.flatnonzero((times >= start - 1e-9 * dt) & (times <= stop + 1e-9 * dt))
+            inside = np.flatnonzero((times >= start - SAME_TIME * dt) & (times <= stop + SAME_TIME * dt))
             rows.append(values[inside] if inside.size else [np.nan])
             first = float(times[inside[0]]) - start if inside.size else 0.0
-            starts.append(0.0 if abs(first) <= 1e-9 * dt else first)
+            starts.append(0.0 if abs(first) <= SAME_TIME * dt else first)
         return replace(self, values=rows, start=tuple(starts))
 
     def shift(self, seconds: float, channels: Sequence[str] | None = None) -> "Measurements":
@@ -367,9 +368,6 @@ def _check_start(start: Any) -> float:
     return as_number(start)
 
 
-_LATEST = 1e-6  # in steps: how far a sample may be after the end of the response, for round-off
-
-
 @dataclass(frozen=True, eq=False)
 class Comparison:
     """Measurements that have gaps, or other sample times than a response, prepared for this response."""
@@ -427,7 +425,7 @@ def compare_with(measurements: Measurements, dt: float, n_steps: int) -> NDArray
         got = f"samples of channel {channel.name!r} from {known[0]:g} to {known[-1]:g} s"
         advice = "correct their start, or replace the samples before zero by NaN (in a TOML file missing = "
         advice += f"[[{known[0]:g}, {-0.5 * step:g}]])"
-        expect(known[0] >= -_LATEST * dt, "measurements", f"times of the response, 0 to {end:g} s", got, advice)
+        expect(known[0] >= -SAME_TIME * dt, "measurements", f"times of the response, 0 to {end:g} s", got, advice)
         # a missing sample may be outside the response: any place within serves
         places.append(make_interpolation(dt, n_steps, np.where(there, times, known[0])))
     if all(place is None for place in places) and not np.isnan(measurements.values).any():
@@ -449,7 +447,7 @@ def _check_end(measurements: Measurements, dt: float, n_steps: int) -> None:
         # missing samples at the end count: they say that the end was not measured. Channels with fewer samples than
         # others are filled with NaN, so only the channel whose rows end first states the end.
         stated = max(last, min(float(measurements.times(channel.name)[-1]) for channel in measurements.channels))
-        fits = last <= end + _LATEST * dt and stated >= end - (1.0 + _LATEST) * max(dt, *measurements.steps)
+        fits = last <= end + SAME_TIME * dt and stated >= end - (1.0 + SAME_TIME) * max(dt, *measurements.steps)
     expected = f"{n_steps} samples with a step of {dt} s up to {end:g} s, as the response has"
     got = f"{measurements.n_steps} with a step of {measurements.dt} s up to {last:g} s"
     advice = "use the same part of record and measurements (trim in Python, duration in a TOML file), correct the step,"

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from ..units import from_si
 from .channels import Channel, Measurements
 from .response_spectrum import ResponseSpectrum, spectrum_of
-from .sampling import array_digest, check_samples, check_step, expect, rest_samples, same_step, sample_window
+from .sampling import SAME_TIME, array_digest, check_samples, check_step, expect, rest_samples, same_step, sample_window
 
 _APART = 1.3  # smallest ratio of successive durations
 _LARGEST_RATIO_TERM = 1000  # of the ratio of steps in `Record.resample`; the filter length grows with it
@@ -457,11 +457,11 @@ class Events(Record):
                 alike, what = known.quantity == channel.quantity, f"channel {channel.name!r}"
                 expect(alike, what, f"{known.quantity!r} as in another event", got, "rename one of them")
         dt = first.dt
-        values = np.full((len(channels), math.floor(self.duration / dt * (1 + 1e-12)) + 1), np.nan)
+        values = np.full((len(channels), math.floor(self.duration / dt + SAME_TIME) + 1), np.nan)
         rows = {name: row for row, name in enumerate(channels)}
         for name, each in measurements.items():
             end, duration = each.start + (each.n_steps - 1) * dt, self.records[self.names.index(name)].duration
-            within = each.start >= -1e-9 * duration and end <= duration * (1 + 1e-9)  # not in a pause or another event
+            within = each.start >= -SAME_TIME * dt and end <= duration + SAME_TIME * dt  # not in a pause
             expected = f"samples in the event from 0, its first sample, to {duration:g} s"
             got = f"measurements from {each.start:g} to {end:g} s"
             expect(within, repr(name), expected, got, "use Measurements.trim(start, stop)")
@@ -469,7 +469,7 @@ class Events(Record):
             start = round(time / dt)
             expected = f"a first sample at a multiple of the step {dt:g} s of the measurements in the joined record"
             advice = "choose pauses after which every event begins at such a multiple"
-            expect(abs(time - start * dt) <= 1e-6 * dt, repr(name), expected, f"{time:g} s", advice)
+            expect(abs(time - start * dt) <= SAME_TIME * dt, repr(name), expected, f"{time:g} s", advice)
             for channel, samples in zip(each.channels, each.values, strict=True):
                 values[rows[channel.name], start : start + each.n_steps] = samples
         described = [f"{name}: {each.description}" for name, each in measurements.items() if each.description]

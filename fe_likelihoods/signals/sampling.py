@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-_TIME_TOLERANCE = 1e-9  # in steps: round-off in times that are multiples of the step
+SAME_TIME = 1e-6  # in steps: times nearer to each other are equal, such as multiples of a rounded step
 _STEP_TOLERANCE = 1e-9  # relative difference up to which two steps are equal
 
 
@@ -85,11 +85,10 @@ def sample_window(name: str, n_steps: int, dt: float, start: float, stop: float 
     """
     duration = (n_steps - 1) * dt
     stop = duration if stop is None else stop
-    slack = _TIME_TOLERANCE * dt
-    within = -slack <= start < stop <= duration * (1 + 1e-12) + slack
+    within = -SAME_TIME * dt <= start < stop <= duration + SAME_TIME * dt
     expect(within, name, f"0 <= start < stop <= {duration:g} s, its duration", f"start = {start}, stop = {stop}")
-    first = max(math.ceil(start / dt - _TIME_TOLERANCE), 0)
-    last = min(math.floor(stop / dt + _TIME_TOLERANCE), n_steps - 1)
+    first = max(math.ceil(start / dt - SAME_TIME), 0)
+    last = min(math.floor(stop / dt + SAME_TIME), n_steps - 1)
     if last - first < 1:
         raise ValueError(f"{start} ... {stop} s keeps fewer than 2 samples of {name!r}, whose step is {dt:g} s")
     return slice(first, last + 1)
@@ -106,8 +105,6 @@ def array_digest(*arrays: NDArray[np.float64]) -> str:
 POINTS = 6
 """Number of samples that determine a value between two samples."""
 
-_SAME_TIME = 1e-6  # in steps: times nearer to a sample than this are equal to the time of the sample
-
 
 class Interpolation(NamedTuple):
     """Samples and weights that give a history at other times."""
@@ -120,7 +117,7 @@ def make_interpolation(dt: float, n_steps: int, times: NDArray[np.float64]) -> I
     """Return samples and weights for times (n_times,) [s] within a history that begins at time zero."""
     position = np.asarray(times, dtype=float) / dt
     nearest = np.clip(np.rint(position), 0, n_steps - 1)
-    same = np.abs(position - nearest) <= _SAME_TIME
+    same = np.abs(position - nearest) <= SAME_TIME
     if same.all():
         return Interpolation(nearest.astype(np.intp), None)
     position = np.where(same, nearest, position)
@@ -211,5 +208,5 @@ def uniform_times(times: NDArray[np.float64], step: float | None, where: str) ->
     duration = times[-1] - times[0]
     got = f"{times.size} in {duration:.4g} s with a gap of {gaps.max(initial=0.0):.4g} s"
     expect(duration <= 2 * times.size * step, where, "samples at most times", got, "cut the file at its long gaps")
-    uniform = times[0] + step * np.arange(int(duration / step + 1e-6) + 1)
+    uniform = times[0] + step * np.arange(int(duration / step + SAME_TIME) + 1)
     return UniformTimes(times, step, uniform, usual, gaps, note, kept)

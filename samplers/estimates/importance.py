@@ -10,11 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtr, stdtrit
 
-from .pareto import LARGEST_SHAPE, pareto_shape
+from .pareto import FEWEST_OF_TAIL, LARGEST_SHAPE, pareto_shape
 from .weights import effective_sample_size, log_mean_weight, normalised_weights
 
-# Levels of a normal distribution one and two standard deviations above its median.
-ONE_AND_TWO_SD = (0.8413, 0.9772)
 # Log-evidences with a larger standard error distinguish hardly any models, and the same weights give the means.
 LARGEST_ERROR = 0.35
 # Fewer effective points, or fewer per parameter (and one more), do not determine means and covariances.
@@ -59,7 +57,7 @@ def evidence_from_weights(log_weights: np.ndarray, made: int) -> EvidenceCheck:
     log_evidence = log_mean_weight(full)
     if effective == 0.0:
         return EvidenceCheck(log_evidence, float("inf"), effective, pareto_shape(log_weights), len(log_weights))
-    one, two = np.quantile(full, ONE_AND_TWO_SD, method="lower")
+    one, two = np.quantile(full, ndtr([1.0, 2.0]), method="lower")
     # one effective point has the relative variance 1, which no set of weights exceeds
     log_normal = np.expm1(min((two - one) ** 2, np.log1p(made))) / made if one > -np.inf else 0.0
     error = float(np.sqrt(max(1.0 / effective - 1.0 / made, log_normal)))
@@ -68,15 +66,11 @@ def evidence_from_weights(log_weights: np.ndarray, made: int) -> EvidenceCheck:
 
 # ---------------------------------------------------------------- rounds
 
-# Pareto shape that is assumed for fewer weights than an estimate needs
-SHAPE_OF_FEW = 0.7
-FEWEST_EFFECTIVE = 5.0
 # Growth of the weights above which the tails of a proposal are too light, for each part of the draws with the lowest
 # posterior. Normal proposals with half the variance of a Student t (3 to 5 degrees of freedom) have 0.11 to 0.5, 0.3 to
 # 0.7 and 0.6 to 0.85; harmless ones, with 6 degrees on 4, 0.03, 0.08 and 0.12.
 LARGE_GROWTH = {0.5: 0.1, 0.25: 0.3, 0.125: 0.3}
 SIGNIFICANT = 4.0  # in errors
-FEWEST_FOR_GROWTH = 8
 # Instead of -inf: rounds of which each misses a draw of another still have shares; from -1e2 to -1e9 they are the same.
 SMALLEST_LOG_DENSITY = -1e5
 
@@ -133,14 +127,14 @@ class PooledRounds(NamedTuple):
 
 def tail_growth(rounds: Sequence[Round], part: float = 0.5) -> tuple[float, float]:
     """Slope of the log-weights over minus the log-posterior, among the `part` of the draws with the lowest posterior,
-    and its error times a factor for few draws; (0, inf) for fewer than 8. It is positive if a proposal has lighter
+    and its error times a factor for few draws; (0, inf) for fewer than three. It is positive if a proposal has lighter
     tails than the posterior (``docs/theory/guided``).
     """
     log_prob = np.concatenate([r.records["log_prob"] for r in rounds])
     log_weights = np.concatenate([r.log_weights for r in rounds])
     possible = np.isfinite(log_weights) & np.isfinite(log_prob)
     depth, log_weights = -log_prob[possible], log_weights[possible]
-    if part * len(depth) < FEWEST_FOR_GROWTH:
+    if part * len(depth) < 3:  # no degree of freedom is left
         return 0.0, float("inf")
     outer = depth >= np.quantile(depth, 1.0 - part)
     depth, log_weights = depth[outer] - depth[outer].mean(), log_weights[outer] - log_weights[outer].mean()
@@ -165,8 +159,8 @@ def tail_variance(log_weights: np.ndarray) -> float:
     Pareto shape, is a standard error, up to 1; infinite for a shape of 1 or an effective size below 5.
     """
     shape = pareto_shape(log_weights)
-    shape = SHAPE_OF_FEW if shape == np.inf else shape
-    if shape >= 1.0 or effective_sample_size(log_weights) < FEWEST_EFFECTIVE:
+    shape = LARGEST_SHAPE if shape == np.inf else shape  # of fewer weights than an estimate needs
+    if shape >= 1.0 or effective_sample_size(log_weights) < FEWEST_OF_TAIL:
         return float("inf")
     largest = float(np.max(normalised_weights(log_weights)))
     return min(largest * max(shape, 0.0) / (1.0 - shape), 1.0) ** 2

@@ -6,10 +6,12 @@ magnitudes of thousands, and a constant added to them must not change anything.
 
 import numpy as np
 
+from ..resampling import GRID
+from .genealogy import MIN_FOUNDER_SHARE
+
 WHERE_TO_LOOK = (
     "check the model and the prior, and see the failures that the model reports (posterior.report() in fe_likelihoods)"
 )
-WEIGHT_GRID = 4096.0
 # Below this log-likelihood, rounding errors exceed 1, so that it compares no points: it is as good as -inf.
 LOWEST = -1.0 / np.finfo(float).eps
 BISECTIONS = 20  # of the next tempering exponent
@@ -37,7 +39,7 @@ def coarse_weights(log_weights: np.ndarray) -> np.ndarray:
     All draws from the fitted proposal then keep their bits when a constant is added to the log-likelihood.
     """
     top = np.max(log_weights)
-    return normalised_weights(np.round((log_weights - top) * WEIGHT_GRID) / WEIGHT_GRID)
+    return normalised_weights(np.round((log_weights - top) * GRID) / GRID)
 
 
 def effective_sample_size(log_weights: np.ndarray) -> float:
@@ -96,7 +98,7 @@ class EvidenceError:
     founder.
     """
 
-    def __init__(self, n_points: int, min_founder_share: float = 0.1):
+    def __init__(self, n_points: int, min_founder_share: float = MIN_FOUNDER_SHARE):
         self.n_points = n_points
         self.min_founder_share = min_founder_share
         self._closed = 0.0

@@ -12,7 +12,6 @@ import numpy as np
 
 LEVEL = 1e-4  # probability of a false alarm in a run
 METROPOLIS_STEPS = 20  # a ball of half the width of the prior is then found in 42 to 100 % of the cases (docs/results)
-FEWEST_POINTS = 32  # signed ranks of fewer points cannot reach the level
 SEED = 20_131  # separate random numbers, so that the test changes no run
 
 
@@ -22,7 +21,7 @@ def not_of_the_prior(coords: np.ndarray, log_prior: Callable[[np.ndarray], np.nd
     after.
     """
     (n, ndim), random = coords.shape, np.random.RandomState(SEED)
-    if n < FEWEST_POINTS:
+    if 2.0 ** (1 - n // 2) > LEVEL / 2:  # signed ranks of so few points cannot reach the level
         return ""
     from scipy.stats import wilcoxon  # slow to import
 

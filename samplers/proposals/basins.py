@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..resampling import GRID
 from .mixture import Mixture, invert_roots, log_components, to_component_space
 from .transforms import log_abs_det_jacobian
 
@@ -48,8 +49,6 @@ WIDER, FEW_POINTS_SCALE = 1.2, 0.7
 # Largest number of basins; smallest and largest share of one, and of all together: an estimated mass may be far too
 # large.
 MOST, SMALLEST_SHARE, LARGEST_SHARE, LARGEST_SHARE_OF_ALL = 3, 0.1, 0.25, 0.5
-# Logarithms are rounded to 1 / 4096, so that a constant added to all of them changes nothing.
-GRID = 4096.0
 # Relative size of what keeps systems of equations regular.
 RIDGE = 1e-9
 

@@ -43,8 +43,8 @@ RIDGE = 1e-10
 NEGLIGIBLE = 1e-3
 # Numbers per shear that the criterion counts: mean, sd, linear and quadratic coefficient.
 PARAMETERS_PER_SHEAR = 4
-# With fewer effective points per dimension, correlations are shrunk towards zero.
-MIN_POINTS_PER_DIMENSION = 5.0
+# Effective points per dimension that determine a covariance; with fewer, correlations are shrunk towards zero.
+POINTS_PER_DIMENSION = 5.0
 # Smallest such shrinkage. Without it, 123 of 200 fits to exactly dependent parameters have a singular matrix.
 SMALLEST_SHRINKAGE = 1e-12
 # Smallest standard deviation, for parameters that do not vary.
@@ -410,7 +410,7 @@ def location_and_root(coords: np.ndarray, weights: np.ndarray) -> tuple[np.ndarr
     # a parameter that does not vary gets a tiny standard deviation, in its own unit
     sd = np.maximum(sd, np.maximum(1e-12 * coords.std(axis=0), np.maximum(np.spacing(np.abs(mean)), SMALLEST_SD)))
     standard = centred / sd
-    few = 1.0 - 1.0 / (weights @ weights) / (MIN_POINTS_PER_DIMENSION * len(mean))
+    few = 1.0 - 1.0 / (weights @ weights) / (POINTS_PER_DIMENSION * len(mean))
     correlation = (1.0 - max(few, SMALLEST_SHRINKAGE)) * (standard * weights[:, None]).T @ standard
     np.fill_diagonal(correlation, 1.0)
     return mean, sd[:, None] * np.linalg.cholesky(correlation)

@@ -17,7 +17,7 @@ from ..estimates.importance import EvidenceCheck, evidence_from_weights
 from ..estimates.weights import coarse_weights, effective_sample_size, log_mean_weight, next_beta, normalised_weights
 from ..judgement.rounds import doubt_recycling
 from ..proposals.basins import find_basins, with_components
-from ..proposals.mixture import Mixture, draw_inside, fit_mixture, log_density
+from ..proposals.mixture import POINTS_PER_DIMENSION, Mixture, draw_inside, fit_mixture, log_density
 from ..proposals.transforms import find_support_bounds
 from ..reports import Report, Stage, Sweep
 from .mutation import tempered_log_prob
@@ -26,9 +26,9 @@ from .population import Density, PendingPoints, Population, stop_at
 # Wanted effective sample size at each beta (the target), as a share of the number of starting points. A small target
 # allows large steps of beta; the fresh draws of a round then restore the effective sample size.
 TARGET_SHARE = 0.2
-# Smallest target per dimension (and one more), also per component once a fit has had several: with fewer, the shares of
+# Smallest target per dimension (and one more) of each component, once a fit has had several: with fewer, the shares of
 # modes drift. And per number of a mean and a covariance: with .25, draws in 40 dimensions have an efficiency of 2 %.
-POINTS_PER_DIMENSION, POINTS_PER_COMPONENT, POINTS_PER_NUMBER = 5.0, 8.0, 0.5
+POINTS_PER_COMPONENT, POINTS_PER_NUMBER = 8.0, 0.5
 # Draws of a round, as a multiple of the target.
 DRAWS_PER_TARGET = 3.0
 # Draws that find narrow modes: draws of the prior, and further draws, spread over the stages below beta = 1, as a
