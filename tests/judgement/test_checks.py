@@ -38,8 +38,7 @@ def test_evidences_that_differ_speak_against_a_run_if_the_check_has_uneven_weigh
     ("error", "check", "several", "doubted"),
     [
         (0.5, None, False, True),
-        (0.38, None, False, False),
-        (0.38, None, True, True),
+        (0.38, None, False, True),
         (0.34, None, True, False),
         (0.5, _check(-10.0), False, False),
         (0.5, _check(-10.0), True, True),  # of the stages, which give the modes their shares
