@@ -81,6 +81,10 @@ class Prior:
         self._joint = [
             ([names.index(name) for name in key], d) for key, d in self.distributions.items() if isinstance(key, tuple)
         ]
+        # equal distributions are mapped together: 50 stiffnesses one by one took ten times as long
+        known = [d for _, d in self._single]
+        alike = [d for k, d in enumerate(known) if d not in known[:k]]
+        self._maps = [([column for column, d in self._single if d == each], each) for each in alike] + self._joint
         self.bounds = np.empty((self.dim, 2))
         for column, distribution in [*self._single, *self._joint]:
             self.bounds[column] = distribution.bounds
@@ -143,16 +147,16 @@ class Prior:
         """
         z = self._checked(z, "z")
         x = np.empty(z.shape)
-        for column, distribution in [*self._single, *self._joint]:
-            x[..., column] = distribution.from_normal(z[..., column])
+        for columns, distribution in self._maps:
+            x[..., columns] = distribution.from_normal(z[..., columns])
         return x
 
     def to_normal(self, x: np.ndarray) -> np.ndarray:
         """Map from parameters x, (dim,) or (n, dim), to standard normal variables, the inverse of `from_normal`."""
         x = self._checked(x, "x")
         z = np.empty(x.shape)
-        for column, distribution in [*self._single, *self._joint]:
-            z[..., column] = distribution.to_normal(x[..., column])
+        for columns, distribution in self._maps:
+            z[..., columns] = distribution.to_normal(x[..., columns])
         return z
 
     def rvs(self, size: int = 1, random_state: RandomState = None) -> np.ndarray:

@@ -77,7 +77,7 @@ def _lower_half(z: np.ndarray, mean: float, sd: float, lower: float, upper: floa
     below = np.logaddexp(log_share, log_ndtr(a))
     above = np.logaddexp(log_ndtr(-z) + log_mass, log_ndtr(-b))
     # from the nearer tail of the normal before truncation
-    x = mean + sd * np.where(below < above, ndtri_exp(np.minimum(below, 0.0)), -ndtri_exp(np.minimum(above, 0.0)))
+    x = mean + sd * np.where(below < above, 1.0, -1.0) * ndtri_exp(np.minimum(np.minimum(below, above), 0.0))
     if np.isneginf(a):
         return x
     area = np.exp(log_share + 0.5 * a * a + HALF_LOG_TWO_PI)

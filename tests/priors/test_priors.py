@@ -257,6 +257,16 @@ def test_draws_depend_on_the_seed_only(prior):
     np.testing.assert_array_equal(first, draws(None))
 
 
+def test_equal_distributions_are_mapped_together_with_the_same_bits(seed):
+    each = [TruncatedNormal(1.0, 0.2), HalfNormal(0.3), TruncatedNormal(1.0, 0.2), LogNormal(1.0, 0.2), HalfNormal(0.3)]
+    prior = Prior(dict(zip("abcde", each, strict=True))).reorder("ebcda")
+    z = 3.0 * np.random.default_rng(seed).standard_normal((500, 5))
+    x, alone = prior.from_normal(z), [each["abcde".index(name)] for name in prior.names]
+    np.testing.assert_array_equal(x.T, [one.from_normal(scores) for one, scores in zip(alone, z.T, strict=True)])
+    np.testing.assert_array_equal(prior.to_normal(x).T, [one.to_normal(v) for one, v in zip(alone, x.T, strict=True)])
+    np.testing.assert_array_equal(prior.from_normal(z[7]), x[7])
+
+
 def test_reorder_keeps_the_density(prior, seed):
     names = prior.names[::-1]
     x = prior.rvs(4, seed)
