@@ -21,15 +21,15 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtri
 
+from .estimates.genealogy import FEWEST_FOR_VARIANCE
 from .estimates.weights import EvidenceError
 from .resampling import systematic
 from .settings import as_whole_number
 
 LEVEL_PROBABILITY = 0.1  # share of the points that each level keeps (Au & Beck 2001)
-FEWEST = 10  # points that a level keeps, and groups of points for the error
 LEAST_PROBABILITY = 1e-15
-FIRST_SCALE, TARGET_ACCEPTANCE = 0.6, 0.44  # of the moves; the target is from Papaioannou et al. (2015)
-MOST_EQUAL = 0.75  # share of points of one value above which levels make no progress
+TARGET_ACCEPTANCE = 0.44  # of the moves (Papaioannou et al. 2015)
+MOST_EQUAL = 0.75  # share of points of one value above which levels make no progress: with it, 120 end at 1e-15
 
 
 class RareEvent(NamedTuple):
@@ -106,8 +106,8 @@ def subset_simulation(
     True
     """
     n = as_whole_number("n", n)
-    if n * LEVEL_PROBABILITY < FEWEST:
-        raise ValueError(f"n must be {FEWEST / LEVEL_PROBABILITY:.0f} points or more; got {n}")
+    if n * LEVEL_PROBABILITY < FEWEST_FOR_VARIANCE:
+        raise ValueError(f"n must be {FEWEST_FOR_VARIANCE / LEVEL_PROBABILITY:.0f} points or more; got {n}")
     if not np.isfinite(threshold):
         raise ValueError(f"threshold must be a finite number; got {threshold!r}")
     simulations = failed = 0
@@ -125,13 +125,13 @@ def subset_simulation(
     values = quantity(points)
     points, values = points[values > -np.inf], values[values > -np.inf]
     made, n, kept = n, len(values), int(np.ceil(LEVEL_PROBABILITY * len(values)))
-    if kept < FEWEST:
+    if kept < FEWEST_FOR_VARIANCE:
         raise ValueError(
-            f"expected {FEWEST / LEVEL_PROBABILITY:.0f} initial points or more whose simulation succeeds; got {n} of "
-            f"{made}: see why the function returns NaN, or return infinity if failures exceed"
+            f"expected {FEWEST_FOR_VARIANCE / LEVEL_PROBABILITY:.0f} initial points or more whose simulation succeeds; "
+            f"got {n} of {made}: see why the function returns NaN, or return infinity if failures exceed"
         )
-    scale = FIRST_SCALE
-    error = EvidenceError(n, FEWEST / n)
+    scale = 1.0
+    error = EvidenceError(n, FEWEST_FOR_VARIANCE / n)
     levels, shares = [], []
     while True:
         above, bound = values > threshold, float(np.partition(values, -kept)[-kept])

@@ -12,9 +12,9 @@ import numpy as np
 from scipy.special import ndtri, stdtrit
 
 MIN_FOUNDER_SHARE = 0.1
-# With few walkers, a tenth of them are too few groups for a variance: with 6 founders of 60 walkers, standard errors
-# were too small by a factor of up to ten.
-MIN_FOUNDERS = 10
+# Points or groups of points that a variance needs: with 6 founders of 60 walkers, standard errors were too small by a
+# factor of up to ten.
+FEWEST_FOR_VARIANCE = 10
 
 
 def student_factor(freedom: float | np.ndarray) -> float | np.ndarray:
@@ -29,7 +29,7 @@ def trace_founders(founders: Sequence[np.ndarray], ancestors: np.ndarray) -> tup
     kept.
     """
     traced = [generation[ancestors] for generation in founders] + [ancestors]
-    fewest = max(MIN_FOUNDER_SHARE * len(ancestors), MIN_FOUNDERS)
+    fewest = max(MIN_FOUNDER_SHARE * len(ancestors), FEWEST_FOR_VARIANCE)
     while len(traced) > 1 and len(np.unique(traced[0])) < fewest:
         traced.pop(0)
     return tuple(traced)
