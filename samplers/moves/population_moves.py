@@ -43,7 +43,8 @@ PARTS, FEW_POINTS = 10, 5.0
 # Share of the difference steps with scale 1, which lead from mode to mode (ter Braak 2006). Without differences, the
 # means of 24 runs with two modes in 11 dimensions are off by 1.6 stated errors.
 UNIT_SCALE_SHARE = 0.1
-# Crossover probabilities of the difference steps: one is chosen per sweep and walker.
+# Crossover probabilities of the difference steps, as in DREAM (Vrugt et al. 2009, doi:10.1515/IJNSNS.2009.10.3.273).
+# With 1 alone, 1 of 24 runs of TMCMC lost one of several modes instead of none, for 2 % fewer evaluations.
 CROSSOVERS = (1.0 / 3.0, 2.0 / 3.0, 1.0)
 
 Inside = Callable[[np.ndarray], np.ndarray]
