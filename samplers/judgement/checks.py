@@ -23,7 +23,8 @@ TRUSTED_DIFFERENCE = 3.0
 ROUNDING = 1e-12
 # Error of the logarithm of a volume: it spoke in 440 of 440 starts of 11 box priors of 0, in none of 720 right ones.
 VOLUME_ERROR = 0.5
-# Smallest difference between two shares of a component that is reported if it is also significant.
+# Smallest difference between two shares of a component that is reported if it is also significant: in 38 wrong and 25
+# right of 1158 runs, and in 38 and 34 without it.
 LARGE_SHARE_DIFFERENCE = 0.1
 # A finding whose numbers are errors of shares and means. Where it speaks in 72 runs of TMCMC, the shares of 18 modes
 # are off by 0.75 stated errors (root mean square), and by 3.7 without these numbers.

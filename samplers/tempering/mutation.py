@@ -22,6 +22,8 @@ from ..reports import Sweep
 from ..settings import Settings
 from .population import Density, Population
 
+# Sweeps without a decrease of the correlation that end moving: without, 30 runs of 100 walkers on five posteriors have
+# equal errors and 2 % more evaluations.
 STALL_SWEEPS = 3
 MOST_POINTS = 10_000  # kept by `VisitedPoints`
 

@@ -49,7 +49,7 @@ def test_a_mode_is_found_from_points_on_its_flank(rng, n, nearest):
     assert np.linalg.norm(error) < nearest * NARROW
     assert np.all(scale < 1.6 * WIDE)
     if n == 80:
-        assert np.allclose(scale, np.sqrt(1.2) * NARROW, rtol=1e-2)
+        assert np.allclose(scale, NARROW, rtol=1e-2)
 
 
 def test_a_covered_target_is_left_alone(rng):
