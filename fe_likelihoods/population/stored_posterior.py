@@ -13,6 +13,7 @@ import numpy as np
 from scipy import linalg
 
 from samplers.estimates.weights import effective_sample_size
+from samplers.proposals.mixture import POINTS_PER_DIMENSION
 from samplers.resampling import systematic
 
 from ..checks.finding import NOTE, Finding
@@ -39,7 +40,6 @@ __all__ = [
 
 _LEAST_INFORMATION = 1.0  # of the data about a direction, relative to the prior, below which it is left to the prior
 _UNSEEN = 1e-6  # information about such a direction
-_FEWEST_SAMPLES = 5  # effective ones per parameter, for their covariance
 _PRIOR_DRAWS = 20_000  # for the moments of a prior
 _MOST = 1000  # samples of a test in a hierarchical model; the time of an evaluation is proportional to them
 
@@ -271,9 +271,9 @@ def normal_likelihood(stored: StoredPosterior, names: Sequence[str]) -> NormalLi
     prior, points = on_scale(stored, names, Scales(np.ones(len(names), dtype=bool)))
     weights, n, d = np.exp(stored.log_weights), stored.effective_sample_size, len(names)
     mean, covariance = weights @ points, np.cov(points.T, aweights=weights, ddof=0)
-    if n < (fewest := _FEWEST_SAMPLES * d) or not (np.diag(covariance) > 0.0).all():
+    if n < (fewest := POINTS_PER_DIMENSION * d) or not (np.diag(covariance) > 0.0).all():
         raise ValueError(
-            f"the likelihood of {d} parameters needs at least {fewest} effective samples; got {n:.0f}, with the "
+            f"the likelihood of {d} parameters needs at least {fewest:.0f} effective samples; got {n:.0f}, with the "
             f"standard deviations {np.sqrt(np.diag(covariance)).tolist()} of the logarithms"
         )
     covariance *= (n - 1.0) / (n - d - 2.0)  # so that its inverse is right on average

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from samplers.proposals.mixture import Mixture, fit_normals, invert_roots, log_density
+from samplers.proposals.mixture import POINTS_PER_DIMENSION, Mixture, fit_normals, invert_roots, log_density
 
 from .distributions import RandomState, as_generator
 from .multivariate import MultivariateDistribution
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 _LARGEST_SCORE = 12.0  # samples at a bound of the prior have infinite scores
 REFITS = 16  # to resampled samples: a standard deviation of 16 has an error of 18 %
-_FEWEST_SAMPLES = 5  # different ones per parameter: populations from 46 samples of 8 differ by .1 to .2 sd
 _SMALLEST_EIGENVALUE = 1e-10  # of the correlations, below which the samples are linearly dependent
 
 
@@ -194,9 +193,9 @@ def fit_mixture(
     points = as_points(samples, prior.names)
     names = prior.names if names is None else tuple(names)
     part, dim = prior.subset(names), len(names)
-    if points.ndim != 2 or len(np.unique(points, axis=0)) < _FEWEST_SAMPLES * dim:
+    if points.ndim != 2 or len(np.unique(points, axis=0)) < POINTS_PER_DIMENSION * dim:
         raise ValueError(
-            f"a fit of {dim} parameters needs {_FEWEST_SAMPLES * dim} different samples or more, in an array "
+            f"a fit of {dim} parameters needs {POINTS_PER_DIMENSION * dim:.0f} different samples or more, in an array "
             f"(n, {prior.dim}); got shape {points.shape}"
         )
     if not np.isfinite(np.atleast_1d(prior.logpdf(points))).all():

@@ -10,6 +10,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ..moves.population_moves import BEST_SCALE
+
 LEVEL = 1e-4  # probability of a false alarm in a run
 METROPOLIS_STEPS = 20  # a ball of half the width of the prior is then found in 42 to 100 % of the cases (docs/results)
 SEED = 20_131  # separate random numbers, so that the test changes no run
@@ -32,7 +34,7 @@ def not_of_the_prior(coords: np.ndarray, log_prior: Callable[[np.ndarray], np.nd
         points, log_values = start, log_prior(start)
         for _ in range(METROPOLIS_STEPS):
             first, second = random.randint(len(other), size=(2, len(points)))
-            proposed = points + 2.38 / np.sqrt(2 * ndim) * (other[first] - other[second])
+            proposed = points + BEST_SCALE / np.sqrt(2 * ndim) * (other[first] - other[second])
             log_proposed = log_prior(proposed)
             accepted = np.log(random.uniform(size=len(points))) < log_proposed - log_values
             points = np.where(accepted[:, None], proposed, points)

@@ -33,8 +33,9 @@ from ..proposals.transforms import find_support_bounds, log_abs_det_jacobian
 # Probability of the independence kernel, and while its acceptance is above a half, since it decorrelates the ensemble
 # fastest: equal probabilities take a tenth more evaluations. Local walk and differences share the rest.
 INDEPENDENT, IF_ACCEPTED = 0.5, 0.8
-# Acceptance of the local walk and of the differences (Roberts et al. 1997: the best one is 0.234).
-TARGET_ACCEPTANCE = 0.25
+# Scale of a random walk times the square root of the dimension, and acceptance of the walk and of the differences: best
+# for normal densities are 2.38 and 0.234 (Roberts et al. 1997).
+BEST_SCALE, TARGET_ACCEPTANCE = 2.38, 0.25
 # Parts of the fitted points, where they are fewer than this per number of a mean and a covariance; the points of a part
 # are moved by a fit to the others. Without, means of two modes in 11 dimensions are off by 1.3 stated errors with 1.9
 # points per number (0.93 with parts, 160 runs), by 1.1 with 2.6, and by 1.0 with 3.2, 3.9 and 6.5 (24 to 38 runs), so
@@ -121,7 +122,7 @@ class RandomWalkMove(_FittedMove):
         self._root = location_and_root(coords, weights)[1]
 
     def _draw(self, coords, random):
-        scale = 2.38 / math.sqrt(coords.shape[1]) if self.scale is None else self.scale
+        scale = BEST_SCALE / math.sqrt(coords.shape[1]) if self.scale is None else self.scale
         return coords + scale * random.standard_normal(coords.shape) @ self._root.T, np.zeros(len(coords))
 
 
@@ -232,7 +233,7 @@ class MixtureMove(_FittedMove):
         before = log_responsibilities(self._mixture, coords)
         cumulated = np.cumsum(np.exp(before), axis=1)
         component = np.sum(cumulated < random.uniform(size=n)[:, None] * cumulated[:, -1:], axis=1)
-        scale = 2.38 / math.sqrt(ndim) * math.exp(self._log_factors[1])
+        scale = BEST_SCALE / math.sqrt(ndim) * math.exp(self._log_factors[1])
         steps = np.einsum("nij,nj->ni", self._mixture.roots[component], random.standard_normal((n, ndim)))
         proposed, factors = self._step(coords, scale * steps)
         rows = np.arange(n)
@@ -256,7 +257,7 @@ class MixtureMove(_FittedMove):
         )
         crossed = random.uniform(size=(n, ndim)) < random.choice(CROSSOVERS, size=n)[:, None]
         crossed[np.arange(n), random.randint(ndim, size=n)] = True
-        scale = 2.38 / np.sqrt(2.0 * crossed.sum(axis=1)) * math.exp(self._log_factors[2])
+        scale = BEST_SCALE / np.sqrt(2.0 * crossed.sum(axis=1)) * math.exp(self._log_factors[2])
         scale[random.uniform(size=n) < UNIT_SCALE_SHARE] = 1.0
         steps = crossed * scale[:, None] * (self._archive[first] - self._archive[second])
         return self._step(coords, steps)
@@ -304,7 +305,7 @@ class WithFastSweeps(MHMove):
         self._root = root[len(slow) :, len(slow) :]
 
     def _draw(self, coords: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
-        proposed, scale = coords.copy(), 2.38 / math.sqrt(len(self.indices))
+        proposed, scale = coords.copy(), BEST_SCALE / math.sqrt(len(self.indices))
         normal = random.standard_normal((len(coords), len(self.indices)))
         proposed[:, self.indices] += scale * normal @ self._root.T
         return proposed, np.zeros(len(coords))

@@ -43,7 +43,8 @@ RIDGE = 1e-10
 NEGLIGIBLE = 1e-3
 # Numbers per shear that the criterion counts: mean, sd, linear and quadratic coefficient.
 PARAMETERS_PER_SHEAR = 4
-# Effective points per dimension that determine a covariance; with fewer, correlations are shrunk towards zero.
+# Effective points per dimension that determine a covariance; with fewer, correlations are shrunk towards zero. Means of
+# populations from 46 samples of 8 parameters differ by .1 to .2 standard deviations.
 POINTS_PER_DIMENSION = 5.0
 # Smallest such shrinkage. Without it, 123 of 200 fits to exactly dependent parameters have a singular matrix.
 SMALLEST_SHRINKAGE = 1e-12
