@@ -21,7 +21,7 @@ from ..text_tables import text_table
 from ..units import find_unit
 from .sufficient_statistics import distinct_gaps
 
-_WINDOW = 5.0  # length of the sums over lags, in correlation times
+_WINDOW = 5.0  # length of the sums over lags, in correlation times (as in emcee.autocorr: Sokal 1997)
 
 
 class ResidualChecks(NamedTuple):

@@ -144,7 +144,7 @@ def interpolate(history: NDArray[np.float64], at: Interpolation) -> NDArray[np.f
 
 # uneven times, from a clock with jitter or a logger that loses packets ------------------------------------------------
 
-_GAP = 1.5  # usual steps between two samples, from which on samples are missing
+_GAP = 1.5  # usual steps between two samples, from which on samples are missing: nearer to two than to one
 _NEAR = 0.1  # usual steps from a sample, within which a time beside a gap has its value
 _MOST_REPEATED = 0.05  # share of rows that repeat a time; more are the times of packets
 _LARGEST_DIFFERENCE = 0.05  # relative, of the new step from the usual one
