@@ -342,7 +342,7 @@ def _read(backend: Backend) -> dict[str, Any]:
 
 
 def _parsed(stored: dict[str, Any]) -> tuple[AnnealingResult, Verdict | None]:
-    makers = {"check": EvidenceCheck._make, "founders": np.array, "parents": np.array}
+    makers = {"check": lambda values: EvidenceCheck(*values), "founders": np.array, "parents": np.array}
     known = {name: make(stored[name]) for name, make in makers.items() if stored.get(name) is not None}
     result = AnnealingResult(tuple(map(Stage._make, stored.get("ladder", ()))), **known)
     if (verdict := stored.get("verdict")) is None:

@@ -8,7 +8,7 @@ from .estimates.control_variates import SignedSample
 from .estimates.genealogy import standard_error_of_mean, student_factor
 from .estimates.importance import EvidenceCheck
 from .evaluation.values import most_common_reasons
-from .judgement.checks import OF_MEAN, OF_SHARES
+from .judgement.checks import OF_SHARES
 from .judgement.clusters import Cluster, error_between_modes, find_clusters
 from .judgement.failures import NearFailures
 from .judgement.verdict import Verdict
@@ -95,21 +95,24 @@ class RunResults:
         """Monte Carlo standard errors (ndim,) of the mean over ``get_chain(discard, thin)``, from this run alone.
 
         Copies made by the latest resamplings, the autocorrelation of the chain (`samplers.estimates.genealogy`) and the
-        errors of the shares of modes (`samplers.judgement.clusters`) are accounted for. The variance of a mean is
-        estimated from as many groups of walkers as there are `founders`; for few groups, the errors are multiplied by a
-        quantile of Student's t, so that two errors contain the true mean with 95 % probability. If `founders` are not
-        known, each walker counts as independent. Dependence between walkers, as by emcee's stretch move, a lost mode,
-        and moves that did not move are not accounted for: after a `SamplingWarning` the errors are too small.
+        errors of the shares of modes (`samplers.judgement.clusters`) are accounted for. For few `founders`, the errors
+        are multiplied by a quantile of Student's t, so that two errors contain the true mean with 95 % probability.
+        Where walkers and weighted draws of several parts of the posterior (`log_evidence_check`) differ by more than
+        both errors, the walkers have the error that is missing. If `founders` are not known, each walker counts as
+        independent. Dependence between walkers, as by emcee's stretch move, a lost mode, and moves that did not move
+        are not accounted for: after a `SamplingWarning` the errors are too small.
 
         Examples
         --------
         >>> bool(np.all(sampler.mean_error() < 0.3 * samples.std(axis=0)))
         True
         """
-        chain = self._chain_of(discard, thin)
-        lost = {} if self._verdict is None else self._verdict.lost
-        of_lost = [lost.get(f"{OF_MEAN} {j}", 0.0) for j in range(chain.shape[2])]
-        return np.hypot(self._error_of_mean(chain, chain), of_lost)
+        chain, check = self._chain_of(discard, thin), self._result.check
+        error = self._error_of_mean(chain, chain)
+        if check is None or check.mean is None:
+            return error
+        apart = np.square(chain.mean(axis=(0, 1)) - check.mean) - np.square(check.mean_error)
+        return np.sqrt(np.maximum(np.square(error), apart))
 
     def sd_error(self, discard: int = 0, thin: int = 1) -> np.ndarray:
         """Monte Carlo standard errors (ndim,) of the standard deviations over ``get_chain(discard, thin)``.
@@ -188,7 +191,7 @@ class RunResults:
     @property
     def modes(self) -> tuple[Cluster, ...]:
         """Modes in which the chain has points, with shares and their standard errors, the largest first."""
-        lost = self.verdict.lost.get(OF_SHARES, 0.0)
+        lost = sum(each.numbers.get(OF_SHARES, 0.0) for each in self.verdict.findings)
         if self.iteration == 0:
             raise ValueError("modes are found in a chain, which is empty: call run_mcmc with one step or more")
         return find_clusters(self.get_chain(), self.founders, self._parents, self._result.error_by_resampling, lost)

@@ -30,6 +30,9 @@ class EvidenceCheck(NamedTuple):
     effective_sample_size: float  #: of the weights
     pareto_shape: float  #: of the largest weights; below 0.7 the error of the mean is finite in practice
     evaluations: int  #: points for which ``log_prob_fn`` was called
+    #: means (ndim,) of the weighted draws and their standard errors, if moves have found several parts; else None
+    mean: list[float] | None = None
+    mean_error: list[float] | None = None
 
     @property
     def reliable(self) -> bool:

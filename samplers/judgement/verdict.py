@@ -20,7 +20,6 @@ from ..estimates.importance import fewest_points, usable
 from ..estimates.pareto import LARGEST_SHAPE
 from ..finding import CARE, NOTE, WRONG, Finding
 from ..reports import LIMIT, AnnealingResult, Weighted
-from .checks import LOST
 from .failures import NearFailures, check_failed_region
 from .guides import UNSEEN
 
@@ -52,11 +51,6 @@ class Verdict(NamedTuple):
     #: what `effective_sample_size` counts: the walkers, or weighted points that the walkers were resampled from
     sample: str
     findings: tuple[Finding, ...] = ()  #: what speaks against the result, each with its severity and what to do
-
-    @property
-    def lost(self) -> dict[str, float]:
-        """How far shares and means of the walkers are from weighted draws, if a mode may be lost; else empty."""
-        return next((each.numbers for each in self.findings if each.kind == LOST), {})
 
     def __str__(self) -> str:
         first = (

@@ -93,8 +93,13 @@ def check_population(
     mixture = with_components(mixture, find_basins(mixture, points, log_target - log_evidence))
     drawn, made = draw_inside(mixture, n, random, density.inside)
     log_weights = density.evaluate(drawn)["log_prob"] - log_density(mixture, drawn)
-    findings = check_shares(mixture, coords, population.founders[0], drawn, log_weights)
-    return evidence_from_weights(log_weights, made), findings
+    check = evidence_from_weights(log_weights, made)
+    if len(mixture.weights) == 1 or check.effective_sample_size == 0.0:
+        return check, []
+    weights = normalised_weights(log_weights)
+    mean, findings = weights @ drawn, check_shares(mixture, coords, population.founders[0], drawn, weights)
+    error = np.sqrt(weights**2 @ (drawn - mean) ** 2)
+    return check._replace(mean=mean.tolist(), mean_error=error.tolist()), findings
 
 
 def _by_recycling(

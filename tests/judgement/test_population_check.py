@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from samplers.judgement.checks import OF_MEAN, OF_SHARES, check_shares
+from samplers.estimates.weights import normalised_weights
+from samplers.judgement.checks import OF_SHARES, check_shares
 from samplers.proposals.mixture import Mixture, draw, invert_roots, log_density
 from samplers.tempering.anneal import check_population
 from samplers.tempering.mutation import VisitedPoints
@@ -32,7 +33,8 @@ def found_in(points_share, true_share, seed=1, family=1):
     drawn = draw(PROPOSAL, N, random)
     log_weights = log_modes(drawn, true_share) - log_density(PROPOSAL, drawn)
     founders = np.arange(N) // family
-    return check_shares(PROPOSAL, population(points_share, random).coords, founders, drawn, log_weights)
+    weights = normalised_weights(log_weights)
+    return check_shares(PROPOSAL, population(points_share, random).coords, founders, drawn, weights)
 
 
 @pytest.mark.parametrize("share", [0.05, 0.3, 0.5])
@@ -47,9 +49,6 @@ def test_different_shares_are_reported(points, truth):
         (doubt,) = found_in(points, truth, seed)
         assert doubt.severity == "care" and "a mode has been lost or has a wrong weight" in doubt.text
         assert doubt.numbers[OF_SHARES] == pytest.approx(abs(points - truth), abs=0.15)
-        apart = abs(points - truth) * np.abs(MEANS[0] - MEANS[1])
-        found = [doubt.numbers[f"{OF_MEAN} {j}"] for j in range(NDIM)]
-        np.testing.assert_allclose(found, apart, atol=0.15 * np.abs(MEANS[0] - MEANS[1]).max() + 0.3)
 
 
 class Modes:
@@ -82,6 +81,8 @@ def test_a_mode_that_only_earlier_points_show_is_reported(seen):
     points = population(1.0, random)
     visit(visited, density, points.coords)
     check, found = check_population(points, density, random, visited, np.log(0.5) + 1.5 * np.log(2.0 * np.pi))
-    assert bool(found) == seen
+    assert bool(found) == seen == (check.mean is not None)
+    if seen:  # the truth is 0, the walkers are at -5
+        assert np.all(np.abs(check.mean) < 3.0 * np.array(check.mean_error) + 0.1) and max(check.mean_error) < 0.6
     truth = 1.5 * np.log(2.0 * np.pi) - (0.0 if seen else np.log(2.0))
     assert check.log_evidence == pytest.approx(truth, abs=0.15)

@@ -114,3 +114,13 @@ def test_a_chain_that_another_sampler_reads_keeps_its_founders(tmp_path):
     assert np.array_equal(again.mean_error(), sampler.mean_error())
     assert not np.array_equal(again.mean_error(), standard_error_of_mean(sampler.get_chain(), np.arange(60)))
     assert sampler.mean_error(discard=1).shape == (3,)
+
+
+def test_walkers_that_weighted_draws_refute_have_the_error_that_is_missing():
+    sampler = SMCSampler(60, 3, Gaussian(), vectorize=True, seed=1, recycle=False)
+    sampler.run_mcmc(None, 3)
+    mean, error = sampler.get_chain(flat=True).mean(axis=0), sampler.mean_error()
+    for apart, expected in ((0.5 * error, error), (np.ones(3), np.full(3, 0.8))):
+        check = sampler.log_evidence_check._replace(mean=(mean + apart).tolist(), mean_error=[0.6] * 3)
+        sampler._result = sampler._result._replace(check=check)
+        assert np.allclose(sampler.mean_error(), expected)
