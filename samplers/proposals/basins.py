@@ -28,7 +28,8 @@ from .transforms import log_abs_det_jacobian
 # Points whose log-density is this far below the highest, per dimension, are left out: equations may be singular with
 # all. The only points of a narrow mode may be low on its flank; with 500, 48 runs differ by 0.4 % of evaluations.
 DEPTH = 50.0
-# Squared distance, and depth below the highest point per dimension, at which a point has a quarter of the weight.
+# Squared distance, and depth below the highest point per dimension, at which a point has a quarter of the weight. With
+# equal weights instead of the first, 3 of 48 runs of recycling and 2 of 24 of TMCMC lost a mode, with it none.
 CORE, TOP = 10.0, 3.0
 # A point belongs to another basin if it is above the quadratic by this, plus this many times its error there.
 SIGNIFICANT, SPREADS = 0.5, 5.0
