@@ -41,6 +41,7 @@ PROPOSAL, TRIAL, ACCURATE, AGAIN = (30, 1e-3), (4, 1e-3), (100, 1e-6), (20, 1e-6
 RIDGE = 1e-10
 # Points with less than this share of the mean weight are left out of the fit.
 NEGLIGIBLE = 1e-3
+MOST_COMPONENTS = 6  # with 8, 60 runs of recycling on several modes and bent ridges are equal to the last bit
 # Numbers per shear that the criterion counts: mean, sd, linear and quadratic coefficient.
 PARAMETERS_PER_SHEAR = 4
 # Effective points per dimension that determine a covariance; with fewer, correlations are shrunk towards zero. Means of
@@ -173,9 +174,7 @@ def draw_inside(
     return np.concatenate(kept), made
 
 
-def fit_mixture(
-    coords: np.ndarray, weights: np.ndarray, max_components: int = 6, bounds: np.ndarray | None = None
-) -> Mixture:
+def fit_mixture(coords: np.ndarray, weights: np.ndarray, bounds: np.ndarray | None = None) -> Mixture:
     """Fit a mixture to points (n, ndim) with weights (n,) of sum 1. The Bayesian information criterion chooses
     components, degrees of freedom, shears, and which `bounds` (2, ndim) near the population a transformation removes.
     """
@@ -187,7 +186,7 @@ def fit_mixture(
         points = to_unbounded(removed, coords)
         volume = sum(volumes[bound] for bound in removed)
         for shears in dict.fromkeys([(), find_shears(points, weights)]):
-            mixture, criterion = _fit_components(shears, points, weights, max_components)
+            mixture, criterion = _fit_components(shears, points, weights)
             tried.append((criterion - 2.0 * effective * volume, mixture._replace(bounds=removed)))
     return min(tried, key=lambda each: each[0])[1]
 
@@ -225,7 +224,7 @@ def fit_normals(coords: np.ndarray, effective: float, start: Mixture | None = No
         mean, root = location_and_root(coords, weights)
         white = (coords - mean) @ invert_roots(root[None])[0].T
         return _unwhitened(_maximise(white, weights, effective, responsibilities, math.inf, AGAIN)[0], mean, root)
-    return _fit_components((), coords, weights, 6, math.inf, effective, ACCURATE)[0]
+    return _fit_components((), coords, weights, math.inf, effective, ACCURATE)[0]
 
 
 def leave_out(mixture: Mixture, coords: np.ndarray, weights: np.ndarray, parts: np.ndarray) -> list[Mixture]:
@@ -253,7 +252,6 @@ def _fit_components(
     shears: tuple[Shear, ...],
     coords: np.ndarray,
     weights: np.ndarray,
-    max_components: int,
     dof: float = DOF,
     effective: float | None = None,
     limits: tuple[int, float] = PROPOSAL,
@@ -269,7 +267,7 @@ def _fit_components(
 
     best, log_likelihood = _maximise(white, weights, effective, np.ones((len(white), 1)), dof, limits)
     best_criterion = _criterion(1, ndim, effective, log_likelihood)
-    for count in range(2, max_components + 1):
+    for count in range(2, MOST_COMPONENTS + 1):
         if effective < count * (ndim + 2):
             break
         starts = _splits(best, white, weights)

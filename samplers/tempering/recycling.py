@@ -37,8 +37,6 @@ DRAWS_PER_TARGET = 3.0
 DRAWS_SHARE, LEAST_DRAWS, FEWEST_TO_SEARCH = 4, 1000, 250
 # A beta is left once the draws made at it have an effective sample size of this share of the target.
 FRESH_SHARE = 0.75
-# More components than in moves, because there are more points.
-MOST_COMPONENTS = 8
 # Share of a proposal's weight that is spread evenly over its components, so that small components receive draws too:
 # without, 48 runs on several modes take 5 % more evaluations.
 EVEN_SHARE = 0.25
@@ -52,7 +50,8 @@ DRAWS_PER_BASIN = 30
 MOST_CHECKS = 4
 # Expected share of distinct points among the walkers above which they are as good as independent draws.
 ENOUGH_DISTINCT = 0.9
-# Factor by which beta is expected to grow from stage to stage, for the spread of draws over the stages.
+# Factor by which beta is expected to grow from stage to stage, for the spread of draws over the stages; with 10, 1 of
+# 48 runs on several modes lost one.
 EXPECTED_GROWTH = 3.0
 # Largest share of the effective sample size that a stage keeps: else beta would hardly grow.
 LARGEST_SHARE_KEPT = 0.9
@@ -129,7 +128,7 @@ def recycle(
             yield population, Sweep(acceptance)
 
         # fit a proposal
-        mixture = fit_mixture(points.coords, coarse_weights(log_weights), MOST_COMPONENTS, bounds)
+        mixture = fit_mixture(points.coords, coarse_weights(log_weights), bounds)
         if len(mixture.weights) > 1 or mixture.shears:
             mixture = mixture.widened(WIDER_VOLUME ** (1.0 / ndim))
         mixture = _with_even_share(mixture, EVEN_SHARE)
