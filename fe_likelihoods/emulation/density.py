@@ -72,14 +72,14 @@ class EmulatedPosterior:
     """
 
     def __init__(self, target: ResponseTarget, regions: Sequence[Region], random: np.random.RandomState) -> None:
-        self._target, self.regions = target, list(regions)
+        self._target, self.regions, self._scales = target, list(regions), regions[0].emulator.scales
         wide, size = self._around_runs(), min(_POOL, _NUMBERS // target.ndim)
         scaled = []
         for region in self.regions:
             roots = around([region], 1.0, np.inf).roots[0].T
-            moved = target.scaled(region.centre + np.concatenate([roots, -roots]))
+            moved = target.scaled(region.centre + np.concatenate([roots, -roots]), self._scales)
             steps = 0.5 * (moved[: target.ndim] - moved[target.ndim :])
-            centre = target.scaled(region.centre[None])[0]
+            centre = target.scaled(region.centre[None], self._scales)[0]
             scaled.append(region._replace(centre=centre, covariance=steps.T @ steps))
         own = 1.0 - sum(share for _, share in wide)
 
@@ -164,7 +164,7 @@ class EmulatedPosterior:
         """Draws (n, ndim) of mixtures with shares, in scaled parameters, their coordinates and log-weights (n,)."""
         counts = random.multinomial(n, [share for _, share in parts])
         points = np.concatenate([draw(each, k, random) for (each, _), k in zip(parts, counts, strict=True)])
-        coords, volume = self._target.unscaled(points)
+        coords, volume = self._target.unscaled(points, self._scales)
         inside = np.flatnonzero(volume > -np.inf)
         for some in np.array_split(inside, 1 + len(inside) // 2000):
             volume[some] += self.log_density(coords[some])
@@ -183,6 +183,6 @@ class EmulatedPosterior:
         probable = coords[emulated > emulated.max() - _PLAUSIBLE - ndim]
         if len(probable) < 2 * ndim or not np.all(np.ptp(probable, axis=0) > 0.0):
             return []
-        probable = self._target.scaled(probable)
+        probable = self._target.scaled(probable, self._scales)
         covariance = np.cov(probable, rowvar=False).reshape(ndim, ndim)
         return [(student_mixture(np.ones(1), [probable.mean(axis=0)], [covariance], _FREEDOM), 0.1)]

@@ -46,6 +46,10 @@ class ResponseEmulator:
         histories[:, archive.numbers[rows]] = np.concatenate([np.full((1, n), 1.0 / n), vectors[:, :k].T @ centred])
         histories[1:] /= lengths[:, None]
         importance = np.minimum(1.0, values[:k] / values[0] * 1e3)
+        # axes from the directions that the data tell best to those left to the prior: of the first, which the posterior
+        # hardly varies in, the response is linear, and length scales find it
+        values, axes = np.linalg.eigh(covariance)
+        axes /= np.sqrt(np.maximum(values, np.finfo(float).eps * values[-1]))
         least, spread = np.inf, np.diag(np.sqrt(np.diag(covariance)))
         for scales in target.scales:  # the ones that predict left-out runs better
             scaled = partial(target.scaled, scales=scales)
@@ -53,12 +57,11 @@ class ResponseEmulator:
             apart = scaled(np.ones((1, d))) - scaled(-np.ones((1, d)))
             steps = np.diag(scaled(centre + spread) - scaled(centre - spread)) / (2.0 * np.diag(spread))
             stretch = np.maximum(steps, 1e-6 * apart[0])
-            whitening = np.linalg.inv(np.linalg.cholesky(covariance * np.outer(stretch, stretch))).T
-            inputs = partial(_whitened, scaled, scaled(centre[None])[0], whitening)
+            inputs = partial(_whitened, scaled, scaled(centre[None])[0], axes / stretch[:, None])
             process = fit_process(inputs(archive.coords[rows]), coefficients, importance)
             error = float(np.square(process.left_out).sum())
             if error < least:
-                least, self._inputs, self._process = error, inputs, process
+                least, self.scales, self._inputs, self._process = error, scales, inputs, process
         self._forms = archive.forms(histories)
 
     def squared_distance(self, coords: np.ndarray) -> np.ndarray:

@@ -76,9 +76,11 @@ class ResponseTarget:
         at = np.array([[-_AT_BOUND], [-2.0], [2.0]]) * np.ones(self.n_structural)
         least, low, high = self.structural_parameters(at)
         factors = (least >= 0.0) & (low > 0.0) & (high < _LARGEST_FACTOR * low)
-        # of inputs of emulators: logarithms where priors are lognormal, and in the last ones also of factors
-        lognormal = self._structural.logarithmic
-        self.scales = [Scales(each) for each in np.unique([lognormal, lognormal | factors], axis=0)]
+        # of inputs of emulators: logarithms where priors are lognormal, and of factors themselves, logarithms, reciprocals
+        linear = 1 - np.array(self._structural.logarithmic)
+        self._logarithms = Scales(linear * ~factors)
+        powers = np.array([linear, self._logarithms.power, self._logarithms.power - factors])
+        self.scales = [Scales(each) for each in np.unique(powers, axis=0)]
 
     def first_parts(self, shares: Sequence[float]) -> list["ResponseTarget"]:
         """The same posterior for the first parts of the record, see `FELikelihood.first_parts`."""
@@ -114,28 +116,28 @@ class ResponseTarget:
         inside = np.isfinite(coords).all(axis=1) & np.isfinite(log_prior)
         return coords, np.where(inside, log_prior - self.log_prior(np.where(inside[:, None], coords, 0.0)), -np.inf)
 
-    def scaled(self, coords: np.ndarray, scales: Scales | None = None) -> np.ndarray:
-        """Structural parameters on scales, by default with logarithms of those that the prior keeps away from zero, and
-        noise coordinates, at coordinates (n, >= d). Products, as E I, are linear in logarithms, and responses smooth
-        functions of these, unlike of coordinates near a bound.
+    def scaled(self, coords: np.ndarray, scales: Scales) -> np.ndarray:
+        """Structural parameters on scales, and noise coordinates, at coordinates (n, >= d). Products, as E I, are linear
+        in logarithms, deflections of springs in series in reciprocals, and responses are smooth functions of all these,
+        unlike of coordinates near a bound.
         """
-        scales, parameters = scales or self.scales[-1], self.structural_parameters(coords[:, : self.n_structural])
-        positive = np.where(scales.is_log, np.maximum(parameters, _SMALLEST), parameters)
+        parameters = self.structural_parameters(coords[:, : self.n_structural])
+        positive = np.where(scales.power < 1, np.maximum(parameters, _SMALLEST), parameters)
         return np.column_stack([scales.to_scale(positive), coords[:, self.n_structural :]])
 
-    def unscaled(self, scaled: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def unscaled(self, scaled: np.ndarray, scales: Scales) -> tuple[np.ndarray, np.ndarray]:
         """Coordinates (n, ndim) of what `scaled` returns, and the logarithm (n,) of their volume over its volume.
 
         The logarithm is -inf outside the support of the prior.
         """
-        points, scales = scaled[:, : self.n_structural], self.scales[-1]
+        points = scaled[:, : self.n_structural]
         coords, volume = self.with_volume(scales.from_scale(points))
         return np.column_stack([coords, scaled[:, points.shape[1] :]]), volume + scales.log_jacobian(points).sum(axis=1)
 
     def line(self, first: np.ndarray, last: np.ndarray, shares: np.ndarray) -> np.ndarray:
-        """Coordinates (n, n_structural) at shares (n,) of the way between two points, straight in scaled parameters."""
-        ends = self.scaled(np.column_stack([[first, last], np.zeros((2, self.n_noise))]))
-        return self.unscaled(ends[0] + shares[:, None] * (ends[1] - ends[0]))[0][:, : self.n_structural]
+        """Coordinates (n, n_structural) at shares (n,) of the way between two points, straight in logarithms."""
+        ends = self.scaled(np.column_stack([[first, last], np.zeros((2, self.n_noise))]), self._logarithms)
+        return self.unscaled(ends[0] + shares[:, None] * (ends[1] - ends[0]), self._logarithms)[0][:, : self.n_structural]
 
     def log_prior(self, coords: np.ndarray) -> np.ndarray:
         """Standard normal log-density (n,) of coordinates (n, k)."""

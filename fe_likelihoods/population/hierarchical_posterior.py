@@ -163,7 +163,7 @@ class HierarchicalPosterior(Posterior):
             name: float(np.mean([test.covariates[name] for test in tests.values()]))
             for name in dict.fromkeys(covariate for _, covariate in self._slopes)
         }
-        self.scales = Scales(np.array([each.scale == "log" for each in varying.values()] + [False] * len(common)))
+        self.scales = Scales(np.array([each.scale != "log" for each in varying.values()] + [True] * len(common)))
         self.described = {}
         for name, test in self.tests.items():
             try:

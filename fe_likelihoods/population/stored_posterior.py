@@ -268,7 +268,7 @@ class NormalLikelihood(NamedTuple):
 
 def normal_likelihood(stored: StoredPosterior, names: Sequence[str]) -> NormalLikelihood:
     """The posterior of positive parameters over their prior; ValueError as `on_scale`, and for too few samples."""
-    prior, points = on_scale(stored, names, Scales(np.ones(len(names), dtype=bool)))
+    prior, points = on_scale(stored, names, Scales(np.zeros(len(names))))
     weights, n, d = np.exp(stored.log_weights), stored.effective_sample_size, len(names)
     mean, covariance = weights @ points, np.cov(points.T, aweights=weights, ddof=0)
     if n < (fewest := POINTS_PER_DIMENSION * d) or not (np.diag(covariance) > 0.0).all():

@@ -44,13 +44,13 @@ from ..reports import GuidedRound, GuideTick, Report
 from .guide import Guide, GuideSession, checked_density, checked_draws
 from .population import Density, Population
 
-# Draws in the first round, as a share of the number of walkers: few, since the guide may still be poor; and in each
-# later round. After a reliable round, a round has as many draws as are expected to suffice.
-FIRST_ROUND_SHARE, ROUND_SHARE = 0.3, 0.6
+# Draws in a round, as a share of the number of walkers: few, since the guide may still be poor. After a reliable round,
+# a round has as many draws as are expected to suffice.
+ROUND_SHARE = 0.3
 # Smallest number of draws in a round. The Pareto shape cannot be estimated from fewer than 25.
 FEWEST_DRAWS = 25
 # Largest number of rounds, and the number after which enough effective draws suffice: the response is rough then.
-MOST_ROUNDS, PATIENT_ROUNDS = 20, 8
+MOST_ROUNDS, PATIENT_ROUNDS = 40, 16
 
 
 def lend(guide: Guide, random: np.random.RandomState, remember: Callable, budget: Record) -> GuideSession:
@@ -198,12 +198,9 @@ def _outcome(rounds: Sequence[Round], pooled: PooledRounds, size: int) -> tuple[
 
 def _next_size(rounds: Sequence[Round], size: int) -> int:
     """Number of draws in the next round."""
-    first = max(FEWEST_DRAWS, int(np.ceil(FIRST_ROUND_SHARE * size)))
-    if not rounds:
-        return first
-    if all_impossible(rounds):  # perhaps all simulations fail: find out with few more
-        return FEWEST_DRAWS
-    if is_reliable(rounds):
-        missing = size - pool_rounds(rounds).effective_sample_size
-        return int(np.clip(np.ceil(missing / rounds[-1].effective_share), first, max(size, first)))
-    return max(FEWEST_DRAWS, int(np.ceil(ROUND_SHARE * size)))
+    few = max(FEWEST_DRAWS, int(np.ceil(ROUND_SHARE * size)))
+    if not rounds or not is_reliable(rounds):
+        # of a guide whose draws are all impossible, perhaps all simulations fail: find out with few more
+        return FEWEST_DRAWS if rounds and all_impossible(rounds) else few
+    missing = size - pool_rounds(rounds).effective_sample_size
+    return int(np.clip(np.ceil(missing / rounds[-1].effective_share), few, max(size, few)))

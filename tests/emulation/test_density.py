@@ -27,10 +27,10 @@ class Target:
     def log_prior(self, coords):
         return -0.5 * np.square(coords).sum(axis=1) - np.log(2.0 * np.pi)
 
-    def scaled(self, coords):
+    def scaled(self, coords, scales):
         return coords
 
-    def unscaled(self, scaled):
+    def unscaled(self, scaled, scales):
         return scaled, np.zeros(len(scaled))
 
 
@@ -42,7 +42,7 @@ def emulated(arc, runs):
         return np.where(np.abs(angle) < arc, -0.5 * np.square((radius - RADIUS) / THICKNESS), -np.inf)
 
     emulator = SimpleNamespace(
-        log_likelihood=log_likelihood, squared_distance=lambda coords: np.square(coords).sum(axis=1)
+        log_likelihood=log_likelihood, squared_distance=lambda coords: np.square(coords).sum(axis=1), scales=None
     )
     region = Region(np.array([RADIUS, 0.0]), np.diag([THICKNESS**2, 1.0]), emulator, 0.0)
     return EmulatedPosterior(Target(runs), [region], np.random.RandomState(1))
