@@ -6,13 +6,14 @@ of squared differences, ...) are quadratic in the residuals, so those of a combi
 
     B(r_i, r_j) = (S(r_i + r_j) - S(r_i - r_j)) / 4,
 
-which are computed once for every pair. No statistic needs to be known in more detail than as a function. With hundreds
-of channels all histories have gigabytes, so they are in a temporary file.
+which are computed once for every pair, when the two are first in one combination: derivatives at different points
+never are. No statistic needs to be known in more detail than as a function. With hundreds of channels all histories
+have gigabytes, so they are in a temporary file.
 """
 
 import tempfile
 import weakref
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -32,7 +33,8 @@ class Archive:
     def __init__(self, statistic: Callable[[np.ndarray], np.ndarray], shape: tuple[int, int]) -> None:
         self._statistic, self._shape = statistic, shape
         self.numbers, self.coords, self.statistics = np.empty(0, int), np.empty((0, 0)), np.empty((0, 0))
-        self._forms: list[np.ndarray] = []  # (i + 1, n_numbers) of history i with those up to itself
+        self._ends = [0]  # of the histories that were added, and are multiplied, together
+        self._forms: dict[tuple[int, int], np.ndarray] = {}  # (k, l, n_numbers) of two such batches
         self._file = tempfile.TemporaryFile(buffering=0)
         weakref.finalize(self, self._file.close)
 
@@ -40,7 +42,7 @@ class Archive:
         return Archive, (self._statistic, self._shape)  # without its runs, which fitted emulators do not need
 
     def __len__(self) -> int:
-        return len(self._forms)
+        return self._ends[-1]
 
     def add(self, coords: np.ndarray, residuals: np.ndarray, statistics: np.ndarray) -> np.ndarray:
         """Add runs at coordinates (m, n_structural); returns their numbers (m,)."""
@@ -54,20 +56,19 @@ class Archive:
         """Add histories (m, n_channels, n_steps), rounded to single precision; returns their numbers (m,)."""
         # computed in double precision and then rounded, a residual keeps its digits where a channel has an offset of a
         # million times its noise; a rounded response would not
-        first, end = len(self), len(self) + len(histories)
         self._file.seek(0, 2)
         np.asarray(histories, np.float32).tofile(self._file)
-        for rows in self._blocks(first, end):
-            own = self.read(rows)
-            parts = [bilinear_form(self._statistic, own, self.read(each)) for each in self._blocks(0, rows.stop)]
-            products = np.concatenate(parts, axis=1)
-            self._forms += [row[: number + 1].copy() for number, row in zip(rows, products, strict=True)]
+        first, end = len(self), len(self) + len(histories)
+        size = max(1, _VALUES // (self._shape[0] * self._shape[1]))
+        self._ends += [min(each, end) for each in range(first + size, end + size, size)]
         return np.arange(first, end)
 
-    def _blocks(self, first: int, end: int) -> Iterator[range]:
-        """Numbers of histories that are in memory together."""
-        size = max(1, _VALUES // (self._shape[0] * self._shape[1]))
-        return (range(begin, min(begin + size, end)) for begin in range(first, end, size))
+    def _form(self, *batches: int) -> np.ndarray:
+        """The bilinear form (k, l, n_numbers) of all histories of two batches."""
+        if batches not in self._forms:
+            histories = (self.read(range(*self._ends[batch : batch + 2])) for batch in batches)
+            self._forms[batches] = bilinear_form(self._statistic, *histories)
+        return self._forms[batches]
 
     def read(self, rows: range) -> np.ndarray:
         """Histories (n, n_channels, n_steps) by their numbers: of runs, measured minus simulated responses [SI]."""
@@ -87,11 +88,10 @@ class Archive:
 
     def forms(self, combinations: np.ndarray) -> np.ndarray:
         """Bilinear form (k, k, n_numbers) of the statistic for combinations (k, n)."""
-        used = np.flatnonzero(combinations.any(axis=0))
-        both, below = combinations[:, used], []
-        for place, number in enumerate(used):
-            row = self._forms[number][used[: place + 1]]
-            row[-1] *= 0.5
-            below.append(both[:, : place + 1] @ row)
-        lower = np.einsum("ki,ilc->klc", both, np.array(below), optimize=True)
+        used = np.unique(np.searchsorted(self._ends, np.flatnonzero(combinations.any(axis=0)), side="right") - 1)
+        parts = {batch: combinations[:, slice(*self._ends[batch : batch + 2])] for batch in used}
+        lower = 0.0
+        for k, weights in parts.items():
+            below = (np.tensordot(parts[m] / (1 + (m == k)), self._form(k, m), (1, 1)) for m in used if m <= k)
+            lower = lower + np.tensordot(weights, sum(below), (1, 1))
         return lower + lower.transpose(1, 0, 2)

@@ -27,7 +27,7 @@ _SETTLED = 0.3  # share of effective draws in a round after which none follows
 _POOL, _NUMBERS = 20_000, 300_000  # points of the pool, and numbers that they have at most, whatever the dimension
 _ENOUGH_PER_DIMENSION = 6.0  # effective points per dimension for a covariance
 _CURVED = 0.15  # share of effective points in the pool below which several components per region are fitted
-_COMPONENTS, _FITTED = 12, 4000  # of them, and points of the pool that they are fitted to
+_FITTED = 4000  # points of the pool that they are fitted to
 _RIDGE = 1e-9  # added to variances, relative, since rounding may make one negative
 _PLAUSIBLE = 8.0  # log-density below the best, besides 1 per dimension, of runs that the pool must reach
 
@@ -97,7 +97,7 @@ class EmulatedPosterior:
                 break
             rows = np.argsort(-log_weights)[:_FITTED]
             weights = tempered(log_weights[rows], 1.5 * _ENOUGH_PER_DIMENSION * target.ndim)
-            fitted = fit_mixture(points[rows], normalised_weights(weights), _COMPONENTS)
+            fitted = fit_mixture(points[rows], normalised_weights(weights))
             both = [(fitted, 0.7), *((each, 0.3 * share) for each, share in parts)]
             proposed = self._propose(both, size, random)
             if effective_sample_size(proposed[2]) <= effective:

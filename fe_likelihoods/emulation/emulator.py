@@ -46,22 +46,19 @@ class ResponseEmulator:
         histories[:, archive.numbers[rows]] = np.concatenate([np.full((1, n), 1.0 / n), vectors[:, :k].T @ centred])
         histories[1:] /= lengths[:, None]
         importance = np.minimum(1.0, values[:k] / values[0] * 1e3)
-        # axes from the directions that the data tell best to those left to the prior: of the first, which the posterior
-        # hardly varies in, the response is linear, and length scales find it
+        # axes from those that the data tell best, along which the response is linear, to those left to the prior
         values, axes = np.linalg.eigh(covariance)
         axes /= np.sqrt(np.maximum(values, np.finfo(float).eps * values[-1]))
-        least, spread = np.inf, np.diag(np.sqrt(np.diag(covariance)))
+        fits, spread = [], np.diag(np.sqrt(np.diag(covariance)))
         for scales in target.scales:  # the ones that predict left-out runs better
             scaled = partial(target.scaled, scales=scales)
             # on a bound of the prior, parameters hardly depend on their coordinates, where any scale will do
-            apart = scaled(np.ones((1, d))) - scaled(-np.ones((1, d)))
             steps = np.diag(scaled(centre + spread) - scaled(centre - spread)) / (2.0 * np.diag(spread))
-            stretch = np.maximum(steps, 1e-6 * apart[0])
+            stretch = np.maximum(steps, 1e-6 * (scaled(np.ones((1, d))) - scaled(-np.ones((1, d))))[0])
             inputs = partial(_whitened, scaled, scaled(centre[None])[0], axes / stretch[:, None])
             process = fit_process(inputs(archive.coords[rows]), coefficients, importance)
-            error = float(np.square(process.left_out).sum())
-            if error < least:
-                least, self.scales, self._inputs, self._process = error, scales, inputs, process
+            fits.append((float(np.square(process.left_out).sum()), scales, inputs, process))
+        _, self.scales, self._inputs, self._process = min(fits, key=lambda fit: fit[0])
         self._forms = archive.forms(histories)
 
     def squared_distance(self, coords: np.ndarray) -> np.ndarray:

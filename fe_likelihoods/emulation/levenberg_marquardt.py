@@ -338,4 +338,4 @@ def axes_of(end: Ascent, free: float = 1.0) -> np.ndarray:
 
 def _differences(runs: np.ndarray, run: int, n: int) -> np.ndarray:
     """Differences of the residuals of runs (m,) from a run, as weights (m, n) of the first n histories."""
-    return np.eye(n)[runs] - np.eye(n)[run]
+    return 1.0 * (np.arange(n) == runs[:, None]) - (np.arange(n) == run)

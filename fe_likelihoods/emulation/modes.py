@@ -129,8 +129,7 @@ class Search:
     """
 
     def __init__(self, target: ResponseTarget, starts: np.ndarray, session: Any, tolerance: float = TOLERANCE) -> None:
-        self._target, self._starts, self._session, self.spent = target, starts, session, 0.0
-        self._tolerance = tolerance
+        self._target, self._starts, self._session, self._tolerance, self.spent = target, starts, session, tolerance, 0.0
         parts = [*target.first_parts(_SHARES), target]
         self._parts = [_Part(part, part.n_steps / target.n_steps, {}, []) for part in parts]
         self.standing_for: list[int] = []  # start that has taken the place of each that has begun; -1 for none

@@ -76,7 +76,8 @@ class ResponseTarget:
         at = np.array([[-_AT_BOUND], [-2.0], [2.0]]) * np.ones(self.n_structural)
         least, low, high = self.structural_parameters(at)
         factors = (least >= 0.0) & (low > 0.0) & (high < _LARGEST_FACTOR * low)
-        # of inputs of emulators: logarithms where priors are lognormal, and of factors themselves, logarithms, reciprocals
+        # of inputs of emulators: logarithms where priors are lognormal; of factors themselves, logarithms (products, as
+        # E I, are linear), or reciprocals (as deflections of springs in series are)
         linear = 1 - np.array(self._structural.logarithmic)
         self._logarithms = Scales(linear * ~factors)
         powers = np.array([linear, self._logarithms.power, self._logarithms.power - factors])
@@ -117,10 +118,7 @@ class ResponseTarget:
         return coords, np.where(inside, log_prior - self.log_prior(np.where(inside[:, None], coords, 0.0)), -np.inf)
 
     def scaled(self, coords: np.ndarray, scales: Scales) -> np.ndarray:
-        """Structural parameters on scales, and noise coordinates, at coordinates (n, >= d). Products, as E I, are linear
-        in logarithms, deflections of springs in series in reciprocals, and responses are smooth functions of all these,
-        unlike of coordinates near a bound.
-        """
+        """Structural parameters on scales, and noise coordinates, at coordinates (n, >= d), not smooth near a bound."""
         parameters = self.structural_parameters(coords[:, : self.n_structural])
         positive = np.where(scales.power < 1, np.maximum(parameters, _SMALLEST), parameters)
         return np.column_stack([scales.to_scale(positive), coords[:, self.n_structural :]])
@@ -137,7 +135,9 @@ class ResponseTarget:
     def line(self, first: np.ndarray, last: np.ndarray, shares: np.ndarray) -> np.ndarray:
         """Coordinates (n, n_structural) at shares (n,) of the way between two points, straight in logarithms."""
         ends = self.scaled(np.column_stack([[first, last], np.zeros((2, self.n_noise))]), self._logarithms)
-        return self.unscaled(ends[0] + shares[:, None] * (ends[1] - ends[0]), self._logarithms)[0][:, : self.n_structural]
+        return self.unscaled(ends[0] + shares[:, None] * (ends[1] - ends[0]), self._logarithms)[0][
+            :, : self.n_structural
+        ]
 
     def log_prior(self, coords: np.ndarray) -> np.ndarray:
         """Standard normal log-density (n,) of coordinates (n, k)."""

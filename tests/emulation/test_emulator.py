@@ -60,13 +60,16 @@ def test_near_a_bound_the_emulator_follows_the_response(prior):
 
 @pytest.mark.parametrize("damping", [LogNormal(0.8, 0.3), TruncatedNormal(1.0, 0.3, -np.inf), Uniform(0.2, 4.0)])
 def test_scaled_parameters_are_those_of_the_coordinates(damping):
-    """Also below zero; densities over both differ by the volume."""
+    """Also below zero; densities over both differ by the volume, and reciprocals have no parameter from zero on."""
     target = ResponseTarget(vibration(damping=damping))
     coords = np.outer(np.linspace(-2.0, 3.0, 9), [1.0, 1.0])
-    scaled = target.scaled(coords)
-    again, volume = target.unscaled(scaled)
-    np.testing.assert_allclose(again, coords, atol=1e-6)
-    assert (np.diff(scaled, axis=0) > 0.0).all()
-    step = 1e-4
-    slopes = (target.scaled(coords + step) - target.scaled(coords - step)) / (2.0 * step)
-    np.testing.assert_allclose(volume, -np.log(slopes).sum(axis=1), atol=1e-5)
+    for scales in target.scales:
+        scaled = target.scaled(coords, scales)
+        again, volume = target.unscaled(scaled, scales)
+        np.testing.assert_allclose(again, coords, atol=1e-6)
+        assert (np.diff(scaled, axis=0) > 0.0).all()
+        step = 1e-4
+        slopes = (target.scaled(coords + step, scales) - target.scaled(coords - step, scales)) / (2.0 * step)
+        np.testing.assert_allclose(volume, -np.log(slopes).sum(axis=1), atol=1e-5)
+        outside = target.unscaled(np.where(scales.power < 0, 0.5, scaled), scales)[1]
+        assert (outside[:, None] == -np.inf).all() or (scales.power >= 0).all()
