@@ -41,7 +41,7 @@ PROPOSAL, TRIAL, ACCURATE, AGAIN = (30, 1e-3), (4, 1e-3), (100, 1e-6), (20, 1e-6
 RIDGE = 1e-10
 # Points with less than this share of the mean weight are left out of the fit.
 NEGLIGIBLE = 1e-3
-MOST_COMPONENTS = 6  # with 8, 60 runs of recycling on several modes and bent ridges are equal to the last bit
+MOST_COMPONENTS = 6  # with 8, 60 runs of recycling on several modes and bent ridges need as many evaluations
 # Numbers per shear that the criterion counts: mean, sd, linear and quadratic coefficient.
 PARAMETERS_PER_SHEAR = 4
 # Effective points per dimension that determine a covariance; with fewer, correlations are shrunk towards zero. Means of
