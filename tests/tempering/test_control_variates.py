@@ -231,7 +231,7 @@ class UncoveringGuide(FixedGuide):
         self.__init__(self.posterior, self.modes, min(len(self.parts) + 1, self.modes))
 
 
-@pytest.mark.parametrize(("modes", "refused"), [(10, False), (30, True)])
+@pytest.mark.parametrize(("modes", "refused"), [(10, False), (60, True)])
 def test_a_density_that_still_grows_is_followed_or_refused(modes, refused):
     ends = [-4.0, -4.0], [modes + 4.0, 4.0]
     whole = UncoveringGuide(Box(*ends, lambda x: 0.0), modes, modes).known_density
