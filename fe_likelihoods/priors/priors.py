@@ -81,10 +81,12 @@ class Prior:
         self._joint = [
             ([names.index(name) for name in key], d) for key, d in self.distributions.items() if isinstance(key, tuple)
         ]
-        # equal distributions are mapped together: 50 stiffnesses one by one took ten times as long
-        known = [d for _, d in self._single]
-        alike = [d for k, d in enumerate(known) if d not in known[:k]]
-        self._maps = [([column for column, d in self._single if d == each], each) for each in alike] + self._joint
+        # equal distributions are mapped together: 50 stiffnesses one by one took ten times as long. A user's class may
+        # compare arrays, or not all that it has: its objects are equal to themselves only
+        alike: dict = {}
+        for column, d in self._single:
+            alike.setdefault(d if type(d).__module__ == Distribution.__module__ else id(d), (d, []))[1].append(column)
+        self._maps = [(columns, d) for d, columns in alike.values()] + self._joint
         self.bounds = np.empty((self.dim, 2))
         for column, distribution in [*self._single, *self._joint]:
             self.bounds[column] = distribution.bounds

@@ -3,6 +3,7 @@
 import math
 import pickle
 import warnings
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -265,6 +266,30 @@ def test_equal_distributions_are_mapped_together_with_the_same_bits(seed):
     np.testing.assert_array_equal(x.T, [one.from_normal(scores) for one, scores in zip(alone, z.T, strict=True)])
     np.testing.assert_array_equal(prior.to_normal(x).T, [one.to_normal(v) for one, v in zip(alone, x.T, strict=True)])
     np.testing.assert_array_equal(prior.from_normal(z[7]), x[7])
+
+
+@dataclass(frozen=True)
+class Histogram(Triangular):
+    edges: np.ndarray
+
+    def _quantile(self, u):
+        return np.interp(u, [0.0, 0.5, 1.0], self.edges)
+
+
+class Doubled(LogNormal):
+    factor = 1.0
+
+    def _from_normal(self, z):
+        return self.factor * super()._from_normal(z)
+
+
+def test_distributions_of_a_users_class_are_mapped_by_their_own_maps():
+    """Also where they compare arrays, or compare equal without being equal."""
+    doubled = Doubled(1.0, 0.2)
+    object.__setattr__(doubled, "factor", 2.0)
+    each = [Histogram(np.array([0.0, 0.1, 1.0])), Histogram(np.array([0.0, 0.9, 1.0])), Doubled(1.0, 0.2), doubled]
+    x = Prior(dict(zip("abcd", each, strict=True))).from_normal(np.zeros(4))
+    np.testing.assert_allclose(x, [0.1, 0.9, each[2].from_normal(0.0), 2.0 * each[2].from_normal(0.0)])
 
 
 def test_reorder_keeps_the_density(prior, seed):
