@@ -110,7 +110,8 @@ def fit_process(
         # with P the inverse of the covariance after the linear part is projected out, the errors are (P y)_i / P_ii
         inverse = np.square(solve_triangular(factor[0], np.eye(m), lower=True)).sum(axis=0)
         inverse -= (solved * cho_solve(gram, solved.T).T).sum(axis=1)
-        left_out[:, members] = weights[:, members] / np.maximum(inverse, _TINY)[:, None]
+        # where a run alone tells a slope of the linear part, both are rounding errors
+        left_out[:, members] = weights[:, members] / np.maximum(inverse, np.finfo(float).eps)[:, None]
     return GaussianProcess(inputs, log_scales, linear, weights, left_out)
 
 

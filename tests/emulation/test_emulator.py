@@ -58,6 +58,21 @@ def test_near_a_bound_the_emulator_follows_the_response(prior):
     assert np.abs(emulated - true).max() < 0.3
 
 
+@pytest.mark.parametrize("coordinate", [-5.0, -8.2])
+def test_a_run_at_a_bound_at_zero_hardly_changes_an_emulator(coordinate):
+    """Its reciprocal is 1e14 and alone tells a slope; a warning of numpy would be an error here."""
+    target = ResponseTarget(vibration(truth=np.array([1.2, 0.03])))
+    assert any((scales.power == -1).all() for scales in target.scales)
+    centre = structural_coordinates(target, np.array([[1.2, 0.05]]))[0]
+    coords = centre + np.random.default_rng(4).standard_normal((40, 2)) * [0.01, 0.3]
+    coords[0, 1] = coordinate
+    statistics = at_once(target.run(coords)).statistics
+    slopes = target.slopes(statistics[0], np.zeros(0))
+    emulator = ResponseEmulator(target, np.arange(40), centre, np.diag(np.square([0.01, 0.3])), slopes)
+    error = emulator.log_likelihood(coords[1:]) - target.log_likelihood(statistics[1:], np.zeros((39, 0)))
+    assert np.abs(error).max() < 0.3
+
+
 @pytest.mark.parametrize("damping", [LogNormal(0.8, 0.3), TruncatedNormal(1.0, 0.3, -np.inf), Uniform(0.2, 4.0)])
 def test_scaled_parameters_are_those_of_the_coordinates(damping):
     """Also below zero; densities over both differ by the volume, and reciprocals have no parameter from zero on."""
