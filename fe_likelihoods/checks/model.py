@@ -241,13 +241,14 @@ def halve_steps(posterior: Posterior, point: np.ndarray, sd: np.ndarray | None =
     least = ROUGH * HALF if before else HALF
     numbers = {posterior.parameter_names[i]: float(shift[i]) for i in np.flatnonzero(shift >= least)}
     shares = dict(zip(posterior.parameter_names, shift * sd / np.maximum(np.abs(point), 1e-300), strict=True))
+    largest = sorted(numbers, key=numbers.__getitem__, reverse=True)
     moves = [
-        f"{name} by {'about ' * before}{by:.2g} posterior standard deviations ({percent(shares[name])})"
-        for name, by in numbers.items()
-    ]
+        f"{name} by {'about ' * before}{numbers[name]:.2g} posterior standard deviations ({percent(shares[name])})"
+        for name in largest[:3]
+    ] + [f"{len(largest) - 3} more by less"] * (len(largest) > 3)
     change = percent(np.sqrt(squares[0] / max(squares[1], 1e-300)))
     text = f"Half of the {' and '.join(halved)} changes the response by {change}, which moves {listed(moves)}."
-    action = f"{'; '.join(halved.values())}. With the shift added to standard deviations, the numbers are usable."
+    action = f"{'; '.join(halved.values())}. Or add the shift to the standard deviations."
     title = "The model is too coarse for its data"
     found = [Finding(title, CARE, text, action, numbers, "fit")] if numbers else []
     return found, "; ".join(dict.fromkeys(tests))

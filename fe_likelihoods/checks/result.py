@@ -361,7 +361,7 @@ def _check_other_events(run: FinishedRun, n: int) -> list[Finding]:
         if spread and values.std() > 0.0:
             # both events differ from the structure's median, each by the spread
             factors[parameter.label] = float(np.hypot(1.0, np.sqrt(2.0) * spread * abs(values.mean()) / values.std()))
-            differing.append(f"{parameter.label} by about {percent(spread)} (factor {factors[parameter.label]:.2g})")
+            differing.append(f"{parameter.label} by about {percent(spread)} (factor {factors[parameter.label]:.3g})")
     text = f"For another event the standard deviations are too small: parameters differ, {listed(differing)}."
     action = "Predict another event with this spread (in Python, predict_new_event), or calibrate several events."
     return [Finding("Another event differs", NOTE, text, action, factors)] if factors else []
