@@ -97,10 +97,10 @@ class RunResults:
         Copies made by the latest resamplings, the autocorrelation of the chain (`samplers.estimates.genealogy`) and the
         errors of the shares of modes (`samplers.judgement.clusters`) are accounted for. For few `founders`, the errors
         are multiplied by a quantile of Student's t, so that two errors contain the true mean with 95 % probability.
-        Where walkers and weighted draws of several parts of the posterior (`log_evidence_check`) differ by more than
-        both errors, the walkers have the error that is missing. If `founders` are not known, each walker counts as
-        independent. Dependence between walkers, as by emcee's stretch move, a lost mode, and moves that did not move
-        are not accounted for: after a `SamplingWarning` the errors are too small.
+        Where walkers and reliable weighted draws of several parts of the posterior (`log_evidence_check`) differ by
+        more than both errors, the walkers have the error that is missing. If `founders` are not known, each walker
+        counts as independent. Dependence between walkers, as by emcee's stretch move, a lost mode, and moves that did
+        not move are not accounted for: after a `SamplingWarning` the errors are too small.
 
         Examples
         --------
@@ -109,7 +109,7 @@ class RunResults:
         """
         chain, check = self._chain_of(discard, thin), self._result.check
         error = self._error_of_mean(chain, chain)
-        if check is None or check.mean is None:
+        if check is None or check.mean is None or not check.reliable:
             return error
         apart = np.square(chain.mean(axis=(0, 1)) - check.mean) - np.square(check.mean_error)
         return np.sqrt(np.maximum(np.square(error), apart))

@@ -124,3 +124,6 @@ def test_walkers_that_weighted_draws_refute_have_the_error_that_is_missing():
         check = sampler.log_evidence_check._replace(mean=(mean + apart).tolist(), mean_error=[0.6] * 3)
         sampler._result = sampler._result._replace(check=check)
         assert np.allclose(sampler.mean_error(), expected)
+    few = check._replace(effective_sample_size=1.5, mean_error=[0.0] * 3)  # whose own error tells nothing
+    sampler._result = sampler._result._replace(check=few)
+    assert np.allclose(sampler.mean_error(), error)
