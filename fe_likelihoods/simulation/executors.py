@@ -79,7 +79,8 @@ class Submitting:
                 found, error = _results(left, [arrived.get() for _ in range(max(1, arrived.qsize()))])
                 yield found
         except (Exception, KeyboardInterrupt, SystemExit) as raised:
-            error = raised
+            closed = self.submits and isinstance(raised, RuntimeError) and not is_transient(raised)  # of `submit`
+            error = ClosedPool() if closed else raised
         finally:
             self.give_up(list(left))
         if error is not None:

@@ -250,6 +250,9 @@ def test_a_run_whose_pool_is_closed_says_what_to_do(name, function, tmp_path):
         as_executor(pool).map(function, [LONG] * 5)
     (tmp_path / "go").touch()
     closing.join()
+    if name == "threads":  # a `LocalPool` starts new processes
+        with pytest.raises(ClosedPool, match="run again with an open pool"):
+            as_executor(pool).map(function, [LONG] * 5)
 
 
 def test_cancelled_items_are_not_run(function, tmp_path, shared_pool):
