@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from samplers.estimates.importance import KnownDensity
 from samplers.evaluation.values import most_common_reasons
 from samplers.finding import Finding
 from samplers.judgement.guides import (
@@ -141,11 +140,6 @@ class ResponseGuide(Guide):
             f"any mode to which more than {100.0 * missed:.0f} % of such starts lead"
         )
 
-    @property
-    def known_density(self) -> KnownDensity | None:
-        """The emulated posterior, whose expectations cost no simulation; None before there is an emulator."""
-        return None if self._emulated is None else self._emulated.known_density
-
     # ------------------------------------------------------------------ what a sampler calls
 
     def prepare(self, session: Any) -> Steps:
@@ -205,7 +199,7 @@ class ResponseGuide(Guide):
         try:
             regions = [self._fit_region(k) for k in range(len(self._regions))]
             self._emulated = EmulatedPosterior(self._target, regions, random)
-            self._regions = self._emulated.regions
+            self._regions, self.known_density = self._emulated.regions, self._emulated.known_density
         except np.linalg.LinAlgError as error:
             logger.info("no emulators could be fitted, or no draws of them made: %s", error)
         self._wide = around(self._regions, _WIDENED, _FREEDOM)

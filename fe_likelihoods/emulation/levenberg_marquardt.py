@@ -104,12 +104,14 @@ class Climb:
             return -1
         self._here = found[0]
         joined = self._explained()
-        if joined is None and not (self.target.data.differentiable and (steps is None or not self.whole)):
-            if steps is not None or not self.derivatives:
-                yield from self._difference(FIRST_DIFFERENCE * np.eye(len(start)) if steps is None else steps)
+        if joined is None:
+            if steps is not None and self.whole:
+                yield from self._difference(steps)
+            elif steps is not None or not self.derivatives:
+                yield from self._derive(FIRST_DIFFERENCE * np.eye(len(start)))
             elif len(start) <= _OWN:
                 axes = np.linalg.qr(np.random.default_rng(self.number).standard_normal(2 * start.shape))[0]
-                yield from self._difference(FIRST_DIFFERENCE * axes[:_DIRECTIONS])
+                yield from self._derive(FIRST_DIFFERENCE * axes[:_DIRECTIONS])
         if joined is None:
             first = max(tolerance, _DESIGN_FROM * len(start)) if steps is None else tolerance
             joined = yield from self._climb(True, first)
@@ -152,6 +154,17 @@ class Climb:
             slopes = self.target.archive.weights(self._nearest()[1])
         changes = _differences(ends, self._here.run, slopes.shape[1]) - steps @ slopes
         self.derivatives.append((self._here.coords, slopes + np.linalg.pinv(steps) @ changes))
+
+    def _derive(self, steps: np.ndarray) -> Requests:
+        """Derivatives at the present point: the model's own, or by differences with steps (n, d)."""
+        if self.target.data.differentiable:
+            slopes = self.target.archive.weights((yield self._here.coords))
+            if self.target.unchecked:  # the first derivatives are compared with a difference
+                self.target.unchecked.clear()
+                yield from self._check(slopes)
+            self.derivatives.append((self._here.coords, slopes))
+        else:
+            yield from self._difference(steps)
 
     def _nearest(self) -> tuple[np.ndarray, np.ndarray]:
         """The nearest coordinates (d,) at which derivatives are known, and these."""
@@ -229,12 +242,6 @@ class Climb:
         """Steps to the top; returns the number of the ascent that this joins, -1 if given up, None at a top."""
         damping, failures, gain = _FIRST_DAMPING, 0, np.inf
         for iteration in range(_MAX_ITERATIONS):
-            if self.target.data.differentiable and not self._known_here():
-                slopes = self.target.archive.weights((yield self._here.coords))
-                if self.target.unchecked:  # the first derivatives are compared with a difference
-                    self.target.unchecked.clear()
-                    yield from self._check(slopes)
-                self.derivatives.append((self._here.coords, slopes))
             at = self._quadratic()
             if merging and (joined := self._explained()) is not None:
                 return joined
@@ -255,23 +262,21 @@ class Climb:
             if gain > _STALLED:
                 failures = 0
                 damping *= 0.1 if gain > 0.5 * promised else 1.0
-                if gain < _MISLED * promised and not self.target.data.differentiable and not self.whole:
+                asks = self.target.data.differentiable and len(self.known) == 1  # which costs as much as a step
+                if asks or gain < _MISLED * promised and not self.whole:
                     yield from self._own_differences(at, 1.0)
                 continue
             failures += 1
             damping = max(30.0 * damping, _FIRST_DAMPING)
             # the first time, the run that gained nothing has corrected the secants
-            if failures > 1 and not self._known_here():
+            if failures > 1 and not any(np.array_equal(self._here.coords, point) for point, _ in self.derivatives):
                 yield from self._own_differences(at, failures)
         return None
-
-    def _known_here(self) -> bool:
-        return any(np.array_equal(self._here.coords, point) for point, _ in self.derivatives)
 
     def _own_differences(self, at: Ascent, factor: float) -> Requests:
         """Derivatives by differences with steps of a share of the standard deviations, times a factor."""
         spread = factor * _DIFFERENCE_SHARE * np.sqrt(np.diag(np.linalg.inv(at.hessian)))
-        yield from self._difference(np.diag(np.clip(spread, *_DIFFERENCE_LIMITS)))
+        yield from self._derive(np.diag(np.clip(spread, *_DIFFERENCE_LIMITS)))
 
     def _explained(self) -> int | None:
         """Number of another ascent whose derivatives, at a higher point, predict the residuals here; None if none.
@@ -318,7 +323,8 @@ class Climb:
         points = end.coords + axes_of(end)
         runs = yield points
         found = self._heights(points, runs, end.noise.coords)
-        yield from self._difference(points - end.coords, runs)
+        if not self.target.data.differentiable:
+            yield from self._difference(points - end.coords, runs)
         # at a saddle, such as the axis of symmetry of an even response, a point of the design is higher
         higher = max(found, key=lambda each: each.value, default=end)
         if higher.value > end.value + tolerance:
