@@ -145,7 +145,7 @@ def test_reasons_of_any_kind(path):
     thetas = np.arange(8.0).reshape(4, 2)
     store(cache, "f", thetas, np.full((4, 2), np.nan), reasons)
     *found, last = look_up(SimulationCache(path), "f", thetas, 2)
-    assert found == ["x" * 2000, "nul \0 byte", "lone surrogate \\udc80"] and np.isnan(last).all()
+    assert found == ["x" * 2000 + " ...", "nul \0 byte", "lone surrogate \\udc80"] and np.isnan(last).all()
 
 
 def test_forget_deletes_the_simulations_of_one_model(path, thetas):
