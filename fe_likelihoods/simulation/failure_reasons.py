@@ -11,6 +11,8 @@ import re
 import subprocess
 from concurrent.futures import BrokenExecutor
 
+from samplers.evaluation.pools import CLOSED
+
 __all__ = [
     "ChangedModel",
     "ClosedPool",
@@ -67,11 +69,8 @@ class ClosedPool(RuntimeError):
 
     ends_run = True
 
-    def __init__(self) -> None:
-        super().__init__(
-            "the pool was closed, or has cancelled simulations, while they were running: run again with an open pool, "
-            "and close it after the run. Simulations that have ended are kept"
-        )
+    def __init__(self, text: str = CLOSED) -> None:
+        super().__init__(text)
 
 
 class TransientReason(str):

@@ -246,8 +246,9 @@ def test_a_run_whose_pool_is_closed_says_what_to_do(name, function, tmp_path):
         target=lambda: (wait_until(lambda: (tmp_path / f"started {LONG[0]!r}").exists()), close())
     )
     closing.start()
-    with pytest.raises(ClosedPool, match="the pool was closed.*run again with an open pool"):
+    with pytest.raises(ClosedPool, match="the pool was closed.*run again with an open pool") as raised:
         as_executor(pool).map(function, [LONG] * 5)
+    assert str(pickle.loads(pickle.dumps(raised.value))) == str(raised.value)
     (tmp_path / "go").touch()
     closing.join()
     if name == "threads":  # a `LocalPool` starts new processes
