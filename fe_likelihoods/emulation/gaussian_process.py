@@ -107,10 +107,9 @@ def fit_process(
         gram = cho_factor(basis.T @ solved)
         linear[:, members] = cho_solve(gram, solved.T @ outputs[:, members])
         weights[:, members] = cho_solve(factor, outputs[:, members] - basis @ linear[:, members])
-        # with P the inverse of the covariance after the linear part is projected out, the errors are (P y)_i / P_ii
+        # (P y)_i / P_ii, P the inverse without the linear part; both are rounding errors if a run alone tells a slope
         inverse = np.square(solve_triangular(factor[0], np.eye(m), lower=True)).sum(axis=0)
         inverse -= (solved * cho_solve(gram, solved.T).T).sum(axis=1)
-        # where a run alone tells a slope of the linear part, both are rounding errors
         left_out[:, members] = weights[:, members] / np.maximum(inverse, np.finfo(float).eps)[:, None]
     return GaussianProcess(inputs, log_scales, linear, weights, left_out)
 

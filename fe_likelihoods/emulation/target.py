@@ -73,15 +73,15 @@ class ResponseTarget:
         self.unchecked = [True] if self.data.differentiable else []
         self._structural = self._prior.subset(self._prior.names[: self.n_structural])
         self._noise = self._prior.subset(self._prior.names[self.n_structural :]) if self.n_noise else None
-        at = np.array([[-_AT_BOUND], [-2.0], [2.0]]) * np.ones(self.n_structural)
-        least, low, high = self.structural_parameters(at)
+        at = np.array([[-_AT_BOUND], [-3.0], [-2.0], [2.0], [3.0]]) * np.ones(self.n_structural)
+        least, lower, low, high, higher = self.structural_parameters(at)
         factors = (least >= 0.0) & (low > 0.0) & (high < _LARGEST_FACTOR * low)
         # of inputs of emulators: logarithms where priors are lognormal; of factors themselves, logarithms (products, as
-        # E I, are linear), or reciprocals (as deflections of springs in series are)
+        # E I, are linear), or reciprocals (as deflections of springs in series are), whose tails draws miss near zero
         linear = 1 - np.array(self._structural.logarithmic)
-        self._logarithms = Scales(linear * ~factors)
-        powers = np.array([linear, self._logarithms.power, self._logarithms.power - factors])
-        self.scales = [Scales(each) for each in np.unique(powers, axis=0)]
+        logs = linear * ~factors
+        powers = np.array([linear, logs, logs - factors * (higher < _LARGEST_FACTOR * lower)])
+        self._logarithms, self.scales = Scales(logs), [Scales(each) for each in np.unique(powers, axis=0)]
 
     def first_parts(self, shares: Sequence[float]) -> list["ResponseTarget"]:
         """The same posterior for the first parts of the record, see `FELikelihood.first_parts`."""
