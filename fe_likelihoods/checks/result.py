@@ -84,10 +84,14 @@ class FinishedRun(NamedTuple):
 
     @property
     def centre(self) -> np.ndarray:
-        """The point that stands for the posterior (ndim,): its mean, or the best sample of several modes."""
-        if self.n_modes == 1:
-            return self.samples.mean(axis=0)
-        return self.samples[int(np.argmax(self.sampler.get_log_prob(flat=True, discard=self.discard)))]
+        """The point that stands for the posterior (ndim,): its mean, or the best sample.
+
+        The mean of several modes stands for none, and the mean of a bent ridge may be beside it: less probable than
+        half of the samples.
+        """
+        mean, values = self.samples.mean(axis=0), self.sampler.get_log_prob(flat=True, discard=self.discard)
+        stands = self.n_modes == 1 and self.posterior.log_prob(mean) >= np.median(values)
+        return mean if stands else self.samples[int(np.argmax(values))]
 
 
 def read_run(

@@ -371,7 +371,8 @@ def gather(
     """What the template shows, by name; a run that was not judged is judged, which may simulate."""
     fits, failed, judgement = judge_run(run) if judged is None else judged
     rows = list(parameter_table(run).itertuples())
-    sets, after = data_sets(run), "posterior mean" if run.n_modes == 1 else "sample of highest posterior density"
+    is_mean = not fits or np.array_equal(run.centre, run.samples.mean(axis=0))
+    sets, after = data_sets(run), "posterior mean" if is_mean else "sample of highest posterior density"
     before, after = "before: mean of the prior", f"after: {after}"
     models = " and ".join(dict.fromkeys(each.model for each in sets)) or "a log-density"
     return {

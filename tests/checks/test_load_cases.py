@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from fe_likelihoods import Channel, FELikelihood, LogNormal, Posterior
+from fe_likelihoods import Channel, FELikelihood, LogNormal, Posterior, check_result
 from fe_likelihoods.modal.load_cases import LoadTest
+from samplers import SMCSampler
 from tests.checks.fitted import check_fit
 
 SPAN, TRUCK, EI, N = 24.0, 200e3, 2e9, 48  # m, N, N m2, integration points
@@ -60,3 +61,20 @@ def test_values_far_beyond_their_stated_errors_are_named_after_a_run():
         likelihood = FELikelihood(test.model(deflections, tuple(prior)), test.measurements)
         found = check_fit(Posterior(likelihood, prior | test.known), samples)
         assert [each.kind for each in found] == ["Values differ more than their stated errors"] * named
+
+
+def test_the_fit_of_a_bent_ridge_is_on_the_ridge():
+    """Deflections of springs in series tell a sum of reciprocals; at the means of the stiffnesses it is another one."""
+
+    def top(theta):
+        return np.full((1, 2), (1e-3 / theta).sum())
+
+    test = LoadTest([Channel("top", "displacement", "mm")], ["1", "2"], top(np.ones(6)), errors={"top": 2e-5})
+    prior = {f"stiffness_{i}": LogNormal(1.0, 0.2) for i in range(6)}
+    posterior = Posterior(FELikelihood(test.model(top, tuple(prior)), test.measurements), prior | test.known)
+    sampler = SMCSampler(100, 6, posterior, vectorize=True, seed=1, guide=posterior.guide())
+    sampler.run_mcmc(None, 1)
+    far = top(sampler.get_chain(flat=True).mean(axis=0)) - test.measurements.values
+    assert np.abs(far).min() > 4.0 * 2e-5
+    judgement = check_result(sampler)
+    assert judgement.status == "use", str(judgement.findings)
