@@ -41,7 +41,6 @@ class ResponseEmulator:
         enough = 1 + int(np.argmax(values.sum() - np.cumsum(values) < _NEGLIGIBLE_VARIANCE * n))
         k = max(1, min(enough, _MAX_COMPONENTS, int((values > _SMALLEST_SHARE * values[0]).sum()), n - 1))
         lengths = np.sqrt(values[:k])
-        coefficients = vectors[:, :k] * lengths
         histories = np.zeros((1 + k, len(archive)))  # the mean residual and the components, as weights of runs
         histories[:, archive.numbers[rows]] = np.concatenate([np.full((1, n), 1.0 / n), vectors[:, :k].T @ centred])
         histories[1:] /= lengths[:, None]
@@ -56,7 +55,7 @@ class ResponseEmulator:
             steps = np.diag(scaled(centre + spread) - scaled(centre - spread)) / (2.0 * np.diag(spread))
             stretch = np.maximum(steps, 1e-6 * (scaled(np.ones((1, d))) - scaled(-np.ones((1, d))))[0])
             inputs = partial(_whitened, scaled, scaled(centre[None])[0], axes / stretch[:, None])
-            process = fit_process(inputs(archive.coords[rows]), coefficients, importance)
+            process = fit_process(inputs(archive.coords[rows]), vectors[:, :k] * lengths, importance)
             fits.append((float(np.square(process.left_out).sum()), scales, inputs, process))
         _, self.scales, self._inputs, self._process = min(fits, key=lambda fit: fit[0])
         self._forms = archive.forms(histories)
