@@ -135,9 +135,8 @@ class ResponseTarget:
     def line(self, first: np.ndarray, last: np.ndarray, shares: np.ndarray) -> np.ndarray:
         """Coordinates (n, n_structural) at shares (n,) of the way between two points, straight in logarithms."""
         ends = self.scaled(np.column_stack([[first, last], np.zeros((2, self.n_noise))]), self._logarithms)
-        return self.unscaled(ends[0] + shares[:, None] * (ends[1] - ends[0]), self._logarithms)[0][
-            :, : self.n_structural
-        ]
+        coords, _ = self.unscaled(ends[0] + shares[:, None] * (ends[1] - ends[0]), self._logarithms)
+        return coords[:, : self.n_structural]
 
     def log_prior(self, coords: np.ndarray) -> np.ndarray:
         """Standard normal log-density (n,) of coordinates (n, k)."""

@@ -44,8 +44,9 @@ from ..reports import GuidedRound, GuideTick, Report
 from .guide import Guide, GuideSession, checked_density, checked_draws
 from .population import Density, Population
 
-# Draws in a round, as a share of the number of walkers: few, since the guide may still be poor. After a reliable round,
-# a round has as many draws as are expected to suffice.
+# Draws in a round, as a share of the number of walkers: few, since the guide may still be poor: with 0.6 after the
+# first, four runs on 30 stiffnesses take 1659 simulations instead of 1464. After a reliable round, a round has as many
+# draws as are expected to suffice.
 ROUND_SHARE = 0.3
 # Smallest number of draws in a round. The Pareto shape cannot be estimated from fewer than 25.
 FEWEST_DRAWS = 25
