@@ -29,6 +29,7 @@ from ..proposals.mixture import (
     to_component_space,
 )
 from ..proposals.transforms import find_support_bounds, log_abs_det_jacobian
+from ..resampling import locate
 
 # Probability of the independence kernel, and while its acceptance is above a half, since it decorrelates the ensemble
 # fastest: equal probabilities take a tenth more evaluations. Local walk and differences share the rest.
@@ -37,9 +38,10 @@ INDEPENDENT, IF_ACCEPTED = 0.5, 0.8
 # for normal densities are 2.38 and 0.234 (Roberts et al. 1997).
 BEST_SCALE, TARGET_ACCEPTANCE = 2.38, 0.25
 # Parts of the fitted points, where they are fewer than this per number of the means and covariances of a fit; the
-# points of a part are moved by a fit to the others, and copies, which follow each other, share a part. Without, means
-# of two modes in 11 dimensions are off by 1.3 stated errors with 1.9 points per number (0.93 with parts, 160 runs), by
-# 1.0 from 3.2 on: 3 and 8 would do too. Four modes, 250 walkers of TMCMC: 1.75 without, 1.15 with parts (40 runs).
+# points of a part are moved by a fit to the others and by their differences, and copies, which follow each other, share
+# a part. Means of two modes in 11 dimensions were off by 1.3 stated errors with 1.9 points per number without parts, by
+# 1.0 from 3.2 on: 3 and 8 would do too. With parts of independent draws alone, nine runs with 20 curved parameters had
+# means off by 1.6 errors and log-evidences of the stages .64 too high; with parts of all kernels 1.1 and .16.
 PARTS, FEW_POINTS = 10, 5.0
 # Share of the difference steps with scale 1, which lead from mode to mode (ter Braak 2006). Without differences, the
 # means of 24 runs with two modes in 11 dimensions are off by 1.6 stated errors.
@@ -151,12 +153,11 @@ class MixtureMove(_FittedMove):
 
     def __init__(self):
         super().__init__()
-        self._mixture: Mixture | None = None
         self._bounds: np.ndarray | None = None  # (2, ndim), of the support
-        self._kernels = (self.draw_independence, self.draw_local_walk, self.draw_differences)
+        self._kernels = (self._draw_independence, self._draw_local_walk, self._draw_differences)
         self._log_factors = [0.0, 0.0, 0.0]
         self._part: np.ndarray | None = None  # of each walker, see `follow`
-        self._mixtures: list[Mixture] = []  # fitted without the points of one part each
+        self._mixtures: list[Mixture] = []  # fitted without the points of one part each, and to all points
         self._current: int | None = None  # kernel index in the latest sweep; None right after a calibration
         self._independence_accepted = False
 
@@ -165,31 +166,30 @@ class MixtureMove(_FittedMove):
     ) -> None:
         """Fit the mixture to points (n, ndim) with normalised weights (n,), or take a given `mixture`; the bounds of
         the support are found at the first call. Each tenth of few points is moved by a fit to the others, if `follow`
-        says which walker descends from which: a point that has widened a mixture is replaced too easily.
+        says which walker descends from which: a point that has shaped a proposal is replaced, or kept, too easily.
         """
         self.is_fitted = True
         if inside is not None and self._bounds is None:
             self._bounds = find_support_bounds(inside, coords)
-        self._mixture = fit_mixture(coords, weights, bounds=self._bounds) if mixture is None else mixture
-        self._inside = inside
-        self._archive = to_component_space(self._mixture, coords)
-        self._cumulated = np.cumsum(weights)
+        whole = fit_mixture(coords, weights, bounds=self._bounds) if mixture is None else mixture
+        self._inside, self._weights = inside, weights
+        self._archive = to_component_space(whole, coords)
         self._current, self._independence_accepted = None, False
-        self._part, self._mixtures = None, []
         n, ndim = coords.shape
-        if mixture is None and n < FEW_POINTS * len(self._mixture.weights) * ndim * (ndim + 3.0) / 2.0:
-            self._mixtures = leave_out(self._mixture, coords, weights, np.arange(n) * PARTS // n)
+        self._part, self._parts, self._mixtures = None, np.full(n, -1), [whole]
+        if mixture is None and n < FEW_POINTS * len(whole.weights) * ndim * (ndim + 3.0) / 2.0:
+            self._parts = np.arange(n) * PARTS // n
+            self._mixtures = [*leave_out(whole, coords, weights, self._parts), whole]
 
     def follow(self, ancestors: np.ndarray) -> None:
         """Say from which of the points of the last calibration each walker descends, by indices (nwalkers,)."""
-        self._part = ancestors * PARTS // len(self._archive)
+        self._part = self._parts[ancestors]
 
     def cover_basins(self, coords: np.ndarray, log_target: np.ndarray) -> None:
         """Add components for parts of the target that the mixture does not cover, from points (n, ndim), also of
         earlier stages, and the `log_target` (n,) there, scaled so that its integral is 1.
         """
-        found = find_basins(self._mixture, coords, log_target)
-        self._mixture = with_components(self._mixture, found)
+        found = find_basins(self._mixtures[-1], coords, log_target)
         self._mixtures = [with_components(mixture, found) for mixture in self._mixtures]
 
     def expect_independence(self) -> None:
@@ -211,50 +211,48 @@ class MixtureMove(_FittedMove):
         first = IF_ACCEPTED if self._independence_accepted else INDEPENDENT
         shares = [first, 0.5 - 0.5 * first, 0.5 - 0.5 * first]
         self._current = 0 if self._current is None else random.choice(len(self._kernels), p=shares)
-        return self._kernels[self._current](coords, random)
-
-    def draw_independence(self, coords: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
-        """Independent draws from the mixture for points (n, ndim), and log-ratios (n,) q(x | x') / q(x' | x)."""
-        fits = [(self._mixture, np.arange(len(coords)))]
-        if self._mixtures and self._part is not None and len(self._part) == len(coords):
-            fits = [(mixture, np.flatnonzero(self._part == part)) for part, mixture in enumerate(self._mixtures)]
-        proposed, log_ratios = coords.copy(), np.full(len(coords), -np.inf)
-        for mixture, rows in (fit for fit in fits if len(fit[1])):
-            n, inside = len(rows), self._inside
-            drawn = draw(mixture, n, random) if inside is None else draw_inside(mixture, n, random, inside)[0]
-            rows = rows[: len(drawn)]  # those without a draw inside the support do not move
-            proposed[rows], before = drawn, log_density(mixture, coords[rows])
-            log_ratios[rows] = before - log_density(mixture, drawn)
+        known = self._part is not None and len(self._part) == len(coords)
+        parts = self._part if known else np.full(len(coords), -1)
+        proposed, log_ratios = coords.copy(), np.empty(len(coords))
+        for part in np.unique(parts):
+            rows = parts == part
+            proposed[rows], log_ratios[rows] = self._kernels[self._current](coords[rows], random, part)
         return proposed, log_ratios
 
-    def draw_local_walk(self, coords: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
-        """Propose steps of the local random walk; parameters and results as in `draw_independence`."""
-        n, ndim = coords.shape
-        before = log_responsibilities(self._mixture, coords)
+    def _draw_independence(self, coords, random, part=-1):
+        """Independent draws for points (n, ndim) of a part, and log-ratios (n,) q(x | x') / q(x' | x)."""
+        mixture, n, inside = self._mixtures[part], len(coords), self._inside
+        drawn = draw(mixture, n, random) if inside is None else draw_inside(mixture, n, random, inside)[0]
+        proposed, log_ratios = coords.copy(), np.full(n, -np.inf)  # those without a draw inside do not move
+        proposed[: len(drawn)] = drawn
+        log_ratios[: len(drawn)] = log_density(mixture, coords[: len(drawn)]) - log_density(mixture, drawn)
+        return proposed, log_ratios
+
+    def _draw_local_walk(self, coords, random, part=-1):
+        """Steps of the local random walk, and log-ratios as for independent draws."""
+        mixture, (n, ndim) = self._mixtures[part], coords.shape
+        before = log_responsibilities(mixture, coords)
         cumulated = np.cumsum(np.exp(before), axis=1)
         component = np.sum(cumulated < random.uniform(size=n)[:, None] * cumulated[:, -1:], axis=1)
         scale = BEST_SCALE / math.sqrt(ndim) * math.exp(self._log_factors[1])
-        steps = np.einsum("nij,nj->ni", self._mixture.roots[component], random.standard_normal((n, ndim)))
+        steps = np.einsum("nij,nj->ni", mixture.roots[component], random.standard_normal((n, ndim)))
         proposed, factors = self._step(coords, scale * steps)
         rows = np.arange(n)
-        return proposed, factors + log_responsibilities(self._mixture, proposed)[rows, component] - before[
-            rows, component
-        ]
+        return proposed, factors + log_responsibilities(mixture, proposed)[rows, component] - before[rows, component]
 
     def _step(self, coords, steps):
         """Make steps in the space of the components; also return the log ratio of volumes that the acceptance needs."""
-        proposed = from_component_space(self._mixture, to_component_space(self._mixture, coords) + steps)
-        before, after = (log_abs_det_jacobian(self._mixture.bounds, points) for points in (coords, proposed))
+        space = self._mixtures[-1]
+        proposed = from_component_space(space, to_component_space(space, coords) + steps)
+        before, after = (log_abs_det_jacobian(space.bounds, points) for points in (coords, proposed))
         possible = (before > -np.inf) & (after > -np.inf)
         return proposed, np.where(possible, np.where(possible, before, 0.0) - np.where(possible, after, 0.0), -np.inf)
 
-    def draw_differences(self, coords: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
-        """Propose steps along differences of points; parameters and results as in `draw_independence`."""
+    def _draw_differences(self, coords, random, part=-1):
+        """Steps along differences of points of other parts, which may have no weight, and log-ratios."""
         n, ndim = coords.shape
-        first, second = (
-            np.searchsorted(self._cumulated, random.uniform(size=n) * self._cumulated[-1], side="right")
-            for _ in range(2)
-        )
+        others = self._weights * np.where(self._parts == part, 1e-200, 1.0)
+        first, second = (locate(others, random.uniform(size=n)) for _ in range(2))
         crossed = random.uniform(size=(n, ndim)) < random.choice(CROSSOVERS, size=n)[:, None]
         crossed[np.arange(n), random.randint(ndim, size=n)] = True
         scale = BEST_SCALE / np.sqrt(2.0 * crossed.sum(axis=1)) * math.exp(self._log_factors[2])

@@ -114,14 +114,14 @@ def overlapping(rng, n):
     return rng.standard_normal((n, 2)), lambda x: stats.norm.logpdf(x).sum(axis=1), None, mixture
 
 
-@pytest.mark.parametrize("kernel", ["draw_independence", "draw_local_walk", "draw_differences"])
+@pytest.mark.parametrize("kernel", ["_draw_independence", "_draw_local_walk", "_draw_differences"])
 @pytest.mark.parametrize(("target", "n"), [(curved, 40_000), (corner, 20_000), (overlapping, 40_000)])
 def test_each_kernel_keeps_the_target(kernel, target, n, rng):
     """Exact draws remain exact, even if the proposal was fitted to other points."""
     start, log_target, inside, *mixture = target(rng, n)
     x, move, random = start.copy(), MixtureMove(), np.random.RandomState(rng.integers(2**31))
     move.calibrate(x[:300] * np.array([1.1, 0.9, 1.0])[: x.shape[1]], uniform(300), inside, *mixture)
-    assert bool(move._mixture.bounds) == (inside is not None)
+    assert bool(move._mixtures[-1].bounds) == (inside is not None)
     for _ in range(5):
         proposed, factors = getattr(move, kernel)(x, random)
         accepted = np.log(random.uniform(size=n)) < log_target(proposed) - log_target(x) + factors
