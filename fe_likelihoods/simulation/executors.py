@@ -5,8 +5,7 @@ The rule for ``pool=``: None is this process, a whole number a `LocalPool` of th
 concurrent.futures, loky, mpi4py.futures and dask, pools of multiprocessing and schwimmbad.
 
 The function (model and measurements) is sent by value (`fe_likelihoods.simulation.by_value`): by a `LocalPool` to each
-worker once, and again when anything that it uses has changed; by other pools with each item. Workers load it once.
-Results do not depend on the pool, to the last bit.
+worker once, and again when anything that it uses has changed; by others with each item. Results are equal to the bit.
 
 When a worker dies, the standard library's pools hang or break, and cannot say which item killed it. A `LocalPool` has a
 thread for each worker, which sends it one item at a time through a pipe, again if it dies. Workers are started with
@@ -44,8 +43,7 @@ from .files import PLACE, Group, working_folder
 __all__ = ["Job", "LocalPool", "PoolExecutor", "Sandbox", "Submitting", "Threads", "as_executor", "result_of", "serve"]
 
 _CHECK = 0.5  # [s] between checks that a process lives, while waiting for its answer
-_LIBRARIES = ("OMP", "OPENBLAS", "MKL", "BLIS", "VECLIB_MAXIMUM", "NUMBA")
-_ONE_THREAD = {f"{each}_NUM_THREADS": "1" for each in _LIBRARIES}
+_ONE_THREAD = {f"{each}_NUM_THREADS": "1" for each in ("OMP", "OPENBLAS", "MKL", "BLIS", "VECLIB_MAXIMUM", "NUMBA")}
 _BOOT = (
     "import json, sys; sys.path[:], sys.argv, fileno = json.loads(sys.argv[1]); "
     "from fe_likelihoods.simulation.executors import serve; serve(fileno)"
@@ -148,13 +146,13 @@ class Threads:
     def __init__(self, make: Callable[[], Callable[[Job], Any]]) -> None:
         self._make, self._jobs, self._lock = make, SimpleQueue(), threading.Lock()
         self._threads: list[threading.Thread] = []
-        self.pending: list[Job] = []  # and some that have ended
+        self.pending: weakref.WeakSet[Job] = weakref.WeakSet()  # and some that have ended
         weakref.finalize(self, self._jobs.put, None)
 
     def submit_all(self, jobs: Sequence[Job], most: int) -> None:
         """Run jobs in at most `most` threads; their `cancel` prevents it before."""
         with self._lock:
-            self.pending = [each for each in self.pending if not each.done()] + list(jobs)
+            self.pending.update(jobs)
             while len(self._threads) < min(most, len(self.pending)):
                 thread = threading.Thread(target=_work, args=(self._jobs, self._make()), daemon=True)
                 thread.start()
@@ -306,7 +304,7 @@ class LocalPool(Submitting, AbstractContextManager):
     def close(self) -> None:
         """Give up all items and end the processes; a later item starts new processes."""
         if threads := self._threads.pop(os.getpid(), None):
-            self.give_up(threads.pending)
+            self.give_up(list(threads.pending))
             threads.close()
 
     def submit_all(self, function: Callable[[Any], Any], items: Sequence[Any]) -> list[Future]:

@@ -357,6 +357,8 @@ class Group:
         with _of_this_library():
             options |= {"stdin": subprocess.DEVNULL, "process_group": self.processes[0].pid}
             self.processes.append(subprocess.Popen(command, **options))
+        if not self.end.alive:  # another thread ends the group, and may wait for this process
+            _kill(self.processes)
         return self.processes[-1]
 
     def run(self, command: Sequence[str], watch: Callable[[float], float], **options: Any) -> int:

@@ -23,7 +23,13 @@ def submit_all(pool: Any, function: Callable, items: Sequence[Any]) -> list[Any]
     sent = SentFunction(function)
     if hasattr(pool, "gather"):  # dask sends the function once with all points
         return pool.map(sent, list(items), pure=False)
-    return [pool.submit(sent, item) for item in items]
+    futures: list[Any] = []
+    try:
+        futures.extend(pool.submit(sent, item) for item in items)
+    finally:
+        for future in futures if len(futures) < len(items) else ():  # Ctrl-C: nobody else knows these
+            future.cancel()
+    return futures
 
 
 def workers_of(pool: Any) -> int | None:

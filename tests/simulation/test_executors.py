@@ -16,7 +16,7 @@ import pytest
 
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.signals.records import Record
-from fe_likelihoods.simulation import by_value
+from fe_likelihoods.simulation import by_value, files
 from fe_likelihoods.simulation.executors import LocalPool, as_executor
 from fe_likelihoods.simulation.failure_reasons import ClosedPool
 from fe_likelihoods.simulation.model import sent_simulation, simulate_batch
@@ -254,6 +254,42 @@ def test_a_run_whose_pool_is_closed_says_what_to_do(name, function, tmp_path):
     if name == "threads":  # a `LocalPool` starts new processes
         with pytest.raises(ClosedPool, match="run again with an open pool"):
             as_executor(pool).map(function, [LONG] * 5)
+
+
+def test_a_process_that_starts_while_another_thread_ends_its_group_is_killed(monkeypatch):
+    group, kill, killed, has_started = files.Group(), os.killpg, threading.Event(), threading.Event()
+
+    def killpg(*arguments):
+        kill(*arguments)
+        killed.set()
+        if threading.current_thread() is ending:
+            has_started.wait(60.0)
+
+    monkeypatch.setattr(files.os, "killpg", killpg)
+    ending = threading.Thread(target=group.end, daemon=True)
+    ending.start()
+    assert killed.wait(60.0)
+    process = group.start(["sleep", "600"])
+    has_started.set()
+    ending.join(60.0)
+    assert not ending.is_alive() and process.poll() is not None
+
+
+def test_items_whose_submission_is_interrupted_are_cancelled():
+    class Interrupted:
+        futures = []
+
+        def submit(self, function, item):
+            if item == 2:
+                raise KeyboardInterrupt
+            self.futures.append(Future())
+            return self.futures[-1]
+
+        map = None
+
+    with pytest.raises(KeyboardInterrupt):
+        as_executor(Interrupted()).map(abs, [0, 1, 2, 3])
+    assert len(Interrupted.futures) == 2 and all(each.cancelled() for each in Interrupted.futures)
 
 
 def test_cancelled_items_are_not_run(function, tmp_path, shared_pool):
