@@ -5,6 +5,7 @@ from typing import NamedTuple
 NOTE = "note"  # good to know
 CARE = "care"  # limits the result
 WRONG = "wrong"  # speaks against the result
+FALSE_ALARM = 1e-4  # probability in a run, of tests whose alarm ends the run or refuses its result
 
 
 class Finding(NamedTuple):

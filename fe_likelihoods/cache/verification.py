@@ -37,8 +37,6 @@ logger = logging.getLogger(__name__)
 ROUNDING = 1e-13  # relative error of a sum of squares, since processors add the terms in different orders
 ROWS = 59  # find a change of 5 % of the space with 95 %: 0.95 ** 59 < 0.05
 FIRST_ROWS = 2  # rows verified before the first row is used, if the label is known
-FIRST_COMPARED = 3  # rows in the first batch of a comparison; each further batch has three times as many as were equal
-MAX_ATTEMPTS = 4  # simulations that may fail for other reasons than the model
 SHARE_OF_TIME = 0.01  # for comparisons of the model
 ROWS_PER_VERIFICATION = round(1.0 / SHARE_OF_TIME)  # one in so many used rows is simulated again
 FINGERPRINT = "its fingerprint"
@@ -381,8 +379,8 @@ class VerifiedModel:
         Returns how many agree, the reasons of new simulations that were stopped, and how which row differs.
         """
         rows, compared, stopped = iter(rows), 0, []
-        while compared < n and len(stopped) < max(MAX_ATTEMPTS, compared):
-            chosen = list(islice(rows, min(max(FIRST_COMPARED, 3 * compared), n - compared)))
+        while compared < n and len(stopped) <= FIRST_ROWS + compared:
+            chosen = list(islice(rows, min(3 * compared + 1, n - compared)))
             if not chosen:
                 break
             again = self._simulate_again(np.array([np.frombuffer(row.theta, dtype="<f8") for row in chosen]))

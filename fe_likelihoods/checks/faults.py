@@ -26,7 +26,7 @@ from .finding import HALF, TAIL, WRONG, Finding, percent
 from .screening import runs_of
 
 BETTER = 0.6  # error with a fault taken into account, as a share of the error without: study `fit_gate`
-EXPLAINED = 0.85  # error (RRMSE) above which a response explains nothing: a correlation of a half
+EXPLAINED = math.sqrt(1.0 - HALF**2)  # error (RRMSE) above which a response explains nothing: a correlation of HALF
 FLOOR = 0.02  # error below which smaller ones count as equal
 FACTOR = 1.5  # from which a factor may be one between units; from 1.67 on, 433 of 444 faults of supports for 442
 SAME_UNITS = 1.25  # ratio of a factor to one between units, up to which it is named after them

@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtrc
 
+from samplers.estimates.genealogy import FEWEST_FOR_VARIANCE as FEWEST
+
 from ..likelihood.fits import MOST_DRAWS, Fit, checks_of
 from ..likelihood.likelihood import FELikelihood
 from ..likelihood.posterior import Posterior
@@ -27,7 +29,6 @@ from .faults import EXPLAINED, find_faults, finding_of, supports_apart
 from .finding import CARE, CORRELATED, HALF, NOTE, SMALL_PROBABILITY, WRONG, Finding, percent
 from .modal import check_modes, squares_of_modes
 
-FEWEST = 10  # samples that the tests of correlation and distribution need
 FAR = 5.0  # mean square of residuals, relative to the stated one, from which on a result is not used
 # A shift of a parameter by half a step is named from HALF a standard deviation on: the mean square of its error is then
 # 1.25 times the variance. For an oscillator with known parameters (eleven noises and steps, six seeds each), 90 %
@@ -40,8 +41,7 @@ NOTHING = 1e-6  # difference of two responses, relative to their norm, well abov
 # of a predicted peak to the calibrated ones: named in 1 of 100 right runs, and in 96 of 100 at three times the strength
 PEAK_RATIO = 2.0
 NARROW = 0.2  # bandwidth of a motion by the calibrated one; earthquakes of one structure differ by 0.38 or more
-# half the range in the last two seconds by the final value, which is then known to 10 % at best; a smaller one than a
-# tenth of the largest response counts as a tenth
+# half the range in the last two seconds by the final value, or by a tenth of the largest response if this is more
 UNSETTLED = 0.1
 STEP = "Step and mesh"
 STEPS = "integration step", "Double `substeps` of the model, or halve its `step`"

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from samplers.estimates.genealogy import FEWEST_FOR_VARIANCE as FEWEST
+
 from ..signals.channels import Channel, Measurements
 from ..signals.datasets import Dataset, read_dataset
 from ..signals.read import read_columns, read_record
@@ -162,9 +164,6 @@ def _read_model(given: dict[str, Any], where: str) -> tuple[str, dict[str, Any]]
     return kind, values
 
 
-FEWEST_SAMPLES = 10  # of a channel, where others lie outside the record
-
-
 def is_dataset(job: Job, section: str) -> bool:
     """Whether the file of a section is a data set in HDF5, which has record and measurements."""
     given = getattr(job, section)
@@ -300,7 +299,7 @@ def _straightened(measured: Measurements, points: Mapping[str, Any]) -> Measurem
 def _within(measured: Measurements, record: Record) -> Measurements:
     """The samples within a record, with NaN where the measurements are shorter; the description says what is left out.
 
-    ValueError if a channel has no sample within the record, or fewer than `FEWEST_SAMPLES` while others were left out.
+    ValueError if a channel has no sample within the record, or fewer than `FEWEST` while others were left out.
     """
     end, rows, starts, notes = record.time[-1], [], [], []
     for channel, values, step in zip(measured.channels, measured.values, measured.steps, strict=True):
@@ -308,9 +307,9 @@ def _within(measured: Measurements, record: Record) -> Measurements:
         inside = np.flatnonzero((times >= -SAME_TIME * step) & (times <= end + SAME_TIME * step))
         found, used = np.isfinite(values).sum(), np.isfinite(values[inside]).sum()
         share = f"{used} of {found} samples of {name} lie within the record"
-        if not used or used < min(found, FEWEST_SAMPLES):
+        if not used or used < min(found, FEWEST):
             raise ValueError(
-                f"{share}, 0 to {end:g} s; expected {FEWEST_SAMPLES} or more. They were measured from {times[0]:g} to "
+                f"{share}, 0 to {end:g} s; expected {FEWEST} or more. They were measured from {times[0]:g} to "
                 f"{times[-1]:g} s: check time_unit, and set zero to the time in the file at which the base motion "
                 'begins (a clock time such as "10:32:07" where the file has clock times)'
             )

@@ -16,12 +16,12 @@ import numpy as np
 
 from samplers.estimates.importance import KnownDensity
 from samplers.estimates.weights import effective_sample_size, log_mean_weight, normalised_weights
-from samplers.proposals.mixture import Mixture, draw, fit_mixture, invert_roots, log_density
+from samplers.proposals.mixture import DOF, Mixture, draw, fit_mixture, invert_roots, log_density
 
 from .emulator import ResponseEmulator
 from .target import ResponseTarget
 
-_FREEDOM = 6.0  # at least, else as many as parameters: 50 keep 86 % of draws of a normal density in 50, 6 keep 44 %
+_FREEDOM = DOF  # at least, else as many as parameters: 50 keep 86 % of draws of a normal density in 50, 6 keep 44 %
 _ROUNDS, _DRAWS = 6, 3000  # of the adaptation, and draws of each
 _SETTLED = 0.3  # share of effective draws in a round after which none follows
 _POOL, _NUMBERS = 20_000, 300_000  # points of the pool, and numbers that they have at most, whatever the dimension

@@ -12,17 +12,15 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.special import ndtri
 
-from samplers.judgement.guides import DOUBTED_SHARE
+from samplers.judgement.guides import DOUBTED_SHARE, HIGHER
 from samplers.tempering.guide import GuideSession
 
 from ..text_tables import text_table
 from .levenberg_marquardt import FIRST_DIFFERENCE, TOLERANCE, Ascent, Climb, axes_of
 from .target import ResponseTarget, Runs, Steps, at_once, nothing_stored
 
-_NEGLIGIBLE = 15.0  # a mode whose log-evidence is lower than the largest by more than this is dropped
-_LOOSEST = 5.0  # largest tolerance of a short part of the record
+_LOOSEST = 5.0  # largest gain that may be left on a short part of the record, or at the top of a rough likelihood
 _FLATTEST = 0.2  # smallest curvature of the Laplace approximation: five times the variance of the prior
-_ROUGH = 5.0  # gain that the quadratic approximation may promise at the top of a rough likelihood
 _APART = 0.25  # prior standard deviations in one coordinate that part ends on a part of the record
 _FEW = 6  # parameters whose differences cost about as much as two steps
 _MOST_STARTS, _DRAWN = 2, 4  # times the number asked for: that begin, and of which the highest begin
@@ -107,7 +105,7 @@ def laplace(target: ResponseTarget, end: Ascent) -> Mode:
     ahead, behind = (target.parameters(at + sign * _STEP * np.eye(target.ndim)) for sign in (1.0, -1.0))
     tangents = (ahead - behind) / (2.0 * _STEP)
     spread = tangents.T @ covariance @ tangents
-    return Mode(target.parameters(at[None])[0], spread, at, covariance, top, log_evidence, end.gain_left < _ROUGH)
+    return Mode(target.parameters(at[None])[0], spread, at, covariance, top, log_evidence, end.gain_left < _LOOSEST)
 
 
 class _OutOfBudget(Exception):
@@ -242,7 +240,7 @@ class Search:
         """The modes at the ends on the whole record, and which of them each start led to."""
         ends = self._parts[-1].ends
         modes = sorted(((laplace(self._target, end), k) for k, end in ends.items()), key=lambda m: -m[0].log_evidence)
-        kept = [(mode, k) for mode, k in modes if mode.log_evidence > modes[0][0].log_evidence - _NEGLIGIBLE]
+        kept = [(mode, k) for mode, k in modes if mode.log_evidence > modes[0][0].log_evidence - HIGHER]
         led = []
         for k in range(len(self.standing_for)):
             for _ in self.standing_for:  # two starts may stand for each other, one of them on an earlier part

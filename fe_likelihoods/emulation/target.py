@@ -18,7 +18,7 @@ from .archive import Archive
 Remember = Callable[..., Sequence[np.ndarray] | None]  # `samplers.tempering.guide.GuideSession.remember`
 Steps = Generator[Callable[[], Any] | None, Any, Any]  # functions to call; None after each batch of simulations
 
-_LARGEST_FACTOR = 30.0  # between the ends of the prior's central 95 %, up to which a parameter is a factor
+LARGEST_FACTOR = 30.0  # between the ends of the prior's central 95 %, up to which a parameter is a factor
 _SMALLEST = 1e-300  # positive parameters are at least this before their logarithm is taken
 _AT_BOUND = 8.5  # from about 8.3, parameters are rounded to a bound that is not zero
 _WIDTHS = 7.0, 3.0, 1.0, 0.3, 0.1  # half widths of the grids on which noise parameters are first searched
@@ -75,12 +75,12 @@ class ResponseTarget:
         self._noise = self._prior.subset(self._prior.names[self.n_structural :]) if self.n_noise else None
         at = np.array([[-_AT_BOUND], [-3.0], [-2.0], [2.0], [3.0]]) * np.ones(self.n_structural)
         least, lower, low, high, higher = self.structural_parameters(at)
-        factors = (least >= 0.0) & (low > 0.0) & (high < _LARGEST_FACTOR * low)
+        factors = (least >= 0.0) & (low > 0.0) & (high < LARGEST_FACTOR * low)
         # of inputs of emulators: logarithms where priors are lognormal; of factors themselves, logarithms (products, as
         # E I, are linear), or reciprocals (as deflections of springs in series are), whose tails draws miss near zero
         linear = 1 - np.array(self._structural.logarithmic)
         logs = linear * ~factors
-        powers = np.array([linear, logs, logs - factors * (higher < _LARGEST_FACTOR * lower)])
+        powers = np.array([linear, logs, logs - factors * (higher < LARGEST_FACTOR * lower)])
         self._logarithms, self.scales = Scales(logs), [Scales(each) for each in np.unique(powers, axis=0)]
 
     def first_parts(self, shares: Sequence[float]) -> list["ResponseTarget"]:

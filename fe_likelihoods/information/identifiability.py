@@ -22,7 +22,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.linalg import eigh
 
+from samplers.estimates.genealogy import FEWEST_FOR_VARIANCE as FEWEST
+
 from ..emulation.modes import Mode, find_modes
+from ..emulation.target import LARGEST_FACTOR
 from ..likelihood.posterior import Posterior
 from ..priors.points import as_rows
 from ..priors.priors import Prior
@@ -32,11 +35,9 @@ DETERMINED = 0.3  # share of the prior's standard deviation up to which a parame
 KEPT = 0.9  # share from which the data say little
 MUCH_BETTER = 0.5  # share left of a combination, over the smallest one of its parameters
 MOST_NAMED = 4  # parameters of a combination whose exponents are given
-LARGEST_FACTOR = 30.0  # between the ends of the prior's central 95 %, up to which a parameter is a factor
 MAP_STEP = 1e-4  # of coordinates, for the slopes of the parameters
 FARTHEST = 4.0  # coordinate up to which slopes are taken: beyond, parameters may be rounded to a bound
 AT_BOUND = 8.5  # coordinate of a parameter that is rounded to a bound of its prior
-FEWEST = 10  # samples for each parameter
 ENDED_EARLY = "The search ended before the best fit, so these shares are rough."
 
 

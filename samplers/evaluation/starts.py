@@ -10,9 +10,9 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ..finding import FALSE_ALARM
 from ..moves.population_moves import BEST_SCALE
 
-LEVEL = 1e-4  # probability of a false alarm in a run
 METROPOLIS_STEPS = 20  # a ball of half the width of the prior is then found in 42 to 100 % of the cases (docs/results)
 SEED = 20_131  # separate random numbers, so that the test changes no run
 
@@ -23,7 +23,7 @@ def not_of_the_prior(coords: np.ndarray, log_prior: Callable[[np.ndarray], np.nd
     after.
     """
     (n, ndim), random = coords.shape, np.random.RandomState(SEED)
-    if 2.0 ** (1 - n // 2) > LEVEL / 2:  # signed ranks of so few points cannot reach the level
+    if 2.0 ** (1 - n // 2) > FALSE_ALARM / 2:  # signed ranks of so few points cannot reach the level
         return ""
     from scipy.stats import wilcoxon  # slow to import
 
@@ -43,7 +43,7 @@ def not_of_the_prior(coords: np.ndarray, log_prior: Callable[[np.ndarray], np.nd
         scale[scale == 0.0] = 1.0
         before, after = (np.sum(((x - centre) / scale) ** 2, axis=1) for x in (start, points))
         change = (after - before)[after != before]
-        if len(change) > 1 and (p := wilcoxon(change).pvalue) < LEVEL / 2:
+        if len(change) > 1 and (p := wilcoxon(change).pvalue) < FALSE_ALARM / 2:
             verb = "spreads" if np.median(change) > 0.0 else "contracts"
             return f"the population {verb} in Metropolis steps that keep the prior (p = {p:.1g})"
     return ""

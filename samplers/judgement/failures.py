@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from ..finding import CARE, WRONG, Finding
+from ..finding import CARE, FALSE_ALARM, WRONG, Finding
 
 # A failure adjoins the samples if it is one of the evaluated points that are nearest to a sample. With 20 points and at
 # least 5 failures, those 6 standard deviations beside a bent ridge rarely count, and those at an edge do.
@@ -19,7 +19,6 @@ LARGE_SHARE_NEAR = 0.02  # of the evaluated points among the samples
 # Probability of so many failures with this share, below which there are more. Cut off 1 to 1.6 standard deviations
 # beside the mode, 24 of 26 runs are then refused, whose means are off by 2 to 5 errors; at 2, 2 of 21 right ones.
 CHANCE = 0.05
-UNLIKELY = 1e-4  # probability that so many of them fail by chance
 INSIDE = 0.99  # share of the samples inside the ellipsoid that counts as their region
 KEPT_POINTS = 20_000  # the latest points are those near the posterior
 
@@ -86,7 +85,7 @@ def failures_near(samples: np.ndarray, failed: np.ndarray, succeeded: np.ndarray
     if len(adjoining) == 0:
         return NearFailures(number, evaluated)
     about = tree.query(points[adjoining], k=min(FEWEST_ADJOINING + 1, len(points)))[1][:, 1:]
-    by_chance = binom.isf(UNLIKELY, about.size, number / evaluated)
+    by_chance = binom.isf(FALSE_ALARM, about.size, number / evaluated)
     return NearFailures(number, evaluated, len(adjoining), bool(has_failed[about].sum() <= by_chance), len(nearest))
 
 

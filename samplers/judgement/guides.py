@@ -3,6 +3,7 @@
 import numpy as np
 
 from ..finding import CARE, WRONG, Finding
+from .rounds import USABLE_SHARE
 
 UNSEEN = "A part of the posterior may be missing"
 # Counted in 102 searches with limits of 100 to 400 simulations, on eight posteriors with 1 to 10 known modes.
@@ -16,10 +17,6 @@ REFUSED_SHARE = 0.3
 # is no reason to refuse a result: with starts in the order drawn and limits of 200 and 400, it was left in 3 of 22
 # searches that had lost one of two modes, and in 29 of 40 right ones of a model that fails in a third of the prior.
 GROWN_STARTS = 2
-# Share of effective draws of the emulated posterior below which it is covered badly: 0.01 to 0.07 in 10 of 10 runs on
-# bananas in 10 to 12 dimensions that were too narrow, 0.12 and more in about 40 right runs with 2 to 30 parameters.
-COVERED = 0.1
-
 # Log-density below the best of a probable simulation, and above the emulated one of a simulation that is excluded.
 # On ridges E h^3 with uniform priors, 20 runs: 4 of 7 wrong runs, among them the 2 that change little from round to
 # round, and none of 12 right ones; none of 40 right runs with other priors and on four problems. Of 10 right runs with
@@ -72,7 +69,7 @@ def check_unseen_modes(share: float, ended: int, modes: int) -> list[Finding]:
 
 def check_draws_in_memory(effective_share: float) -> list[Finding]:
     """Whether the draws of an emulated posterior cover it, by the share of them that is effective."""
-    if effective_share >= COVERED:
+    if effective_share >= USABLE_SHARE:
         return []
     text = (
         "the emulated posterior is curved and its draws in memory cover it badly (their effective sample "

@@ -14,20 +14,20 @@ from ..finding import Finding
 # Recycling is given up when the mean efficiency of the last 6 rounds is smaller than 0.03 (moves then need fewer
 # evaluations), or after 200 rounds without a check at beta = 1.
 SMALLEST_EFFICIENCY, PATIENCE, MOST_ROUNDS = 0.03, 6, 200
-# Smallest efficiency of the check for which the result is used, and the efficiency above which the Pareto shape need
-# not be below 0.7 (Vehtari et al. 2024, JMLR 25(72)): the shape is uncertain for the short tail of even weights.
-RELIABLE_EFFICIENCY, HIGH_EFFICIENCY = 0.25, 0.5
+# Efficiency of the check above which any Pareto shape will do: it is uncertain for the short tail of even weights.
+HIGH_EFFICIENCY = 0.5
 # Largest fall of the log-evidence from the earlier points to the check for which the result is used: the last fit has
 # lost a part. A rise is no reason: earlier points that a fit was made from weigh too little, in 30 normal dimensions by
 # a third, where the draws of the check and their evidence are right; 6 runs each of 17 posteriors have equal verdicts.
 LARGEST_DIFFERENCE = 0.25
-# Reliable rounds have at least this effective share, the latest one and the mean of three, and the latest one a Pareto
-# shape below this value, for which the variance of its weights is finite. By the latest one alone, a cyclic test whose
-# response has jumps was converged and wrong by 3.5 errors.
+# Reliable rounds, and the check of recycling, have at least this effective share, the latest round and the mean of
+# three, and the latest one a Pareto shape below this value, for which the variance of its weights is finite. By the
+# latest one alone, a cyclic test whose response has jumps was converged and wrong by 3.5 errors.
 RELIABLE_SHARE, LARGEST_RELIABLE_SHAPE = 0.25, 0.5
 # After the last round of a guide, the draws are used even if no round was reliable, provided that the last round has at
 # least this effective share, all rounds together have an effective sample size equal to the number of walkers, and the
-# Pareto shape of their weights is below 0.7.
+# Pareto shape of their weights is below 0.7. Draws of the emulated posterior itself had 0.01 to 0.07 in 10 of 10 runs
+# on bananas in 10 to 12 dimensions that were too narrow, 0.12 and more in about 40 right runs with 2 to 30 parameters.
 USABLE_SHARE = 0.1
 # Rounds go on while more than this share of the guide's latest known density is hardly reached by the draws of all of
 # them, or was not in the known density before; the result is not usable if that is so at the end. A smaller share that
@@ -61,7 +61,7 @@ def doubt_recycling(check: EvidenceCheck | None, log_evidence: float, beta: floa
         return f"only beta = {beta:.3g} was reached in {MOST_ROUNDS} rounds" if too_long else ""
     if not check.reliable and efficiencies[-1] < HIGH_EFFICIENCY:
         return f"the weights of fresh draws have a Pareto shape of {check.pareto_shape:.2g}"
-    if efficiencies[-1] < RELIABLE_EFFICIENCY:
+    if efficiencies[-1] < RELIABLE_SHARE:
         return f"the effective sample size of the check is {100 * efficiencies[-1]:.2g} % of their number"
     if log_evidence - check.log_evidence > LARGEST_DIFFERENCE:
         return f"fresh draws lower the log-evidence by {log_evidence - check.log_evidence:.2g}"

@@ -79,7 +79,7 @@ def test_a_change_that_no_fingerprint_contains_is_an_error_that_says_what_to_do(
         0,
         0,
     )
-    assert likelihood.simulator.verifications == likelihood.model.runs == 2
+    assert likelihood.simulator.verifications == likelihood.model.runs == 1
     likelihood.simulator.cache.forget(*likelihood.simulator.cache_keys)
     np.testing.assert_array_equal(likelihood.misfit(thetas), likelihood_of(Scaled(1.01), None).misfit(thetas))
 
@@ -115,7 +115,7 @@ def test_a_difference_remains_an_error_for_all_rows(filled, thetas):
         with pytest.raises(StaleCache):
             likelihood.misfit(theta)
         runs.append(likelihood.simulator.verifications)
-    assert set(runs) == {2}
+    assert set(runs) == {1}
     copy = pickle.loads(pickle.dumps(likelihood))
     with pytest.raises(StaleCache):
         copy.misfit(thetas[:1])
@@ -260,7 +260,7 @@ def test_rows_are_used_if_no_simulation_ends(filled, thetas, caplog):
     likelihood.misfit(thetas)
     likelihood.misfit(thetas[:40])
     assert likelihood.simulator.verifications == 0
-    assert likelihood.simulator.unverified == verification.MAX_ATTEMPTS  # and no more for a while
+    assert likelihood.simulator.unverified == verification.FIRST_ROWS + 1  # and no more for a while
     warnings = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
     assert sum("could not be verified" in text for text in warnings) == 1
 
