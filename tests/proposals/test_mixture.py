@@ -114,6 +114,25 @@ def overlapping(rng, n):
     return rng.standard_normal((n, 2)), lambda x: stats.norm.logpdf(x).sum(axis=1), None, mixture
 
 
+def test_bends_are_found_in_correlated_parameters(rng):
+    """Ten bends that explain a tenth of the variance, but most of what the other parameters leave of it: 31 to 37 % of
+    the draws of five fits are effective. With one linear term, 5 to 9 bends are found, and 6 to 30 % effective."""
+    axes = np.linalg.qr(np.random.default_rng(1001).standard_normal((20, 20)))[0]
+    root = axes * np.geomspace(0.05, 0.5, 20)
+
+    def bend(x, sign):
+        return np.column_stack([x[:, :10], x[:, 10:] + sign * x[:, :10] ** 2])
+
+    for _ in range(2):
+        x = bend(rng.standard_normal((400, 20)) @ root.T, 1.0)
+        mixture = fit_mixture(x, uniform(400))
+        assert len(mixture.shears) == 10
+        y = draw(mixture, 4000, np.random.RandomState(1))
+        log_target = stats.norm.logpdf(np.linalg.solve(root, bend(y, -1.0).T)).sum(axis=0)
+        weights = np.exp(log_target - log_density(mixture, y))
+        assert weights.sum() ** 2 / (weights @ weights) > 0.25 * len(y)
+
+
 @pytest.mark.parametrize("kernel", ["_draw_independence", "_draw_local_walk", "_draw_differences"])
 @pytest.mark.parametrize(("target", "n"), [(curved, 40_000), (corner, 20_000), (overlapping, 40_000)])
 def test_each_kernel_keeps_the_target(kernel, target, n, rng):
