@@ -9,7 +9,7 @@ gives the evidence of the emulated posterior, and draws.
 """
 
 from collections.abc import Sequence
-from functools import cached_property, partial
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -66,9 +66,10 @@ def around(regions: Sequence[Region], widened: float, dof: float) -> Mixture:
 class EmulatedPosterior:
     """Density of the emulated posterior, from regions with emulators, and a weighted sample of it, the pool.
 
-    `log_evidence` is the log of the integral over the emulated density, with an error from the importance sampling in
-    memory; `effective_share` is the share of effective points in the pool; `of_runs` are log-densities (n,) of the
-    simulations by their responses, and by the emulators; `regions` are those given, with their moments.
+    `log_evidence` is the log of the integral over the emulated density; `known_density` is this of the parameters, with
+    the pool and the error of the importance sampling in memory; `effective_share` is the share of effective points in
+    the pool; `of_runs` are log-densities (n,) of the simulations by their responses, and by the emulators; `regions`
+    are those given, with their moments.
     """
 
     def __init__(self, target: ResponseTarget, regions: Sequence[Region], random: np.random.RandomState) -> None:
@@ -110,7 +111,9 @@ class EmulatedPosterior:
         self.regions = self._moments(self.regions, self._pool, self._pool, log_weights, 0.0)
         self._weights = normalised_weights(log_weights)
         self.log_evidence, self.effective_share = log_mean_weight(log_weights), effective / size
-        self.log_evidence_error = float(np.sqrt(max(1.0 / effective - 1.0 / size, 0.0)))
+        error = float(np.sqrt(max(1.0 / effective - 1.0 / size, 0.0)))
+        density = partial(target.density_of_parameters, self.normalised)
+        self.known_density = KnownDensity(density, target.parameters(self._pool), self._weights, error)
 
     def log_density(self, coords: np.ndarray) -> np.ndarray:
         """Logarithm of prior times emulated likelihood (n,) at coordinates (n, ndim); not normalised."""
@@ -120,12 +123,6 @@ class EmulatedPosterior:
             if len(rows):
                 result[rows] = region.emulator.log_likelihood(coords[rows])
         return np.where(np.isnan(result), -np.inf, result) + self._target.log_prior(coords)
-
-    @cached_property
-    def known_density(self) -> KnownDensity:
-        """This density of the parameters, with the pool."""
-        density = partial(self._target.density_of_parameters, self.normalised)
-        return KnownDensity(density, self._target.parameters(self._pool), self._weights, self.log_evidence_error)
 
     def normalised(self, coords: np.ndarray) -> np.ndarray:
         """Normalised log-density (n,) of coordinates (n, ndim)."""

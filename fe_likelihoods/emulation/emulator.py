@@ -67,12 +67,8 @@ class ResponseEmulator:
     def log_likelihood(self, coords: np.ndarray) -> np.ndarray:
         """Logarithm (n,) of the emulated likelihood at coordinates (n, ndim)."""
         mean = predict(self._process, self._inputs(coords))
-        constant, linear, quadratic = self._forms[0, 0], self._forms[1:, 0], self._forms[1:, 1:]
-        columns = [
-            constant[a] + 2.0 * mean @ linear[:, a] + ((mean @ quadratic[:, :, a]) * mean).sum(axis=1)
-            for a in range(len(constant))
-        ]
-        statistics = np.maximum(np.stack(columns, axis=1), np.finfo(float).tiny)
+        quadratic = np.einsum("nk,kla,nl->na", mean, self._forms[1:, 1:], mean, optimize=True)
+        statistics = np.maximum(self._forms[0, 0] + 2.0 * mean @ self._forms[1:, 0] + quadratic, np.finfo(float).tiny)
         return self.target.log_likelihood(statistics, coords[:, self.target.n_structural :])
 
 

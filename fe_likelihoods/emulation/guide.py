@@ -28,7 +28,8 @@ from samplers.tempering.guide import Guide
 
 from .density import EmulatedPosterior, Region, around, student_mixture
 from .emulator import ResponseEmulator
-from .modes import ModeSearch, Search, check_starts, draw_starts
+from .levenberg_marquardt import TOLERANCE
+from .modes import LOOSEST, ModeSearch, Search, check_starts, draw_starts
 from .target import ResponseTarget, Steps, at_once
 
 logger = logging.getLogger(__name__)
@@ -42,26 +43,12 @@ _ALWAYS = 5  # best runs per dimension that train in any case
 
 
 class ResponseGuide(Guide):
-    """Draws near the posterior of a likelihood whose responses are known.
-
-    Made by `Posterior.guide`.
-
-    Parameters
-    ----------
-    posterior : Posterior
-        Its noise must use statistics that are quadratic in the residuals.
-    starts : int
-        Starts of the search for modes that shall lead to one: see `Posterior.guide`.
+    """Draws near the posterior of a likelihood whose responses are known; made by `Posterior.guide`, with its example.
 
     Attributes
     ----------
     search : ModeSearch, optional
         Result of the search for modes; None before it.
-
-    Examples
-    --------
-    >>> guide = posterior.guide(starts=6)
-    >>> guided = SMCSampler(40, posterior.ndim, posterior, vectorize=True, guide=guide, seed=1)
     """
 
     def __init__(self, posterior: Any, starts: int = 12) -> None:
@@ -75,8 +62,9 @@ class ResponseGuide(Guide):
         self._target = ResponseTarget(posterior)
         self._posterior, self._starts = posterior, starts
         self.search: ModeSearch | None = None
-        self._spent = float  # simulations of a search that has not ended
-        self.highest = -np.inf  # log-density of a draw
+        self._spent, self._searching = 0.0, None  # simulations of searches that have ended, and the one that has not
+        self._derivatives: list | None = None  # that the first of them has left
+        self._excess = -np.inf  # log-density of a draw above all modes
         self._regions: list[Region] = []
         self._emulated: EmulatedPosterior | None = None
         self._wide: Mixture | None = None
@@ -84,7 +72,7 @@ class ResponseGuide(Guide):
     @property
     def simulations(self) -> float:
         """Simulations run by the guide: parts of a record are fractions, a call of a ``jacobian`` counts as one."""
-        return self._spent() if self.search is None else self.search.simulations
+        return self._spent + (0.0 if self._searching is None else self._searching.spent)
 
     def check(self, log_prob_fn: Callable) -> None:
         """Raise ValueError if a sampler evaluates another object: every draw would be simulated twice."""
@@ -110,19 +98,17 @@ class ResponseGuide(Guide):
         search = self.search
         if search is None:
             return ()
-        if not search.finished:
-            found = [find_missing_part("the budget ended the search for modes")]
-        elif not search.modes:
-            found = [find_missing_part("no start of the search led to a mode: the simulations of all starts fail")]
-        elif not all(mode.converged for mode in search.modes):
-            found = [find_missing_part("the search for modes ended before the top of a mode")]
-        else:
-            found = []
+        reasons = {
+            "the budget ended the search for modes": not search.finished,
+            "no start of the search led to a mode: the simulations of all starts fail": not search.modes,
+            "the search for modes ended before the top of a mode": not all(mode.converged for mode in search.modes),
+        }
+        found = [find_missing_part(text) for text, is_true in reasons.items() if is_true][:1]
         if len(search.modes) > 1:
             found += check_unseen_modes(search.unseen_share, search.ended, len(search.modes))
         else:
             found += check_ends(search.ended, len(search.ends), self._starts, search.grown)
-        found += check_tops(self.highest - max((mode.log_density for mode in search.modes), default=np.inf))
+        found += check_tops(self._excess)
         if self._emulated is not None:
             found += check_draws_in_memory(self._emulated.effective_share)
             found += check_excluded_runs(*self._emulated.of_runs)
@@ -145,13 +131,7 @@ class ResponseGuide(Guide):
     def prepare(self, session: Any) -> Steps:
         """Search for modes; yields as `Search.run`."""
         starts = draw_starts(self._target, self._starts, session.random)
-        searching = Search(self._target, starts, session)
-        self._spent = lambda: searching.spent
-        try:
-            self.search = yield from searching.run(self._starts)
-        finally:  # a search that raised an error is counted, and not kept: its session cannot be pickled
-            self._spent = partial(float, searching.spent)
-        self._regions = [Region(mode.coords, mode.covariance, None, mode.log_evidence) for mode in self.search.modes]
+        yield from self._search(starts, session)
         archive = self._target.archive
         if self.search.finished and len(archive.numbers) == 0:
             reasons = most_common_reasons(self._target.posterior.report()["failure_reasons"])
@@ -183,14 +163,35 @@ class ResponseGuide(Guide):
         d = self._target.n_structural
         at_once(self._target.run(self._target.coordinates(parameters)[:, :d], session.remember, parameters[:, :d]))
 
-    def refine(self, parameters: np.ndarray, log_prob: np.ndarray, session: Any) -> None:
-        """Learn from evaluated points (n, ndim): new emulators."""
-        alive = np.isfinite(log_prob)
-        heights = log_prob[alive] - self._target.with_volume(parameters[alive])[1]
-        self.highest = max(self.highest, float(np.max(heights, initial=-np.inf)))
+    def refine(self, parameters: np.ndarray, log_prob: np.ndarray, session: Any) -> Steps:
+        """Learn from evaluated points (n, ndim): new emulators, and where an ascent ended below its top and a point is
+        far above, the top that an ascent from there leads to.
+        """
+        coords, volume = self._target.with_volume(parameters)
+        heights, modes = np.where(np.isfinite(log_prob), log_prob - volume, -np.inf), self.search.modes
+        top = max((mode.log_density for mode in modes), default=np.inf)
+        self._excess = max(self._excess, float(heights.max()) - top)
+        if check_tops(self._excess) and not all(mode.converged for mode in modes):
+            yield from self._search(coords[[np.argmax(heights)], : self._target.n_structural], session, LOOSEST)
         self._emulate(session.random)
 
     # ------------------------------------------------------------------ parts
+
+    def _search(self, starts: np.ndarray, session: Any, tolerance: float = TOLERANCE) -> Steps:
+        """Search from starts (n, n_structural), see `Search`, or go on where an earlier search ended below its top."""
+        searching = self._searching = Search(self._target, starts, session, tolerance, self._derivatives)
+        try:
+            found = yield from searching.run(min(self._starts, len(starts)))
+        finally:  # also one that raised an error is counted; none is kept, since its session cannot be pickled
+            self._spent, self._searching, self._derivatives = self.simulations, None, searching.derivatives
+        if (earlier := self.search) is not None:
+            if not found.modes:
+                return
+            led = [-1 if mode.converged else 0 for mode in earlier.modes] + [-1]
+            ends = tuple(led[end] for end in earlier.ends)
+            found, self._excess = found._replace(ends=ends, grown=earlier.grown, simulations=self._spent), -np.inf
+        self.search = found
+        self._regions = [Region(mode.coords, mode.covariance, None, mode.log_evidence) for mode in found.modes]
 
     def _emulate(self, random: np.random.RandomState) -> None:
         """Fit emulators to all runs, and the emulated posterior; the earlier ones stay if runs do not span a region."""

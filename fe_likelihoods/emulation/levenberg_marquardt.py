@@ -66,7 +66,7 @@ class Ascent(NamedTuple):
     statistics: np.ndarray  # of the residuals (n_numbers,)
     noise: NoiseFit  # the best noise parameters
     value: float  # log-density at the best noise parameters
-    slopes: Any = None  # d residuals / d coords (n_structural, n), as weights of the first n histories in the archive
+    slopes: Any = None  # d residuals / d coords, numbers (n_structural,) or weights (n_structural, n) in the archive
     weights: Any = None  # derivatives of the log-likelihood by the statistics (n_numbers,)
     gradient: Any = None  # of the log-density (n_structural,)
     hessian: Any = None  # Gauss-Newton, of minus the log-density (n_structural, n_structural)
@@ -88,7 +88,7 @@ class Climb:
     """
 
     target: ResponseTarget
-    derivatives: list[tuple[np.ndarray, np.ndarray]]  # coordinates (d,), and derivatives (d, n) there
+    derivatives: list[tuple[np.ndarray, np.ndarray]]  # coordinates (d,), and derivatives there as `Ascent.slopes`
     number: int
     centre: np.ndarray
     known: dict[int, Ascent]
@@ -158,7 +158,7 @@ class Climb:
     def _derive(self, steps: np.ndarray) -> Requests:
         """Derivatives at the present point: the model's own, or by differences with steps (n, d)."""
         if self.target.data.differentiable:
-            slopes = self.target.archive.weights((yield self._here.coords))
+            slopes = yield self._here.coords
             if self.target.unchecked:  # the first derivatives are compared with a difference
                 self.target.unchecked.clear()
                 yield from self._check(slopes)
@@ -171,7 +171,7 @@ class Climb:
         return min(reversed(self.derivatives), key=lambda each: float(np.square(each[0] - self._here.coords).sum()))
 
     def _check(self, slopes: np.ndarray) -> Requests:
-        """ValueError if derivatives (d, n), as weights, deny the residuals at a step along all coordinates, which is
+        """ValueError if derivatives, numbers (d,), deny the residuals at a step along all coordinates, which is
         small beside the residuals. Where that fails or changes nothing, the next ones are compared.
         """
         target, here = self.target, self._here
@@ -185,7 +185,7 @@ class Climb:
         steps = (-1.0) ** np.arange(len(slopes)) * np.linspace(0.5, 1.0, len(slopes))
         steps *= np.minimum(_CHECKED_CHANGE * of_residuals / np.maximum(sizes, 1e-300), _DIFFERENCE_LIMITS[1])
         runs = yield (here.coords + steps)[None]
-        change, predicted = target.archive.weights([runs.numbers[0], steps @ slopes])
+        change, predicted = target.archive.weights([runs.numbers[0], steps @ target.archive.weights(slopes)])
         change[here.run] -= 1.0
         *sizes, error = norms(np.array([change, predicted, change - predicted]))
         rounding = np.finfo(np.float32).eps * of_residuals  # of residuals in single precision
@@ -287,7 +287,7 @@ class Climb:
         for number, other in self.known.items():
             move = here.coords - other.coords
             if np.abs(move).max() < self.apart and here.value < other.value:
-                ours, theirs, predicted = archive.weights([here.run, other.run, move @ other.slopes])
+                ours, theirs, predicted = archive.weights([here.run, other.run, move @ archive.weights(other.slopes)])
                 error = archive.forms((ours - theirs - predicted)[None])[0, 0]
                 if -error @ other.weights < _EXPLAINED:
                     return number

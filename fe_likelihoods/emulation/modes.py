@@ -19,7 +19,7 @@ from ..text_tables import text_table
 from .levenberg_marquardt import FIRST_DIFFERENCE, TOLERANCE, Ascent, Climb, axes_of
 from .target import ResponseTarget, Runs, Steps, at_once, nothing_stored
 
-_LOOSEST = 5.0  # largest gain that may be left on a short part of the record, or at the top of a rough likelihood
+LOOSEST = 5.0  # largest gain that may be left on a short part of the record, or at the top of a rough likelihood
 _FLATTEST = 0.2  # smallest curvature of the Laplace approximation: five times the variance of the prior
 _APART = 0.25  # prior standard deviations in one coordinate that part ends on a part of the record
 _FEW = 6  # parameters whose differences cost about as much as two steps
@@ -105,7 +105,7 @@ def laplace(target: ResponseTarget, end: Ascent) -> Mode:
     ahead, behind = (target.parameters(at + sign * _STEP * np.eye(target.ndim)) for sign in (1.0, -1.0))
     tangents = (ahead - behind) / (2.0 * _STEP)
     spread = tangents.T @ covariance @ tangents
-    return Mode(target.parameters(at[None])[0], spread, at, covariance, top, log_evidence, end.gain_left < _LOOSEST)
+    return Mode(target.parameters(at[None])[0], spread, at, covariance, top, log_evidence, end.gain_left < LOOSEST)
 
 
 class _OutOfBudget(Exception):
@@ -118,18 +118,21 @@ class _Part(NamedTuple):
     target: ResponseTarget
     share: float
     ends: dict[int, Ascent]
-    derivatives: list  # see `Climb`, shared by all ascents
 
 
 class Search:
     """Search from starts (n, n_structural) [standard normal coordinates], on growing parts of the record if possible.
-    `spent` are the simulations so far; ascents leave less than a `tolerance` of log-density to gain.
+    `spent` are the simulations so far; ascents leave less than a `tolerance` of log-density to gain. A search that goes
+    on with the `derivatives` of an earlier one, see `Climb`, is on the whole record.
     """
 
-    def __init__(self, target: ResponseTarget, starts: np.ndarray, session: Any, tolerance: float = TOLERANCE) -> None:
+    def __init__(
+        self, target: ResponseTarget, starts: np.ndarray, session: Any, tolerance: float = TOLERANCE, derivatives=None
+    ) -> None:
         self._target, self._starts, self._session, self._tolerance, self.spent = target, starts, session, tolerance, 0.0
-        parts = [*target.first_parts(_SHARES), target]
-        self._parts = [_Part(part, part.n_steps / target.n_steps, {}, []) for part in parts]
+        parts = [*(target.first_parts(_SHARES) if derivatives is None else ()), target]
+        self._parts = [_Part(part, part.n_steps / target.n_steps, {}) for part in parts]
+        self.derivatives = [] if derivatives is None else derivatives
         self.standing_for: list[int] = []  # start that has taken the place of each that has begun; -1 for none
 
     def run(self, starts: int) -> Steps:
@@ -199,8 +202,8 @@ class Search:
                 for k in wave:
                     start, steps = fronts[k]
                     centre = np.zeros(self._target.n_structural) if whole else start
-                    climb = Climb(part.target, part.derivatives if shared else [], k, centre, part.ends, apart, whole)
-                    least = self._tolerance if whole else min(TOLERANCE / part.share, _LOOSEST)
+                    climb = Climb(part.target, self.derivatives if shared else [], k, centre, part.ends, apart, whole)
+                    least = self._tolerance if whole else min(TOLERANCE / part.share, LOOSEST)
                     ascents[k] = climb.run(start, steps, least)
                 yield from self._side_by_side(part, ascents)
             wide = place == len(self._parts) - 2

@@ -69,7 +69,7 @@ class ResponseTarget:
         self.n_noise = self.ndim - self.n_structural
         self.n_steps = self.data.shape[1]
         self.archive = Archive(self.data.statistic, self.data.shape)
-        self._simulated: set[bytes] = set()
+        self._numbers: dict[bytes, int] = {}  # of simulated coordinates in the archive, -1 where failed
         self.unchecked = [True] if self.data.differentiable else []
         self._structural = self._prior.subset(self._prior.names[: self.n_structural])
         self._noise = self._prior.subset(self._prior.names[self.n_structural :]) if self.n_noise else None
@@ -154,29 +154,31 @@ class ResponseTarget:
 
     def new_points(self, coords: np.ndarray) -> int:
         """Number of structural coordinates (n, n_structural) that `run` has not simulated yet."""
-        return len({row.tobytes() for row in coords} - self._simulated)
+        return len({row.tobytes() for row in coords} - self._numbers.keys())
 
     def run(self, coords: np.ndarray, remember: Remember = nothing_stored, thetas: np.ndarray | None = None) -> Steps:
-        """Simulate structural coordinates (n, n_structural), whose parameters are `thetas` if given; returns `Runs`.
+        """Simulate structural coordinates (n, n_structural), whose parameters are `thetas` if given, once each; returns
+        `Runs`.
 
         Yields what is to be called, so that no search stands between a sampler and a model; residuals are rounded to
         single precision, so that a resumed run is the same.
         """
-        if thetas is None:
-            self._simulated.update(row.tobytes() for row in coords)
-            thetas = self.structural_parameters(coords)
-        parts = []
-        for k in range(0, max(len(thetas), 1), self.data.together):
-            some = thetas[k : k + self.data.together]
-            found = yield from self._stored("residuals", self.data.simulate, some, remember)
+        thetas = self.structural_parameters(coords) if thetas is None else thetas
+        keys = [row.tobytes() for row in coords]
+        new = list({key: row for row, key in enumerate(keys) if key not in self._numbers}.values())
+        for k in range(0, len(new), self.data.together):
+            rows = new[k : k + self.data.together]
+            found = yield from self._stored("residuals", self.data.simulate, thetas[rows], remember)
             residuals, statistics, reasons = found
-            self.data.recall(some, statistics, json.loads(reasons.tobytes().decode()))
-            failed = ~(np.isfinite(residuals).all(axis=(1, 2)) & np.isfinite(statistics).all(axis=1))
-            numbers = np.full(len(failed), -1)
-            of_success = coords[k : k + self.data.together][~failed], residuals[~failed], statistics[~failed]
-            numbers[~failed] = self.archive.add(*of_success)
-            parts.append(Runs(numbers, statistics, failed))
-        return Runs(*map(np.concatenate, zip(*parts, strict=True)))
+            self.data.recall(thetas[rows], statistics, json.loads(reasons.tobytes().decode()))
+            good = np.isfinite(residuals).all(axis=(1, 2)) & np.isfinite(statistics).all(axis=1)
+            numbers = np.full(len(rows), -1)
+            numbers[good] = self.archive.add(coords[rows][good], residuals[good], statistics[good])
+            self._numbers |= {keys[row]: number for row, number in zip(rows, numbers, strict=True)}
+        numbers, known = np.array([self._numbers[key] for key in keys], int), self.archive.statistics
+        statistics = np.full((len(keys), known.shape[1]), np.nan)
+        statistics[numbers >= 0] = known[np.searchsorted(self.archive.numbers, numbers[numbers >= 0])]
+        return Runs(numbers, statistics, numbers < 0)
 
     def derivatives(self, coords: np.ndarray, remember: Remember = nothing_stored) -> Steps:
         """Derivatives of residuals by coordinates (n, n_structural), as numbers (n, n_structural) in the archive, from

@@ -2,6 +2,7 @@
 
 import pickle
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from fe_likelihoods import (
     Uniform,
 )
 from fe_likelihoods.emulation.guide import ResponseGuide
+from fe_likelihoods.emulation.modes import Search
 from samplers import SamplingWarning, SMCSampler, TMCMCSampler
 from samplers.judgement.guides import check_excluded_runs, check_tops
 from tests.statistics.hard_posteriors import CASES
@@ -245,6 +247,33 @@ def test_a_rough_response_is_doubted_too(rng):
 @pytest.mark.parametrize(("excess", "severities"), [(-np.inf, []), (6.4, []), (28.0, ["wrong"])])
 def test_draws_above_every_mode_are_told(excess, severities):
     assert [found.severity for found in check_tops(excess)] == severities
+
+
+@pytest.mark.parametrize("converged", [False, True])
+@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
+def test_an_ascent_that_ended_below_its_top_goes_on_and_a_wrong_mode_is_refused(converged, monkeypatch):
+    """Far above the mode of a search, draws are on the way that its ascent has left, or that it knew nothing of."""
+
+    class Short(Search):
+        def run(self, starts):
+            found = yield from super().run(starts)
+            if starts == 1:
+                return found
+            mode, first.search = found.modes[0], found
+            lower = mode.coords + 8.0 * np.linalg.cholesky(mode.covariance)[:, 0]
+            return found._replace(
+                modes=(mode._replace(coords=lower, log_density=mode.log_density - 32.0, converged=converged),)
+            )
+
+    first = SimpleNamespace()
+    monkeypatch.setattr("fe_likelihoods.emulation.guide.Search", Short)
+    sampler = guided(vibration(), 600)
+    search, known = sampler.guide.search, first.search
+    assert abs(sampler.log_evidence - quadrature(vibration())[0]) < 3.0 * sampler.log_evidence_error < 0.3
+    assert sampler.verdict.status == ("not usable" if converged else "converged")
+    assert search.ends == known.ends and search.finished
+    assert (search.simulations - known.simulations < 10) and sampler.guide.simulations == search.simulations
+    assert abs(search.modes[0].log_density - known.modes[0].log_density) < (33.0 if converged else 1.0)
 
 
 def test_a_search_that_finds_some_of_five_modes_is_refused():
