@@ -22,7 +22,7 @@ from ..units import G0
 _WORK = {"force": ("energy", "kJ"), "moment": ("energy", "kJ"), "stress": ("stress", "MPa")}  # dimension and unit
 
 FAILED = 0.8  # of the largest force, below which a structure has failed (by convention a loss of 20 %)
-_AS_FAR, _MOVED = 0.97, 0.01  # of the largest displacement so far, as far as which an excursion goes; of all, at rest
+_AS_FAR = 0.97  # of the largest displacement so far, as far as which an excursion goes: repeated cycles are equal
 
 
 @dataclass(frozen=True, eq=False)
@@ -322,7 +322,7 @@ def find_failure(force: np.ndarray, displacement: np.ndarray) -> int:
     reached = 0.0
     for start, stop in itertools.pairwise(ends):
         largest = size[start:stop].max()
-        if largest > _AS_FAR * reached and reached > _MOVED * size.max() and start > np.argmax(np.abs(force)):
+        if largest > _AS_FAR * reached and start > np.argmax(np.abs(force)):
             if np.abs(force[start:stop]).max() < FAILED * largest_force:
                 return int(start)
         reached = max(reached, largest)

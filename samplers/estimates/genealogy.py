@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.special import ndtri, stdtrit
 
+# Of n points: a variance of as many groups has an error of sqrt(20 / n), a seventh for 1000.
 MIN_FOUNDER_SHARE = 0.1
 # Points or groups of points that a variance needs: with 6 founders of 60 walkers, standard errors were too small by a
 # factor of up to ten.

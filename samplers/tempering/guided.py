@@ -23,7 +23,7 @@ from ..estimates.importance import (
     pool_rounds,
     tails_are_light,
 )
-from ..estimates.pareto import LARGEST_SHAPE
+from ..estimates.pareto import FEWEST_OF_TAIL, LARGEST_SHAPE
 from ..estimates.weights import normalised_weights
 from ..finding import CARE, WRONG, Finding
 from ..judgement.rounds import (
@@ -49,7 +49,7 @@ from .population import Density, Population
 # draws as are expected to suffice.
 ROUND_SHARE = 0.3
 # Smallest number of draws in a round. The Pareto shape cannot be estimated from fewer than 25.
-FEWEST_DRAWS = 25
+FEWEST_DRAWS = 5 * FEWEST_OF_TAIL
 # Largest number of rounds, and the number after which enough effective draws suffice: the response is rough then.
 MOST_ROUNDS, PATIENT_ROUNDS = 40, 16
 

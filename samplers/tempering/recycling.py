@@ -34,7 +34,8 @@ DRAWS_PER_TARGET = 3.0
 # Draws that find narrow modes: draws of the prior, and further draws, spread over the stages below beta = 1, as a
 # multiple of the walkers; from 250 on, at least 1000 of each kind. Widths 1:6 and 1:8 in three dimensions and 1:3 in
 # five, 250 walkers: a mode was lost in 21 of 72 runs with 250 and 1500, in 2 of 96 with 1000 and 1000.
-DRAWS_SHARE, LEAST_DRAWS, FEWEST_TO_SEARCH = 4, 1000, 250
+DRAWS_SHARE, FEWEST_TO_SEARCH = 4, 250
+LEAST_DRAWS = DRAWS_SHARE * FEWEST_TO_SEARCH
 # A beta is left once the draws made at it have an effective sample size of this share of the target.
 FRESH_SHARE = 0.75
 # Share of a proposal's weight that is spread evenly over its components, so that small components receive draws too:
