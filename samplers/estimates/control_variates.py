@@ -139,10 +139,10 @@ def _evidence(found: Sequence[tuple[Round, np.ndarray, float]], shares: np.ndarr
     values = np.array([value for _, _, value in found])
     top = values.max()
     parts = shares * np.exp(values - top)
-    variance = max(r.known.log_density_error for r, _, _ in found) ** 2
-    for (_, differences, _), part in zip(found, parts / parts.sum(), strict=True):
-        variance += float(part**2 * _variance_of_sum(differences / len(differences)))
-    return float(top + np.log(parts.sum())), float(np.sqrt(variance))
+    total, parts = parts.sum(), parts / parts.sum()
+    of_known = parts @ [r.known.log_density_error for r, _, _ in found]
+    variances = [_variance_of_sum(differences / len(differences)) for _, differences, _ in found]
+    return float(top + np.log(total)), float(np.hypot(np.sqrt(parts**2 @ variances), of_known))
 
 
 def _variance_of_sum(parts: np.ndarray) -> np.ndarray:

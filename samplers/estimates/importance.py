@@ -218,7 +218,7 @@ def pool_rounds(rounds: Sequence[Round]) -> PooledRounds:
         weights = np.exp(part - log_evidence)
         within += n * float(np.var(weights, ddof=1)) if n > 1 else np.inf
         between += float(weights.sum() - share) ** 2
-    known = max((r.known.log_density_error for r in rounds if r.known is not None), default=0.0)
+    known = float(shares @ [0.0 if r.known is None else r.known.log_density_error for r in rounds])
     missed = max(float(total - log_evidence), 0.0)
     error = float(np.sqrt(max(within, between, missed**2) + tail_variance(own) + known**2))
     log_weights = log_weights + (log_evidence - total)

@@ -192,11 +192,11 @@ def two_modes(shares, n=POOL):
 
 
 class GrowingGuide(FixedGuide):
-    """Knows one of two modes, and the other one after the first round."""
+    """Knows one of two modes, and not how probable it is, and the other one after the first round."""
 
     def __init__(self, posterior):
         super().__init__(posterior, [[1.0, 1.0]], [0.012 * np.eye(2)])
-        self.known_density = two_modes([1.0, 0.0])
+        self.known_density = two_modes([1.0, 0.0])._replace(log_density_error=0.3)
 
     def refine(self, coords, log_prob, session):
         both = np.array([[1.0, 1.0], [-1.0, -1.0]])
