@@ -186,6 +186,21 @@ def test_a_few_failures_more_than_the_limit_are_chance(failed, evaluated, place)
     assert NearFailures(failed, evaluated, 10, False, evaluated).place == place
 
 
+@pytest.mark.parametrize(("gap", "place"), [(6.0, "beside"), (1.3, "border")])
+def test_failures_beside_a_bend_do_not_border_on_it(gap, place, rng):
+    def draws(n, scale):
+        x = rng.normal(size=n)
+        return np.column_stack([x, 1.5 * x**2 + 0.2 * scale * rng.normal(size=n)])
+
+    def fails(points):
+        return points[:, 1] - 1.5 * points[:, 0] ** 2 > 0.2 * gap
+
+    evaluated, samples = np.concatenate([draws(1500, 2.0**k) for k in (4, 3, 2, 1, 0, 0)]), draws(2000, 1.0)
+    has_failed = fails(evaluated)
+    near = failures_near(samples[~fails(samples)][:500], evaluated[has_failed], evaluated[~has_failed])
+    assert near.place == place
+
+
 def test_walkers_in_one_place_have_no_region(rng):
     """As where a limit ended the run after a collapse; the smallest number of points that span a region has one."""
     failed, succeeded = rng.normal(0.0, 1.0, (40, 2)), rng.normal(0.0, 1.0, (40, 2))

@@ -64,7 +64,7 @@ def test_recycling_keeps_the_variance_of_heavy_tails(seed):
 @pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
 def test_light_proposals_that_are_fitted_to_their_points_cut_heavy_tails(seed, monkeypatch):
     """Negative control: six degrees of freedom, and sweeps by a fit to the points that they move."""
-    monkeypatch.setattr(mixture, "HEAVIER", ())
+    monkeypatch.setattr(mixture, "HEAVIER", mixture.DOF)
     calibrate = MixtureMove.calibrate
     monkeypatch.setattr(MixtureMove, "calibrate", lambda *fit: calibrate(*fit[:4]))  # without the proposal
     squares, _ = mean_squares(1000 * seed + np.arange(200))
