@@ -16,16 +16,15 @@ import numpy as np
 
 from samplers.estimates.importance import KnownDensity
 from samplers.estimates.weights import effective_sample_size, log_mean_weight, normalised_weights
-from samplers.proposals.mixture import DOF, Mixture, draw, fit_mixture, invert_roots, log_density
+from samplers.judgement.rounds import RELIABLE_SHARE
+from samplers.proposals.mixture import DOF, POINTS_PER_DIMENSION, Mixture, draw, fit_mixture, invert_roots, log_density
 
 from .emulator import ResponseEmulator
 from .target import ResponseTarget
 
 _FREEDOM = DOF  # at least, else as many as parameters: 50 keep 86 % of draws of a normal density in 50, 6 keep 44 %
 _ROUNDS, _DRAWS = 6, 3000  # of the adaptation, and draws of each
-_SETTLED = 0.3  # share of effective draws in a round after which none follows
 _POOL, _NUMBERS = 20_000, 300_000  # points of the pool, and numbers that they have at most, whatever the dimension
-_ENOUGH_PER_DIMENSION = 6.0  # effective points per dimension for a covariance
 _CURVED = 0.15  # share of effective points in the pool below which several components per region are fitted
 _FITTED = 4000  # points of the pool that they are fitted to
 _RIDGE = 1e-9  # added to variances, relative, since rounding may make one negative
@@ -88,7 +87,7 @@ class EmulatedPosterior:
         for _ in range(_ROUNDS):
             points, coords, log_weights = self._propose([(around(scaled, 1.1, freedom), own), *wide], _DRAWS, random)
             scaled = self._moments(scaled, points, coords, log_weights, 1.5)
-            if effective_sample_size(log_weights) > _SETTLED * _DRAWS:
+            if effective_sample_size(log_weights) > RELIABLE_SHARE * _DRAWS:
                 break
         parts = [(around(scaled, 1.1, freedom), own), *wide]
         points, self._pool, log_weights = self._propose(parts, size, random)
@@ -97,7 +96,7 @@ class EmulatedPosterior:
             if effective >= _CURVED * size:
                 break
             rows = np.argsort(-log_weights)[:_FITTED]
-            weights = tempered(log_weights[rows], 1.5 * _ENOUGH_PER_DIMENSION * target.ndim)
+            weights = tempered(log_weights[rows], 1.5 * POINTS_PER_DIMENSION * target.ndim)
             fitted = fit_mixture(points[rows], normalised_weights(weights))
             both = [(fitted, 0.7), *((each, 0.3 * share) for each, share in parts)]
             proposed = self._propose(both, size, random)
@@ -140,7 +139,7 @@ class EmulatedPosterior:
         self, regions: Sequence[Region], points: np.ndarray, coords: np.ndarray, log_weights: np.ndarray, least: float
     ) -> list[Region]:
         """Regions with the moments of weighted points (n, ndim), at coordinates, where these suffice."""
-        enough, nearest, updated = _ENOUGH_PER_DIMENSION * self._target.ndim, self._nearest(coords), []
+        enough, nearest, updated = POINTS_PER_DIMENSION * self._target.ndim, self._nearest(coords), []
         for k, region in enumerate(regions):
             rows = (nearest == k) & (log_weights > -np.inf)
             if rows.any():

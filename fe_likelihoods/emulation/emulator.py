@@ -15,7 +15,7 @@ import numpy as np
 from .gaussian_process import fit_process, predict
 from .target import ResponseTarget
 
-_MAX_COMPONENTS = 60
+_MAX_COMPONENTS = 60  # bounds the cost where a response is rough (not measured)
 _NEGLIGIBLE_VARIANCE = 1e-3  # of the left-out components together, per run, in units of the noise variance
 _SMALLEST_SHARE = 1e-10  # of the leading component
 

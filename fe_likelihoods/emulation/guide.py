@@ -23,7 +23,7 @@ from samplers.judgement.guides import (
     check_unseen_modes,
     find_missing_part,
 )
-from samplers.proposals.mixture import Mixture, draw, log_density
+from samplers.proposals.mixture import DOF, Mixture, draw, log_density
 from samplers.tempering.guide import Guide
 
 from .density import EmulatedPosterior, Region, around, student_mixture
@@ -34,8 +34,8 @@ from .target import ResponseTarget, Steps, at_once
 
 logger = logging.getLogger(__name__)
 
-_WIDE_SHARE, _PRIOR_SHARE = 0.10, 0.05
-_WIDENED, _FREEDOM = 1.5, 5.0  # of the wide components: variances over those of their regions; degrees of freedom
+_WIDE_SHARE, _PRIOR_SHARE = 0.10, 0.05  # of the draws: weights are bounded by their inverses (not measured)
+_WIDENED = 1.5  # of the wide components: variances over those of their regions
 _FEWEST_CACHED = 10_000  # simulations that the likelihood must cache in memory
 _MOST_RUNS = 300  # that train the emulator of a region
 _DEPTH = 40.0, 8.0  # log-density below the best within which runs train an emulator: constant, per dimension
@@ -203,7 +203,7 @@ class ResponseGuide(Guide):
             self._regions, self.known_density = self._emulated.regions, self._emulated.known_density
         except np.linalg.LinAlgError as error:
             logger.info("no emulators could be fitted, or no draws of them made: %s", error)
-        self._wide = around(self._regions, _WIDENED, _FREEDOM)
+        self._wide = around(self._regions, _WIDENED, DOF)
 
     def _fit_region(self, k: int) -> Region:
         """A region with an emulator of its nearest runs."""

@@ -9,14 +9,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from samplers.judgement.guides import HIGHER
+
 from .target import NoiseFit, ResponseTarget, Runs
 
 _FIRST_DAMPING = 1e-2
-_LARGEST_STEP = 2.0  # prior standard deviations
 FIRST_DIFFERENCE = 3e-3  # prior standard deviations
 _DIFFERENCE_SHARE, _DIFFERENCE_LIMITS = 0.1, (3e-4, 2e-2)  # of a posterior standard deviation; prior ones
 _CHECKED_CHANGE = 1e-3  # of the residuals by a step, relative, where the model's derivatives are first used
-_CHECKED_ERROR = 0.05
+_CHECKED_ERROR = 0.05  # of the norm of this change, by which derivatives may differ from it (not measured)
 # Parameters up to which every start makes differences, and their directions where others have made them along all axes.
 # Without, secants of the first ascent lead all starts into its mode: in 8 parameters, one of two was lost in 4 of 12
 # searches; with 3, 5 and 8 directions in none, for 109, 129 and 158 simulations.
@@ -36,14 +37,13 @@ _PATIENCE, _HOPELESS, _LEFT = 4, 200.0, 6.0
 # Log-density that the error of a prediction which shows the same mode costs. As a share of all that the parameters
 # change, which hides one of them that has two modes, starts joined the other mode in 7 of 12 searches.
 _EXPLAINED = 1.0
-_NEAR = 20.0  # largest difference of log-densities at which the line between ends is examined
 _ALONG = np.array([0.207, 0.414, 0.732])  # points of this line, unequal so that equally spaced modes are not all hit
 _SAME_MODE = 4.0  # squared distance per dimension, in units of a Laplace approximation, up to which no line is needed
 _DIP = 3.0  # depth of a valley in log-density that separates modes
 _DESIGN_FROM = 0.25  # log-density per dimension still to gain at which the steps of a standard deviation are made
-# Directions that are left to the prior, and standard deviations that are simulated along them. Without these runs, the
-# evidence of one of two ridges was wrong by six stated errors.
-_LONGEST, _FAR = 4, 2.0
+# Prior standard deviations of the largest step, and of the runs along directions that are left to the prior, of which
+# there are at most so many. Without these runs, the evidence of one of two ridges was wrong by six stated errors.
+_FAR, _LONGEST = 2.0, 4
 _FREE = 2.0  # curvatures of the Hessian below this are the prior's, which is 1, with little of the data's
 _SHARPEST = 1e18  # curvature at which a step of a standard deviation, 1e-9 of the prior's, is lost in rounding
 _EXACT = (
@@ -251,7 +251,7 @@ class Climb:
             if at.gain_left < tolerance or failures > 3:
                 return None
             move = np.linalg.solve(at.hessian + damping * np.diag(np.diag(at.hessian)), at.gradient)
-            move *= min(1.0, _LARGEST_STEP / np.abs(move).max())
+            move *= min(1.0, _FAR / np.abs(move).max())
             point = (at.coords + move)[None]
             runs = yield point
             reached = self._heights(point, runs, at.noise.coords)
@@ -299,7 +299,7 @@ class Climb:
         """
         here = self._here
         for number, end in list(self.known.items()):
-            near = abs(end.value - here.value) < _NEAR and np.abs(end.coords - here.coords).max() < self.apart
+            near = abs(end.value - here.value) < HIGHER and np.abs(end.coords - here.coords).max() < self.apart
             if number == self.number or not near or (end.value < here.value - _DIP and not end.ended):
                 continue
             move, depth = here.coords - end.coords, 0.0
