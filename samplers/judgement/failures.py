@@ -14,9 +14,7 @@ from ..finding import CARE, FALSE_ALARM, WRONG, Finding
 # least 5 failures, those 6 standard deviations beside a bent ridge rarely count, and those at an edge do.
 NEAREST = 20  # or all evaluated points per sample, if these are more
 FEWEST_ADJOINING = 5  # as many points about each are looked at, which tell scattered failures from a region of them
-LEAST_ADJOINING = (
-    0.08  # of the failures in the ellipsoid by that of points there; at 0, 43 of 60 bends for 3 are refused
-)
+LEAST_ADJOINING = 0.08  # in the ellipsoid, by the share of all points there; at 0, 43 of 60 right bends are refused
 LARGE_SHARE_NEAR = 0.02  # of the evaluated points among the samples
 # Probability of so many failures with this share, below which there are more. Cut off 1 to 1.6 standard deviations
 # beside the mode, 24 of 26 runs are then refused, whose means are off by 2 to 5 errors; at 2, 2 of 21 right ones.
