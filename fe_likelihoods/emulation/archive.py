@@ -31,7 +31,8 @@ class Archive:
     """
 
     def __init__(self, statistic: Callable[[np.ndarray], np.ndarray], shape: tuple[int, int]) -> None:
-        self._statistic, self._shape = statistic, shape
+        self._statistic, self._shape, self._kept = statistic, shape, 1.0
+        self._views: list[Archive] = []
         self.numbers, self.coords, self.statistics = np.empty(0, int), np.empty((0, 0)), np.empty((0, 0))
         self._ends = [0]  # of the histories that were added, and are multiplied, together
         self._forms: dict[tuple[int, int], np.ndarray] = {}  # (k, l, n_numbers) of two such batches
@@ -47,10 +48,24 @@ class Archive:
     def add(self, coords: np.ndarray, residuals: np.ndarray, statistics: np.ndarray) -> np.ndarray:
         """Add runs at coordinates (m, n_structural); returns their numbers (m,)."""
         numbers = self.add_histories(residuals)
+        self._append(numbers, coords, statistics)
+        for view in self._views if len(numbers) else ():
+            view._append(numbers, coords, np.array([view._statistic(each * view._kept) for each in residuals]))
+        return numbers
+
+    def _append(self, numbers: np.ndarray, coords: np.ndarray, statistics: np.ndarray) -> None:
+        """Add runs to the arrays of all runs."""
         both = (self.coords, coords), (self.statistics, statistics)
         self.coords, self.statistics = (np.concatenate(each[not len(self.numbers) :]) for each in both)
         self.numbers = np.append(self.numbers, numbers)
-        return numbers
+
+    def view(self, statistic: Callable[[np.ndarray], np.ndarray], kept: np.ndarray) -> "Archive":
+        """An archive of the same histories, so far none, that are zero where not `kept` (n_channels, n_steps)."""
+        other = Archive(statistic, self._shape)
+        other._file.close()
+        other._kept, other._file, other._ends = kept, self._file, self._ends
+        self._views.append(other)
+        return other
 
     def add_histories(self, histories: np.ndarray) -> np.ndarray:
         """Add histories (m, n_channels, n_steps), rounded to single precision; returns their numbers (m,)."""
@@ -74,7 +89,8 @@ class Archive:
         """Histories (n, n_channels, n_steps) by their numbers: of runs, measured minus simulated responses [SI]."""
         size = self._shape[0] * self._shape[1]
         self._file.seek(4 * size * rows.start)
-        return np.fromfile(self._file, np.float32, size * len(rows)).reshape(-1, *self._shape).astype(float)
+        found = np.fromfile(self._file, np.float32, size * len(rows)).reshape(-1, *self._shape)
+        return found.astype(float) * self._kept
 
     def weights(self, rows: Sequence[Any]) -> np.ndarray:
         """Combinations (k, n) that are given as numbers of histories, or as weights of the first of them."""

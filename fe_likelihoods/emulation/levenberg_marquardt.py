@@ -18,18 +18,15 @@ FIRST_DIFFERENCE = 3e-3  # prior standard deviations
 _DIFFERENCE_SHARE, _DIFFERENCE_LIMITS = 0.1, (3e-4, 2e-2)  # of a posterior standard deviation; prior ones
 _CHECKED_CHANGE = 1e-3  # of the residuals by a step, relative, where the model's derivatives are first used
 _CHECKED_ERROR = 0.05  # of the norm of this change, by which derivatives may differ from it (not measured)
-# Parameters up to which every start makes differences, and their directions where others have made them along all axes.
-# Without, secants of the first ascent lead all starts into its mode: in 8 parameters, one of two was lost in 4 of 12
-# searches; with 3, 5 and 8 directions in none, for 109, 129 and 158 simulations.
-_OWN, _DIRECTIONS = 12, 3
 _NEAREST_RUNS = 3, 10  # runs that secants are fitted to: per dimension, and in addition
 _TOO_CLOSE = 1e-8  # squared distance of runs that tell nothing about derivatives: residuals have seven digits
 TOLERANCE = 0.5  # log-density still to gain, according to the quadratic approximation
 _MAX_ITERATIONS = 40
 _STALLED = 0.1  # gain in log-density below which a step counts as failed
-# Share of the promised gain below which an ascent with derivatives of its own makes new differences. Without them,
-# searches need 5 to 23 % fewer simulations, but fewer starts of a column end at a mode: its right runs are doubted.
-_MISLED = 0.7
+# Share of the promised gain below which an ascent that is alone makes new differences: 0.7 took 246 simulations in a
+# search of a column (of 12), 0.4 took 177, and 0 took 181, but only one start ended at a mode in two of them. Where
+# ascents share all runs, this costs more than it saves (20 and 30 parameters: 202 and 300 simulations, or 126 and 172).
+_MISLED = 0.4
 # on a part of the record, an ascent is given up after so many iterations, if it is so far below the best one, and needs
 # so many more like the last; on the whole record, where this saves nothing, it may lead to another mode. Without this,
 # searches of the isolated bridge took 509 and 387 simulations instead of 94 and 218
@@ -83,8 +80,9 @@ class Climb:
     """Levenberg-Marquardt from one start on a part of the record, where the prior is centred at `centre`.
 
     `known` has where every ascent on this part has arrived, by its number; ends are different where one coordinate
-    differs by `apart`. Where no shorter part came before the `whole` record, a step of a standard deviation is
-    simulated along every axis of the Laplace approximation at the end.
+    differs by `apart`. On a shorter record, where runs are cheap, it is `alone`: its derivatives are its own. Where no
+    shorter part came before the `whole` record, a step of a standard deviation is simulated along every axis of the
+    Laplace approximation at the end.
     """
 
     target: ResponseTarget
@@ -94,6 +92,7 @@ class Climb:
     known: dict[int, Ascent]
     apart: float
     whole: bool
+    alone: bool
 
     def run(self, start: np.ndarray, steps: np.ndarray | None, tolerance: float) -> Requests:
         """Returns the number of the ascent that it joins, its own at an end of its own, -1 if it fails or is given up.
@@ -109,9 +108,8 @@ class Climb:
                 yield from self._difference(steps)
             elif steps is not None or not self.derivatives:
                 yield from self._derive(FIRST_DIFFERENCE * np.eye(len(start)))
-            elif len(start) <= _OWN or self.target.data.differentiable:
-                axes = np.linalg.qr(np.random.default_rng(self.number).standard_normal(2 * start.shape))[0]
-                yield from self._derive(FIRST_DIFFERENCE * axes[:_DIRECTIONS])
+            elif self.target.data.differentiable:
+                yield from self._derive(np.empty((0, len(start))))
         if joined is None:
             first = max(tolerance, _DESIGN_FROM * len(start)) if steps is None else tolerance
             joined = yield from self._climb(True, first)
@@ -156,7 +154,9 @@ class Climb:
         self.derivatives.append((self._here.coords, slopes + np.linalg.pinv(steps) @ changes))
 
     def _derive(self, steps: np.ndarray) -> Requests:
-        """Derivatives at the present point: the model's own, or by differences with steps (n, d)."""
+        """Derivatives at the present point: the model's own, or by differences with steps (n, d); unless known."""
+        if any(np.array_equal(self._here.coords, point) for point, _ in self.derivatives):
+            return
         if self.target.data.differentiable:
             slopes = yield self._here.coords
             if self.target.unchecked:  # the first derivatives are compared with a difference
@@ -200,8 +200,8 @@ class Climb:
             )
 
     def _slopes(self) -> np.ndarray:
-        """Derivatives (d, n) of the residuals here, from differences at few points and all runs that are nearer than
-        `apart` in each coordinate: those of other ascents farther away lead into their modes.
+        """Derivatives (d, n) of the residuals here, from differences at few points and all lower runs: secants to
+        higher ones lead ascents into the modes of others (two storeys in 8 and 15 parameters: one lost in 15 of 16).
 
         At a point z, with the derivatives J_0 of the nearest point z_0 at which they are known, and runs at z + s_i
         whose residuals differ by y_i from those at z, they are J_0 + D with the least sum_i |y_i - (J_0 + D) s_i|^2 /
@@ -213,7 +213,10 @@ class Climb:
         far, d = float(np.square(origin - here.coords).sum()), len(origin)
         steps = archive.coords - here.coords
         squared = np.square(steps).sum(axis=1)
-        rows = np.flatnonzero((squared > _TOO_CLOSE) & (np.abs(steps).max(axis=1) < self.apart))
+        noise = np.repeat(here.noise.coords[None], len(steps) + 1, axis=0)
+        heights = self.target.log_likelihood(np.concatenate([archive.statistics, here.statistics[None]]), noise)
+        heights += self.target.log_prior(np.concatenate([archive.coords, here.coords[None]]) - self.centre)
+        rows = np.flatnonzero((squared > _TOO_CLOSE) & (heights[:-1] < heights[-1]))
         rows = rows[np.argsort(squared[rows])[: _NEAREST_RUNS[0] * d + _NEAREST_RUNS[1]]]
         if far < _TOO_CLOSE or not len(rows):
             return slopes
@@ -263,13 +266,13 @@ class Climb:
                 failures = 0
                 damping *= 0.1 if gain > 0.5 * promised else 1.0
                 # a model is asked everywhere: by secants 13 of 16 searches in 8 and 15 parameters lost one of two modes
-                if self.target.data.differentiable or gain < _MISLED * promised and not self.whole:
+                if self.target.data.differentiable or gain < _MISLED * promised and self.alone:
                     yield from self._own_differences(at, 1.0)
                 continue
             failures += 1
             damping = max(30.0 * damping, _FIRST_DAMPING)
             # the first time, the run that gained nothing has corrected the secants
-            if failures > 1 and not any(np.array_equal(self._here.coords, point) for point, _ in self.derivatives):
+            if failures > 1:
                 yield from self._own_differences(at, failures)
         return None
 
@@ -303,7 +306,7 @@ class Climb:
             if number == self.number or not near or (end.value < here.value - _DIP and not end.ended):
                 continue
             move, depth = here.coords - end.coords, 0.0
-            if min(move @ each.hessian @ move for each in (end, self.known[self.number])) > _SAME_MODE * len(move):
+            if min(move @ each.hessian @ move for each in (end, self.known[self.number])) > _SAME_MODE:
                 points = self.target.line(here.coords, end.coords, _ALONG)
                 runs = yield points
                 if runs.failed.any() or number not in self.known:

@@ -22,7 +22,6 @@ from .target import ResponseTarget, Runs, Steps, at_once, nothing_stored
 LOOSEST = 5.0  # largest gain that may be left on a short part of the record, or at the top of a rough likelihood
 _FLATTEST = 0.2  # smallest curvature of the Laplace approximation: five times the variance of the prior
 _APART = 0.25  # prior standard deviations in one coordinate that part ends on a part of the record
-_FEW = 6  # parameters whose differences cost about as much as two steps
 _MOST_STARTS, _DRAWN = 2, 4  # times the number asked for: that begin, and of which the highest begin
 _STEP = 1e-4  # of the derivatives of parameters by coordinates
 # Shares of the Arias intensity at which the parts of the record end. On whole records alone, two runs on the isolated
@@ -132,6 +131,7 @@ class Search:
         self._target, self._starts, self._session, self._tolerance, self.spent = target, starts, session, tolerance, 0.0
         parts = [*(target.first_parts(_SHARES) if derivatives is None else ()), target]
         self._parts = [_Part(part, part.n_steps / target.n_steps, {}) for part in parts]
+        self._grown = self._parts[0].share < 1.0
         self.derivatives = [] if derivatives is None else derivatives
         self.standing_for: list[int] = []  # start that has taken the place of each that has begun; -1 for none
 
@@ -188,25 +188,27 @@ class Search:
 
     def _ascend(self, numbers: range) -> Steps:
         """Ascents from starts on all parts of the record."""
-        small = FIRST_DIFFERENCE * np.eye(self._target.n_structural) if len(self._parts) > 1 else None
+        small = FIRST_DIFFERENCE * np.eye(self._target.n_structural) if self._grown else None
         fronts = {k: (self._starts[k], small) for k in numbers}
         for place, part in enumerate(self._parts):
             whole = part.target is self._target
             # ends may differ on a later part of the record only, so that none may be lost before
             apart = np.inf if whole else _APART
-            shared = whole and self._target.n_structural > _FEW
             # one ascent leads: others often lead to its end, which costs them no derivatives
-            order, leading = list(fronts), 1 if place or shared else len(fronts)
+            order, leading = list(fronts), 1 if place or not self._grown else len(fronts)
             for wave in (order[:leading], order[leading:]):
                 ascents = {}
                 for k in wave:
                     start, steps = fronts[k]
                     centre = np.zeros(self._target.n_structural) if whole else start
-                    climb = Climb(part.target, self.derivatives if shared else [], k, centre, part.ends, apart, whole)
-                    least = self._tolerance if whole else min(TOLERANCE / part.share, LOOSEST)
+                    derivatives = [] if self._grown else self.derivatives
+                    alone = self._grown and not whole
+                    climb = Climb(part.target, derivatives, k, centre, part.ends, apart, whole, alone)
+                    loose = min(TOLERANCE / part.share, LOOSEST) if self._grown else LOOSEST
+                    least = self._tolerance if whole else loose
                     ascents[k] = climb.run(start, steps, least)
                 yield from self._side_by_side(part, ascents)
-            wide = place == len(self._parts) - 2
+            wide = self._grown and place == len(self._parts) - 2
             ends = {k: part.ends[k] for k in fronts if k in part.ends}
             fronts = {
                 k: (end.coords, axes_of(end, FIRST_DIFFERENCE) if wide else small)
@@ -249,7 +251,7 @@ class Search:
             for _ in self.standing_for:  # two starts may stand for each other, one of them on an earlier part
                 k = k if k < 0 or k in ends else self.standing_for[k]
             led.append(next((number for number, (_, start) in enumerate(kept) if start == k), -1))
-        names, grown = tuple(self._target.posterior.parameter_names), len(self._parts) > 1
+        names, grown = tuple(self._target.posterior.parameter_names), self._grown
         return ModeSearch(tuple(mode for mode, _ in kept), tuple(led), self.spent, finished, grown, names)
 
 

@@ -68,7 +68,7 @@ class ResponseTarget:
         self.ndim, self.n_structural = posterior.ndim, len(self.data.parameter_names)
         self.n_noise = self.ndim - self.n_structural
         self.n_steps = self.data.shape[1]
-        self.archive = Archive(self.data.statistic, self.data.shape)
+        self.archive, self._whole = Archive(self.data.statistic, self.data.shape), self
         self._numbers: dict[bytes, int] = {}  # of simulated coordinates in the archive, -1 where failed
         self.unchecked = [True] if self.data.differentiable else []
         self._structural = self._prior.subset(self._prior.names[: self.n_structural])
@@ -87,8 +87,11 @@ class ResponseTarget:
         """The same posterior for the first parts of the record, see `FELikelihood.first_parts`."""
         parts = self.posterior.likelihood.first_parts(shares)
         targets = [ResponseTarget(type(self.posterior)(part, self._prior)) for part in parts]
-        for each in targets:
+        for each, part in zip(targets, parts, strict=True):
             each.unchecked = self.unchecked
+            if part.model is self.posterior.likelihood.model:  # cannot be shortened: the same simulations are used
+                each._whole, each._numbers = self, self._numbers
+                each.archive = self.archive.view(each.data.statistic, ~part.measured.missing)
         return targets
 
     # ------------------------------------------------------------------ coordinates
@@ -163,6 +166,8 @@ class ResponseTarget:
         Yields what is to be called, so that no search stands between a sampler and a model; residuals are rounded to
         single precision, so that a resumed run is the same.
         """
+        if self._whole is not self:  # which leaves nothing new
+            yield from self._whole.run(coords, remember, thetas)
         thetas = self.structural_parameters(coords) if thetas is None else thetas
         keys = [row.tobytes() for row in coords]
         new = list({key: row for row, key in enumerate(keys) if key not in self._numbers}.values())
@@ -184,6 +189,8 @@ class ResponseTarget:
         """Derivatives of residuals by coordinates (n, n_structural), as numbers (n, n_structural) in the archive, from
         the model's own. Yields as `run`.
         """
+        if self._whole is not self:
+            return (yield from self._whole.derivatives(coords, remember))
         thetas, steps = self.structural_parameters(coords), _STEP * np.eye(self.n_structural)
         (found,) = yield from self._stored("slopes of residuals", self.data.derivatives, thetas, remember)
         numbers = []

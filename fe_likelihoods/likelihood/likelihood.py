@@ -7,6 +7,7 @@ residuals, see `fe_likelihoods.noise.gaussian`.) A `Simulator` runs and caches t
 """
 
 import copy
+import dataclasses
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -199,13 +200,18 @@ class FELikelihood(SumOfDataSets):
         period add up to a phase there.
         """
         static = isinstance(getattr(self.model, "loading", None), DisplacementHistory)
-        if static or not hasattr(self.model, "first") or not self.measurements.simultaneous:
+        if static or not self.measurements.simultaneous:
             return []
         found, measured = [], self.measurements
         steps = np.nan_to_num(np.diff(measured.values, axis=1))  # because a residual displacement is not motion
         for seconds in growing_durations(steps, measured.dt, shares)[:-1] if steps.any() else ():
             try:
-                found.append(self.first(measured.start + seconds))
+                if hasattr(self.model, "first"):
+                    found.append(self.first(measured.start + seconds))
+                else:
+                    later = measured.dt * np.arange(measured.values.shape[1]) > seconds + SAME_TIME
+                    part = dataclasses.replace(measured, values=np.where(later, np.nan, measured.values))
+                    found.append(self._with(self.model, part, self.noise))
             except ValueError:
                 if not isinstance(self.measured, Comparison):
                     raise  # else a channel has no sample in this part

