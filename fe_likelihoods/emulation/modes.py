@@ -1,9 +1,10 @@
 """Modes of a posterior, by ascents from several starts on growing parts of the record.
 
-A model that can be shortened (``first(seconds)``) is first fitted to the start of its record, from all starts, and then
-to longer parts, from the distinct ends so far (`fe_likelihoods.emulation.levenberg_marquardt`). Short runs are cheap,
-and their misfit is smoother, because errors in a period have had less time to add up to a phase. There the prior is
-centred on each start, so that starts keep their differences in parameters without effect on the early part.
+A model is first fitted to the start of its record, from all starts, and then to longer parts, from the distinct ends so
+far (`fe_likelihoods.emulation.levenberg_marquardt`). The misfit of short parts is smoother, because errors in a period
+have had less time to add up to a phase. There the prior is centred on each start, so that starts keep their differences
+in parameters without effect on the early part. A model with ``first(seconds)`` simulates these parts alone, and the
+record is said to grow; of another one, all parts use the same simulations of the whole record.
 """
 
 from typing import Any, NamedTuple
@@ -50,7 +51,7 @@ class ModeSearch(NamedTuple):
     #: simulations run, parts of a record counted as fractions; a call of the model's ``jacobian`` counts as one
     simulations: float
     finished: bool  #: False if `max_simulations` ended the search
-    #: whether it began with the first part of the record, where most starts are given up, in right runs as well
+    #: whether it simulated short parts of the record alone, where most starts are given up, in right runs as well
     grown: bool = False
     parameter_names: tuple[str, ...] = ()  #: names of all parameters
 

@@ -196,8 +196,8 @@ class FELikelihood(SumOfDataSets):
     def first_parts(self, shares: Sequence[float]) -> list["FELikelihood"]:
         """The likelihoods of the first parts of the measurements, up to shares of their Arias intensity.
 
-        None where the model has no ``first``, channels are not simultaneous, or the test is static: no errors of a
-        period add up to a phase there.
+        Those of a model without ``first`` have missing samples instead. None where channels are not simultaneous, or
+        the test is static: no errors of a period add up to a phase there.
         """
         static = isinstance(getattr(self.model, "loading", None), DisplacementHistory)
         if static or not self.measurements.simultaneous:

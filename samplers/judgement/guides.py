@@ -12,8 +12,8 @@ UNSEEN = "A part of the posterior may be missing"
 DOUBTED_SHARE = 0.05
 # The same, from which a result is not usable: 20 of 21, and 12 of 62.
 REFUSED_SHARE = 0.3
-# Starts that have to end at one mode, if the search grew with the record. Fewer than six, without growth, spoke in 9 of
-# 9 searches that had found one of several modes, and in 6 of 10 that had found the only one. A single one of several
+# Starts that have to end at one mode, if a search simulated short parts of the record. Fewer than six, on whole ones,
+# spoke in 9 of 9 searches that had found one of several modes, and in 6 of 10 that had found the only one. A single one of several
 # is no reason to refuse a result: with starts in the order drawn and limits of 200 and 400, it was left in 3 of 22
 # searches that had lost one of two modes, and in 29 of 40 right ones of a model that fails in a third of the prior.
 GROWN_STARTS = 2
@@ -34,13 +34,13 @@ def find_missing_part(text: str, severity: str = CARE) -> Finding:
 
 
 def check_ends(ended: int, made: int, starts: int, grown: bool) -> list[Finding]:
-    """Whether half of the `starts` that were asked for led to the only mode; `grown`: on a record that grows."""
+    """Whether half of the `starts` that were asked for led to the only mode; `grown`: on short parts of a record."""
     if ended == 0 or ended >= (GROWN_STARTS if grown else (starts + 1) // 2):
         return []
     text = (
         f"only {ended} of {made} starts led to the one mode that was found, the others were given up far below it: "
         f"{1.0 - 0.05 ** (1.0 / ended):.0%} of such starts may lead to modes that were not found. Use more starts; "
-        "for histories, let a function take n_steps, so that the search begins with the first part of the record"
+        "for histories, let a function take n_steps, so that short parts of the record, where starts go first, are cheap"
     )
     return [find_missing_part(text)]
 
