@@ -197,10 +197,10 @@ class FELikelihood(SumOfDataSets):
         """The likelihoods of the first parts of the measurements, up to shares of their Arias intensity.
 
         Those of a model without ``first`` have missing samples instead. None where channels are not simultaneous, or
-        the test is static: no errors of a period add up to a phase there.
+        samples are not along time, or the test is static: no errors of a period add up to a phase there.
         """
         static = isinstance(getattr(self.model, "loading", None), DisplacementHistory)
-        if static or not self.measurements.simultaneous:
+        if static or not self.measurements.is_history or not self.measurements.simultaneous:
             return []
         found, measured = [], self.measurements
         steps = np.nan_to_num(np.diff(measured.values, axis=1))  # because a residual displacement is not motion

@@ -17,6 +17,7 @@ def test_the_posterior_of_a_flexibility_is_normal():
     model = test.model(lambda theta: theta[0] * UNIT, ("flexibility",))
     posterior = Posterior(FELikelihood(model, test.measurements), {"flexibility": Uniform(0.5, 2.0)} | test.known)
     assert posterior.parameter_names == ["flexibility"] and test.measurements.points == CASES
+    assert not posterior.likelihood.first_parts([0.1])  # load cases have no order
     weights = UNIT / np.array([[2e-5], [1e-6]])
     weights[1, 2] = 0.0
     precision = np.square(weights).sum()
