@@ -12,11 +12,10 @@ UNSEEN = "A part of the posterior may be missing"
 DOUBTED_SHARE = 0.05
 # The same, from which a result is not usable: 20 of 21, and 12 of 62.
 REFUSED_SHARE = 0.3
-# Starts that have to end at one mode, if a search simulated short parts of the record. Fewer than six, on whole ones,
-# spoke in 9 of 9 searches that had found one of several modes, and in 6 of 10 that had found the only one. A single one
-# of several is no reason to refuse a result: with starts in the order drawn and limits of 200 and 400, it was left in 3
-# of 22 searches that had lost one of two modes, and in 29 of 40 right ones of a model that fails in a third of the
-# prior.
+# Starts that have to end at one mode, if a search simulated short records. Fewer than six, on whole ones, spoke in 9 of
+# 9 searches that had found one of several modes, and in 6 of 10 that had found the only one. A single one of several is
+# no reason to refuse a result: with starts in the order drawn and limits of 200 and 400, it was left in 3 of 22
+# searches that had lost one of two modes, and in 29 of 40 right ones of a model that fails in a third of the prior.
 GROWN_STARTS = 2
 # Log-density below the best of a probable simulation, and above the emulated one of a simulation that is excluded.
 # On ridges E h^3 with uniform priors, 20 runs: 4 of 7 wrong runs, among them the 2 that change little from round to
