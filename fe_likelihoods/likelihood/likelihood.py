@@ -205,16 +205,15 @@ class FELikelihood(SumOfDataSets):
         found, measured = [], self.measurements
         steps = np.nan_to_num(np.diff(measured.values, axis=1))  # because a residual displacement is not motion
         for seconds in growing_durations(steps, measured.dt, shares)[:-1] if steps.any() else ():
-            try:
-                if hasattr(self.model, "first"):
-                    found.append(self.first(measured.start + seconds))
-                else:
-                    later = measured.dt * np.arange(measured.values.shape[1]) > seconds + SAME_TIME
-                    part = dataclasses.replace(measured, values=np.where(later, np.nan, measured.values))
-                    found.append(self._with(self.model, part, self.noise))
-            except ValueError:
-                if not isinstance(self.measured, Comparison):
-                    raise  # else a channel has no sample in this part
+            later = measured.dt * np.arange(measured.values.shape[1]) > seconds + SAME_TIME
+            values = np.where(later, np.nan, measured.values)
+            # a channel that is still at rest, or has no sample in this part, says nothing of its noise
+            if not np.nan_to_num(values).any(axis=1).all():
+                continue
+            if hasattr(self.model, "first"):
+                found.append(self.first(measured.start + seconds))
+            else:
+                found.append(self._with(self.model, dataclasses.replace(measured, values=values), self.noise))
         return found
 
     def residuals_of(self, response: np.ndarray) -> np.ndarray:

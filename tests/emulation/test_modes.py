@@ -244,6 +244,21 @@ def test_a_model_that_needs_the_whole_record_is_searched_on_it():
     assert search.modes and all(mode.converged for mode in search.modes)
 
 
+def test_a_channel_that_is_at_rest_at_first_denies_no_part_of_the_record():
+    time, channels = DT * np.arange(N_STEPS), (CHANNELS[0], Channel("roof", "displacement", "mm"))
+
+    def pulse(theta):
+        later = np.maximum(time - 2.0, 0.0)
+        return np.stack([0.05 * np.sin(9.0 * np.sqrt(theta[0]) * each) for each in (time, later)])
+
+    model = FunctionModel(pulse, ["stiffness"], channels, DT, N_STEPS)
+    values = noisy(model, np.array([1.2]), np.array([2e-3, 2e-3])).values * np.array([time >= 0.0, time > 2.0])
+    sigmas = {"sigma_top": HalfNormal(0.01), "sigma_roof": HalfNormal(0.01)}
+    likelihood = FELikelihood(model, Measurements(channels, DT, values)).marginal(sigmas)
+    search = find_modes(Posterior(likelihood, {"stiffness": TruncatedNormal(1.0, 0.3)}), seed=1)
+    assert len(search.modes) == 1 and abs(search.modes[0].parameters[0] - 1.2) < 0.01
+
+
 def test_a_search_in_which_everything_fails_finds_nothing():
     def fails(theta):
         raise RuntimeError("diverged")
