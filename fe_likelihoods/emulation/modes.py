@@ -23,7 +23,6 @@ from .target import ResponseTarget, Runs, Steps, at_once, nothing_stored
 LOOSEST = 5.0  # largest gain that may be left on a short part of the record, or at the top of a rough likelihood
 _FLATTEST = 0.2  # smallest curvature of the Laplace approximation: five times the variance of the prior
 _APART = 0.25  # prior standard deviations in one coordinate that part ends on a part of the record
-_MOST_STARTS, _DRAWN = 2, 4  # times the number asked for: that begin, and of which the highest begin
 _STEP = 1e-4  # of the derivatives of parameters by coordinates
 # Shares of the Arias intensity at which the parts of the record end. On whole records alone, two runs on the isolated
 # bridge took 308 and 306 simulations instead of 153 and 152.
@@ -146,8 +145,6 @@ class Search:
         begin, following, finished = 0, starts, True
         while True:
             try:
-                if begin == starts:
-                    yield from self._order(starts)
                 self.standing_for.extend(range(begin, following))
                 yield from self._ascend(range(begin, following))
             except _OutOfBudget:
@@ -175,17 +172,6 @@ class Search:
         if not self._session.fits(simulations):
             raise _OutOfBudget
         self.spent += simulations
-
-    def _order(self, begun: int) -> Steps:
-        """Further starts in the order of their likelihoods on the first part: high ones end at modes more often."""
-        part, rest = self._parts[0], self._starts[begun:]
-        self._pay(part.share * part.target.new_points(rest))
-        runs = yield from part.target.run(rest, self._session.remember)
-        yield None
-        found = zip(runs.failed, runs.statistics, strict=True)
-        heights = [-np.inf if failed else part.target.fit_noise(each).log_density for failed, each in found]
-        highest = np.argsort(-np.array(heights), kind="stable")[: (_MOST_STARTS - 1) * begun]
-        self._starts = np.concatenate([self._starts[:begun], rest[highest]])
 
     def _ascend(self, numbers: range) -> Steps:
         """Ascents from starts on all parts of the record."""
@@ -258,11 +244,11 @@ class Search:
 
 def draw_starts(target: ResponseTarget, n: int, random: Any) -> np.ndarray:
     """Starts (m, n_structural) in standard normal coordinates, of which a search begins with the first n: the median of
-    the prior, and a Latin hypercube of n - 1. A larger one of further starts follows; none for n = 1.
+    the prior, and a Latin hypercube of n - 1. One of n further starts follows; none for n = 1.
     """
     d = target.n_structural
     blocks = [np.zeros((1, d))]
-    for size in (n - 1, (_DRAWN - 1) * n) if n > 1 else ():
+    for size in (n - 1, n) if n > 1 else ():
         columns = [random.permutation(size) + random.uniform(size=size) for _ in range(d)]
         blocks.append(ndtri(np.column_stack(columns) / size))
     return np.concatenate(blocks)
