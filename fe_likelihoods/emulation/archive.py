@@ -48,16 +48,12 @@ class Archive:
     def add(self, coords: np.ndarray, residuals: np.ndarray, statistics: np.ndarray) -> np.ndarray:
         """Add runs at coordinates (m, n_structural); returns their numbers (m,)."""
         numbers = self.add_histories(residuals)
-        self._append(numbers, coords, statistics)
-        for view in self._views if len(numbers) else ():
-            view._append(numbers, coords, np.array([view._statistic(each * view._kept) for each in residuals]))
+        for each in (self, *self._views) if len(numbers) else ():
+            own = statistics if each is self else np.array([each._statistic(r * each._kept) for r in residuals])
+            both = (each.coords, coords), (each.statistics, own)
+            each.coords, each.statistics = (np.concatenate(pair[not len(each.numbers) :]) for pair in both)
+            each.numbers = np.append(each.numbers, numbers)
         return numbers
-
-    def _append(self, numbers: np.ndarray, coords: np.ndarray, statistics: np.ndarray) -> None:
-        """Add runs to the arrays of all runs."""
-        both = (self.coords, coords), (self.statistics, statistics)
-        self.coords, self.statistics = (np.concatenate(each[not len(self.numbers) :]) for each in both)
-        self.numbers = np.append(self.numbers, numbers)
 
     def view(self, statistic: Callable[[np.ndarray], np.ndarray], kept: np.ndarray) -> "Archive":
         """An archive of the same histories, so far none, that are zero where not `kept` (n_channels, n_steps)."""

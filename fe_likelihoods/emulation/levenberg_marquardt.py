@@ -35,7 +35,7 @@ _PATIENCE, _HOPELESS, _LEFT = 4, 200.0, 6.0
 # change, which hides one of them that has two modes, starts joined the other mode in 7 of 12 searches.
 _EXPLAINED = 1.0
 _ALONG = np.array([0.207, 0.414, 0.732])  # points of this line, unequal so that equally spaced modes are not all hit
-_SAME_MODE = 4.0  # squared distance per dimension, in units of a Laplace approximation, up to which no line is needed
+_SAME_MODE = 4.0  # squared distance up to which no line is needed; 4 d joined two modes of 15 parameters
 _DIP = 3.0  # depth of a valley in log-density that separates modes
 _DESIGN_FROM = 0.25  # log-density per dimension still to gain at which the steps of a standard deviation are made
 # Prior standard deviations of the largest step, and of the runs along directions that are left to the prior, of which
@@ -234,7 +234,7 @@ class Climb:
         gradient = 2.0 * forms[:-1, -1] - (self._here.coords - self.centre)
         values, vectors = np.linalg.eigh(np.eye(len(slopes)) - 2.0 * forms[:-1, :-1])
         if not values[-1] < _SHARPEST:
-            raise ValueError(_EXACT.format(self.target.structural_parameters(self._here.coords[None])[0]))
+            raise ValueError(_EXACT.format(self.target.parameters(self._here.coords[None])[0]))
         hessian = (vectors * np.maximum(values, 1.0)) @ vectors.T  # rounding can make it less than the prior's
         self.known[self.number] = self._here._replace(
             slopes=slopes, weights=weights, gradient=gradient, hessian=hessian

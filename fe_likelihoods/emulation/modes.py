@@ -150,8 +150,7 @@ class Search:
             except _OutOfBudget:
                 finished = False
             if finished and len(self._parts) > 1 and not self._parts[0].ends:
-                del self._parts[:-1]
-                begin, self.standing_for = 0, []
+                self._parts, self._grown, begin, self.standing_for = self._parts[-1:], False, 0, []
                 continue
             search = self._found(finished)
             half = (starts + 1) // 2

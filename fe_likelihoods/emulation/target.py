@@ -74,7 +74,7 @@ class ResponseTarget:
         self._structural = self._prior.subset(self._prior.names[: self.n_structural])
         self._noise = self._prior.subset(self._prior.names[self.n_structural :]) if self.n_noise else None
         at = np.array([[-_AT_BOUND], [-3.0], [-2.0], [2.0], [3.0]]) * np.ones(self.n_structural)
-        least, lower, low, high, higher = self.structural_parameters(at)
+        least, lower, low, high, higher = self.parameters(at)
         factors = (least >= 0.0) & (low > 0.0) & (high < LARGEST_FACTOR * low)
         # of inputs of emulators: logarithms where priors are lognormal; of factors themselves, logarithms (products, as
         # E I, are linear), or reciprocals (as deflections of springs in series are), whose tails draws miss near zero
@@ -97,12 +97,8 @@ class ResponseTarget:
     # ------------------------------------------------------------------ coordinates
 
     def parameters(self, coords: np.ndarray) -> np.ndarray:
-        """Parameters (n, ndim) at coordinates (n, ndim)."""
-        return self._prior.from_normal(coords)
-
-    def structural_parameters(self, coords: np.ndarray) -> np.ndarray:
-        """Structural parameters (n, n_structural) at coordinates (n, n_structural)."""
-        return self._structural.from_normal(coords)
+        """Parameters (n, ndim) at coordinates (n, ndim), or structural ones at coordinates (n, n_structural)."""
+        return (self._prior if coords.shape[1] == self.ndim else self._structural).from_normal(coords)
 
     def coordinates(self, parameters: np.ndarray) -> np.ndarray:
         """Coordinates of parameters (n, ndim), or of structural ones (n, n_structural), finite also where these were
@@ -122,7 +118,7 @@ class ResponseTarget:
 
     def scaled(self, coords: np.ndarray, scales: Scales) -> np.ndarray:
         """Structural parameters on scales, and noise coordinates, at coordinates (n, >= d), not smooth near a bound."""
-        parameters = self.structural_parameters(coords[:, : self.n_structural])
+        parameters = self.parameters(coords[:, : self.n_structural])
         positive = np.where(scales.power < 1, np.maximum(parameters, _SMALLEST), parameters)
         return np.column_stack([scales.to_scale(positive), coords[:, self.n_structural :]])
 
@@ -168,7 +164,7 @@ class ResponseTarget:
         """
         if self._whole is not self:  # which leaves nothing new
             yield from self._whole.run(coords, remember, thetas)
-        thetas = self.structural_parameters(coords) if thetas is None else thetas
+        thetas = self.parameters(coords) if thetas is None else thetas
         keys = [row.tobytes() for row in coords]
         new = list({key: row for row, key in enumerate(keys) if key not in self._numbers}.values())
         for k in range(0, len(new), self.data.together):
@@ -191,11 +187,11 @@ class ResponseTarget:
         """
         if self._whole is not self:
             return (yield from self._whole.derivatives(coords, remember))
-        thetas, steps = self.structural_parameters(coords), _STEP * np.eye(self.n_structural)
+        thetas, steps = self.parameters(coords), _STEP * np.eye(self.n_structural)
         (found,) = yield from self._stored("slopes of residuals", self.data.derivatives, thetas, remember)
         numbers = []
         for at, slopes in zip(coords, found, strict=True):
-            by_coords = (self.structural_parameters(at + steps) - self.structural_parameters(at - steps)) / (2 * _STEP)
+            by_coords = (self.parameters(at + steps) - self.parameters(at - steps)) / (2 * _STEP)
             numbers.append(self.archive.add_histories(np.tensordot(by_coords, slopes.astype(float), 1)))
         return np.array(numbers)
 
