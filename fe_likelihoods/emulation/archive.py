@@ -34,6 +34,7 @@ class Archive:
         self._statistic, self._shape, self._kept = statistic, shape, 1.0
         self._views: list[Archive] = []
         self.numbers, self.coords, self.statistics = np.empty(0, int), np.empty((0, 0)), np.empty((0, 0))
+        self.number_of: dict[bytes, int] = {}  # number of the run at simulated coordinates, -1 where it failed
         self._ends = [0]  # of the histories that were added, and are multiplied, together
         self._forms: dict[tuple[int, int], np.ndarray] = {}  # (k, l, n_numbers) of two such batches
         self._file = tempfile.TemporaryFile(buffering=0)
@@ -59,7 +60,7 @@ class Archive:
         """An archive of the same histories, so far none, that are zero where not `kept` (n_channels, n_steps)."""
         other = Archive(statistic, self._shape)
         other._file.close()
-        other._kept, other._file, other._ends = kept, self._file, self._ends
+        other._kept, other._file, other._ends, other.number_of = kept, self._file, self._ends, self.number_of
         self._views.append(other)
         return other
 

@@ -69,7 +69,6 @@ class ResponseTarget:
         self.n_noise = self.ndim - self.n_structural
         self.n_steps = self.data.shape[1]
         self.archive, self._whole = Archive(self.data.statistic, self.data.shape), self
-        self._numbers: dict[bytes, int] = {}  # of simulated coordinates in the archive, -1 where failed
         self.unchecked = [True] if self.data.differentiable else []
         self._structural = self._prior.subset(self._prior.names[: self.n_structural])
         self._noise = self._prior.subset(self._prior.names[self.n_structural :]) if self.n_noise else None
@@ -90,8 +89,7 @@ class ResponseTarget:
         for each, part in zip(targets, parts, strict=True):
             each.unchecked = self.unchecked
             if part.model is self.posterior.likelihood.model:  # cannot be shortened: the same simulations are used
-                each._whole, each._numbers = self, self._numbers
-                each.archive = self.archive.view(each.data.statistic, ~part.measured.missing)
+                each._whole, each.archive = self, self.archive.view(each.data.statistic, ~part.measured.missing)
         return targets
 
     # ------------------------------------------------------------------ coordinates
@@ -153,7 +151,7 @@ class ResponseTarget:
 
     def new_points(self, coords: np.ndarray) -> int:
         """Number of structural coordinates (n, n_structural) that `run` has not simulated yet."""
-        return len({row.tobytes() for row in coords} - self._numbers.keys())
+        return len({row.tobytes() for row in coords} - self.archive.number_of.keys())
 
     def run(self, coords: np.ndarray, remember: Remember = nothing_stored, thetas: np.ndarray | None = None) -> Steps:
         """Simulate structural coordinates (n, n_structural), whose parameters are `thetas` if given, once each; returns
@@ -166,7 +164,7 @@ class ResponseTarget:
             yield from self._whole.run(coords, remember, thetas)
         thetas = self.parameters(coords) if thetas is None else thetas
         keys = [row.tobytes() for row in coords]
-        new = list({key: row for row, key in enumerate(keys) if key not in self._numbers}.values())
+        new = list({key: row for row, key in enumerate(keys) if key not in self.archive.number_of}.values())
         for k in range(0, len(new), self.data.together):
             rows = new[k : k + self.data.together]
             found = yield from self._stored("residuals", self.data.simulate, thetas[rows], remember)
@@ -175,8 +173,8 @@ class ResponseTarget:
             good = np.isfinite(residuals).all(axis=(1, 2)) & np.isfinite(statistics).all(axis=1)
             numbers = np.full(len(rows), -1)
             numbers[good] = self.archive.add(coords[rows][good], residuals[good], statistics[good])
-            self._numbers |= {keys[row]: number for row, number in zip(rows, numbers, strict=True)}
-        numbers, known = np.array([self._numbers[key] for key in keys], int), self.archive.statistics
+            self.archive.number_of |= {keys[row]: number for row, number in zip(rows, numbers, strict=True)}
+        numbers, known = np.array([self.archive.number_of[key] for key in keys], int), self.archive.statistics
         statistics = np.full((len(keys), known.shape[1]), np.nan)
         statistics[numbers >= 0] = known[np.searchsorted(self.archive.numbers, numbers[numbers >= 0])]
         return Runs(numbers, statistics, numbers < 0)

@@ -22,6 +22,7 @@ from fe_likelihoods import (
 )
 from fe_likelihoods.emulation.guide import ResponseGuide
 from fe_likelihoods.emulation.modes import Search
+from fe_likelihoods.emulation.target import nothing_stored
 from samplers import SamplingWarning, SMCSampler, TMCMCSampler
 from samplers.judgement.guides import check_excluded_runs, check_tops
 from tests.statistics.hard_posteriors import CASES
@@ -82,6 +83,9 @@ def test_a_pickled_run_goes_on_as_the_run_itself():
     for each in (sampler, again):
         each.run_mcmc(None, 3)
     np.testing.assert_array_equal(sampler.get_chain(), again.get_chain())
+    known, session = sampler.get_chain(flat=True)[:5], SimpleNamespace(remember=nothing_stored)
+    again.guide.observe(known, session)  # it was pickled without its runs
+    assert len(again.guide._target.archive.coords) == len(np.unique(known, axis=0))
 
 
 @pytest.mark.slow
