@@ -188,11 +188,14 @@ def test_modes_are_those_of_the_samples_that_are_there(rng):
     there = np.zeros((2, N_STEPS), dtype=bool)
     there[:, rows] = True
     found, expected = (
-        find_modes(gappy_vibration(GaussianNoise, there, which), starts=1, seed=0).modes[0] for which in (None, rows)
+        find_modes(gappy_vibration(GaussianNoise, there, which), starts=1, seed=0, tolerance=1e-12).modes[0]
+        for which in (None, rows)
     )
-    np.testing.assert_allclose(found.parameters, expected.parameters, rtol=1e-6)
-    np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-4, atol=1e-8)
-    assert found.log_evidence == pytest.approx(expected.log_evidence, abs=1e-4)
+    np.testing.assert_allclose(found.parameters[:2], expected.parameters[:2], rtol=1e-6)
+    sd = np.sqrt(np.diag(expected.parameter_covariance))  # noise parameters are optimised to a part of it
+    np.testing.assert_allclose(found.parameters / sd, expected.parameters / sd, rtol=0.0, atol=1e-3)
+    np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-3, atol=1e-8)
+    assert found.log_evidence == pytest.approx(expected.log_evidence, abs=1e-3)
 
 
 # checks of residuals --------------------------------------------------------------------------------------------------
