@@ -29,7 +29,6 @@ from .settings import as_whole_number
 LEVEL_PROBABILITY = 0.1  # share of the points that each level keeps (Au & Beck 2001)
 LEAST_PROBABILITY = 1e-15
 TARGET_ACCEPTANCE = 0.44  # of the moves (Papaioannou et al. 2015)
-MOST_EQUAL = 0.75  # share of points of one value above which levels make no progress: with it, 120 end at 1e-15
 
 
 class RareEvent(NamedTuple):
@@ -131,18 +130,18 @@ def subset_simulation(
             f"got {n} of {made}: see why the function returns NaN, or return infinity if failures exceed"
         )
     scale = 1.0
-    error = EvidenceError(n, FEWEST_FOR_VARIANCE / n)
+    error = EvidenceError(n)
     levels, shares = [], []
     while True:
         above, bound = values > threshold, float(np.partition(values, -kept)[-kept])
-        last = above.mean() >= LEVEL_PROBABILITY
+        last, stays = above.mean() >= LEVEL_PROBABILITY, bound in levels[-1:]
         above = above if last else values >= bound
         levels.append(threshold if last else bound)
         shares.append(float(above.mean()))
         deviation = error.weigh(above / above.sum())
         if last:
             break
-        if shares[-1] > MOST_EQUAL or np.prod(shares) < LEAST_PROBABILITY:
+        if stays or np.prod(shares) < LEAST_PROBABILITY:
             raise ValueError(
                 f"expected a quantity that reaches {threshold:g} with a probability above {LEAST_PROBABILITY:g}; at "
                 f"{np.prod(shares):.2g}, {shares[-1]:.0%} of the points are at or above {bound:g}, the largest is "

@@ -34,9 +34,8 @@ FAR = 5.0  # mean square of residuals, relative to the stated one, from which on
 # 1.25 times the variance. For an oscillator with known parameters (eleven noises and steps, six seeds each), 90 %
 # intervals without it held the stiffness in 17 of 18 runs with shifts of 0.3 to 1.3, and in 0 of 36 with 5 to 60.
 # Before a run, a shift at the best draw of the prior is rough: 0.6 for 0.16 of a cracked column. Of 48 steps and meshes
-# of seven structures, 29 of which move the mode by half a standard deviation or more, limits of half, one and two
-# standard deviations named 24, 21 and 18, and none of the 19 others; halving at the mode named 27 and 1.
-ROUGH = 2.0
+# of seven structures, 29 of which move the mode by half a standard deviation or more, it names 24 (21 and 18 from one
+# and two standard deviations on), and none of the 19 others; halving at the mode named 27 and 1.
 NOTHING = 1e-6  # difference of two responses, relative to their norm, well above the round-off of a long response
 # of a predicted peak to the calibrated ones: named in 1 of 100 right runs, and in 96 of 100 at three times the strength
 PEAK_RATIO = 2.0
@@ -198,8 +197,8 @@ def halve_steps(posterior: Posterior, point: np.ndarray, sd: np.ndarray | None =
     """Halve step and mesh at a fit (ndim,), and compare the parameters' change with their standard deviations (ndim,).
 
     Before a run the point is a draw of the prior, the standard deviations follow from the errors that a linear fit from
-    there leaves, and shifts are named from `ROUGH` times as many on. Returns findings, and what was tested. A model
-    that fails with half a step, or whose response does not change, keeps a step of its own, which is not tested.
+    there leaves. Returns findings, and what was tested. A model that fails with half a step, or whose response does not
+    change, keeps a step of its own, which is not tested.
     """
     before, prior_sd = sd is None, np.array([row[3] for row in posterior.prior.table()[1]])
     sd = 0.1 * prior_sd if before else sd
@@ -238,8 +237,7 @@ def halve_steps(posterior: Posterior, point: np.ndarray, sd: np.ndarray | None =
     covariance = np.linalg.pinv(precision)
     narrower = np.sqrt(np.maximum(np.diag(covariance), 1e-300)) if before else 1.0
     shift, sd = np.abs(covariance @ pull) / narrower, sd * narrower
-    least = ROUGH * HALF if before else HALF
-    numbers = {posterior.parameter_names[i]: float(shift[i]) for i in np.flatnonzero(shift >= least)}
+    numbers = {posterior.parameter_names[i]: float(shift[i]) for i in np.flatnonzero(shift >= HALF)}
     shares = dict(zip(posterior.parameter_names, shift * sd / np.maximum(np.abs(point), 1e-300), strict=True))
     largest = sorted(numbers, key=numbers.__getitem__, reverse=True)
     moves = [

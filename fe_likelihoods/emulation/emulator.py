@@ -15,7 +15,6 @@ import numpy as np
 from .gaussian_process import fit_process, predict
 from .target import ResponseTarget
 
-_MAX_COMPONENTS = 60  # bounds the cost where a response is rough (not measured)
 _NEGLIGIBLE_VARIANCE = 1e-3  # of the left-out components together, per run, in units of the noise variance
 _SMALLEST_SHARE = 1e-10  # of the leading component
 
@@ -39,7 +38,7 @@ class ResponseEmulator:
         if values[0] <= 0.0:
             raise np.linalg.LinAlgError("the responses of all runs are equal")
         enough = 1 + int(np.argmax(values.sum() - np.cumsum(values) < _NEGLIGIBLE_VARIANCE * n))
-        k = max(1, min(enough, _MAX_COMPONENTS, int((values > _SMALLEST_SHARE * values[0]).sum()), n - 1))
+        k = max(1, min(enough, int((values > _SMALLEST_SHARE * values[0]).sum()), n - 1))
         lengths = np.sqrt(values[:k])
         histories = np.zeros((1 + k, len(archive)))  # the mean residual and the components, as weights of runs
         histories[:, archive.numbers[rows]] = np.concatenate([np.full((1, n), 1.0 / n), vectors[:, :k].T @ centred])

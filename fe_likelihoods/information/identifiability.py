@@ -32,7 +32,6 @@ from ..priors.priors import Prior
 from ..text_tables import listed
 
 DETERMINED = 0.3  # share of the prior's standard deviation up to which a parameter is determined
-KEPT = 0.9  # share from which the data say little
 MUCH_BETTER = 0.5  # share left of a combination, over the smallest one of its parameters
 MOST_NAMED = 4  # parameters of a combination whose exponents are given
 MAP_STEP = 1e-4  # of coordinates, for the slopes of the parameters
@@ -133,15 +132,15 @@ class Identifiability(NamedTuple):
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What is determined, which combinations are, what is narrowed, of what the data say little, and remarks."""
+        """What is determined, which combinations are, of what the data tell less, and remarks."""
         combinations = self.combinations
         combined = {name for each in combinations for name in each.names}
-        known, narrowed, kept = [], [], []
+        known, less = [], []
         for name, left in zip(self.names, self.left, strict=True):
             if left <= DETERMINED:
                 known.append((name, left))
             elif name not in combined:
-                (kept if left >= KEPT else narrowed).append((name, left))
+                less.append((name, left))
         lines = [
             f"These data determine {_with_shares(known)}." if known else "These data determine no parameter alone."
         ]
@@ -149,8 +148,7 @@ class Identifiability(NamedTuple):
             alone = [(name, self.left[self.names.index(name)]) for name in each.names]
             alone = [f"{name} alone keeps {_percent(left)} %" for name, left in alone]
             lines.append(f"They determine {each} ({_percent(each.left)} % is left), although {listed(alone)}.")
-        lines += [f"They narrow {_with_shares(narrowed)}."] if narrowed else []
-        lines += [f"They say little of {_with_shares(kept)}."] if kept else []
+        lines += [f"They tell less of {_with_shares(less)}."] if less else []
         return (*lines, *self.remarks)
 
     def __str__(self) -> str:

@@ -16,7 +16,6 @@ from .channels import Measurements
 from .sampling import interpolate, make_interpolation
 
 _LEAST = 1e-3  # energy of the reference at a lag, of the largest at any lag, below which nothing is compared
-_GOOD = 0.7  # correlation below which the reference does not explain the channel
 _SMOOTH = 0.02  # share of the lines over which the spectrum of errors is averaged
 _SURE = 0.99  # probability of the highest peak, up to which the second one is stated
 _NEARLY_ONE = 1.0 - 1e-12  # largest squared correlation
@@ -35,7 +34,9 @@ class Alignment(NamedTuple):
     def statement(self) -> str:
         """Lag, gains and their uncertainty, in words."""
         shown = ", ".join(f"{name} {self.gain[name]:.3g} ({c:.3f})" for name, c in self.correlation.items())
-        low = ", ".join(name for name, value in self.correlation.items() if abs(value) < _GOOD)
+        low = ", ".join(
+            name for name, value in self.correlation.items() if value**2 < 1.0 - value**2
+        )  # less is explained than left
         text = f"lag {self.lag:.5g} s, standard error {self.standard_error:.2g} s, gain (correlation) {shown}"
         text += f"; NOT SURE: {low} is not a shifted copy of the reference" if low else ""
         return text if self.second_lag is None else f"{text}; NOT SURE: {self.second_lag:.5g} s is nearly as good"

@@ -11,8 +11,6 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.special import ndtri, stdtrit
 
-# Of n points: a variance of as many groups has an error of sqrt(20 / n), a seventh for 1000.
-MIN_FOUNDER_SHARE = 0.1
 # Points or groups of points that a variance needs: with 6 founders of 60 walkers, standard errors were too small by a
 # factor of up to ten.
 FEWEST_FOR_VARIANCE = 10
@@ -26,12 +24,10 @@ def student_factor(freedom: float | np.ndarray) -> float | np.ndarray:
 def trace_founders(founders: Sequence[np.ndarray], ancestors: np.ndarray) -> tuple[np.ndarray, ...]:
     """Founders (n,) of each point after one more resampling by `ancestors` (n,), per generation, the oldest first.
 
-    A generation is dropped once it has fewer founders than a tenth of the points, or fewer than ten; the last one is
-    kept.
+    A generation is dropped once it has fewer than ten founders; the last one is kept.
     """
     traced = [generation[ancestors] for generation in founders] + [ancestors]
-    fewest = max(MIN_FOUNDER_SHARE * len(ancestors), FEWEST_FOR_VARIANCE)
-    while len(traced) > 1 and len(np.unique(traced[0])) < fewest:
+    while len(traced) > 1 and len(np.unique(traced[0])) < FEWEST_FOR_VARIANCE:
         traced.pop(0)
     return tuple(traced)
 

@@ -7,7 +7,7 @@ magnitudes of thousands, and a constant added to them must not change anything.
 import numpy as np
 
 from ..resampling import GRID
-from .genealogy import MIN_FOUNDER_SHARE
+from .genealogy import FEWEST_FOR_VARIANCE
 
 WHERE_TO_LOOK = (
     "check the model and the prior, and see the failures that the model reports (posterior.report() in fe_likelihoods)"
@@ -94,13 +94,11 @@ def next_beta(log_likelihood: np.ndarray, beta: float, target: float, base: np.n
 
 class EvidenceError:
     """Standard error of the log-evidence, accumulated during one run (Chan & Lai 2013; ``docs/theory/tempering``). Once
-    fewer founders than `min_founder_share` times `n_points` are left, the sums are closed, and every point becomes a
-    founder.
+    fewer than ten founders are left, the sums are closed, and every point becomes a founder.
     """
 
-    def __init__(self, n_points: int, min_founder_share: float = MIN_FOUNDER_SHARE):
+    def __init__(self, n_points: int):
         self.n_points = n_points
-        self.min_founder_share = min_founder_share
         self._closed = 0.0
         self._start_groups()
 
@@ -116,7 +114,7 @@ class EvidenceError:
     def resample(self, ancestors: np.ndarray) -> None:
         """Follow a resampling: `ancestors` (n,) int is the previous index of each point; n may be another number."""
         self._founder = self._founder[ancestors]
-        few = len(np.unique(self._founder)) < self.min_founder_share * self.n_points
+        few = len(np.unique(self._founder)) < FEWEST_FOR_VARIANCE
         if few or len(ancestors) != self.n_points:
             self._closed, self.n_points = self._closed + float(self._sums @ self._sums), len(ancestors)
             self._start_groups()

@@ -14,12 +14,6 @@ from ..finding import Finding
 # Recycling is given up when the mean efficiency of the last 6 rounds is smaller than 0.03 (moves then need fewer
 # evaluations), or after 200 rounds without a check at beta = 1.
 SMALLEST_EFFICIENCY, PATIENCE, MOST_ROUNDS = 0.03, 6, 200
-# Efficiency of the check above which any Pareto shape will do: it is uncertain for the short tail of even weights.
-HIGH_EFFICIENCY = 0.5
-# Largest fall of the log-evidence from the earlier points to the check for which the result is used: the last fit has
-# lost a part. A rise is no reason: earlier points that a fit was made from weigh too little, in 30 normal dimensions by
-# a third, where the draws of the check and their evidence are right; 6 runs each of 17 posteriors have equal verdicts.
-LARGEST_DIFFERENCE = 0.25
 # Reliable rounds, and the check of recycling, have at least this effective share, the latest round and the mean of
 # three, and the latest one a Pareto shape below this value, for which the variance of its weights is finite. By the
 # latest one alone, a cyclic test whose response has jumps was converged and wrong by 3.5 errors.
@@ -51,7 +45,7 @@ def find_unreached_part(text: str, severity: str) -> Finding:
     return Finding("The guide missed a part of the posterior", severity, f"{text[0].upper()}{text[1:]}.")
 
 
-def doubt_recycling(check: EvidenceCheck | None, log_evidence: float, beta: float, efficiencies: list[float]) -> str:
+def doubt_recycling(check: EvidenceCheck | None, beta: float, efficiencies: list[float]) -> str:
     """Reason to give up, or not to use the result; empty if there is none."""
     recent = float(np.mean(efficiencies[-PATIENCE:]))
     if len(efficiencies) >= PATIENCE and recent < SMALLEST_EFFICIENCY:
@@ -59,12 +53,10 @@ def doubt_recycling(check: EvidenceCheck | None, log_evidence: float, beta: floa
     if check is None:
         too_long = len(efficiencies) >= MOST_ROUNDS
         return f"only beta = {beta:.3g} was reached in {MOST_ROUNDS} rounds" if too_long else ""
-    if not check.reliable and efficiencies[-1] < HIGH_EFFICIENCY:
+    if not check.reliable:
         return f"the weights of fresh draws have a Pareto shape of {check.pareto_shape:.2g}"
     if efficiencies[-1] < RELIABLE_SHARE:
         return f"the effective sample size of the check is {100 * efficiencies[-1]:.2g} % of their number"
-    if log_evidence - check.log_evidence > LARGEST_DIFFERENCE:
-        return f"fresh draws lower the log-evidence by {log_evidence - check.log_evidence:.2g}"
     return ""
 
 

@@ -88,7 +88,7 @@ def test_a_parameter_without_effect_keeps_its_prior():
     prior = {"a": norm(0.0, 1.0), "idle": LogNormal(2.0, 0.3)}
     found = identifiability(posterior_of(lambda t: (t[0] * SHAPES[0])[None], prior, [0.3, 2.0]))
     np.testing.assert_allclose(found.left[1], 1.0, rtol=1e-6)
-    assert "They say little of idle (100 % of the prior's standard deviation is left)." in found.sentences
+    assert "They tell less of idle (100 % of the prior's standard deviation is left)." in found.sentences
     assert not found.combinations
 
 
@@ -98,7 +98,7 @@ def test_control_correlation_alone_makes_no_combination():
     equal = compare_covariances(0.04 * np.eye(3), "abc")
     weak = compare_covariances(np.array([[0.5, 0.2], [0.2, 0.5]]), "ab")
     assert not determined.combinations + equal.combinations + weak.combinations
-    assert str(weak).endswith("They narrow a and b (71 and 71 % of the prior's standard deviation are left).")
+    assert str(weak).endswith("They tell less of a and b (71 and 71 % of the prior's standard deviation are left).")
     five = np.full((5, 5), -0.199) + np.diag(np.full(5, 1.0))
     (many,) = compare_covariances(five, "abcde").combinations
     assert str(many) == "a combination of a, b, c, d and e"

@@ -102,7 +102,7 @@ def test_evidence_error_sees_points_that_never_move(rng):
     ancestors = RESAMPLING["systematic"](weights, rng)
     halves.resample(ancestors)
     assert halves.weigh(normalised_weights(0.5 * log_likelihood[ancestors])) == pytest.approx(whole, rel=0.05)
-    weights, closed = np.array([0.4, 0.3, 0.2, 0.1]), EvidenceError(4, min_founder_share=1.0)
+    weights, closed = np.array([0.4, 0.3, 0.2, 0.1]), EvidenceError(4)  # four founders are few
     for count in (1, 2, 3):  # every resampling leaves too few founders, so that the sums of all stages add up
         assert closed.weigh(weights) == pytest.approx(np.sqrt(count * 0.05))
         closed.resample(np.array([0, 0, 1, 2]))
