@@ -28,11 +28,13 @@ class Archive:
 
     `numbers` (m,) are the numbers of the runs among all histories, which are residuals of runs, and derivatives of
     residuals; `coords` (m, n_structural) their structural coordinates, `statistics` (m, n_numbers) of their residuals.
+    `derivatives` are coordinates (d,), and numbers (d,) or weights (d, n) of the derivatives there.
     """
 
     def __init__(self, statistic: Callable[[np.ndarray], np.ndarray], shape: tuple[int, int]) -> None:
         self._statistic, self._shape, self._kept = statistic, shape, 1.0
         self._views: list[Archive] = []
+        self.derivatives: list[tuple[np.ndarray, np.ndarray]] = []
         self.numbers, self.coords, self.statistics = np.empty(0, int), np.empty((0, 0)), np.empty((0, 0))
         self.number_of: dict[bytes, int] = {}  # number of the run at simulated coordinates, -1 where it failed
         self._ends = [0]  # of the histories that were added, and are multiplied, together

@@ -63,7 +63,6 @@ class ResponseGuide(Guide):
         self._posterior, self._starts = posterior, starts
         self.search: ModeSearch | None = None
         self._spent, self._searching = 0.0, None  # simulations of searches that have ended, and the one that has not
-        self._derivatives: list | None = None  # that the first of them has left
         self._excess = -np.inf  # log-density of a draw above all modes
         self._regions: list[Region] = []
         self._emulated: EmulatedPosterior | None = None
@@ -179,11 +178,11 @@ class ResponseGuide(Guide):
 
     def _search(self, starts: np.ndarray, session: Any, tolerance: float = TOLERANCE) -> Steps:
         """Search from starts (n, n_structural), see `Search`, or go on where an earlier search ended below its top."""
-        searching = self._searching = Search(self._target, starts, session, tolerance, self._derivatives)
+        searching = self._searching = Search(self._target, starts, session, tolerance)
         try:
             found = yield from searching.run(min(self._starts, len(starts)))
         finally:  # also one that raised an error is counted; none is kept, since its session cannot be pickled
-            self._spent, self._searching, self._derivatives = self.simulations, None, searching.derivatives
+            self._spent, self._searching = self.simulations, None
         if (earlier := self.search) is not None:
             if not found.modes:
                 return

@@ -122,17 +122,14 @@ class _Part(NamedTuple):
 class Search:
     """Search from starts (n, n_structural) [standard normal coordinates], on growing parts of the record if possible.
     `spent` are the simulations so far; ascents leave less than a `tolerance` of log-density to gain. A search that goes
-    on with the `derivatives` of an earlier one, see `Climb`, is on the whole record.
+    on with the runs and derivatives of an earlier one is on the whole record.
     """
 
-    def __init__(
-        self, target: ResponseTarget, starts: np.ndarray, session: Any, tolerance: float = TOLERANCE, derivatives=None
-    ) -> None:
+    def __init__(self, target: ResponseTarget, starts: np.ndarray, session: Any, tolerance: float = TOLERANCE) -> None:
         self._target, self._starts, self._session, self._tolerance, self.spent = target, starts, session, tolerance, 0.0
-        parts = [*(target.first_parts(_SHARES) if derivatives is None else ()), target]
+        parts = [*(() if len(target.archive) else target.first_parts(_SHARES)), target]
         self._parts = [_Part(part, part.n_steps / target.n_steps, {}) for part in parts]
         self._grown = self._parts[0].share < 1.0
-        self.derivatives = [] if derivatives is None else derivatives
         self.standing_for: list[int] = []  # start that has taken the place of each that has begun; -1 for none
 
     def run(self, starts: int) -> Steps:
@@ -187,7 +184,7 @@ class Search:
                 for k in wave:
                     start, steps = fronts[k]
                     centre = np.zeros(self._target.n_structural) if whole else start
-                    derivatives = [] if self._grown else self.derivatives
+                    derivatives = [] if self._grown else self._target.archive.derivatives
                     alone = self._grown and not whole
                     climb = Climb(part.target, derivatives, k, centre, part.ends, apart, whole, alone)
                     loose = min(TOLERANCE / part.share, LOOSEST) if self._grown else LOOSEST

@@ -22,7 +22,7 @@ from fe_likelihoods import (
 )
 from fe_likelihoods.emulation.guide import ResponseGuide
 from fe_likelihoods.emulation.modes import Search
-from fe_likelihoods.emulation.target import nothing_stored
+from fe_likelihoods.emulation.target import at_once, nothing_stored
 from samplers import SamplingWarning, SMCSampler, TMCMCSampler
 from samplers.judgement.guides import check_excluded_runs, check_tops
 from tests.statistics.hard_posteriors import CASES
@@ -83,9 +83,13 @@ def test_a_pickled_run_goes_on_as_the_run_itself():
     for each in (sampler, again):
         each.run_mcmc(None, 3)
     np.testing.assert_array_equal(sampler.get_chain(), again.get_chain())
-    known, session = sampler.get_chain(flat=True)[:5], SimpleNamespace(remember=nothing_stored)
+    known = sampler.get_chain(flat=True)[:5]
+    session = SimpleNamespace(remember=nothing_stored, fits=lambda _: True, remaining=lambda: np.inf)
     again.guide.observe(known, session)  # it was pickled without its runs
     assert len(again.guide._target.archive.coords) == len(np.unique(known, axis=0))
+    top = again.guide.search.log_evidence
+    at_once(again.guide._search(np.zeros((1, again.guide._target.n_structural)), session))
+    assert abs(again.guide.search.log_evidence - top) < 0.5
 
 
 @pytest.mark.slow
