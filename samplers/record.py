@@ -6,8 +6,8 @@ differ only in fast parameters share a simulation.
 
 The file is a sequence of blocks: kind, length, two CRC-32, a text (JSON) and arrays in NumPy's format. Kinds are the
 start of the annealing (``RUN``), evaluated points with log-probabilities, blobs and reasons of failure (``EVAL``), and
-arrays under a key (``MEMO``): simulations of a guide, or the order in which points arrived. A kill can leave only the
-last block incomplete, which is dropped.
+arrays under a key (``MEMO``), such as simulations of a guide, which stay in the file, without one in a temporary file.
+A kill can leave only the last block incomplete, which is dropped.
 """
 
 import io
@@ -16,10 +16,12 @@ import logging
 import os
 import shutil
 import struct
+import tempfile
 import weakref
 import zlib
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from numbers import Real
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -119,10 +121,14 @@ class Record:
         # log-probability, blobs (1, ...) or None, reason of failure, empty without one, and batch of each point
         self._known: dict[bytes, tuple[float, np.ndarray | None, str, int]] = {}
         self.simulated: set[bytes] = set()  # keys of the points
-        self._arrays: defaultdict[str, list[list[np.ndarray]]] = defaultdict(list)  # by key, in the order of storing
+        # by key, in the order of storing: arrays, or their place and length in the file
+        self._arrays: dict[str, list[list[np.ndarray] | tuple[int, int]]] = {}
 
     def __getstate__(self):
-        return {**self.__dict__, "_file": None, "_seen": self._seen if self._file is None else self._whole}
+        state = {**self.__dict__, "_file": None, "_seen": self._seen if self._file is None else self._whole}
+        if self.path is None:
+            state["_arrays"] = {key: [*map(self._stored, each)] for key, each in self._arrays.items()}
+        return state
 
     # ------------------------------------------------------------------ evaluations
 
@@ -189,7 +195,7 @@ class Record:
         """Simulations that the guide has made by itself, or those in the record, if the annealing is not made again."""
         if self.guide is not None:
             return self.guide.simulations
-        return float(sum(allowed.item() for (allowed,) in self._arrays[OF_GUIDES]))
+        return float(sum(allowed.item() for (allowed,) in map(self._stored, self._arrays.get(OF_GUIDES, ()))))
 
     @property
     def simulations(self) -> float:
@@ -241,7 +247,7 @@ class Record:
         used: Counter[str] = Counter()
 
         def remember(key: str, compute: Callable[[], Sequence[np.ndarray]] | None = None) -> list[np.ndarray] | None:
-            known = self._arrays[key]
+            known = self._arrays.setdefault(key, [])
             if used[key] == len(known):
                 if self.is_complete:
                     raise Incomplete
@@ -249,10 +255,9 @@ class Record:
                     return None
                 arrays = [np.asarray(array) for array in compute()]
                 with deferred_interrupts():
-                    self._write(b"MEMO", key, arrays)
-                    known.append(arrays)
+                    known.append(self._write(b"MEMO", key, arrays))
             used[key] += 1
-            return known[used[key] - 1]
+            return self._stored(known[used[key] - 1])
 
         return remember
 
@@ -271,7 +276,10 @@ class Record:
 
     def open(self) -> None:
         """Open the file for writing, and lock it. ValueError if another process writes to it."""
-        if self.path is None or self._file is not None:
+        if self.path is None and self._file is None:
+            self._file = tempfile.TemporaryFile(buffering=0)
+            weakref.finalize(self, self._file.close)
+        if self._file is not None:
             return
         if (earlier := _open_records.get(self.path)) is not None:  # the last sampler of a process owns it
             earlier.close()
@@ -316,16 +324,25 @@ class Record:
         self.open()  # another process that writes to the file owns it
         self._clear()
 
-    def _write(self, kind: bytes, text: Any, arrays: Sequence[np.ndarray]) -> None:
-        """Append a block to the file, if there is one."""
+    def _write(self, kind: bytes, text: Any, arrays: Sequence[np.ndarray]) -> tuple[int, int] | None:
+        """Append a block to the file; returns the place and length of its content."""
+        if self.path is None and kind != b"MEMO":
+            return None
         self.open()
-        if self._file is None:
-            return
         content = io.BytesIO()
         for array in (np.frombuffer(json.dumps(text).encode(), dtype=np.uint8), *arrays):
             np.lib.format.write_array(content, np.ascontiguousarray(array), allow_pickle=False)
         data = content.getvalue()
         self._append(BLOCK.pack(kind, len(data), zlib.crc32(data), _of_both(kind, len(data))) + data)
+        return self._whole - len(data), len(data)
+
+    def _stored(self, kept: list[np.ndarray] | tuple[int, int]) -> list[np.ndarray]:
+        """Arrays under a key."""
+        if isinstance(kept, list):
+            return kept
+        with open(self.path, "rb") if self._file is None else nullcontext(self._file) as file:
+            file.seek(kept[0])
+            return _parsed(file.read(kept[1]))[1]
 
     def _append(self, data: bytes) -> None:
         """Write all bytes to the end of the file, or none: an incomplete block would hide the blocks after it."""
@@ -363,15 +380,12 @@ class Record:
                 said += "copy of the file is kept as %s"
                 logger.warning(said, self.path, place, len(data), self.count, kept_aside(self.path))
                 break
-            self._read_block(kind, content)
+            self._read_block(kind, content, place + BLOCK.size)
             place = end
         self._whole, self._seen = place if len(data) >= len(MAGIC) else 0, len(data)
 
-    def _read_block(self, kind: bytes, content: bytes) -> None:
-        stream, arrays = io.BytesIO(content), []
-        while stream.tell() < len(content):
-            arrays.append(np.lib.format.read_array(stream, allow_pickle=False))
-        text, arrays = json.loads(arrays[0].tobytes()), arrays[1:]
+    def _read_block(self, kind: bytes, content: bytes, place: int) -> None:
+        text, arrays = _parsed(content)
         if kind == b"EVAL":
             coords, log_prob, *blobs = arrays
             reasons = {int(row): reason for row, reason in text.items()}
@@ -381,7 +395,15 @@ class Record:
             header, name, *rest = text
             self.start = RunStart(header, arrays[0], (name, arrays[1], *rest))
         else:
-            self._arrays[text].append(arrays)
+            self._arrays.setdefault(text, []).append((place, len(content)))
+
+
+def _parsed(content: bytes) -> tuple[Any, list[np.ndarray]]:
+    """Text and arrays of a block."""
+    stream, arrays = io.BytesIO(content), []
+    while stream.tell() < len(content):
+        arrays.append(np.lib.format.read_array(stream, allow_pickle=False))
+    return json.loads(arrays[0].tobytes()), arrays[1:]
 
 
 def kept_aside(path: Path) -> Path:

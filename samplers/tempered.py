@@ -586,10 +586,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
         said += check_prior(coords, log_prior) if self.guide is None else list(self.guide.findings)
         for finding in said:
             self._result = self._result.add(finding, population.founders)
-        basis, independent = (
-            "" if self.guide is None else self.guide.basis,
-            independent_points(result, population.coords),
-        )
+        basis = "" if self.guide is None else self.guide.basis
+        independent = independent_points(result, population.coords)
         self._result = self._result._replace(basis=basis, independent_points=independent)
         ended = bool(result.ended)
         self._guided = population.coords.copy() if weighted is not None and weighted.guided and not ended else None

@@ -16,7 +16,7 @@ from ..chain import check_storable
 from ..interrupts import interrupts_end_the_run
 from ..record import BudgetExhausted, EvaluatedBatch, Incomplete, Record, Remember
 from ..tempering.population import RECORD, PendingPoints
-from .pools import CLOSED, map_in
+from .pools import CLOSED
 from .user_target import Target
 
 SECONDS_BETWEEN_NOTES = 0.05
@@ -49,11 +49,6 @@ class Evaluator:
         self.running, self.done = self.running - ended, self.done + ended
         if self.observer is not None:
             self.observer()
-
-    @property
-    def map(self) -> Callable:
-        """Python's ``map``, or the ``map`` of the pool."""
-        return map_in(self.pool)
 
     def inside(self, coords: np.ndarray) -> np.ndarray:
         """Whether each of the points (n, ndim) lies in the support of the prior."""

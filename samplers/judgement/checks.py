@@ -120,10 +120,8 @@ def check_shares(
     of_draws = np.exp(log_responsibilities(mixture, coords))
     of_points = np.exp(log_responsibilities(mixture, points))
     expected, found = weights @ of_draws, of_points.mean(axis=0)
-    error = np.hypot(
-        np.sqrt(weights**2 @ (of_draws - expected) ** 2),
-        standard_error_of_mean(of_points[None], founders),
-    )
+    error = np.sqrt(weights**2 @ (of_draws - expected) ** 2)
+    error = np.hypot(error, standard_error_of_mean(of_points[None], founders))
     difference = np.abs(found - expected)
     wrong = difference > np.maximum(LARGE_SHARE_DIFFERENCE, 3.0 * error)
     if not wrong.any():

@@ -114,16 +114,12 @@ def check_failed_region(near: NearFailures) -> list[Finding]:
         f"{near.failed} of {near.evaluated} evaluated points in the region of the final points failed, and "
         f"{near.adjoining} failed points adjoin the final points"
     )
+    action = "Mend the model there, or exclude the region by the prior if it is impossible."
     if near.place == "border":
         text += ": the failures, not the data, end the posterior there, so means and standard deviations may be wrong."
-        action = "Mend the model there, or exclude the region by the prior if it is impossible."
         return [Finding("Failures border on the samples", WRONG, text, action)]
     text += (
         ". Means and standard deviations are right if these failures are scattered, and too small if the posterior "
         "goes on where they are."
-    )
-    action = (
-        "Look at their reasons and parameters, and mend the model there, or exclude the region by the prior if it is "
-        "impossible."
     )
     return [Finding("Failures beside the samples", CARE, text, action)]

@@ -268,10 +268,7 @@ def _fit_components(
     best, log_likelihood = _maximise(white, weights, effective, np.ones((len(white), 1)), dof, limits)
     best_criterion = _criterion(1, ndim, effective, log_likelihood)
     for count in range(2, MOST_COMPONENTS + 1):
-        if effective < count * (ndim + 2):
-            break
-        starts = _splits(best, white, weights)
-        if not starts:
+        if effective < count * (ndim + 2) or not (starts := _splits(best, white, weights)):
             break
         tried = [_maximise(white, weights, effective, responsibilities, dof, TRIAL) for responsibilities in starts]
         found, _ = max(tried, key=lambda trial: trial[1])

@@ -153,9 +153,8 @@ def _from_guide(
             f"none of {len(pooled.coords)} draws of the guide has a finite log-probability: {WHERE_TO_LOOK}, use a "
             "better guide, or run without a guide"
         )
-    why = LIMIT if found.stopped else ""
-    if found.reason:
-        why = f"The rounds of the guide ended, because {found.reason},"
+    ended = f"The rounds of the guide ended, because {found.reason}," if found.reason else ""
+    why = ended or (LIMIT if found.stopped else "")
     if not why:
         schedule.calibrate(pooled.coords, coarse_weights(pooled.log_weights), density.inside)
     points = Population(1.0, *pooled[:2], pooled.effective_sample_size, (), pooled.log_weights)

@@ -141,7 +141,7 @@ def _tempered_model(kernel: Kernel, beta: float) -> Model:
         return tempered_log_prob(records, beta), records
 
     density = kernel.density
-    return Model(density.evaluate, partial(density.evaluate, then=tempered), density.map, kernel.random)
+    return Model(density.evaluate, partial(density.evaluate, then=tempered), map, kernel.random)
 
 
 def _centred(coords: np.ndarray, records: np.ndarray) -> np.ndarray:

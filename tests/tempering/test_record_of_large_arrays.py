@@ -1,6 +1,7 @@
 """Arrays under a key of a record are returned as they were."""
 
 import pickle
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -27,3 +28,16 @@ def test_large_arrays_are_returned_as_they_were(tmp_path, in_file):
     for other in others:
         for arrays, expected in zip(asked_from(other, False), given, strict=True):
             assert len(arrays) == 2 and all(map(np.array_equal, arrays, expected))
+
+
+def test_large_arrays_of_a_record_in_memory_are_on_disk():
+    record, size = Record(), 2_000_000  # 50 stiffnesses: derivatives took 200 of 460 MB
+    tracemalloc.start()
+    remember = record.remembering()
+    for number in range(5):
+        remember("key", lambda number=number: [np.full(size, number)])
+    held, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert held < 8 * size
+    remember = record.remembering()
+    assert all(np.array_equal(remember("key", pytest.fail)[0], np.full(size, number)) for number in range(5))
