@@ -23,7 +23,7 @@ from ..signals.channels import Channel, Measurements
 from ..text_tables import listed
 from ..units import DIMENSIONS, UNITS, find_unit
 from .finding import HALF, TAIL, WRONG, Finding, percent
-from .screening import runs_of
+from .screening import ONE_CAUSE, runs_of
 
 BETTER = 0.6  # error with a fault taken into account, as a share of the error without: study `fit_gate`
 EXPLAINED = math.sqrt(1.0 - HALF**2)  # error (RRMSE) above which a response explains nothing: a correlation of HALF
@@ -32,9 +32,6 @@ FACTOR = 1.5  # from which a factor may be one between units; from 1.67 on, 433 
 SAME_UNITS = 1.25  # ratio of a factor to one between units, up to which it is named after them
 AGREE = 0.1  # difference of a draw from the median, half of the draws: gains of 45 right fits are then 0.96 to 1.21
 SMOOTH = 7  # lines of the spectrum over which powers are averaged, and fewest lines of a band
-# Coherence from which gain and lag are looked at: 0.985 or more in 45 right fits of nine real structures. Two supports
-# have it in a band for 103 of 109 right pairs.
-COHERENT = 0.9
 LARGE_LAG = 0.025  # [s]; right fits have at most 0.02
 PASSED = 0.06  # [s] between supports; waves make 0.05 at most in 37 right events, 100 of 111 late by 0.1 s have more
 
@@ -210,7 +207,8 @@ def slow_motion(y: np.ndarray, r: np.ndarray, step: float, n: int) -> SlowMotion
     centre = np.median(r.real, axis=0) + 1j * np.median(r.imag, axis=0)
     agree = _smooth(np.median(np.abs(r - centre), axis=0) ** 2) < AGREE**2 * _smooth(np.abs(centre) ** 2)
     slow = _in_band(agree, y, centre, step, n)
-    return slow if slow is not None and slow.after**2 < 1.0 - COHERENT else None
+    # 0.985 or more is coherent in 45 right fits of nine real structures
+    return slow if slow is not None and slow.after**2 < 1.0 - ONE_CAUSE else None
 
 
 def supports_apart(motions: Sequence[np.ndarray], names: Sequence[str], step: float) -> dict[int, list[Fault]]:
@@ -220,7 +218,8 @@ def supports_apart(motions: Sequence[np.ndarray], names: Sequence[str], step: fl
         slow = list[SlowMotion]()
         for reference in (each for other, each in spectra.items() if other != k):
             powers = (_smooth(np.abs(each) ** 2) for each in (own, reference))
-            good = np.abs(_smooth(own * reference.conj())) ** 2 > COHERENT * math.prod(powers)
+            # two supports are coherent in a band for 103 of 109 right pairs
+            good = np.abs(_smooth(own * reference.conj())) ** 2 > ONE_CAUSE * math.prod(powers)
             slow += filter(None, [_in_band(good, own, reference, step, len(motions[0]))])
         if slow:
             gain, lag = np.median([each[:2] for each in slow], axis=0)

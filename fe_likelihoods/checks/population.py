@@ -5,9 +5,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.special import ndtri
 
+from samplers.estimates.pareto import LARGEST_SHAPE
+
 from .finding import CARE, TAIL, Finding
 
-LARGEST_SHAPE = 0.8  # Pareto shape of weights; up to here, right results have it as well (study `hierarchy_warnings`)
 HARMLESS_ERROR = 0.15  # of the means [posterior sd], up to which uneven weights and mixtures do no harm
 # Standard deviations of the prior by which the median of a common factor may differ from its mean: named in 1 of 120
 # right cases, and in 120 of 120 in which all stiffnesses, known to 2 %, have lost 14 or 20 %.

@@ -25,7 +25,8 @@ STILL = 3  # equal samples at an extremum, half of those elsewhere; right channe
 LONG, VANISHED = 1.5, 10.0  # for so many periods a signal is never so much smaller than beside; right: 5.8
 SPIKE = 18.0  # ratio to the errors of interpolation around it; right channels: 15.9
 LEVEL = 0.02  # smallest mean of a tenth of a channel, or change of such means, in peaks; right channels: 0.012
-SMOOTH = 0.9  # share of the variance of these means in a polynomial; right channels: 0.8
+# Share of a power that one cause explains: of these means a polynomial (right channels: 0.8), of a history another one.
+ONE_CAUSE = 0.9
 STRAIGHT = 15  # equal steps of a motion in a row; right motions: 11; found in 786 of 787 gaps of 0.2 to 1 s
 WIDEST, AROUND = 3, 10  # samples of a spike, and samples around it that are looked at
 LEAVE_OUT, SUBTRACT = "Leave these samples out", "Subtract it, unless the structure did move so"
@@ -199,7 +200,7 @@ def _baseline(x: np.ndarray) -> tuple[float, ...]:
     least, spread = LEVEL * _peak(x), np.square(parts - parts.mean()).sum()
     for degree in (1, 2) if len(parts) > 4 else ():
         line = np.polynomial.Polynomial.fit(places, parts, degree, domain=[-1, 1])
-        smooth = np.square(parts - line(places)).sum() < (1.0 - SMOOTH) * spread
+        smooth = np.square(parts - line(places)).sum() < (1.0 - ONE_CAUSE) * spread
         if smooth and np.ptp(line(places)) > least:
             return tuple(line(np.linspace(-1.0, 1.0, degree + 1)).tolist())
     large = np.abs(parts).min() > least and (np.sign(parts) == np.sign(parts[0])).all()

@@ -15,10 +15,10 @@ from ..finding import CARE, FALSE_ALARM, WRONG, Finding
 NEAREST = 20  # or all evaluated points per sample, if these are more
 FEWEST_ADJOINING = 5  # as many points about each are looked at, which tell scattered failures from a region of them
 LEAST_ADJOINING = 0.08  # in the ellipsoid, by the share of all points there; at 0, 43 of 60 right bends are refused
-LARGE_SHARE_NEAR = 0.02  # of the evaluated points among the samples
-# Probability of so many failures with this share, below which there are more. Cut off 1 to 1.6 standard deviations
-# beside the mode, 24 of 26 runs are then refused, whose means are off by 2 to 5 errors; at 2, 2 of 21 right ones.
-CHANCE = 0.05
+# Share of the evaluated points among the samples, from which failures are many, unless by chance (`FALSE_ALARM`). Cut
+# off 1, 1.3 and 1.6 standard deviations beside the mode, 15, 12 and 7 of 16 runs each are then refused and the others
+# doubted, none at 2; with a chance of 0.05, 16, 15 and 10, and 2.
+LARGE_SHARE_NEAR = 0.02
 INSIDE = 0.99  # share of the samples inside the ellipsoid that counts as their region
 KEPT_POINTS = 20_000  # the latest points are those near the posterior
 
@@ -44,7 +44,7 @@ class NearFailures(NamedTuple):
             return "beside" if self.failed > LARGE_SHARE_NEAR * self.evaluated else "away"
         from scipy.stats import binom  # slow to import
 
-        is_large = binom.sf(self.failed - 1, self.evaluated, LARGE_SHARE_NEAR) < CHANCE
+        is_large = binom.sf(self.failed - 1, self.evaluated, LARGE_SHARE_NEAR) < FALSE_ALARM
         # of failures beside a bent posterior, far fewer adjoin the samples than of the other points in the ellipsoid
         adjoin = self.adjoining * self.evaluated > LEAST_ADJOINING * self.failed * self.nearest
         return "border" if is_large and adjoin else "beside"

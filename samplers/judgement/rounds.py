@@ -12,8 +12,8 @@ from ..estimates.pareto import LARGEST_SHAPE
 from ..finding import Finding
 
 # Recycling is given up when the mean efficiency of the last 6 rounds is smaller than 0.03 (moves then need fewer
-# evaluations), or after 200 rounds without a check at beta = 1.
-SMALLEST_EFFICIENCY, PATIENCE, MOST_ROUNDS = 0.03, 6, 200
+# evaluations).
+SMALLEST_EFFICIENCY, PATIENCE = 0.03, 6
 # Reliable rounds, and the check of recycling, have at least this effective share, the latest round and the mean of
 # three, and the latest one a Pareto shape below this value, for which the variance of its weights is finite. By the
 # latest one alone, a cyclic test whose response has jumps was converged and wrong by 3.5 errors.
@@ -45,14 +45,13 @@ def find_unreached_part(text: str, severity: str) -> Finding:
     return Finding("The guide missed a part of the posterior", severity, f"{text[0].upper()}{text[1:]}.")
 
 
-def doubt_recycling(check: EvidenceCheck | None, beta: float, efficiencies: list[float]) -> str:
+def doubt_recycling(check: EvidenceCheck | None, efficiencies: list[float]) -> str:
     """Reason to give up, or not to use the result; empty if there is none."""
     recent = float(np.mean(efficiencies[-PATIENCE:]))
     if len(efficiencies) >= PATIENCE and recent < SMALLEST_EFFICIENCY:
         return f"the effective sample size of fresh draws is {100 * recent:.2g} % of their number"
     if check is None:
-        too_long = len(efficiencies) >= MOST_ROUNDS
-        return f"only beta = {beta:.3g} was reached in {MOST_ROUNDS} rounds" if too_long else ""
+        return ""
     if not check.reliable:
         return f"the weights of fresh draws have a Pareto shape of {check.pareto_shape:.2g}"
     if efficiencies[-1] < RELIABLE_SHARE:

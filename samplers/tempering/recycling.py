@@ -174,7 +174,7 @@ def recycle(
         if checking:  # every point has arrived
             points.update()
             log_evidence, error = _evidence(points.log_weights(beta), inherited)
-        reason = doubt_recycling(check, beta, efficiencies)
+        reason = doubt_recycling(check, efficiencies)
         # draws that contradict a fit also improve it: check again, as long as that is cheap
         independent = checking and not reason
         if independent:  # are `n` points resampled from the draws as good as independent draws of the posterior?
