@@ -38,7 +38,7 @@ class Archive:
         self.numbers, self.coords, self.statistics = np.empty(0, int), np.empty((0, 0)), np.empty((0, 0))
         self.number_of: dict[bytes, int] = {}  # number of the run at simulated coordinates, -1 where it failed
         self._ends = [0]  # of the histories that were added, and are multiplied, together
-        self._forms: dict[tuple[int, int], np.ndarray] = {}  # (k, l, n_numbers) of two such batches
+        self._forms: dict[tuple[int, int], np.ndarray] = {}  # (n_numbers, k, l) of two such batches
         self._file = tempfile.TemporaryFile(buffering=0)
         weakref.finalize(self, self._file.close)
 
@@ -78,10 +78,10 @@ class Archive:
         return np.arange(first, end)
 
     def _form(self, *batches: int) -> np.ndarray:
-        """The bilinear form (k, l, n_numbers) of all histories of two batches."""
+        """The bilinear form (n_numbers, k, l) of all histories of two batches."""
         if batches not in self._forms:
             histories = (self.read(range(*self._ends[batch : batch + 2])) for batch in batches)
-            self._forms[batches] = bilinear_form(self._statistic, *histories)
+            self._forms[batches] = np.ascontiguousarray(bilinear_form(self._statistic, *histories).transpose(2, 0, 1))
         return self._forms[batches]
 
     def read(self, rows: range) -> np.ndarray:
@@ -107,6 +107,6 @@ class Archive:
         parts = {batch: combinations[:, slice(*self._ends[batch : batch + 2])] for batch in used}
         lower = 0.0
         for k, weights in parts.items():
-            below = (np.tensordot(parts[m] / (1 + (m == k)), self._form(k, m), (1, 1)) for m in used if m <= k)
-            lower = lower + np.tensordot(weights, sum(below), (1, 1))
-        return lower + lower.transpose(1, 0, 2)
+            below = sum(parts[m] / (1 + (m == k)) @ self._form(m, k) for m in used if m <= k)
+            lower = lower + below @ weights.T
+        return (lower + lower.transpose(0, 2, 1)).transpose(1, 2, 0)

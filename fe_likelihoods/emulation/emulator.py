@@ -66,7 +66,7 @@ class ResponseEmulator:
     def log_likelihood(self, coords: np.ndarray) -> np.ndarray:
         """Logarithm (n,) of the emulated likelihood at coordinates (n, ndim)."""
         mean = predict(self._process, self._inputs(coords))
-        quadratic = np.einsum("nk,kla,nl->na", mean, self._forms[1:, 1:], mean, optimize=True)
+        quadratic = np.stack([np.einsum("nk,nk->n", mean @ form, mean) for form in self._forms[1:, 1:].T], axis=1)
         statistics = np.maximum(self._forms[0, 0] + 2.0 * mean @ self._forms[1:, 0] + quadratic, np.finfo(float).tiny)
         return self.target.log_likelihood(statistics, coords[:, self.target.n_structural :])
 

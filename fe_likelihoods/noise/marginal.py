@@ -162,16 +162,14 @@ def _find(fit: np.ndarray, count: float, prior: Any) -> _Peak:
     # three below the likelihood's maximum, its exponent is exp(2 * 3) = 400 times as large
     below = np.maximum(np.minimum(top, fit) - 3.0, least)
     above = np.minimum(top + (far - middle) + 3.0, most)
-    bounds = []
-    for inside, outside in ((top, below), (top, above)):
-        for _ in range(_MAX_ITERATIONS):
-            half = 0.5 * (inside + outside)
-            fallen = _log_integrand(half, fit, count, prior) < floor
-            inside, outside = np.where(fallen, inside, half), np.where(fallen, half, outside)
-            if (np.abs(outside - inside) <= 0.1 * np.abs(outside - top)).all():
-                break
-        bounds.append(outside)
-    return _Peak(top, *bounds)
+    inside, outside = top, np.concatenate([below, above], axis=1)
+    for _ in range(_MAX_ITERATIONS):
+        half = 0.5 * (inside + outside)
+        fallen = _log_integrand(half, fit, count, prior) < floor
+        inside, outside = np.where(fallen, inside, half), np.where(fallen, half, outside)
+        if (np.abs(outside - inside) <= 0.1 * np.abs(outside - top)).all():
+            break
+    return _Peak(top, *np.split(outside, 2, axis=1))
 
 
 def _logarithms(prior: Any) -> tuple[float, float]:
