@@ -457,10 +457,11 @@ class Events(Record):
                 alike, what = known.quantity == channel.quantity, f"channel {channel.name!r}"
                 expect(alike, what, f"{known.quantity!r} as in another event", got, "rename one of them")
         dt = first.dt
-        values = np.full((len(channels), math.floor(self.duration / dt + SAME_TIME) + 1), np.nan)
+        # steps that differ by round-off, and a start and an end within SAME_TIME, may add up to a little more
+        values = np.full((len(channels), math.floor(self.duration / dt + 3.0 * SAME_TIME) + 1), np.nan)
         rows = {name: row for row, name in enumerate(channels)}
         for name, each in measurements.items():
-            end, duration = each.start + (each.n_steps - 1) * dt, self.records[self.names.index(name)].duration
+            end, duration = each.start + (each.n_steps - 1) * dt, windows[name].end - windows[name].start
             within = each.start >= -SAME_TIME * dt and end <= duration + SAME_TIME * dt  # not in a pause
             expected = f"samples in the event from 0, its first sample, to {duration:g} s"
             got = f"measurements from {each.start:g} to {end:g} s"

@@ -33,7 +33,7 @@ from numbers import Integral
 from queue import SimpleQueue
 from typing import Any
 
-from samplers.evaluation.pools import submit_all, workers_of
+from samplers.evaluation.pools import submit_all, was_cancelled, workers_of
 from samplers.interrupts import Ended, SentFunction, become_worker
 
 from .by_value import Pickled, load
@@ -98,7 +98,7 @@ def _results(left: dict[Any, int], ended: Sequence[Any]) -> tuple[dict[int, Any]
         try:
             found[number] = result_of(future)
         except BaseException as raised:
-            error = error or (ClosedPool() if type(raised).__name__.endswith("CancelledError") else raised)
+            error = error or (ClosedPool() if was_cancelled(raised) else raised)
     return found, error
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from ..interrupts import Ended, deferred_interrupts, interrupts_end_the_run
 from ..tempering.population import PendingPoints
 from .evaluator import Evaluator
-from .pools import CLOSED, submit_all, workers_of
+from .pools import CLOSED, submit_all, was_cancelled, workers_of
 from .user_target import Target
 from .values import Caught, Failed
 
@@ -146,7 +146,7 @@ class AsynchronousEvaluator(Evaluator):
                     del self._futures[number]
             self.count(0, len(values))
         if wait and fault is not None:
-            raise RuntimeError(CLOSED) if type(fault).__name__.endswith("CancelledError") else fault
+            raise RuntimeError(CLOSED) if was_cancelled(fault) else fault
 
     def _arrive(self, numbers: list[int]) -> None:
         """Let points that were submitted together arrive, and check how many have failed."""

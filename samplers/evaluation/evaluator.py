@@ -16,7 +16,7 @@ from ..chain import check_storable
 from ..interrupts import interrupts_end_the_run
 from ..record import BudgetExhausted, EvaluatedBatch, Incomplete, Record, Remember
 from ..tempering.population import RECORD, PendingPoints
-from .pools import CLOSED
+from .pools import CLOSED, was_cancelled
 from .user_target import Target
 
 SECONDS_BETWEEN_NOTES = 0.05
@@ -109,7 +109,7 @@ class Evaluator:
             except BaseException as error:  # Ctrl-C, a pool that cannot go on, or too many failures
                 with suppress(TypeError, ValueError):  # of values that are none
                     self._enter_successes(new, results)
-                if type(error).__name__.endswith("CancelledError"):
+                if was_cancelled(error):
                     raise RuntimeError(CLOSED) from error
                 raise
         self.evaluations += len(asked)

@@ -32,6 +32,11 @@ def submit_all(pool: Any, function: Callable, items: Sequence[Any]) -> list[Any]
     return futures
 
 
+def was_cancelled(error: BaseException | None) -> bool:
+    """Whether a future was cancelled: `concurrent.futures`, asyncio and dask have a class each."""
+    return type(error).__name__.endswith("CancelledError")
+
+
 def workers_of(pool: Any) -> int | None:
     """Number of items that a pool runs at once; None if it does not say."""
     threads = getattr(pool, "nthreads", None)  # of a dask client

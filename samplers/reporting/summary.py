@@ -44,22 +44,22 @@ def summary(
         the units of the parameters, which the rows name.
     mean_error, sd_error : array_like, shape (ndim,), optional
         Standard errors of mean and standard deviation, from ``sampler.mean_error()`` and ``sampler.sd_error()``, since
-        copies made by resampling are correlated; NaN where they are unknown.
+        copies made by resampling are correlated.
 
     Returns
     -------
     pandas.DataFrame
-        A row per parameter: ``mean`` and ``mean_error``, ``sd`` and ``sd_error``, and the coefficient of variation
+        A row per parameter: ``mean`` and ``sd``, each followed by its error if given, and the coefficient of variation
         ``cv``, standard deviation / magnitude of the mean [-].
 
     Examples
     --------
     >>> print(summary(samples, posterior))  # doctest: +SAMPLED
-                                mean  mean_error        sd  sd_error        cv
-    stiffness [x nominal]   1.102246         NaN  0.002427       NaN  0.002202
-    damping [x nominal]     0.857993         NaN  0.022188       NaN  0.025860
-    sigma_acceleration [g]  0.047031         NaN  0.002261       NaN  0.048078
-    sigma_displacement [cm] 1.812300         NaN  0.084900       NaN  0.046850
+                                mean        sd        cv
+    stiffness [x nominal]   1.102246  0.002427  0.002202
+    damping [x nominal]     0.857993  0.022188  0.025860
+    sigma_acceleration [g]  0.047031  0.002261  0.048078
+    sigma_displacement [cm] 1.812300  0.084900  0.046850
     """
     import pandas  # slow to import
 
@@ -70,6 +70,7 @@ def summary(
         )
     names = names_of_parameters(getattr(names, "parameters", names), samples.shape[1])
     columns = {"mean": samples.mean(axis=0), "mean_error": mean_error, "sd": samples.std(axis=0), "sd_error": sd_error}
+    columns = {name: each for name, each in columns.items() if each is not None}
     found = pandas.DataFrame(columns, [getattr(each, "label", each) for each in names], dtype=float)
     found = found.div([getattr(each, "factor", 1.0) for each in names], axis=0)
     return found.assign(cv=found["sd"] / found["mean"].abs())

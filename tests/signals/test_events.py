@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fe_likelihoods import Events, LinearOscillator, RCColumn, Record
+from fe_likelihoods import Channel, Events, LinearOscillator, Measurements, RCColumn, Record
 from fe_likelihoods.problems import bridge_column_data
 
 
@@ -106,3 +106,14 @@ class TestEvents:
                 Events(*arguments)
         with pytest.raises(ValueError, match="no event 'EQ3'; the events are EQ1"):
             Events([eq1]).window("EQ3")
+
+
+@pytest.mark.parametrize("step", [0.01 * (1.0 + 1e-9), 0.01 * (1.0 + 2e-10), 0.01 * (1.0 - 2e-10)])
+def test_steps_that_differ_by_round_off_are_joined_or_refused(step):
+    """The end of the second event had been beyond the joined samples: an error of numpy."""
+    events = Events([Record("a", 0.01, np.ones(3001)), Record("b", 0.01, np.ones(3001))], rest=10.0)
+    measured = Measurements([Channel("top", "displacement", "m")], step, [np.ones(round(30.0 / step) + 1)])
+    try:
+        assert np.nansum(events.join({"a": measured, "b": measured}).values) == 2 * measured.n_steps
+    except ValueError as error:
+        assert "samples in the event" in str(error) or "at a multiple of the step" in str(error)
