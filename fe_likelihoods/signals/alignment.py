@@ -15,7 +15,6 @@ from scipy.optimize import minimize_scalar
 from .channels import Measurements
 from .sampling import interpolate, make_interpolation
 
-_LEAST = 1e-3  # energy of the reference at a lag, of the largest at any lag, below which nothing is compared
 _SMOOTH = 0.02  # share of the lines over which the spectrum of errors is averaged
 _SURE = 0.99  # probability of the highest peak, up to which the second one is stated
 _NEARLY_ONE = 1.0 - 1e-12  # largest squared correlation
@@ -72,7 +71,7 @@ class _Pair(NamedTuple):
         there, values, history = np.isfinite(self.values), np.nan_to_num(self.values), self.reference[::-1]
         n = len(values) + len(history) - 1  # of a correlation at all lags
         power, product = np.fft.irfft(np.fft.rfft([there, values], n) * np.fft.rfft([history**2, history], n), n)
-        squares = product**2 / ((values @ values) * np.maximum(power, _LEAST * power.max()))
+        squares = product**2 / ((values @ values) * np.maximum(power, (1.0 - _NEARLY_ONE) * power.max()))
         grid = self.start + self.step * np.arange(1 - len(history), len(there))
         return np.log1p(-np.interp(lags, grid, np.minimum(squares, _NEARLY_ONE), left=0.0, right=0.0))
 
