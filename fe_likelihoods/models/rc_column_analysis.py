@@ -27,8 +27,6 @@ from .validation import check_values, invalid
 
 LARGEST_DRIFT = 0.5
 """Largest imposed displacement by the height; tested columns have failed at 0.05 to 0.15."""
-LOST_BARS = 0.5
-"""Share of the bar area in a section: with more fractured bars, a column without equilibrium has collapsed."""
 MAX_ITERATIONS, HALVINGS = 20, 10  # of Newton's method per attempt, and how often a step may be halved
 ELEMENT_TOLERANCE = 1e-10  # work of the last correction of an element [J]
 
@@ -268,6 +266,6 @@ def _reason(status: int, n_steps: int, at: str, halvings: int, sections: Section
     lost = float((broken @ sections.bar_area[: broken.shape[1]]).max()) / float(sections.bar_area.sum())
     if lost == 0.0:
         return reason
-    if lost > LOST_BARS:
+    if lost > 1.0 - lost:  # with more broken than left, a column without equilibrium has collapsed
         reason = f"collapse: {reason}"
     return f"{reason}; bars with {lost:.0%} of the area of all bars in a section had fractured before"
