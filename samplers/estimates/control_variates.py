@@ -55,20 +55,26 @@ class SignedSample(NamedTuple):
             )
         if not np.all(np.isfinite(values)):
             raise ValueError(f"function must return finite numbers; {np.sum(~np.isfinite(values))} are not")
+        # one component after the other: the points of 50 parameters have up to 100 MB, and so have all their copies
+        found = np.array([self._of_component(column) for column in values.reshape(len(values), -1).T])
+        return Expectation(*found.T.reshape(2, *values.shape[1:]))
+
+    def _of_component(self, values: np.ndarray) -> tuple[float, float]:
+        """Expectation and standard error of numbers (m,) at the points."""
         value = self.weights @ values
         apart = values - value
-        parts = (self.weights * apart.T).T
+        parts = self.weights * apart
         known = self.rounds == 0
         spread, fourth = (self.weights[known] @ apart[known] ** power for power in (2, 4))
-        kurtosis = fourth / np.where(spread > 0.0, spread, 1.0) ** 2
-        variance = np.square(parts[known]).sum(axis=0)
+        kurtosis = fourth / (spread if spread > 0.0 else 1.0) ** 2
+        variance = np.square(parts[known]).sum()
         for number in np.unique(self.rounds[~known]):
             rows = self.rounds == number
             # few draws may miss the tails of the function: at least the variance for differences independent of it
             least = (1.0 + FEW / rows.sum()) * np.square(self.weights[rows]).sum() * spread
             least = least * (1.0 + kurtosis / rows.sum())
-            variance = variance + np.maximum(_variance_of_sum(parts[rows]), least)
-        return Expectation(value, np.sqrt(variance))
+            variance = variance + max(_variance_of_sum(parts[rows]), least)
+        return value, np.sqrt(variance)
 
     def standard_deviation(self) -> Expectation:
         """Standard deviations (ndim,) of the parameters.
