@@ -39,7 +39,7 @@ class Settings:
         belongs to 20 parameters or fewer; samplers add 3 for each further parameter.
     max_correlation : float
         Between `min_moves` and `max_moves`, moving stops once the correlations of all parameters and the log-likelihood
-        with their values after the resampling are below this value, or decrease no further.
+        with their values after the resampling are below this value.
     chains : {"equal", "leaders"}
         With "equal", every resampled point is moved equally often. With "leaders", a chain grows from each distinct
         resampled point, one step per copy of it, and sweeps follow if the points are still correlated.

@@ -44,7 +44,7 @@ class SMCSampler(TemperedSampler):
     >>> sampler.verdict.status
     'converged'
     >>> print(f"{sampler.log_evidence:.1f} +- {sampler.log_evidence_error:.2g}")  # doctest: +SAMPLED
-    376.1 +- 0.079
+    376.1 +- 0.053
     """
 
     @classmethod
