@@ -182,6 +182,14 @@ def add_round(rounds: Sequence[Round], latest: Round) -> list[Round]:
     return [*earlier, latest._replace(log_densities=np.column_stack(densities))]
 
 
+def joined(first: Round, more: Round) -> Round:
+    """A round and further draws of the same proposal, before `add_round`."""
+    known = None if first.log_known is None else np.concatenate([first.log_known, more.log_known])
+    names = "coords", "records", "log_weights", "log_densities"
+    both = {name: np.concatenate([getattr(each, name) for each in (first, more)]) for name in names}
+    return first._replace(log_known=known, **both)
+
+
 def log_mixture(rounds: Sequence[Round], coords: np.ndarray) -> np.ndarray:
     """Log-density (m,) of the draws of all rounds together at points (m, ndim)."""
     sizes = np.array([len(r.coords) for r in rounds])

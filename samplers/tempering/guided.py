@@ -19,6 +19,7 @@ from ..estimates.importance import (
     PooledRounds,
     Round,
     add_round,
+    joined,
     log_mixture,
     pool_rounds,
     tails_are_light,
@@ -46,7 +47,7 @@ from .population import Density, Population
 
 # Draws in a round, as a share of the number of walkers: few, since the guide may still be poor: with 0.6 after the
 # first, four runs on 30 stiffnesses take 1659 simulations instead of 1464. After a reliable round, a round has as many
-# draws as are expected to suffice.
+# draws as are expected to suffice, and goes on if fewer than this are missing then.
 ROUND_SHARE = 0.3
 # Smallest number of draws in a round. The Pareto shape cannot be estimated from fewer than 25.
 FEWEST_DRAWS = 5 * FEWEST_OF_TAIL
@@ -134,12 +135,18 @@ def draw_rounds(
     yield from asked(guide.prepare(session), "search")
     while True:
         yield tick(f"round {len(rounds) + 1}")
-        coords = checked_draws(guide, _next_size(rounds, size), random, population.coords.shape[1])
-        latest, refused = _evaluated(coords, density, guide, session)
-        outcome = None
-        if latest is not None:
-            rounds = add_round(rounds, latest)
+        n, latest, refused, outcome, before = _next_size(rounds, size), None, False, None, rounds
+        while n and not refused:  # a reliable round that misses its aim by less than a round goes on
+            coords = checked_draws(guide, n, random, population.coords.shape[1])
+            part, refused = _evaluated(coords, density, guide, session)
+            if part is None:
+                break
+            latest = part if latest is None else joined(latest, part)
+            rounds = add_round(before, latest)
             pooled = pool_rounds(rounds)
+            n = _missing(rounds, pooled, size)
+            n *= n < _fewest(size)
+        if latest is not None:
             population = population._replace(effective_sample_size=pooled.effective_sample_size)
             shares = len(latest.coords), latest.effective_share, latest.pareto_shape
             yield population, GuidedRound(*shares, *pooled[3:6])
@@ -197,11 +204,19 @@ def _outcome(rounds: Sequence[Round], pooled: PooledRounds, size: int) -> tuple[
     return ("", (find_unreached_part(shortfall, CARE),)) if usable else (shortfall, ())
 
 
+def _fewest(size: int) -> int:
+    """Number of draws in a round, but after a reliable one."""
+    return max(FEWEST_DRAWS, int(np.ceil(ROUND_SHARE * size)))
+
+
+def _missing(rounds: Sequence[Round], pooled: PooledRounds, size: int) -> int:
+    """Number of draws after which the effective sample size is expected to be `size`; 0 after an unreliable round."""
+    missing = max(size - pooled.effective_sample_size, 0.0)
+    return int(np.ceil(missing / rounds[-1].effective_share)) if is_reliable(rounds) else 0
+
+
 def _next_size(rounds: Sequence[Round], size: int) -> int:
     """Number of draws in the next round."""
-    few = max(FEWEST_DRAWS, int(np.ceil(ROUND_SHARE * size)))
-    if not rounds or not is_reliable(rounds):
-        # of a guide whose draws are all impossible, perhaps all simulations fail: find out with few more
-        return FEWEST_DRAWS if rounds and all_impossible(rounds) else few
-    missing = size - pool_rounds(rounds).effective_sample_size
-    return int(np.clip(np.ceil(missing / rounds[-1].effective_share), few, max(size, few)))
+    # of a guide whose draws are all impossible, perhaps all simulations fail: find out with few more
+    few = FEWEST_DRAWS if rounds and all_impossible(rounds) else _fewest(size)
+    return max(few, min(_missing(rounds, pool_rounds(rounds), size), size)) if rounds else few
