@@ -308,20 +308,26 @@ class Climb:
             near = abs(end.value - here.value) < HIGHER and np.abs(end.coords - here.coords).max() < self.apart
             if number == self.number or not near or (end.value < here.value - _DIP and not end.ended):
                 continue
-            move, depth = here.coords - end.coords, 0.0
-            if min(move @ each.hessian @ move for each in (end, self.known[self.number])) > _SAME_MODE:
-                points = self.target.line(here.coords, end.coords, _ALONG)
-                runs = yield points
-                if runs.failed.any() or number not in self.known:
-                    continue  # it has joined another one meanwhile
-                between = self._heights(points, runs, here.noise.coords)
-                values = [here.value, *(each.value for each in between), end.value]
-                lower = np.minimum(np.maximum.accumulate(values), np.maximum.accumulate(values[::-1])[::-1])
-                depth = (lower - values).max()
-            if depth < _DIP:
+            move = here.coords - end.coords
+            close = min(move @ each.hessian @ move for each in (end, self.known[self.number])) <= _SAME_MODE
+            if (close or (yield from self._level(end))) and number in self.known:  # it may have joined another meanwhile
                 self.known[number] = max(end, self.known[self.number], key=lambda each: each.value)
                 return number
         return None
+
+    def _level(self, end: Ascent) -> Requests:
+        """Whether one of the lines from the present point to an end has no valley."""
+        for line in self.target.lines(self._here.coords, end.coords, _ALONG):
+            for points in (line[1:2], line):  # most valleys show in the middle
+                runs = yield points
+                between = self._heights(points, runs, self._here.noise.coords)
+                values = [self._here.value, *(each.value for each in between), end.value]
+                lower = np.minimum(np.maximum.accumulate(values), np.maximum.accumulate(values[::-1])[::-1])
+                if runs.failed.any() or (lower - values).max() >= _DIP:
+                    break
+            else:
+                return True
+        return False
 
     def _design(self, tolerance: float) -> Requests:
         """Steps of a standard deviation along all axes of the Laplace approximation, and a climb from there."""

@@ -80,7 +80,8 @@ class ResponseTarget:
         linear = 1 - np.array(self._structural.logarithmic)
         logs = linear * ~factors
         powers = np.array([linear, logs, logs - factors * (higher < LARGEST_FACTOR * lower)])
-        self._logarithms, self.scales = Scales(logs), [Scales(each) for each in np.unique(powers, axis=0)]
+        self.scales = [Scales(each) for each in np.unique(powers, axis=0)]
+        self._straight = [Scales(logs), Scales(np.ones_like(logs))][: 1 + np.any(logs < 1)]
 
     def first_parts(self, shares: Sequence[float]) -> list["ResponseTarget"]:
         """The same posterior for the first parts of the record, see `FELikelihood.first_parts`."""
@@ -129,11 +130,15 @@ class ResponseTarget:
         coords, volume = self.with_volume(scales.from_scale(points))
         return np.column_stack([coords, scaled[:, points.shape[1] :]]), volume + scales.log_jacobian(points).sum(axis=1)
 
-    def line(self, first: np.ndarray, last: np.ndarray, shares: np.ndarray) -> np.ndarray:
-        """Coordinates (n, n_structural) at shares (n,) of the way between two points, straight in logarithms."""
-        ends = self.scaled(np.column_stack([[first, last], np.zeros((2, self.n_noise))]), self._logarithms)
-        coords, _ = self.unscaled(ends[0] + shares[:, None] * (ends[1] - ends[0]), self._logarithms)
-        return coords[:, : self.n_structural]
+    def lines(self, first: np.ndarray, last: np.ndarray, shares: np.ndarray) -> list[np.ndarray]:
+        """Coordinates (n, n_structural) at shares (n,) of the way between two points, straight in logarithms, or else
+        in parameters."""
+        lines = []
+        for scales in self._straight:
+            ends = self.scaled(np.column_stack([[first, last], np.zeros((2, self.n_noise))]), scales)
+            coords, _ = self.unscaled(ends[0] + shares[:, None] * (ends[1] - ends[0]), scales)
+            lines.append(coords[:, : self.n_structural])
+        return lines
 
     def log_prior(self, coords: np.ndarray) -> np.ndarray:
         """Standard normal log-density (n,) of coordinates (n, k)."""
