@@ -135,9 +135,8 @@ class ResponseTarget:
         in parameters."""
         lines = []
         for scales in self._straight:
-            ends = self.scaled(np.column_stack([[first, last], np.zeros((2, self.n_noise))]), scales)
-            coords, _ = self.unscaled(ends[0] + shares[:, None] * (ends[1] - ends[0]), scales)
-            lines.append(coords[:, : self.n_structural])
+            begin, end = self.scaled(np.array([first, last]), scales)
+            lines.append(self.unscaled(begin + shares[:, None] * (end - begin), scales)[0])
         return lines
 
     def log_prior(self, coords: np.ndarray) -> np.ndarray:

@@ -100,9 +100,8 @@ def _evaluated(coords: np.ndarray, density: Density, guide: Guide, session: Guid
     coords, records = pending.arrived_part()
     if len(coords) == 0:
         return None, pending.refused
-    log_density, log_prob = log_density[: len(coords)], records["log_prob"]
-    alive = log_prob > -np.inf
-    log_weights = np.where(alive, np.where(alive, log_prob, 0.0) - log_density, -np.inf)
+    log_density = log_density[: len(coords)]
+    log_weights = records["log_prob"] - log_density
     log_known = None if known is None else known.log_density(coords) - log_density
     return Round(coords, records, log_weights, known, log_known, function, log_density[:, None]), pending.refused
 
@@ -135,7 +134,7 @@ def draw_rounds(
     yield from asked(guide.prepare(session), "search")
     while True:
         yield tick(f"round {len(rounds) + 1}")
-        n, latest, refused, outcome, before = _next_size(rounds, size), None, False, None, rounds
+        n, latest, refused, outcome, before = max(_sizes(rounds, pooled, size)), None, False, None, rounds
         while n and not refused:  # a reliable round that misses its aim by less than a round goes on
             coords = checked_draws(guide, n, random, population.coords.shape[1])
             part, refused = _evaluated(coords, density, guide, session)
@@ -144,8 +143,8 @@ def draw_rounds(
             latest = part if latest is None else joined(latest, part)
             rounds = add_round(before, latest)
             pooled = pool_rounds(rounds)
-            n = _missing(rounds, pooled, size)
-            n *= n < _fewest(size)
+            few, missing = _sizes(rounds, pooled, size)
+            n = missing if missing < few else 0
         if latest is not None:
             population = population._replace(effective_sample_size=pooled.effective_sample_size)
             shares = len(latest.coords), latest.effective_share, latest.pareto_shape
@@ -204,19 +203,11 @@ def _outcome(rounds: Sequence[Round], pooled: PooledRounds, size: int) -> tuple[
     return ("", (find_unreached_part(shortfall, CARE),)) if usable else (shortfall, ())
 
 
-def _fewest(size: int) -> int:
-    """Number of draws in a round, but after a reliable one."""
-    return max(FEWEST_DRAWS, int(np.ceil(ROUND_SHARE * size)))
-
-
-def _missing(rounds: Sequence[Round], pooled: PooledRounds, size: int) -> int:
-    """Number of draws after which the effective sample size is expected to be `size`; 0 after an unreliable round."""
-    missing = max(size - pooled.effective_sample_size, 0.0)
-    return int(np.ceil(missing / rounds[-1].effective_share)) if is_reliable(rounds) else 0
-
-
-def _next_size(rounds: Sequence[Round], size: int) -> int:
-    """Number of draws in the next round."""
-    # of a guide whose draws are all impossible, perhaps all simulations fail: find out with few more
-    few = FEWEST_DRAWS if rounds and all_impossible(rounds) else _fewest(size)
-    return max(few, min(_missing(rounds, pool_rounds(rounds), size), size)) if rounds else few
+def _sizes(rounds: Sequence[Round], pooled: PooledRounds | None, size: int) -> tuple[int, int]:
+    """Smallest number of draws in the next round, and number that is missing after a reliable one."""
+    few = max(FEWEST_DRAWS, int(np.ceil(ROUND_SHARE * size)))
+    if not rounds or not is_reliable(rounds):
+        # of a guide whose draws are all impossible, perhaps all simulations fail: find out with few more
+        return FEWEST_DRAWS if rounds and all_impossible(rounds) else few, 0
+    missing = size - pooled.effective_sample_size
+    return few, int(np.clip(np.ceil(missing / rounds[-1].effective_share), 0, max(size, few)))
