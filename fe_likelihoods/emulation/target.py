@@ -81,7 +81,7 @@ class ResponseTarget:
         logs = linear * ~factors
         powers = np.array([linear, logs, logs - factors * (higher < LARGEST_FACTOR * lower)])
         self.scales = [Scales(each) for each in np.unique(powers, axis=0)]
-        self._straight = [Scales(logs), Scales(np.ones_like(logs))][: 1 + np.any(logs < 1)]
+        self._straight = [Scales(logs), Scales(np.ones_like(logs))]
 
     def first_parts(self, shares: Sequence[float]) -> list["ResponseTarget"]:
         """The same posterior for the first parts of the record, see `FELikelihood.first_parts`."""
@@ -133,11 +133,9 @@ class ResponseTarget:
     def lines(self, first: np.ndarray, last: np.ndarray, shares: np.ndarray) -> list[np.ndarray]:
         """Coordinates (n, n_structural) at shares (n,) of the way between two points, straight in logarithms, or else
         in parameters."""
-        lines = []
-        for scales in self._straight:
-            begin, end = self.scaled(np.array([first, last]), scales)
-            lines.append(self.unscaled(begin + shares[:, None] * (end - begin), scales)[0])
-        return lines
+        ends = [self.scaled(np.array([first, last]), each) for each in self._straight]
+        lines = [begin + shares[:, None] * (end - begin) for begin, end in ends]
+        return [self.unscaled(line, each)[0] for line, each in zip(lines, self._straight, strict=True)]
 
     def log_prior(self, coords: np.ndarray) -> np.ndarray:
         """Standard normal log-density (n,) of coordinates (n, k)."""
