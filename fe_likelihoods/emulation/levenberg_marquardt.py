@@ -35,6 +35,8 @@ _PATIENCE, _HOPELESS, _LEFT = 4, 200.0, 6.0
 # change, which hides one of them that has two modes, starts joined the other mode in 7 of 12 searches.
 _EXPLAINED = 1.0
 _ALONG = np.array([0.207, 0.414, 0.732])  # points of this line, unequal so that equally spaced modes are not all hit
+# prior standard deviations in one coordinate that part ends on a part of the record: only a later one may tell them
+_APART = 0.25
 _SAME_MODE = 4.0  # squared distance up to which no line is needed; 4 d joined two modes of 15 parameters
 _DIP = 3.0  # depth of a valley in log-density that separates modes
 _DESIGN_FROM = 0.25  # log-density per dimension still to gain at which the steps of a standard deviation are made
@@ -79,10 +81,9 @@ class Ascent(NamedTuple):
 class Climb:
     """Levenberg-Marquardt from one start on a part of the record, where the prior is centred at `centre`.
 
-    `known` has where every ascent on this part has arrived, by its number; ends are different where one coordinate
-    differs by `apart`. On a shorter record, where runs are cheap, it is `alone`: its derivatives are its own. Where no
-    shorter part came before the `whole` record, a step of a standard deviation is simulated along every axis of the
-    Laplace approximation at the end.
+    `known` has where every ascent on this part has arrived, by its number. On a shorter record, where runs are cheap, it
+    is `alone`: its derivatives are its own. Where no shorter part came before the `whole` record, a step of a standard
+    deviation is simulated along every axis of the Laplace approximation at the end.
     """
 
     target: ResponseTarget
@@ -90,7 +91,6 @@ class Climb:
     number: int
     centre: np.ndarray
     known: dict[int, Ascent]
-    apart: float
     whole: bool
     alone: bool
 
@@ -292,7 +292,7 @@ class Climb:
         archive, here = self.target.archive, self._here
         for number, other in self.known.items():
             move = here.coords - other.coords
-            if np.abs(move).max() < self.apart and here.value < other.value:
+            if (self.whole or np.abs(move).max() < _APART) and here.value < other.value:
                 ours, theirs, predicted = archive.weights([here.run, other.run, move @ archive.weights(other.slopes)])
                 error = archive.forms((ours - theirs - predicted)[None])[0, 0]
                 if -error @ other.weights < _EXPLAINED:
@@ -305,10 +305,10 @@ class Climb:
         """
         here = self._here
         for number, end in list(self.known.items()):
-            near = abs(end.value - here.value) < HIGHER and np.abs(end.coords - here.coords).max() < self.apart
+            move = here.coords - end.coords
+            near = abs(end.value - here.value) < HIGHER and (self.whole or np.abs(move).max() < _APART)
             if number == self.number or not near or (end.value < here.value - _DIP and not end.ended):
                 continue
-            move = here.coords - end.coords
             close = min(move @ each.hessian @ move for each in (end, self.known[self.number])) <= _SAME_MODE
             if (close or (yield from self._level(end))) and number in self.known:  # it may have joined another meanwhile
                 self.known[number] = max(end, self.known[self.number], key=lambda each: each.value)

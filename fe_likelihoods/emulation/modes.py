@@ -22,7 +22,6 @@ from .target import ResponseTarget, Runs, Steps, at_once, nothing_stored
 
 LOOSEST = 5.0  # largest gain that may be left on a short part of the record, or at the top of a rough likelihood
 _FLATTEST = 0.2  # smallest curvature of the Laplace approximation: five times the variance of the prior
-_APART = 0.25  # prior standard deviations in one coordinate that part ends on a part of the record
 _STEP = 1e-4  # of the derivatives of parameters by coordinates
 # Shares of the Arias intensity at which the parts of the record end. On whole records alone, two runs on the isolated
 # bridge took 308 and 306 simulations instead of 153 and 152.
@@ -175,8 +174,6 @@ class Search:
         fronts = {k: (self._starts[k], small) for k in numbers}
         for place, part in enumerate(self._parts):
             whole = part.target is self._target
-            # ends may differ on a later part of the record only, so that none may be lost before
-            apart = np.inf if whole else _APART
             # one ascent leads: others often lead to its end, which costs them no derivatives
             order, leading = list(fronts), 1 if place or not self._grown else len(fronts)
             for wave in (order[:leading], order[leading:]):
@@ -186,7 +183,7 @@ class Search:
                     centre = np.zeros(self._target.n_structural) if whole else start
                     derivatives = [] if self._grown else self._target.archive.derivatives
                     alone = self._grown and not whole
-                    climb = Climb(part.target, derivatives, k, centre, part.ends, apart, whole, alone)
+                    climb = Climb(part.target, derivatives, k, centre, part.ends, whole, alone)
                     loose = min(TOLERANCE / part.share, LOOSEST) if self._grown else LOOSEST
                     least = self._tolerance if whole else loose
                     ascents[k] = climb.run(start, steps, least)
