@@ -1,8 +1,8 @@
 """A guide to the posterior: draws near it, and their density, from few simulations (``docs/theory/guided``).
 
 Draws come from the emulated posterior q_e (absent before there are enough runs), and, which bounds weights where the
-emulator is wrong or does not reach, from a wide t mixture q_t around the modes and the prior. Every simulation,
-including the search, trains the emulators.
+emulator is wrong or does not reach, from a wide t mixture q_t around the modes. Every simulation, including the search,
+trains the emulators.
 """
 
 import copy
@@ -23,7 +23,7 @@ from samplers.judgement.guides import (
     check_unseen_modes,
     find_missing_part,
 )
-from samplers.proposals.mixture import DOF, Mixture, draw, log_density
+from samplers.proposals.mixture import DOF, draw, log_density
 from samplers.tempering.guide import Guide
 
 from .density import EmulatedPosterior, Region, around, student_mixture
@@ -34,12 +34,11 @@ from .target import ResponseTarget, Steps, at_once
 
 logger = logging.getLogger(__name__)
 
-_WIDE_SHARE, _PRIOR_SHARE = 0.10, 0.05  # of the draws: weights are bounded by their inverses (not measured)
+_WIDE_SHARE = 0.10  # of the draws: weights are bounded by its inverse (not measured)
 _WIDENED = 1.5  # of the wide components: variances over those of their regions
 _FEWEST_CACHED = 10_000  # simulations that the likelihood must cache in memory
 _MOST_RUNS = 300  # that train the emulator of a region
 _DEPTH = 40.0, 8.0  # log-density below the best within which runs train an emulator: constant, per dimension
-_ALWAYS = 5  # best runs per dimension that train in any case
 
 
 class ResponseGuide(Guide):
@@ -66,7 +65,8 @@ class ResponseGuide(Guide):
         self._excess = -np.inf  # log-density of a draw above all modes
         self._regions: list[Region] = []
         self._emulated: EmulatedPosterior | None = None
-        self._wide: Mixture | None = None
+        d = self._target.ndim
+        self._wide = student_mixture(np.ones(1), np.zeros((1, d)), np.eye(d)[None], np.inf)  # the prior, without modes
 
     @property
     def simulations(self) -> float:
@@ -216,7 +216,7 @@ class ResponseGuide(Guide):
         rows = np.flatnonzero(np.argmin(distances, axis=0) == k)
         rows = rows[np.argsort(-density[rows])]
         deep = int(np.sum(density[rows] > density[rows].max(initial=-np.inf) - _DEPTH[0] - _DEPTH[1] * d))
-        rows = rows[: min(max(deep, _ALWAYS * d), _MOST_RUNS)]
+        rows = rows[: min(deep, _MOST_RUNS)]
         if len(rows) < d + 4:
             raise np.linalg.LinAlgError(f"a mode has {len(rows)} runs")
         best = archive.statistics[rows[0]]
@@ -226,13 +226,10 @@ class ResponseGuide(Guide):
 
     def _parts(self) -> list[tuple[float, Callable, Callable]]:
         """Shares of the draws, and functions of coordinates that they are from: draws and log-density."""
-        d = self._target.ndim
-        mixtures = [(_PRIOR_SHARE, student_mixture(np.ones(1), np.zeros((1, d)), np.eye(d)[None], np.inf))]
-        mixtures += [] if self._wide is None else [(_WIDE_SHARE, self._wide)]
-        parts = [(share, partial(draw, mixture), partial(log_density, mixture)) for share, mixture in mixtures]
-        # the emulated posterior has the rest; without it the wide mixture, and without modes the prior
-        main = parts.pop()[1:] if self._emulated is None else (self._emulated.draw, self._emulated.normalised)
-        return [(1.0 - sum(share for share, *_ in parts), *main), *parts]
+        wide = partial(draw, self._wide), partial(log_density, self._wide)
+        if self._emulated is None:
+            return [(1.0, *wide)]
+        return [(_WIDE_SHARE, *wide), (1.0 - _WIDE_SHARE, self._emulated.draw, self._emulated.normalised)]
 
     def _log_density(self, coords: np.ndarray) -> np.ndarray:
         return np.logaddexp.reduce([np.log(share) + density(coords) for share, _, density in self._parts()])
