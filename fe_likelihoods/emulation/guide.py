@@ -215,8 +215,7 @@ class ResponseGuide(Guide):
         distances = [np.einsum("ni,ij,nj->n", *each) for each in zip(apart, inverses, apart, strict=True)]
         rows = np.flatnonzero(np.argmin(distances, axis=0) == k)
         rows = rows[np.argsort(-density[rows])]
-        deep = int(np.sum(density[rows] > density[rows].max(initial=-np.inf) - _DEPTH[0] - _DEPTH[1] * d))
-        rows = rows[: min(deep, _MOST_RUNS)]
+        rows = rows[density[rows] > density[rows].max(initial=-np.inf) - _DEPTH[0] - _DEPTH[1] * d][:_MOST_RUNS]
         if len(rows) < d + 4:
             raise np.linalg.LinAlgError(f"a mode has {len(rows)} runs")
         best = archive.statistics[rows[0]]

@@ -136,15 +136,15 @@ def draw_rounds(
         yield tick(f"round {len(rounds) + 1}")
         n, latest, refused, outcome, before = max(_sizes(rounds, pooled, size)), None, False, None, rounds
         while n and not refused:  # a reliable round that misses its aim by less than a round goes on
-            coords = checked_draws(guide, n, random, population.coords.shape[1])
-            part, refused = _evaluated(coords, density, guide, session)
+            drawn = checked_draws(guide, n, random, population.coords.shape[1])
+            part, refused = _evaluated(drawn, density, guide, session)
             if part is None:
                 break
             latest = part if latest is None else joined(latest, part)
             rounds = add_round(before, latest)
             pooled = pool_rounds(rounds)
             few, missing = _sizes(rounds, pooled, size)
-            n = missing if missing < few else 0
+            n = missing * (missing < few)
         if latest is not None:
             population = population._replace(effective_sample_size=pooled.effective_sample_size)
             shares = len(latest.coords), latest.effective_share, latest.pareto_shape
@@ -209,5 +209,5 @@ def _sizes(rounds: Sequence[Round], pooled: PooledRounds | None, size: int) -> t
     if not rounds or not is_reliable(rounds):
         # of a guide whose draws are all impossible, perhaps all simulations fail: find out with few more
         return FEWEST_DRAWS if rounds and all_impossible(rounds) else few, 0
-    missing = size - pooled.effective_sample_size
-    return few, int(np.clip(np.ceil(missing / rounds[-1].effective_share), 0, max(size, few)))
+    missing = np.ceil((size - pooled.effective_sample_size) / rounds[-1].effective_share)
+    return few, int(np.clip(missing, 0, max(size, few)))
