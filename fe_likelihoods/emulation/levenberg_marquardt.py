@@ -310,7 +310,9 @@ class Climb:
             if number == self.number or not near or (end.value < here.value - _DIP and not end.ended):
                 continue
             close = min(move @ each.hessian @ move for each in (end, self.known[self.number])) <= _SAME_MODE
-            if (close or (yield from self._level(end))) and number in self.known:  # it may have joined another meanwhile
+            if (
+                close or (yield from self._level(end))
+            ) and number in self.known:  # it may have joined another meanwhile
                 self.known[number] = max(end, self.known[self.number], key=lambda each: each.value)
                 return number
         return None
