@@ -81,9 +81,9 @@ class Ascent(NamedTuple):
 class Climb:
     """Levenberg-Marquardt from one start on a part of the record, where the prior is centred at `centre`.
 
-    `known` has where every ascent on this part has arrived, by its number. On a shorter record, where runs are cheap, it
-    is `alone`: its derivatives are its own. Where no shorter part came before the `whole` record, a step of a standard
-    deviation is simulated along every axis of the Laplace approximation at the end.
+    `known` has where every ascent on this part has arrived, by its number. On a shorter record, where runs are cheap,
+    it is `alone`: its derivatives are its own. Where no shorter part came before the `whole` record, a step of a
+    standard deviation is simulated along every axis of the Laplace approximation at the end.
     """
 
     target: ResponseTarget
@@ -310,9 +310,7 @@ class Climb:
             if number == self.number or not near or (end.value < here.value - _DIP and not end.ended):
                 continue
             close = min(move @ each.hessian @ move for each in (end, self.known[self.number])) <= _SAME_MODE
-            if (
-                close or (yield from self._level(end))
-            ) and number in self.known:  # it may have joined another meanwhile
+            if (close or (yield from self._level(end))) and number in self.known:  # it may have joined another one
                 self.known[number] = max(end, self.known[self.number], key=lambda each: each.value)
                 return number
         return None
