@@ -60,8 +60,8 @@ def check_unseen_modes(share: float, ended: int, modes: int) -> list[Finding]:
     if share <= DOUBTED_SHARE:
         return []
     text = (
-        f"{ended} starts led to {modes} modes, to some of them only once, so about {100.0 * share:.0f} % of further "
-        "starts would lead to modes that were not found: use more starts, or a larger limit of simulations"
+        f"{ended} starts ended at {modes} points, as on one flat ridge or in several modes; about {share:.0%} of "
+        "further starts would end elsewhere, perhaps in modes not found yet: use more starts, or a larger limit"
     )
     return [find_missing_part(text)]
 

@@ -24,7 +24,7 @@ from fe_likelihoods.emulation.guide import ResponseGuide
 from fe_likelihoods.emulation.modes import Search
 from fe_likelihoods.emulation.target import at_once, nothing_stored
 from samplers import SamplingWarning, SMCSampler, TMCMCSampler
-from samplers.judgement.guides import check_excluded_runs, check_tops
+from samplers.judgement.guides import check_excluded_runs, check_tops, check_unseen_modes
 from tests.statistics.hard_posteriors import CASES
 
 from .problems import guided, vibration
@@ -303,3 +303,10 @@ def test_a_search_that_finds_some_of_five_modes_is_refused():
         with pytest.warns(SamplingWarning):
             sampler.run_mcmc(None, 0)
         assert sampler.verdict.status == "not usable"
+
+
+def test_many_ends_of_a_search_are_not_said_to_be_modes():
+    """The draws of a flat ridge are one mode in the verdict, which the finding must not deny."""
+    (finding,) = check_unseen_modes(0.29, 24, 11)
+    assert "24 starts ended at 11 points" in finding.text and "11 modes" not in finding.text
+    assert check_unseen_modes(0.05, 24, 11) == []
