@@ -110,7 +110,6 @@ class Climb:
                 yield from self._derive(FIRST_DIFFERENCE * np.eye(len(start)))
             elif self.target.data.differentiable:
                 yield from self._derive(np.empty((0, len(start))))
-        if joined is None:
             first = max(tolerance, _DESIGN_FROM * len(start)) if steps is None else tolerance
             joined = yield from self._climb(True, first)
         if joined is None:

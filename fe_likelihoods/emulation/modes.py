@@ -7,6 +7,7 @@ in parameters without effect on the early part. A model with ``first(seconds)`` 
 record is said to grow; of another one, all parts use the same simulations of the whole record.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -162,12 +163,6 @@ class Search:
                 return search
             begin, following = following, min(following + missing, len(self._starts))
 
-    def _pay(self, simulations: float) -> None:
-        """Count simulations that are made next, if they fit."""
-        if not self._session.fits(simulations):
-            raise _OutOfBudget
-        self.spent += simulations
-
     def _ascend(self, numbers: range) -> Steps:
         """Ascents from starts on all parts of the record."""
         small = FIRST_DIFFERENCE * np.eye(self._target.n_structural) if self._grown else None
@@ -210,7 +205,10 @@ class Search:
             answers, sizes = {}, [len(waiting[number]) for number in points]
             # derivatives at a point count as one simulation
             coords = np.concatenate([np.empty((0, self._target.n_structural)), *(waiting[number] for number in points)])
-            self._pay(part.share * (len(slopes) + part.target.new_points(coords)))
+            simulations = part.share * (len(slopes) + part.target.new_points(coords))
+            if not self._session.fits(simulations):
+                raise _OutOfBudget
+            self.spent += simulations
             if slopes:
                 at = np.array([waiting[number] for number in slopes])
                 found = yield from part.target.derivatives(at, self._session.remember)
@@ -260,12 +258,15 @@ def find_modes(
     seed: Any = None,
     max_simulations: float | None = None,
     tolerance: float = TOLERANCE,
+    show: Callable[[float], None] = lambda spent: None,
 ) -> ModeSearch:
-    """The modes of a posterior, see `Posterior.mode`; ascents leave less than a `tolerance` of log-density to gain."""
+    """The modes of a posterior, see `Posterior.mode`; ascents leave less than a `tolerance` of log-density to gain, and
+    `show` is called with the simulations so far after each batch.
+    """
     starts = check_starts(starts)
     target = ResponseTarget(posterior)
     limit = np.inf if max_simulations is None else float(max_simulations)
     random = np.random.default_rng(seed)
     session = GuideSession(random, nothing_stored, lambda n: search.spent + n <= limit, lambda: limit - search.spent)
     search = Search(target, draw_starts(target, starts, random), session, tolerance)
-    return at_once(search.run(starts))
+    return at_once(search.run(starts), lambda: show(search.spent))

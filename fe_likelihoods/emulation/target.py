@@ -46,15 +46,15 @@ def nothing_stored(_: str, compute: Callable[[], Sequence[np.ndarray]] | None = 
     return None if compute is None else compute()
 
 
-def at_once(steps: Steps) -> Any:
-    """Result of steps whose functions are called here."""
+def at_once(steps: Steps, ended: Callable[[], None] = lambda: None) -> Any:
+    """Result of steps whose functions are called here, and `ended` after each batch."""
     answer = None
     while True:
         try:
             item = steps.send(answer)
         except StopIteration as end:
             return end.value
-        answer = None if item is None else item()
+        answer = ended() if item is None else item()
 
 
 class ResponseTarget:

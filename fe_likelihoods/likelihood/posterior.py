@@ -358,7 +358,9 @@ class Posterior:
 
         return ResponseGuide(self, starts)
 
-    def mode(self, starts: int = 12, seed: Any = None, max_simulations: float | None = None) -> "ModeSearch":
+    def mode(
+        self, starts: int = 12, seed: Any = None, max_simulations: float | None = None, progress: bool | str = False
+    ) -> "ModeSearch":
         """The modes of the density: most probable parameters, Laplace covariances and evidences.
 
         The search of `guide`, with a few more simulations at each top. Responses are cached, so a sampler with a guide,
@@ -372,6 +374,8 @@ class Posterior:
             Of the starts.
         max_simulations : float, optional
             Limit of the search.
+        progress : bool or str
+            Whether to show the simulations so far, as in `run_mcmc`.
 
         Returns
         -------
@@ -397,9 +401,23 @@ class Posterior:
         (1, True)
         """
         self._check_models("the search for modes")
+        from samplers.reporting.progress import open_bar
+
         from ..emulation.modes import find_modes  # scipy.special and scipy.optimize are slow to import
 
-        return find_modes(self, starts, seed, max_simulations, _TOP)
+        with open_bar(progress, None, bar_format="{desc}: {n:.0f} simulations [{elapsed}]") as bar:
+
+            def show(simulations: float, doing: str = "search") -> None:
+                bar.set_description_str(doing, refresh=doing != "search")
+                bar.update(simulations)
+
+            show(0.0)
+            bar.refresh()  # the first simulation may take long
+            self.when_simulated(show if progress else None)
+            try:
+                return find_modes(self, starts, seed, max_simulations, _TOP, lambda spent: show(spent - bar.n))
+            finally:
+                self.when_simulated(None)
 
     def executor(self) -> InThreads:
         """An executor whose threads call this posterior, each for one point, and wait for its simulations.

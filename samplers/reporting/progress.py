@@ -35,7 +35,7 @@ class _Lines:
             self._last = line
 
 
-def _open_bar(display: bool | str, total: int | None, **kwargs: Any) -> Any:
+def open_bar(display: bool | str, total: int | None, **kwargs: Any) -> Any:
     """A bar of tqdm, disabled if `display` is False; emcee's bar of this name for a str.
 
     Where stderr is neither a terminal nor a notebook, the bar writes at most one line per minute and the last state.
@@ -63,7 +63,7 @@ class Progress:
         self, bar: Mapping[str, Any], evaluator: Evaluator, function: Callable, label: str, total: int | None = None
     ):
         kwargs = {"desc": label, "unit": " sweeps"} | dict(bar["progress_kwargs"] or {})
-        self._bar = _open_bar(bar["progress"] if total != 0 else False, total, **kwargs)
+        self._bar = open_bar(bar["progress"] if total != 0 else False, total, **kwargs)
         self._evaluator, self._label, self._total = evaluator, label, total
         self._text = ""  # what the run does at present; empty before it is known
         self._search: GuideTick | None = None  # the latest one of the search of a guide

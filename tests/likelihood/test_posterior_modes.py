@@ -105,6 +105,16 @@ def test_a_mode_beside_failures_is_found():
     assert mode.parameters[0] == pytest.approx(1.0 - 0.1 / 11.0, abs=0.02) and mode.converged
 
 
+@pytest.mark.parametrize("make", [problems.free_vibration, lambda: linear(np.random.default_rng(1), True)[0]])
+def test_progress_shows_the_simulations_from_the_first_one_on(make, capsys):
+    make().mode(seed=1)
+    assert capsys.readouterr().err == ""
+    found = make().mode(seed=1, progress=True)
+    first, last = capsys.readouterr().err.splitlines()
+    assert first.startswith("search: 0 simulations [")
+    assert last.startswith(f"search: {found.simulations:.0f} simulations [")
+
+
 def test_a_limit_ends_the_search():
     found = problems.free_vibration().mode(seed=1, max_simulations=4)
     assert not found.finished
