@@ -16,7 +16,6 @@ from .moves.population_moves import MixtureMove
 from .tempered import TemperedSampler
 from .tempering.mutation import needs_many_walkers
 
-FEWEST_TO_RECYCLE = 150  # with 75, recycling loses a mode in 0 of 25 runs and moves in 8, but it often fails
 OF_MOVES = {"ess_ratio", "ess_floor", "resampling", "min_moves", "max_moves", "max_correlation"}
 # Steps of a chain from a leader before its points count: without them the shares of the points are biased.
 BURN_IN = 4
@@ -32,8 +31,7 @@ class SMCSampler(TemperedSampler):
         `samplers.moves.population_moves.MixtureMove`: three kernels from a mixture fitted to every stage.
     recycle : bool, optional
         Anneal by recycling every evaluated point (`samplers.tempering.recycling`), and by moves if the result cannot be
-        trusted. Default: True with 150 walkers or more, unless `moves` or a setting of annealing by moves is given
-        (`ess_ratio` to `max_correlation`). With fewer walkers, a mode can be lost unnoticed, and recycling often fails.
+        trusted. Default: True, unless `moves` or a setting of moves is given (`ess_ratio` to `max_correlation`).
 
     Examples
     --------
@@ -48,10 +46,9 @@ class SMCSampler(TemperedSampler):
     """
 
     @classmethod
-    def _chosen(cls, settings: dict[str, Any], moves: Any, nwalkers: int) -> tuple[dict[str, Any], Any]:
+    def _chosen(cls, settings: dict[str, Any], moves: Any) -> tuple[dict[str, Any], Any]:
         if settings.get("recycle") is None:
-            recycle = moves is None and not OF_MOVES & set(settings) and nwalkers >= FEWEST_TO_RECYCLE
-            settings = settings | {"recycle": recycle}
+            settings = settings | {"recycle": moves is None and not OF_MOVES & set(settings)}
         return settings, MixtureMove() if moves is None else moves
 
 
@@ -78,7 +75,7 @@ class TMCMCSampler(TemperedSampler):
     """
 
     @classmethod
-    def _chosen(cls, settings: dict[str, Any], moves: Any, nwalkers: int) -> tuple[dict[str, Any], Any]:
+    def _chosen(cls, settings: dict[str, Any], moves: Any) -> tuple[dict[str, Any], Any]:
         settings = {"chains": "equal" if needs_many_walkers(moves) else "leaders", "recycle": False} | settings
         if settings["chains"] == "leaders":
             settings.setdefault("burn_in", BURN_IN)

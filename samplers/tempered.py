@@ -42,7 +42,7 @@ from .judgement.verdict import (
 from .moves.population_moves import RandomWalkMove, describe, guide_move, with_fast_sweeps, without_unfitted
 from .record import BudgetExhausted, EvaluatedBatch, Incomplete, RunStart, as_limit
 from .reporting.progress import Progress
-from .reports import AnnealingResult, Report, Stage, warn
+from .reports import AnnealingResult, Report, Restart, Stage, warn
 from .results import RunResults
 from .settings import Settings, as_whole_number, check_arguments
 from .tempering.anneal import anneal
@@ -139,7 +139,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._target = target = Target(*functions, ndim, args, kwargs, vectorize, blobs_dtype)
         self.log_prior_fn = target.log_prior_fn
         check_size(nwalkers, ndim)
-        settings, moves = self._chosen(settings, moves, nwalkers)
+        settings, moves = self._chosen(settings, moves)
         # with 40 normal parameters, 7 sweeps leave means off by 0.57 standard deviations, 60 by 0.04
         most_moves = Settings.max_moves + 3 * max(ndim - 20, 0)
         self.settings = given = Settings(**{"max_moves": most_moves} | settings)
@@ -194,7 +194,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
             self._random.seed(stream)
 
     @classmethod
-    def _chosen(cls, settings: dict[str, Any], moves: Any, nwalkers: int) -> tuple[dict[str, Any], Any]:
+    def _chosen(cls, settings: dict[str, Any], moves: Any) -> tuple[dict[str, Any], Any]:
         """The given settings, with the settings that this sampler chooses, and the moves."""
         return {"recycle": False} | settings, RandomWalkMove() if moves is None else moves
 
@@ -554,7 +554,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
             guided = self.guide, lend(self.guide, self._random, remember, self._record)
         self._record.is_complete = stored is not None
         population = Population(0.0, start.coords, None, float(self.nwalkers))
-        since = time.perf_counter(), self._evaluator.evaluations
+        since = begun = time.perf_counter(), self._evaluator.evaluations
         try:
             with (
                 closing(self._evaluator),
@@ -567,6 +567,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
                         seconds, made = time.perf_counter() - since[0], self._evaluator.evaluations - since[1]
                         report = report._replace(seconds=seconds, evaluations=made)
                         since = time.perf_counter(), self._evaluator.evaluations
+                    elif isinstance(report, Restart):  # the first stage takes what the stages before it took
+                        since = begun
                     elif isinstance(report, EvidenceCheck):
                         since = since[0], since[1] + report.evaluations  # these belong to no stage
                     self._result = self._result.add(report, population.founders)

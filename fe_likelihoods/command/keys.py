@@ -376,7 +376,7 @@ class Sampler(Section):
     seed: Any = key("whole number >= 0", "Seed", 1)
     chains: Any = key("whole number >= 1", "Independent runs with successive seeds; the report is of the first", 1)
     guide: Any = key("yes or no", "Find the posterior from the responses, with hundreds of simulations", False)
-    recycle: Any = key("yes or no", "Reuse every evaluated point; by default with 150 walkers or more")
+    recycle: Any = key("yes or no", "Reuse every evaluated point; by default yes")
     max_failure_share: Any = key("number", "Share of failed evaluations at which the run stops (0.5)")
 
 

@@ -13,8 +13,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from samplers.smc import FEWEST_TO_RECYCLE
-
 from ..checks.finding import Finding, Judgement, percent
 from ..checks.model import describe_residuals
 from ..checks.result import FinishedRun
@@ -339,8 +337,7 @@ def how_to_repeat(run: FinishedRun) -> str:
     if sampler.max_simulations is not None:
         arguments.append(f"max_simulations={sampler.max_simulations:g}")
     changed = changed_settings(sampler.settings)
-    recycles = name == "SMCSampler" and sampler.nwalkers >= FEWEST_TO_RECYCLE
-    usual = ("recycle", str(recycles))  # None, the default, was replaced by it
+    usual = ("recycle", str(name == "SMCSampler"))  # None, the default, was replaced by it
     arguments += [f"{key}={text}" for key, text in changed if "." not in key and (key, text) != usual]
     lines = "".join(f"    {each},\n" for each in arguments)
     return f"from {package} import {name}\n\nsampler = {name}(\n{lines})\nsampler.run_mcmc(None, {sampler.iteration})"

@@ -31,11 +31,11 @@ TARGET_SHARE = 0.2
 POINTS_PER_COMPONENT, POINTS_PER_NUMBER = 8.0, 0.5
 # Draws of a round, as a multiple of the target.
 DRAWS_PER_TARGET = 3.0
-# Draws that find narrow modes: draws of the prior, and further draws, spread over the stages below beta = 1, as a
-# multiple of the walkers; from 250 on, at least 1000 of each kind. Widths 1:6 and 1:8 in three dimensions and 1:3 in
-# five, 250 walkers: a mode was lost in 21 of 72 runs with 250 and 1500, in 2 of 96 with 1000 and 1000.
-DRAWS_SHARE, FEWEST_TO_SEARCH = 4, 250
-LEAST_DRAWS = DRAWS_SHARE * FEWEST_TO_SEARCH
+# Draws that find narrow modes, of the prior, and spread over the stages below beta = 1, as a multiple of the walkers;
+# of each kind at least this multiple or 1000. Widths 1:6 and 1:8 in three dimensions and 1:3 in five, 250 walkers: a
+# mode was lost in 21 of 72 runs with 250 and 1500, in 2 of 96 with 1000 and 1000. With 32 and 50 walkers and at most
+# 1500 simulations, 15 of 18 runs are usable; with 1000 and 1000, none of 6.
+DRAWS_SHARE, LEAST_DRAWS = 4, 1000
 # A beta is left once the draws made at it have an effective sample size of this share of the target.
 FRESH_SHARE = 0.75
 # Share of a proposal's weight that is spread evenly over its components, so that small components receive draws too:
@@ -82,7 +82,9 @@ def recycle(
     StoppedEarly at the limit of simulations.
     """
     first, ndim = pending.coords.shape
-    left, enlarged, explored = float(search_draws(n)), 1.0, False  # draws that search for narrow modes
+    share = DRAWS_SHARE * n
+    left = float(max(share - first_draws(n), min(share, LEAST_DRAWS)))  # further draws that search for narrow modes
+    enlarged, explored = 1.0, False
     numbers = ndim * (ndim + 3) / 2.0  # of a mean and a covariance
     of_numbers = min(POINTS_PER_NUMBER * numbers, LARGEST_SHARE_KEPT * n)
     target = least = max(TARGET_SHARE * n, POINTS_PER_DIMENSION * (ndim + 1.0), of_numbers)
@@ -94,7 +96,7 @@ def recycle(
         points.update()
         alive = effective_sample_size(points.log_weights(0.0))
     if alive < target:
-        reason = f"only {alive:.0f} of {first} starting points have a likelihood above zero"
+        reason = f"{alive:.0f} of {first} starting points have a likelihood above zero, fewer than {target:.0f}"
         return Recycled(reason, Population(0.0, *pending.arrived_part(), alive), float("-inf"), float("inf"), None)
     while True:
         # choose beta
@@ -294,12 +296,7 @@ def submit_start(coords: np.ndarray, density: Density, whole: bool = False) -> P
 
 def first_draws(size: int) -> int:
     """Number of draws of the prior that a run starts from, for a number of walkers."""
-    return max(size, LEAST_DRAWS if size >= FEWEST_TO_SEARCH else 0)
-
-
-def search_draws(size: int) -> int:
-    """Number of further draws that search for narrow modes, for a number of walkers."""
-    return max(DRAWS_SHARE * size - first_draws(size), LEAST_DRAWS if size >= FEWEST_TO_SEARCH else 0)
+    return max(size, min(DRAWS_SHARE * size, LEAST_DRAWS))
 
 
 def most_running(density: Density, submitted: int) -> int:

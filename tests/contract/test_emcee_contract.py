@@ -183,7 +183,7 @@ def test_a_pool_that_is_closed_during_a_run(settings):
 
 @pytest.mark.parametrize("Sampler", [SMCSampler, TMCMCSampler])
 def test_a_broken_function_stops_with_its_reason(Sampler):
-    with pytest.raises(RuntimeError, match="all 24 evaluations of a batch failed.*TypeError: no such argument"):
+    with pytest.raises(RuntimeError, match="all 96 evaluations of a batch failed.*TypeError: no such argument"):
         run(Sampler, posterior=Broken())
 
 

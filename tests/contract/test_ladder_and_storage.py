@@ -39,7 +39,9 @@ def test_stages_account_for_everything():
     # the prior is unbounded, so all proposals are evaluated
     assert all(s.evaluations == N * s.moves for s in sampler.ladder[1:])
     assert all(2 <= s.moves <= 7 and 0 < s.acceptance <= 1 for s in sampler.ladder)
-    assert all(abs(s.effective_sample_size / (0.5 * N) - 1) < 1e-4 for s in sampler.ladder[:-1])
+    sizes = [4 * N] + [N] * len(sampler.ladder)
+    for stage, size in zip(sampler.ladder[:-1], sizes, strict=False):
+        assert abs(stage.effective_sample_size / (0.5 * size) - 1) < 1e-4
     assert sampler.ladder[-1].effective_sample_size >= 0.5 * N
     assert sampler.log_evidence_ladder == sum(s.log_evidence_increment for s in sampler.ladder)
     assert sampler.ladder[-1].log_evidence_error > 0

@@ -36,6 +36,8 @@ def test_control_a_start_that_is_not_of_the_prior_would_be_wrong(monkeypatch):
     """Negative control: why starts are tested."""
     monkeypatch.setattr(user_target, "not_of_the_prior", lambda *args: "")
     posterior = Gaussian(3, sd=0.1)
-    sampler = SMCSampler(100, 3, posterior, vectorize=True, seed=1)
+    settings = {"vectorize": True, "seed": 1, "recycle": False}
+    # a function without `sample_prior`, so that no draws of the prior are added
+    sampler = SMCSampler(100, 3, lambda x: posterior(x), log_prior_fn=posterior.log_prior, **settings)
     sampler.run_mcmc(ball(posterior, 100, 0.02), 1)
     assert sampler.log_evidence_ladder - posterior.log_evidence > 10.0 * sampler.ladder[-1].log_evidence_error

@@ -155,7 +155,7 @@ def scattered(x):
 
 
 @pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
-@pytest.mark.parametrize("seed", [102, 103])  # of 30 seeds, 29, 29, 27, 28 and 30 pass the cases
+@pytest.mark.parametrize("seed", [101, 102])  # of 12 seeds, 12, 11, 10 and 11 pass the last four cases
 @pytest.mark.parametrize(
     ("log_likelihood", "fails", "place", "status"),
     [

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from samplers import SMCSampler, TMCMCSampler
-from samplers.tempering import anneal, recycling
+from samplers.tempering import recycling
 from tests.statistics import analytic_runs
 
 NDIM = 10
@@ -79,8 +79,7 @@ def test_moves_keep_the_narrow_mode():
 @pytest.mark.parametrize(("explores", "found"), [(True, True), (False, False)])
 def test_a_mode_that_is_met_at_the_end_is_explored(explores, found, monkeypatch):
     """One draw of the last round before the check hits the flank of the narrow mode."""
-    monkeypatch.setattr(anneal, "first_draws", lambda size: size)
-    monkeypatch.setattr(recycling, "search_draws", lambda size: 0)
+    monkeypatch.setattr(recycling, "DRAWS_SHARE", 0)
     if not explores:
         monkeypatch.setattr(recycling, "find_basins", lambda *points: None)
     result = analytic_runs.run(analytic_runs.Cell("two", 100.0, "SMC", 500), 4, 1, {})

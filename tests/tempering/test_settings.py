@@ -105,7 +105,7 @@ def test_the_share_of_failures_stops_the_run(path):
 @pytest.mark.parametrize(
     ("Sampler", "settings", "match"),
     [
-        (SMCSampler, {"asynchronous": True}, "asynchronous=True cannot act here"),
+        (SMCSampler, {"asynchronous": True, "recycle": False}, "asynchronous=True cannot act here"),
         (SMCSampler, {"ess_floor": 60.0}, "must be below nwalkers=60"),
         (SMCSampler, {"pool": 4}, "pool must be an object with a method map"),
         (SMCSampler, {"backend": "run.h5"}, "backend must be a backend of emcee"),
@@ -188,7 +188,7 @@ def test_defaults_of_the_samplers():
     leaders = replace(Settings(), recycle=False, chains="leaders", burn_in=BURN_IN)
     assert TMCMCSampler(300, 3, posterior).settings == leaders
     assert TMCMCSampler(300, 3, posterior, moves=moves).settings == replace(Settings(), recycle=False)
-    assert SMCSampler(150, 3, posterior).settings == replace(Settings(), recycle=True)
-    for few, settings in ((149, {}), (300, {"ess_ratio": 0.95}), (300, {"resampling": "multinomial"})):
-        assert not SMCSampler(few, 3, posterior, **settings).settings.recycle
+    assert SMCSampler(6, 3, posterior).settings == replace(Settings(), recycle=True)
+    for settings in ({"ess_ratio": 0.95}, {"resampling": "multinomial"}):
+        assert not SMCSampler(300, 3, posterior, **settings).settings.recycle
     assert SMCSampler(300, 3, posterior, moves=moves).settings == replace(Settings(), recycle=False)
