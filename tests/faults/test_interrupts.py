@@ -308,7 +308,7 @@ def test_an_exception_says_that_the_run_is_kept_and_goes_on(stored, tmp_path):
     with pytest.raises(OSError, match="no space left") as caught:
         broken.run_mcmc(None, 3)
     (note,) = caught.value.__notes__
-    assert "90 evaluations and 0 steps are kept in" in note and "The same call goes on" in note
+    assert "330 evaluations and 0 steps are kept in" in note and "The same call goes on" in note
     assert ("broken.h5" in note) == stored
     broken.run_mcmc(None, 3)
     np.testing.assert_array_equal(broken.get_chain(), whole.get_chain())
