@@ -42,7 +42,7 @@ Remember = Callable[..., list[np.ndarray] | None]  # see `Record.remembering`
 # Guides count parts of a simulation as fractions: their sums, in another order, differ by less.
 ROUNDING = 1e-6
 OF_GUIDES = "simulations of guides"  # key in the record
-_open_records: "weakref.WeakValueDictionary[Path, Record]" = weakref.WeakValueDictionary()
+_open_records: "weakref.WeakValueDictionary[Path | int, Record]" = weakref.WeakValueDictionary()  # int: in memory
 
 
 def lock_now(file: Any) -> None:
@@ -261,10 +261,6 @@ class Record:
 
         return remember
 
-    def forget_arrays(self) -> None:
-        """Forget the arrays in memory: the annealing has ended, and is not made again in this process."""
-        self._arrays.clear()
-
     # ------------------------------------------------------------------ the file
 
     @deferred_interrupts()
@@ -276,10 +272,7 @@ class Record:
 
     def open(self) -> None:
         """Open the file for writing, and lock it. ValueError if another process writes to it."""
-        if self.path is None and self._file is None:
-            self._file = tempfile.TemporaryFile(buffering=0)
-            weakref.finalize(self, self._file.close)
-        if self._file is not None:
+        if self.path is None or self._file is not None:
             return
         if (earlier := _open_records.get(self.path)) is not None:  # the last sampler of a process owns it
             earlier.close()
@@ -308,10 +301,12 @@ class Record:
             weakref.finalize(self, file.close)
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the file; a temporary file is lost, with the arrays in it."""
         if self._file is not None:
             self._file.close()
             self._file, self._seen = None, self._whole
+        if self.path is None:
+            self._arrays.clear()
 
     @property
     def is_stale(self) -> bool:
@@ -328,6 +323,10 @@ class Record:
         """Append a block to the file; returns the place and length of its content."""
         if self.path is None and kind != b"MEMO":
             return None
+        if self.path is None and self._file is None:
+            self._file, self._whole = tempfile.TemporaryFile(buffering=0), 0
+            weakref.finalize(self, self._file.close)
+            _open_records[id(self)] = self
         self.open()
         content = io.BytesIO()
         for array in (np.frombuffer(json.dumps(text).encode(), dtype=np.uint8), *arrays):
@@ -353,12 +352,9 @@ class Record:
                 written += self._file.write(data[written:])
         except OSError as error:
             self._file.truncate(self._whole)
-            raise OSError(
-                error.errno,
-                f"the record of the run cannot be written ({error.strerror}). Everything before is kept: make space, "
-                "and call run_mcmc again",
-                str(self.path),
-            ) from error
+            said = f"the record of the run cannot be written ({error.strerror}). Everything before is kept: "
+            said += "make space, and call run_mcmc again"
+            raise OSError(error.errno, said, str(self.path or tempfile.gettempdir())) from error
         self._whole += len(data)
 
     def _read(self) -> None:

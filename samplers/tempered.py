@@ -599,8 +599,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
             schedule.calibrate(population.coords, np.full(self.nwalkers, 1.0 / self.nwalkers))
             self._moves, self._weights = schedule
         self._judge(0, population.coords)
-        if not ended:
-            self._record.forget_arrays()
+        if not ended and self._record.path is None:  # the annealing is not made again in this process
+            self._record.close()
         if stored is not None and not ended:
             self.random_state = stored.random_state
             return stored
