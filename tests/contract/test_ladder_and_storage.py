@@ -244,9 +244,8 @@ def test_collapse_is_reported():
         posterior = Gaussian()
         SMCSampler(N, 3, posterior, vectorize=True, seed=1, moves=emcee.moves.GaussianMove(1e6)).run_mcmc(None, 1)
     messages = [str(w.message) for w in caught]
-    assert len(messages) == 2  # each reason once, for any number of stages
-    assert "importance sampling from the final points gives" in messages[0]
-    assert "standard error of the log-evidence" in messages[1]
+    for said in ("importance sampling from the final points gives", "standard error of the log-evidence"):
+        assert sum(said in message for message in messages) == 1  # each reason once, for any number of stages
     with pytest.warns(SamplingWarning, match="estimates of the evidence|log-evidence"):
         posterior = Gaussian(sd=1e-3)
         SMCSampler(N, 3, posterior, vectorize=True, seed=1, ess_ratio=0.03, recycle=False).run_mcmc(None, 1)
