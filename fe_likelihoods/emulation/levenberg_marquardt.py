@@ -18,11 +18,11 @@ FIRST_DIFFERENCE = 3e-3  # prior standard deviations
 _DIFFERENCE_SHARE, _DIFFERENCE_LIMITS = 0.1, (3e-4, 2e-2)  # of a posterior standard deviation; prior ones
 _CHECKED_CHANGE = 1e-3  # of the residuals by a step, relative, where the model's derivatives are first used
 _CHECKED_ERROR = 0.05  # of the norm of this change, by which derivatives may differ from it (not measured)
-_NEAREST_RUNS = 3, 10  # runs that secants are fitted to: per dimension, and in addition
+_NEAREST_RUNS = 3, 10  # that secants are fitted to, per dimension and in addition; with all, searches took 7 % more
 _TOO_CLOSE = 1e-8  # squared distance of runs that tell nothing about derivatives: residuals have seven digits
 TOLERANCE = 0.5  # log-density still to gain, according to the quadratic approximation
 _MAX_ITERATIONS = 40
-_STALLED = 0.1  # gain in log-density below which a step counts as failed
+_STALLED = 0.1  # gain below which a step counts as failed; with 0, searches of an aliased frequency took 20 % more
 # Share of the promised gain below which an ascent that is alone makes new differences: 0.7 took 246 simulations in a
 # search of a column (of 12), 0.4 took 177, and 0 took 181, but only one start ended at a mode in two of them. Where
 # ascents share all runs, this costs more than it saves (20 and 30 parameters: 202 and 300 simulations, or 126 and 172).
