@@ -35,7 +35,7 @@ def run(function, vectorize=True, pool=None):
 def test_a_response_of_the_wrong_shape_is_named_where_the_run_ends():
     with pytest.raises(ValueError, match="no point of the population") as caught:
         run(lambda time: lambda theta: np.sin(theta[0] * time))
-    assert "20 x the response has shape (50,), expected (n_channels, n_steps) = (1, 50)" in caught.value.__notes__[0]
+    assert "80 x the response has shape (50,), expected (n_channels, n_steps) = (1, 50)" in caught.value.__notes__[0]
     summary = run(lambda time: lambda theta: [np.sin(theta[0] * time)[: 50 if theta[0] < 4.0 else 49]]).describe()
     assert " x the response has shape (1, 49), expected (n_channels, n_steps) = (1, 50))." in summary
 
