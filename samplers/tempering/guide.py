@@ -124,7 +124,7 @@ class Guide(ABC):
 
 def checked_draws(guide: Guide, n: int, random: np.random.RandomState, ndim: int) -> np.ndarray:
     """Draws (n, ndim) of a guide; ValueError for any other shape."""
-    coords = np.asarray(guide.draw(n, random), dtype=float)
+    coords = np.atleast_2d(np.asarray(guide.draw(n, random), dtype=float))  # one draw of scipy has a shape (ndim,)
     if coords.shape != (n, ndim) or not np.all(np.isfinite(coords)):
         raise ValueError(
             f"guide.draw({n}, random) must return {n} finite points of {ndim} parameters; got shape {coords.shape}"
@@ -135,7 +135,7 @@ def checked_draws(guide: Guide, n: int, random: np.random.RandomState, ndim: int
 
 def checked_density(guide: Guide, coords: np.ndarray) -> np.ndarray:
     """Log-density (n,) of a guide; ValueError for any other shape, NaN or +inf."""
-    values = np.asarray(guide.log_density(coords.copy()), dtype=float)
+    values = np.atleast_1d(np.asarray(guide.log_density(coords.copy()), dtype=float))
     if values.shape != (len(coords),) or np.any(np.isnan(values) | (values == np.inf)):
         raise ValueError(
             f"guide.log_density must return one number per point, {len(coords)} in all, neither NaN nor +inf; got "

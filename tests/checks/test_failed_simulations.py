@@ -160,7 +160,7 @@ def test_runs_on_one_posterior_count_their_own_failures():
 def test_failed_simulations_are_counted_however_few_are_in_memory(memory_rows):
     """Reasons left the memory with the simulations; points that share a simulation had made the share smaller."""
     posterior = posterior_of([1.0, 0.8], memory_rows=memory_rows)
-    sampler = run(posterior, steps=1)
+    sampler = run(posterior, steps=1, recycle=False)  # moves share simulations
     reasons = {tuple(each["parameters"][:2]): each["reason"] for each in sampler.failures}
     assert len(reasons) > 20 and set(reasons.values()) == {"no convergence"}
     assert sampler.simulations < 0.5 * sampler.evaluations
