@@ -33,9 +33,8 @@ class Alignment(NamedTuple):
     def statement(self) -> str:
         """Lag, gains and their uncertainty, in words."""
         shown = ", ".join(f"{name} {self.gain[name]:.3g} ({c:.3f})" for name, c in self.correlation.items())
-        low = ", ".join(
-            name for name, value in self.correlation.items() if value**2 < 1.0 - value**2
-        )  # less is explained than left
+        # less is explained than left
+        low = ", ".join(name for name, value in self.correlation.items() if value**2 < 1.0 - value**2)
         text = f"lag {self.lag:.5g} s, standard error {self.standard_error:.2g} s, gain (correlation) {shown}"
         text += f"; NOT SURE: {low} is not a shifted copy of the reference" if low else ""
         return text if self.second_lag is None else f"{text}; NOT SURE: {self.second_lag:.5g} s is nearly as good"
